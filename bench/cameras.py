@@ -35,7 +35,7 @@ def scene(worlds, device):
         [(0, 0, 0), (0, 0, 0), *[(0.25, 0.2, 0.15)] * (BODIES * worlds)],
         body=[-1, -1, *range(BODIES * worlds)],
         local=[floor, (0, 0, 6, 0, 0, 0, 1), *[(0, 0, 0, *turn) for turn in turns] * worlds],
-        albedo=0.4,
+        reflectance=0.4,
         world=[-1, -1, *np.repeat(np.arange(worlds), BODIES)],
         worlds=worlds,
         device=device,

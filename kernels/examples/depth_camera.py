@@ -236,10 +236,11 @@ def sea_floor(camera):
     lens.pixel_tangent = camera.lidar.pixel_tangent
     depth, distance, reflectance = (wp.empty(camera.shape, dtype=float, device=camera.device) for _ in range(3))
     normal = wp.empty(camera.shape, dtype=wp.vec3, device=camera.device)
+    none = wp.empty((0, 0), dtype=wp.vec3, device=camera.device)
     wp.launch(
         sk.truth_kernel,
         dim=camera.shape,
-        inputs=[lens, sk.make_surfaces(mesh), wp.empty((0, 0), dtype=wp.vec3, device=camera.device)],
+        inputs=[lens, sk.make_surfaces(mesh), none, none],
         outputs=[depth, distance, normal, reflectance],
         device=camera.device,
     )

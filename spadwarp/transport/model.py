@@ -109,7 +109,7 @@ def build_model(
         model = polarised_model(model, scene, mesh)
     if camera:
         spare = _check_size(scene, model, copies, len(derivatives) + len(scene.camera.tallied_channels))
-        model = dataclasses.replace(model, low_words=spare)
+        model = dataclasses.replace(model, split_accumulators=spare)
     return model
 
 
@@ -274,7 +274,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
 
 def _laser(scene: Scene, device: wp.Device) -> Any:
     beam = scene.beam
-    laser = sk.Laser()
+    laser: Any = sk.Laser()
     laser.position = wp.vec3(*beam.position)
     laser.axis = wp.vec3(*beam.axis)
     if (port := laser_port(scene)) is not None:

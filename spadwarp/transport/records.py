@@ -73,8 +73,8 @@ class PhotonRecords:
         reasons: Names of the ledger's entries: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low, ...
         ledger: As in `Result`, with its unit.
         derivatives: Names of the P parameters that were asked for.
-        log_derivatives: float32 `[N, P]`, ∂ ln f/∂parameter of the photon's flights and events f so far: the derivative of the
-            expectation of anything that the records tell is the mean of this times the score.
+        log_derivatives: float32 `[N, P]`, ∂ ln f/∂parameter of the photon's flights and events f so far: the
+            derivative of the expectation of anything that the records tell is the mean of this times the score.
     """
 
     id: NDArray[np.uint64]
@@ -180,7 +180,9 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
             file.create_dataset(name, data=getattr(records, name), compression="gzip", compression_opts=1, shuffle=True)
         if records.derivatives:
             file.attrs["derivatives"] = list(records.derivatives)
-            file.create_dataset("log_derivatives", data=records.log_derivatives, compression="gzip", compression_opts=1, shuffle=True)
+            file.create_dataset(
+                "log_derivatives", data=records.log_derivatives, compression="gzip", compression_opts=1, shuffle=True
+            )
         file.create_dataset("ledger", data=json.dumps(records.ledger))  # integers without limit
         if scene is not None:
             file.create_dataset("config", data=scene.to_toml())

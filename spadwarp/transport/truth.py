@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -40,23 +40,21 @@ def trace_truth(scene: Scene, model: Model) -> Truth:
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
-    directions = wp.zeros((0, 0), dtype=wp.vec3, device=model.device)
+    origins = directions = wp.zeros((0, 0), dtype=wp.vec3, device=model.device)
     if not scene.camera.is_plain:
         directions = wp.array(pixel_directions(scene.camera).astype(np.float32), dtype=wp.vec3, device=model.device)
     lines = lines_of_sight(scene)
     depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
     normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
-    inputs: list[Any] = [model.camera, model.surfaces, directions]
     if scene.camera.port is not None:
         # A ray that does not get through goes where nothing is.
         passes = np.isfinite(lines.direction).all(axis=-1, keepdims=True)
         rays = [np.where(passes, lines.start, 1e9), np.where(passes, lines.direction, [0.0, 0.0, 1.0])]
-        arrays: list[Any] = [wp.array(part.astype(np.float32), dtype=wp.vec3, device=model.device) for part in rays]
-        inputs = [model.surfaces, *arrays]
+        origins, directions = (wp.array(part.astype(np.float32), dtype=wp.vec3, device=model.device) for part in rays)
     wp.launch(
-        sk.truth_kernel if scene.camera.port is None else sk.truth_along_kernel,
+        sk.truth_kernel,
         dim=shape,
-        inputs=inputs,
+        inputs=[model.camera, model.surfaces, origins, directions],
         outputs=[depth, distance, normal, reflectance],
         device=model.device,
     )

@@ -13,6 +13,7 @@ from fuzz import optics_calls, world_calls
 from fuzz.isolation import run_isolated
 from helpers.lit_box import lit_box
 from spadwarp_kernels import PortKind, analytic, detection
+from spadwarp_kernels.optics.visibility import near_depth_map
 
 NUMBERS = (0, -1, 1, 2, 1.5, -0.5, math.nan, math.inf, -math.inf, 1e30, 1e-30, 2**31 - 1, 2**31, 2**63, 2**64, -(2**31))
 NUMBERS += (1e300, True, 10**40)
@@ -150,7 +151,7 @@ def _valid_calls():
         "fournier_forand": (sk.fournier_forand_density, {"t": 0.5, "particle_index": 1.1, "junge_slope": 3.6}),
         "henyey_greenstein": (sk.henyey_greenstein_density, {"t": 0.5, "g": 0.5}),
         "two_term": (sk.two_term_henyey_greenstein_density, {"t": 0.5, "g1": 0.5, "g2": -0.1, "alpha": 0.9}),
-        "near_depth_map": (sk.near_depth_map, {"mesh": mesh, "camera": lit_box()["camera"]}),
+        "near_depth_map": (near_depth_map, {"mesh": mesh, "camera": lit_box()["camera"]}),
         "load_kernel": (
             sk.load_transport_kernel,
             {"spec": sk.TransportSpec("next_event"), "device": "cpu", "model": model, "photon_count": 20},

@@ -8,6 +8,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.lit_box import lit_box
 from spadwarp_kernels import analytic
+from spadwarp_kernels.water.limits import reflection_images
 
 
 def valid_calls(mesh: wp.Mesh) -> dict:
@@ -37,7 +38,7 @@ def valid_calls(mesh: wp.Mesh) -> dict:
         ),
         "has_overflowed": (sk.has_overflowed, {"tally": wp.zeros(12, dtype=wp.int64, device="cpu"), "signed": False}),
         "reflection_images": (
-            sk.reflection_images,
+            reflection_images,
             {"low": [1.0, 0.0, 0.0], "high": [0.0, 1.0, 0.0], "max_reflections": 2},
         ),
         "surface_choices": (sk.surface_choices, {"surfaces": sk.make_surfaces(mesh, 0.5)}),
@@ -60,14 +61,14 @@ def _launches(mesh: wp.Mesh, grid, flat: dict) -> dict:
     cloud = sk.Model(
         device="cpu",
         mesh=mesh,
-        surfaces=sk.make_surfaces(mesh, 0.5, textures=textures, specular=0.1, public_tree=True),
+        surfaces=sk.make_surfaces(mesh, 0.5, textures=textures, specular=0.1, use_warp_bvh=True),
         scale=2.0**50,
         layers=layers,
         derivatives=sk.make_derivatives((), (), (), blocks=blocks, device="cpu"),
         **behind,
     )
     in_cloud = sk.TransportSpec(
-        "guided", mesh=True, pattern=True, specular=True, public_tree=True, grid=sk.REGULAR_TRACKING,
+        "guided", mesh=True, pattern=True, specular=True, use_warp_bvh=True, grid=sk.REGULAR_TRACKING,
         port=sk.FLAT_PORT, blocks=("absorption",),
     )  # fmt: skip
     limits, camera, laser = within["limits"], within["camera"], within["laser"]

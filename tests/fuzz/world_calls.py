@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 import spadwarp_kernels as sk
+from spadwarp_kernels.worlds.shapes import move_shapes
 
 _STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -20,7 +21,7 @@ def valid_calls(mesh: wp.Mesh) -> dict:
         "body": [-1, 0, 1],
         "local": [(0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 1.0), _STILL, _STILL],
         "mesh": [None, None, mesh],
-        "albedo": [0.5, 0.3, 0.8],
+        "reflectance": [0.5, 0.3, 0.8],
         "world": [-1, 0, 1],
         "worlds": 2,
         "visible": [True, True, True],
@@ -31,7 +32,7 @@ def valid_calls(mesh: wp.Mesh) -> dict:
     image, normal = wp.full((2, 4, 6), 2.0, dtype=float), wp.full((2, 4, 6), wp.vec3(0.0, 0.0, -1.0), dtype=wp.vec3)
     camera = {"config": small, "cameras": 2, "world": [0, 1], "frame": "optical", "device": "cpu"}
     looked = {"shapes": made, "camera_q": poses, "body_q": poses}
-    images = {"depth": image, "normal": normal, "albedo": image, "along_ray": False, "camera_q": poses}
+    images = {"depth": image, "normal": normal, "reflectance": image, "along_ray": False, "camera_q": poses}
     matrix = wp.full(2, wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), dtype=wp.mat33, device="cpu")
     points = wp.array(mesh.points.numpy(), dtype=wp.vec3, device="cpu")
     moving = wp.Mesh(points, wp.array(mesh.indices.numpy(), dtype=int, device="cpu"))
@@ -43,7 +44,7 @@ def valid_calls(mesh: wp.Mesh) -> dict:
         "SpadCamera.update": (lambda **changed: sk.SpadCamera(**camera).update(**changed), looked),
         "SpadCamera.images": (lambda **changed: sk.SpadCamera(**camera).update_from_images(**changed), images),
         "SpadTracer": (sk.SpadTracer, {"shapes": made, "photons": 100, "oversampling": 2, **camera}),
-        "move_shapes": (sk.move_shapes, {"shapes": made, "body_q": poses}),
+        "move_shapes": (move_shapes, {"shapes": made, "body_q": poses}),
         "write_poses": (
             sk.write_poses,
             {"position": wp.zeros(2, dtype=wp.vec3), "rotation": matrix, "out": wp.zeros(2, dtype=wp.transform)},

@@ -11,6 +11,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.lit_box import lit_box
 from spadwarp_kernels import analytic, detection
+from spadwarp_kernels.water.limits import reflection_images
 
 
 @pytest.fixture(scope="module")
@@ -121,14 +122,14 @@ def test_a_mesh_that_is_not_there(box):
     launch(box, sk.TransportSpec("next_event", mesh=False), model=model)
 
 
-def test_a_public_tree_is_read_from_the_mesh_that_the_model_keeps(box):
+def test_the_bvh_of_warp_is_read_from_the_mesh_that_the_model_keeps(box):
     """With a mesh that nobody keeps this was a segmentation fault, too."""
-    surfaces = sk.make_surfaces(box, 0.5, public_tree=True)
-    spec = sk.TransportSpec("next_event", public_tree=True)
+    surfaces = sk.make_surfaces(box, 0.5, use_warp_bvh=True)
+    spec = sk.TransportSpec("next_event", use_warp_bvh=True)
     for mesh in (None, wp.Mesh(wp.clone(box.points), wp.clone(box.indices))):
         model = sk.Model(device="cpu", mesh=mesh, surfaces=surfaces, scale=2.0**50, **structs())
         with pytest.raises(
-            sk.ArgumentError, match=r"spec\.public_tree = True reads the mesh that the surfaces were made"
+            sk.ArgumentError, match=r"spec\.use_warp_bvh = True reads the mesh that the surfaces were made"
         ):
             launch(box, spec, model=model)
     model = sk.Model(device="cpu", mesh=box, surfaces=surfaces, scale=2.0**50, **structs())
@@ -142,8 +143,8 @@ NONE = {"kinds": (), "value": (), "scale": (1.0,), "channels": 1, "device": "cpu
 @pytest.mark.parametrize(
     ("make", "arguments", "text"),
     [
-        (sk.reflection_images, ([1, 0, 0], [0, 0], 2), r"high = \[0, 0\] is not three numbers"),
-        (sk.reflection_images, ([1, 0, 0], [0, 0, 0], 10**9), r"max_reflections = 1000000000 is outside \[0, 8\]"),
+        (reflection_images, ([1, 0, 0], [0, 0], 2), r"high = \[0, 0\] is not three numbers"),
+        (reflection_images, ([1, 0, 0], [0, 0, 0], 10**9), r"max_reflections = 1000000000 is outside \[0, 8\]"),
         (sk.make_boundary, (None, [0, 0, 0]), "low is .* a list is needed"),
         (sk.sphere_integral, (3.0,), "function = 3.0 is not a function"),
         (sk.sphere_integral, (lambda t: None,), "what function returns has shape"),

@@ -14,8 +14,8 @@ from helpers.statistics_of_samples import DEVICES
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp_kernels.tally.tally import add_to_words, fold_low_words
-from spadwarp_kernels.transport.launch import uses_low_words
+from spadwarp_kernels.tally.tally import add_to_words, fold_accumulators
+from spadwarp_kernels.transport.launch import splits_accumulators
 
 MANY_FACES = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 PENCIL = {
@@ -60,16 +60,16 @@ def tally_of(spec, model, launches=2, photons=100_000):
 @pytest.mark.parametrize("case", CASES)
 def test_the_tally_has_the_same_bits_after_every_launch(always, device, case):
     spec, model = built(CASES[case], device)
-    assert model.low_words
+    assert model.split_accumulators
     sums, data = tally_of(spec, model)
-    expected, plain = tally_of(spec, dataclasses.replace(model, low_words=False))
+    expected, plain = tally_of(spec, dataclasses.replace(model, split_accumulators=False))
     for found, other in zip(sums, expected, strict=True):
         np.testing.assert_array_equal(found, other)
-    assert plain.low_words is None and expected[-1].max() > 2**32
+    assert plain.split_accumulators is None and expected[-1].max() > 2**32
     if device == "cpu":
-        assert data.low_words is None
+        assert data.split_accumulators is None
     else:
-        assert data.low_words.shape == data.tally.shape and not data.low_words.numpy().any()
+        assert data.split_accumulators.shape == data.tally.shape and not data.split_accumulators.numpy().any()
 
 
 @pytest.mark.slow
@@ -80,11 +80,11 @@ def test_smaller_launches_after_a_large_one_give_the_same_bits(monkeypatch, devi
     kept, plain = sk.make_data(model), sk.make_data(model)
     first = 0
     for photons in (200, 100_000, 200):
-        for data, one in ((kept, model), (plain, dataclasses.replace(model, low_words=False))):
+        for data, one in ((kept, model), (plain, dataclasses.replace(model, split_accumulators=False))):
             sk.launch_transport(spec, one, data, seed=3, first_id=first, photon_count=photons)
         first += photons
         np.testing.assert_array_equal(kept.tally.numpy(), plain.tally.numpy())
-        assert (kept.low_words is None) == (device == "cpu" or photons == first)
+        assert (kept.split_accumulators is None) == (device == "cpu" or photons == first)
 
 
 @wp.kernel
@@ -92,10 +92,10 @@ def add_kernel(
     voxel: wp.array(dtype=int),
     value: wp.array(dtype=wp.int64),
     tally: wp.array(dtype=wp.int64),
-    low_words: wp.array(dtype=wp.uint32),
+    split_accumulators: wp.array(dtype=wp.uint32),
 ):
     i = wp.tid()
-    add_to_words(tally, low_words, voxel[i], value[i])
+    add_to_words(tally, split_accumulators, voxel[i], value[i])
 
 
 @pytest.mark.parametrize("device", DEVICES[1:])
@@ -109,19 +109,19 @@ def test_carries_and_values_of_more_than_32_bits(device):
     expected = start.copy()
     np.add.at(expected, voxels, values)
     tally = wp.array(start, dtype=wp.int64, device=device)
-    low_words = wp.zeros(4, dtype=wp.uint32, device=device)
+    split_accumulators = wp.zeros(4, dtype=wp.uint32, device=device)
     inputs = [wp.array(array, device=device) for array in (voxels, values)]
-    wp.launch(add_kernel, dim=voxels.size, inputs=[*inputs, tally, low_words], device=device)
-    fold_low_words(low_words, tally)
+    wp.launch(add_kernel, dim=voxels.size, inputs=[*inputs, tally, split_accumulators], device=device)
+    fold_accumulators(split_accumulators, tally)
     np.testing.assert_array_equal(tally.numpy(), expected)
-    assert not low_words.numpy().any()
+    assert not split_accumulators.numpy().any()
 
 
 def test_words_are_folded_once(device):
     tally = wp.array([5, 2**40, 0], dtype=wp.int64, device=device)
-    low_words = wp.array(np.array([0, 2**32 - 1, 7], np.uint32), dtype=wp.uint32, device=device)
+    split_accumulators = wp.array(np.array([0, 2**32 - 1, 7], np.uint32), dtype=wp.uint32, device=device)
     for _ in range(2):
-        fold_low_words(low_words, tally)
+        fold_accumulators(split_accumulators, tally)
         assert tally.numpy().tolist() == [5, 2**40 + 2**32 - 1, 7]
 
 
@@ -136,7 +136,7 @@ LARGE = 64 * 64 * 2048  # voxels of a component, 67 MB
         (True, {"merged": True}, {}, 1 << 26),
         (False, {}, {}, 4 * LARGE - 1),
         (False, {}, {"tally_size": 3 * LARGE // 2}, 1 << 26),
-        (False, {}, {"low_words": False}, 1 << 26),
+        (False, {}, {"split_accumulators": False}, 1 << 26),
         (False, {}, {"device": SimpleNamespace(is_cuda=False)}, 1 << 26),
         (False, {"estimator": "none"}, {}, 1 << 26),
         (False, {"derivatives": ("absorption",)}, {}, 1 << 26),
@@ -145,9 +145,9 @@ LARGE = 64 * 64 * 2048  # voxels of a component, 67 MB
     ],
 )
 def test_large_launches_into_large_tallies_on_a_gpu_keep_them(chosen, spec, changes, photons):
-    fields = {"low_words": True, "device": SimpleNamespace(is_cuda=True), "tally_size": 3 * LARGE}
+    fields = {"split_accumulators": True, "device": SimpleNamespace(is_cuda=True), "tally_size": 3 * LARGE}
     model = SimpleNamespace(**{**fields, **changes})
-    assert uses_low_words(sk.TransportSpec(**{"estimator": "next_event", **spec}), model, photons) is chosen
+    assert splits_accumulators(sk.TransportSpec(**{"estimator": "next_event", **spec}), model, photons) is chosen
 
 
 def test_only_where_their_memory_is_left(monkeypatch):
@@ -155,7 +155,7 @@ def test_only_where_their_memory_is_left(monkeypatch):
     needed = 16 * 3 * 4 * 4 * 8
     for part, fits in ((1.6, True), (1.4, False)):
         monkeypatch.setattr("spadwarp.transport.model.physical_memory", lambda part=part: part * needed)
-        assert built({}, "cpu")[1].low_words is fits
+        assert built({}, "cpu")[1].split_accumulators is fits
     monkeypatch.setattr("spadwarp.transport.model.physical_memory", lambda: 0.9 * needed)
     with pytest.raises(spadwarp.DeviceError, match="are available"):
         built({}, "cpu")
@@ -163,6 +163,6 @@ def test_only_where_their_memory_is_left(monkeypatch):
 
 def test_words_of_another_length_are_refused():
     spec, model = built({}, "cpu")
-    data = dataclasses.replace(sk.make_data(model), low_words=wp.zeros(3, dtype=wp.uint32, device="cpu"))
-    with pytest.raises(sk.ArgumentError, match=r"data\.low_words"):
+    data = dataclasses.replace(sk.make_data(model), split_accumulators=wp.zeros(3, dtype=wp.uint32, device="cpu"))
+    with pytest.raises(sk.ArgumentError, match=r"data\.split_accumulators"):
         sk.launch_transport(spec, model, data, seed=1, first_id=0, photon_count=10)

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_array, check_integer, check_number
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 
 from .lidar import Lidar
-from .optics import IN_WATER, Optics, check_optics
+from .optics import IN_WATER, Optics, SightRay, check_optics, point_at
 
 __all__ = ["single_scatter_table"]
 
@@ -26,8 +26,17 @@ TABLE_EDGES = 65
 _PANELS = wp.constant(TABLE_EDGES - 1)
 
 
+@wp.struct
+class Scattering:
+    """What the water scatters back, made by `make_scattering`."""
+
+    lines: wp.array[wp.vec3d]  # photons per pulse, extinction and scattering [1/m] of each spectral line
+    phase: wp.array[wp.float64]  # phase function [1/sr] at angles uniform on [0, π]
+    profile: wp.array2d[float]  # backscatter detections per pulse and bin, see `statistics_maps`
+
+
 @wp.func
-def phase_at(phase: wp.array(dtype=wp.float64), cos_theta: wp.float64) -> wp.float64:
+def phase_at(phase: wp.array[wp.float64], cos_theta: wp.float64) -> wp.float64:
     """Phase function [1/sr] from its table over the scattering angle, uniform on [0, pi]."""
     last = phase.shape[0] - 1
     position = wp.acos(wp.clamp(cos_theta, -ONE, ONE)) / PI * wp.float64(last)
@@ -37,32 +46,19 @@ def phase_at(phase: wp.array(dtype=wp.float64), cos_theta: wp.float64) -> wp.flo
 
 
 class SingleScatter(NamedTuple):
-    """Warp functions for single scattering seen through some optics.
+    """Warp functions for single scattering seen through some optics."""
 
-    Attributes:
-        per_metre: (lidar, lines, phase, sight, r) -> detections per pulse and metre of range [1/m].
-        rate: (lidar, lines, phase, sight, time) -> C_back(t) [1/s].
-    """
-
-    per_metre: wp.Function
-    rate: wp.Function
+    per_metre: wp.Function  # (lidar, water, sight, r) -> detections per pulse and metre of range [1/m]
+    rate: wp.Function  # (lidar, water, sight, time) -> C_back(t) [1/s]
 
 
-@made_once
+@memoised
 def make_single_scatter(optics: Optics) -> SingleScatter:
     """The functions for a camera and a laser with these optics."""
-    Sight = optics.sight
-    light_at, point, direction, optics_view = optics.light, optics.point, optics.direction, optics.view
-    range_of_path, from_lens, in_front_of_lens = optics.range_of_path, optics.from_lens, optics.collected
+    light_at, range_of_path = optics.light, optics.range_of_path
 
     @wp.func
-    def single_scatter_per_metre(
-        lidar: Lidar,
-        lines: wp.array(dtype=wp.vec3d),
-        phase: wp.array(dtype=wp.float64),
-        sight: Sight,
-        r: wp.float64,
-    ) -> wp.float64:
+    def single_scatter_per_metre(lidar: Lidar, water: Scattering, sight: SightRay, r: wp.float64) -> wp.float64:
         """Single-scatter detections per pulse and metre of range at the range r [1/m], over all lines.
 
         For a laser in the lens, a narrow cone and the axis it is C_back(t) of Lu et al. 2024 times dt/dr.
@@ -71,83 +67,70 @@ def make_single_scatter(optics: Optics) -> SingleScatter:
         if lidar.lu2024 == 1:
             # pitch^2/N^2 = 4 A (pitch/f)^2/pi
             etendue = wp.float64(4.0) / PI * lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent
-            for k in range(lines.shape[0]):
-                line = lines[k]
-                scale = line[0] * lidar.pde * line[2] * phase[phase.shape[0] - 1]
+            for k in range(water.lines.shape[0]):
+                line = water.lines[k]
+                scale = line[0] * lidar.pde * line[2] * water.phase[water.phase.shape[0] - 1]
                 total += scale * etendue * wp.exp(-TWO * line[1] * r) / (wp.float64(4.0) * lidar.tan2 * r * r)
             return total
-        light = light_at(lidar, point(sight, r))
-        cos_theta = -wp.dot(light.u, direction(sight))
-        axial = optics_view(sight)[2]
+        light = light_at(lidar, point_at(sight, r))
+        cos_theta = -wp.dot(light.u, sight.u)
+        axial = sight.view[2]
         cos_psi2 = axial * axial
         # A cos(psi)/r^2 to the lens times the r^2 (pitch/f)^2 cos^3(psi) that the pixel sees.
         collected = lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent * cos_psi2 * cos_psi2
-        density = phase_at(phase, cos_theta)
+        density = phase_at(water.phase, cos_theta)
         path = light.water + r
-        for k in range(lines.shape[0]):
-            line = lines[k]
+        for k in range(water.lines.shape[0]):
+            line = water.lines[k]
             scale = line[0] * lidar.pde * line[2] * density * collected
             total += scale * light.fluence * wp.exp(-line[1] * path)
-        return in_front_of_lens(sight, total)
+        return total * sight.radiance
 
     @wp.func
-    def single_scatter_rate(
-        lidar: Lidar,
-        lines: wp.array(dtype=wp.vec3d),
-        phase: wp.array(dtype=wp.float64),
-        sight: Sight,
-        time: wp.float64,
-    ) -> wp.float64:
+    def single_scatter_rate(lidar: Lidar, water: Scattering, sight: SightRay, time: wp.float64) -> wp.float64:
         """Single-scatter rate C_back(t) [1/s] on a line of sight without a target."""
         r = range_of_path(lidar.laser, lidar.ports, sight, time * lidar.speed)
-        if r <= ZERO or from_lens(sight, r) < lidar.nearest:
+        if r <= ZERO or sight.distance + r < lidar.nearest:
             return ZERO
         # path = |r u - p| + r, so that d path/dr = 1 - cos(scattering angle).
-        stretch = ONE + wp.dot(light_at(lidar, point(sight, r)).u, direction(sight))
-        return single_scatter_per_metre(lidar, lines, phase, sight, r) * lidar.speed / stretch
+        stretch = ONE + wp.dot(light_at(lidar, point_at(sight, r)).u, sight.u)
+        return single_scatter_per_metre(lidar, water, sight, r) * lidar.speed / stretch
 
     return SingleScatter(single_scatter_per_metre, single_scatter_rate)
 
 
 single_scatter_rate = make_single_scatter(IN_WATER).rate
-"""That of a camera and a laser in the water, `sight` being the unit line of sight."""
+"""That of a camera and a laser in the water."""
 
 
-@made_once
+@memoised
 def _make_table_kernel(optics: Optics) -> wp.Kernel:
-    see, point, light_at, whole_path = optics.see, optics.point, optics.light, optics.whole_path
-    range_of_path, illuminated, from_lens, along = (
-        optics.range_of_path,
-        optics.illuminated,
-        optics.from_lens,
-        optics.along,
-    )
+    see, light_at, range_of_path, illuminated = optics.see, optics.light, optics.range_of_path, optics.illuminated
     per_metre = make_single_scatter(optics).per_metre
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
     def table_kernel(
         first: int,
         lidar: Lidar,
-        lines: wp.array(dtype=wp.vec3d),
-        phase: wp.array(dtype=wp.float64),
-        view: wp.array(dtype=wp.vec3d),
-        distance: wp.array(dtype=wp.float64),
+        water: Scattering,
+        view: wp.array[wp.vec3d],
+        distance: wp.array[wp.float64],
         # Out:
-        paths: wp.array2d(dtype=float),
-        cumulative: wp.array2d(dtype=float),
-        total: wp.array(dtype=wp.float64),
+        paths: wp.array2d[float],
+        cumulative: wp.array2d[float],
+        total: wp.array[wp.float64],
     ):
         """Edges in path, cumulative distribution and total of single-scatter backscatter. Launch grid: pixels."""
         i = first + wp.tid()
         sight = see(lidar.ports, view[i])
         opens = range_of_path(lidar.laser, lidar.ports, sight, lidar.start * lidar.speed)
-        near = wp.max(wp.max(along(sight, lidar.nearest), ZERO), opens)
+        near = wp.max(wp.max(lidar.nearest - sight.distance, ZERO), opens)
         far = range_of_path(lidar.laser, lidar.ports, sight, lidar.stop * lidar.speed)
         if distance[i] > ZERO:
             far = wp.min(far, distance[i])
         lit = illuminated(lidar, sight, near, far)
-        near = from_lens(sight, lit[0])
-        far = wp.max(from_lens(sight, lit[1]), near)
+        near = sight.distance + lit[0]
+        far = wp.max(sight.distance + lit[1], near)
         # Gauss-Legendre of three nodes on panels of equal ln(distance from the lens): the rate falls as a power times
         # an exponential.
         step = wp.log(far / near) / wp.float64(_PANELS)
@@ -157,15 +140,15 @@ def _make_table_kernel(optics: Optics) -> wp.Kernel:
         cumulative[i, 0] = 0.0
         r = wp.float64(near)
         for k in range(paths.shape[1]):
-            s = along(sight, r)
-            paths[i, k] = float(whole_path(sight, light_at(lidar, point(sight, s)).path + s))
+            s = r - sight.distance
+            paths[i, k] = float(light_at(lidar, point_at(sight, s)).path + s + sight.delay)
             if k < _PANELS:
                 mid = r * wp.exp(half)
                 low = mid * wp.exp(-offset * half)
                 high = mid * wp.exp(offset * half)
-                f = wp.float64(8.0) * mid * per_metre(lidar, lines, phase, sight, along(sight, mid))
-                f += wp.float64(5.0) * low * per_metre(lidar, lines, phase, sight, along(sight, low))
-                f += wp.float64(5.0) * high * per_metre(lidar, lines, phase, sight, along(sight, high))
+                f = wp.float64(8.0) * mid * per_metre(lidar, water, sight, mid - sight.distance)
+                f += wp.float64(5.0) * low * per_metre(lidar, water, sight, low - sight.distance)
+                f += wp.float64(5.0) * high * per_metre(lidar, water, sight, high - sight.distance)
                 sum += f * step / wp.float64(18.0)
                 cumulative[i, k + 1] = float(sum)
                 r = r * wp.exp(step)
@@ -177,22 +160,14 @@ def _make_table_kernel(optics: Optics) -> wp.Kernel:
     return table_kernel
 
 
-@made_once
+@memoised
 def make_background_rate(optics: Optics) -> wp.Function:
     """The Warp function of the rate of dark counts and backscatter for these optics."""
-    Sight = optics.sight
     scatter_rate = make_single_scatter(optics).rate
 
     @wp.func
     def background_rate(
-        lidar: Lidar,
-        lines: wp.array(dtype=wp.vec3d),
-        phase: wp.array(dtype=wp.float64),
-        profile: wp.array2d(dtype=float),
-        i: int,
-        sight: Sight,
-        beyond: int,
-        time: wp.float64,
+        lidar: Lidar, water: Scattering, i: int, sight: SightRay, beyond: int, time: wp.float64
     ) -> wp.float64:
         """C_dark + C_back at a time inside the gate [1/s]; a profile is interpolated between bin centres.
 
@@ -203,32 +178,34 @@ def make_background_rate(optics: Optics) -> wp.Function:
         if lidar.source == 1:
             if beyond == 1:
                 return lidar.dark
-            return lidar.dark + scatter_rate(lidar, lines, phase, sight, time)
-        row = i % profile.shape[0]
-        last = profile.shape[1] - 1
+            return lidar.dark + scatter_rate(lidar, water, sight, time)
+        row = i % water.profile.shape[0]
+        last = water.profile.shape[1] - 1
         position = wp.clamp((time - lidar.start) / lidar.bin_width - HALF, ZERO, wp.float64(last))
         k = wp.min(int(position), wp.max(last - 1, 0))
         w = position - wp.float64(k)
-        value = (ONE - w) * wp.float64(profile[row, k]) + w * wp.float64(profile[row, wp.min(k + 1, last)])
+        value = (ONE - w) * wp.float64(water.profile[row, k]) + w * wp.float64(water.profile[row, wp.min(k + 1, last)])
         return lidar.dark + value / lidar.bin_width
 
     return background_rate
 
 
-def spectral_lines(lidar: Any, lines: wp.array | None, device: wp.Device) -> wp.array:
-    """The lines given, or the lidar's own photons, extinction and scattering as one line."""
-    if lines is None:
-        own = wp.vec3d(float(lidar.photons), float(lidar.extinction), float(lidar.scattering))
-        return wp.array([own], dtype=wp.vec3d, device=device)
-    check_array("lines", lines, wp.vec3d, (None,), device)
-    check_integer("number of lines", lines.size, 1)
-    return lines
-
-
-def check_phase(phase: Any, device: wp.Device) -> None:
-    """A table of a phase function over the scattering angle."""
+def make_scattering(
+    lidar: Any, phase: Any, device: wp.Device, *, lines: Any = None, profile: wp.array | None = None
+) -> Scattering:
+    """The lines given, or the lidar's own photons, extinction and scattering as one line; and a phase function, whose
+    table is checked. Raises `ArgumentError`."""
     check_array("phase", phase, wp.float64, (None,), device)
     check_integer("entries of phase", phase.size, 2)
+    if lines is None:
+        own = wp.vec3d(float(lidar.photons), float(lidar.extinction), float(lidar.scattering))
+        lines = wp.array([own], dtype=wp.vec3d, device=device)
+    check_array("lines", lines, wp.vec3d, (None,), device)
+    check_integer("number of lines", lines.size, 1)
+    water = Scattering()
+    water.lines, water.phase = lines, phase
+    water.profile = wp.zeros((1, 1), dtype=float, device=device) if profile is None else profile
+    return water
 
 
 def single_scatter_table(
@@ -260,11 +237,11 @@ def single_scatter_table(
     check_number("lidar.nearest", lidar.nearest, "(0, inf)")
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
-    check_phase(phase, device)
+    water = make_scattering(lidar, phase, device, lines=lines)
     check_array("distance", distance, wp.float64, (count,), device)
     paths = wp.empty((count, TABLE_EDGES), dtype=float, device=device)
     cumulative = wp.empty((count, TABLE_EDGES), dtype=float, device=device)
     total = wp.empty(count, dtype=wp.float64, device=device)
-    inputs = [lidar, spectral_lines(lidar, lines, device), phase, view, distance]
+    inputs = [lidar, water, view, distance]
     launch_pixels(_make_table_kernel(optics), count, [*inputs, paths, cumulative, total], device=device)
     return paths, cumulative, total

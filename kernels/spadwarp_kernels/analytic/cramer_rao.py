@@ -8,16 +8,22 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_number
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
-from spadwarp_kernels.base.native import HALF, ONE, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_arrays,
+    check_choice,
+    check_integer,
+    check_range,
+)
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
+from spadwarp_kernels.base.native import HALF, ONE, PI, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 
-from .backscatter import check_phase, make_background_rate, spectral_lines
+from .backscatter import Scattering, make_background_rate, make_scattering
 from .lidar import Lidar
-from .optics import Optics, check_optics
-from .outliers import outlier_probability
+from .optics import Optics, SightRay, check_optics
 
-__all__ = ["COUNT_LAWS", "histogram_information", "statistics_maps"]
+__all__ = ["histogram_information", "outlier_probabilities", "statistics_maps"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
@@ -38,19 +44,120 @@ def recorded_photons(
     return acquisitions * (ONE - wp.pow(wp.max(ONE - alpha, ZERO), pulses_per_frame))
 
 
+# ---- How often a fit reports background instead of the target: where the bound is out of reach.
+
+
+@wp.func
+def outlier_probability(signal_count: wp.float64, level: wp.float64, window: wp.float64) -> wp.float64:
+    """Probability that the maximum-likelihood delay locks on background counts, more than 4 sigma from the truth.
+
+    The score of a delay is the sum over counts of g(z) = ln(1 + r exp(-z^2/2)), a Poisson shot noise. K(s) is the
+    cumulant function of its background part; the score at the true delay has the same law tilted to s = 1. Rice's
+    formula with the saddlepoint density gives the mean number of upcrossings of x = K'(s) over the window, and
+    P = E[1 - exp(-upcrossings of the true delay's score)].
+    What first order leaves out: 1/sqrt(1 + s) is the gain of the score by the fit's freedom (half a chi^2 of one
+    degree), and 1 - 0.18 b/(b + 0.2), for crossings that come in clusters, is fitted to Monte Carlo.
+
+    Args:
+        signal_count: Expected signal counts of the whole acquisition.
+        level: Expected background counts per sigma, b.
+        window: Gate over sigma.
+    """
+    # A fit that knows nothing is anywhere in the window.
+    blind = wp.max(ONE - wp.float64(8.0) / window, ZERO)
+    if signal_count <= ZERO:
+        return blind
+    if level <= ZERO:
+        return ZERO
+    ratio = signal_count / (level * SQRT_2PI)
+    reach = wp.max(wp.sqrt(TWO * wp.log(ONE + ratio)) + wp.float64(3.5), wp.float64(5.0))
+    h = reach / wp.float64(24.0)
+    spread = wp.float64(0.0)
+    half_way = wp.float64(0.0)
+    for j in range(25):
+        z = wp.float64(j) * h
+        e = ratio * wp.exp(-HALF * z * z)
+        g = wp.log(ONE + e)
+        w = wp.where(j == 0, ONE, TWO)
+        spread += w * (ONE + e) * g * g
+        half_way += w * (wp.sqrt(ONE + e) - ONE)
+    # Signal and background scores overlap most at s = 1/2: exp(2 K(1/2) - K(1)) bounds the probability.
+    if TWO * level * h * half_way - signal_count + wp.log(window) < wp.float64(-60.0):
+        return ZERO
+    width = wp.float64(7.0) / wp.sqrt(level * h * spread)
+    low = wp.max(ONE - width, -ONE)
+    high = wp.min(ONE + width, wp.float64(3.0))
+    step = (high - low) / wp.float64(32.0)
+    clusters = wp.max(window - wp.float64(8.0), ZERO) * (ONE - wp.float64(0.18) * level / (level + wp.float64(0.2)))
+    mass = wp.float64(0.0)
+    lost = wp.float64(0.0)
+    most = wp.float64(0.0)
+    # From high scores to low ones, so that the number of crossings can be kept from falling below the mean score.
+    for n in range(33):
+        s = high - wp.float64(n) * step
+        k0 = wp.float64(0.0)
+        k1 = wp.float64(0.0)
+        k2 = wp.float64(0.0)
+        slope = wp.float64(0.0)
+        for j in range(25):
+            z = wp.float64(j) * h
+            e = ratio * wp.exp(-HALF * z * z)
+            g = wp.log(ONE + e)
+            w = wp.where(j == 0, ONE, TWO)
+            tilt = wp.exp(s * g)
+            dg = z * e / (ONE + e)
+            k0 += w * (tilt - ONE)
+            k1 += w * tilt * g
+            k2 += w * tilt * g * g
+            slope += w * tilt * dg * dg
+        k0 *= level * h
+        k1 *= level * h
+        k2 *= level * h
+        slope *= level * h
+        log_density = k0 - s * k1 - HALF * wp.log(TWO * PI * k2)
+        crossings = clusters * wp.exp(wp.min(log_density, wp.float64(50.0))) * wp.sqrt(slope / (TWO * PI))
+        most = wp.max(most, crossings / wp.sqrt(ONE + wp.max(s, ZERO)))
+        weight = k2 * wp.exp(wp.min(log_density + k1 - signal_count, wp.float64(50.0)))
+        mass += weight
+        lost += weight * one_minus_exp(most)
+    if not (mass > ZERO):
+        return blind  # too faint for the sums
+    return wp.min(lost / mass, blind)
+
+
+@wp.kernel
+def _outliers(
+    first: int,
+    signal_count: wp.array[wp.float64],
+    level: wp.array[wp.float64],
+    window: wp.array[wp.float64],
+    # Out:
+    probability: wp.array[wp.float64],
+):
+    """Launch grid: elements."""
+    i = first + wp.tid()
+    probability[i] = outlier_probability(signal_count[i], level[i], window[i])
+
+
+def outlier_probabilities(signal_count: wp.array, level: wp.array, window: wp.array) -> wp.array:
+    """`outlier_probability` of every element: float64 arrays of one length in and out."""
+    check_array("signal_count", signal_count, wp.float64, (None,))
+    check_arrays(wp.float64, signal_count.shape, signal_count.device, level=level, window=window)
+    out = wp.empty(signal_count.shape[0], dtype=wp.float64, device=signal_count.device)
+    launch_pixels(_outliers, signal_count.shape[0], [signal_count, level, window, out], device=signal_count.device)
+    return out
+
+
+# ---- The bound of a pulse.
+
+
 @wp.struct
 class PulseIntegrals:
-    """Integrals over the time of the pulse of the signal's rate S, the background's B and the total L, per laser pulse.
+    """Integrals over the time of a pulse of the rates of the signal S, the background B and both L, per laser pulse."""
 
-    Attributes:
-        information: ∫ (dL/dμ)²/L dt [1/s²].
-        background: ∫ S B dt [1/s].
-        signal: ∫ S dt.
-    """
-
-    information: wp.float64
-    background: wp.float64
-    signal: wp.float64
+    information: wp.float64  # ∫ (dL/dμ)²/L dt [1/s²]
+    background: wp.float64  # ∫ S B dt [1/s]
+    signal: wp.float64  # ∫ S dt
 
 
 @wp.func
@@ -69,22 +176,14 @@ def _gauss_legendre(node: int) -> wp.vec2d:
     return wp.vec2d(x, w)
 
 
-@made_once
+@memoised
 def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
-    Sight, see = optics.sight, optics.see
+    see = optics.see
     background_rate = make_background_rate(optics)
 
     @wp.func
     def integrate_pulse(
-        lidar: Lidar,
-        lines: wp.array(dtype=wp.vec3d),
-        phase: wp.array(dtype=wp.float64),
-        profile: wp.array2d(dtype=float),
-        i: int,
-        sight: Sight,
-        s: wp.float64,
-        mu: wp.float64,
-        ambient: wp.float64,
+        lidar: Lidar, water: Scattering, i: int, sight: SightRay, s: wp.float64, mu: wp.float64, ambient: wp.float64
     ) -> PulseIntegrals:
         """The integrals for a signal of s detections that arrives at mu: on both sides, since backscatter ends there,
         24 panels of at most σ/2 with five Gauss-Legendre nodes."""
@@ -98,11 +197,11 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
                 high = wp.min(lidar.stop, mu + wp.float64(12.0) * sigma)
             half = (high - low) / wp.float64(48.0)
             if half > ZERO:
-                right = background_rate(lidar, lines, phase, profile, i, sight, side, low) + ambient
+                right = background_rate(lidar, water, i, sight, side, low) + ambient
                 for panel in range(24):
                     middle = low + (TWO * wp.float64(panel) + ONE) * half
                     left = wp.float64(right)
-                    right = background_rate(lidar, lines, phase, profile, i, sight, side, middle + half) + ambient
+                    right = background_rate(lidar, water, i, sight, side, middle + half) + ambient
                     for node in range(5):
                         rule = _gauss_legendre(node)
                         x = rule[0]
@@ -113,7 +212,7 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
                         # Straight across a panel; only a profile can have more detail than that.
                         noise_rate = HALF * (left + right) + HALF * (right - left) * x
                         if lidar.source == 2:
-                            noise_rate = background_rate(lidar, lines, phase, profile, i, sight, side, t) + ambient
+                            noise_rate = background_rate(lidar, water, i, sight, side, t) + ambient
                         rate = noise_rate + pulse
                         if rate > ZERO:
                             total.information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
@@ -125,24 +224,22 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
     def statistics_kernel(
         first: int,
         lidar: Lidar,
-        lines: wp.array(dtype=wp.vec3d),
-        phase: wp.array(dtype=wp.float64),
-        profile: wp.array2d(dtype=float),
-        view: wp.array(dtype=wp.vec3d),
-        signal: wp.array(dtype=wp.float64),
-        arrival: wp.array(dtype=wp.float64),
-        backscatter: wp.array(dtype=wp.float64),
-        ambient: wp.array(dtype=wp.float64),
+        water: Scattering,
+        view: wp.array[wp.vec3d],
+        signal: wp.array[wp.float64],
+        arrival: wp.array[wp.float64],
+        backscatter: wp.array[wp.float64],
+        ambient: wp.array[wp.float64],
         count_law: int,
         acquisitions: wp.float64,
         pulses_per_frame: wp.float64,
         with_outliers: int,
         # Out:
-        alpha: wp.array(dtype=wp.float64),
-        fisher: wp.array(dtype=wp.float64),
-        sigma_time: wp.array(dtype=wp.float64),
-        level: wp.array(dtype=wp.float64),
-        outlier: wp.array(dtype=wp.float64),
+        alpha: wp.array[wp.float64],
+        fisher: wp.array[wp.float64],
+        sigma_time: wp.array[wp.float64],
+        level: wp.array[wp.float64],
+        outlier: wp.array[wp.float64],
     ):
         """α (integral of eq 8), Fisher information per photon (eq 9), σ*, outlier probability. Launch grid: pixels."""
         i = first + wp.tid()
@@ -159,7 +256,7 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
         alpha[i] = a
         pulse = PulseIntegrals()
         if s * fraction > ZERO:
-            pulse = integrate_pulse(lidar, lines, phase, profile, i, see(lidar.ports, view[i]), s, mu, beside)
+            pulse = integrate_pulse(lidar, water, i, see(lidar.ports, view[i]), s, mu, beside)
         counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
         f = wp.float64(0.0)
         sigma_star = wp.float64(wp.nan)
@@ -186,13 +283,13 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
 @wp.kernel
 def _histogram_information(
     first: int,
-    signal: wp.array2d(dtype=float),
-    background: wp.array2d(dtype=float),
-    taps: wp.array(dtype=wp.float64),
-    slope_taps: wp.array(dtype=wp.float64),
+    signal: wp.array2d[float],
+    background: wp.array2d[float],
+    taps: wp.array[wp.float64],
+    slope_taps: wp.array[wp.float64],
     first_photon: int,
     # Out:
-    information: wp.array(dtype=wp.float64),
+    information: wp.array[wp.float64],
 ):
     """Fisher information of the delay per pulse, in 1/bins². Launch grid: pixels.
 
@@ -271,38 +368,26 @@ def statistics_maps(
     optics = check_optics(lidar, optics)
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
-    check_phase(phase, device)
     check_array("profile", profile, wp.float32, (None, None), device)
     check_integer("entries of profile", profile.size, 1)
-    for name, array in {"signal": signal, "arrival": arrival, "backscatter": backscatter}.items():
-        check_array(name, array, wp.float64, (count,), device)
+    water = make_scattering(lidar, phase, device, lines=lines, profile=profile)
+    check_arrays(wp.float64, (count,), device, signal=signal, arrival=arrival, backscatter=backscatter)
     check_choice("count_law", count_law, COUNT_LAWS)
-    check_number("acquisitions", acquisitions, "(0, inf)")
-    check_number("pulses_per_frame", pulses_per_frame, "(0, inf)")
+    check_range("(0, inf)", acquisitions=acquisitions, pulses_per_frame=pulses_per_frame)
     out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(5))
-    counting = [
-        COUNT_LAWS.index(count_law),
-        wp.float64(acquisitions),
-        wp.float64(pulses_per_frame),
-        int(bool(outliers)),
-    ]
+    counting = [COUNT_LAWS.index(count_law), acquisitions, pulses_per_frame, int(bool(outliers))]
     if ambient is None:
         ambient = wp.zeros(1, dtype=wp.float64, device=device)
     check_array("ambient", ambient, wp.float64, (None,), device)
     if ambient.size not in (1, count):
         raise ArgumentError(f"ambient has {ambient.size} entries; 1 or {count} are needed")
-    inputs = [lidar, spectral_lines(lidar, lines, device), phase, profile, view, signal, arrival, backscatter, ambient]
+    inputs = [lidar, water, view, signal, arrival, backscatter, ambient]
     launch_pixels(_make_statistics_kernel(optics), count, [*inputs, *counting, *out], device=device)
     return out
 
 
 def histogram_information(
-    signal: wp.array,
-    background: wp.array,
-    taps: wp.array,
-    slope_taps: wp.array,
-    *,
-    first_photon: bool,
+    signal: wp.array, background: wp.array, taps: wp.array, slope_taps: wp.array, *, first_photon: bool
 ) -> wp.array:
     """Fisher information of the delay per pulse [1/bins²], float64 `[pixel]`.
 

@@ -1,6 +1,10 @@
-"""Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon instead."""
+"""Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon instead.
 
-from collections.abc import Mapping, Sequence
+`sample_frames` gives depth [m] and labels; `draw_frames` gives them as a dataset stores them, as integers and bits, for
+frames that differ in the part of their pixels that reports background, with the number of recorded photons beside them.
+"""
+
+from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
@@ -8,45 +12,45 @@ import warp as wp
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
+    check_arrays,
+    check_fields,
     check_integer,
     check_number,
     check_seed,
+    check_struct,
     check_vector,
 )
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
-from spadwarp_kernels.base.philox import STREAM_ANALYTIC, random_block, u01, u01_open
+from spadwarp_kernels.base.binomial import count_quantile
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
+from spadwarp_kernels.base.philox import STREAM_ANALYTIC, STREAM_FRAMES, random_block, u01, u01_open
 
 from .lidar import Ports
-from .optics import IN_WATER, Optics, check_ports
+from .optics import IN_WATER, Optics, check_ports, point_at
 
-__all__ = ["sample_frames"]
+__all__ = ["FrameCoding", "draw_frames", "sample_frames"]
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 
 @wp.struct
-class Sampler:
-    """What is drawn.
-
-    Attributes:
-        laser: Position of the laser [m].
-        nearest, farthest: Paths at which the gate opens and closes [m].
-        pixels: Number of pixels of a frame.
-        first_frame, frames: The range of frames.
-        seed: Of the random numbers.
-    """
+class PixelMaps:
+    """What frames are drawn from, float32 `[pixel]`: see `sample_frames`."""
 
     laser: wp.vec3
-    nearest: float
-    farthest: float
-    pixels: int
-    first_frame: int
-    frames: int
-    seed: wp.uint64
+    nearest: float  # path at which the gate opens [m]
+    farthest: float  # path at which it closes [m]
+    view: wp.array[wp.vec3]
+    depth: wp.array[float]
+    sigma_depth: wp.array[float]
+    probability: wp.array[float]
+    flat_share: wp.array[float]
+    paths: wp.array2d[float]
+    cumulative: wp.array2d[float]
+    ports: Ports
 
 
 @wp.func
-def path_at_share(paths: wp.array2d(dtype=float), cumulative: wp.array2d(dtype=float), pixel: int, u: float) -> float:
+def path_at_share(paths: wp.array2d[float], cumulative: wp.array2d[float], pixel: int, u: float) -> float:
     """The path [m] at which a pixel's cumulative distribution of backscatter reaches u."""
     row = pixel % cumulative.shape[0]
     edges = pixel % paths.shape[0]
@@ -75,102 +79,116 @@ def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
     return view[2] * (path * path - baseline2) / (2.0 * (path - wp.dot(view, laser)))
 
 
-@made_once
-def make_depth_of_path(optics: Optics) -> wp.Function:
-    """The Warp function ``(laser, ports, view, path)`` -> planar depth at which light has gone a path; 0 if there is
-    none."""
-    see, point, range_of_path = optics.see, optics.point, optics.range_of_path
+@memoised
+def _make_depths(optics: Optics) -> tuple[wp.Function, wp.Function]:
+    """Two Warp functions: ``(maps, pixel, path)`` -> planar depth at which light has gone a path, 0 if there is none;
+    and ``(maps, pixel, flat, draw)`` -> that of a background photon, which comes at any time of the gate alike (flat)
+    or by its distribution."""
+    see, range_of_path = optics.see, optics.range_of_path
     in_water = optics is IN_WATER
 
     @wp.func
-    def depth_at(laser: wp.vec3, ports: Ports, view: wp.vec3, path: float) -> float:
+    def depth_at(maps: PixelMaps, pixel: int, path: float) -> float:
         if wp.static(in_water):
-            return depth_of_path(laser, view, path)
-        sight = see(ports, wp.vec3d(view))
-        r = range_of_path(wp.vec3d(laser), ports, sight, wp.float64(path))
+            return depth_of_path(maps.laser, maps.view[pixel], path)
+        sight = see(maps.ports, wp.vec3d(maps.view[pixel]))
+        r = range_of_path(wp.vec3d(maps.laser), maps.ports, sight, wp.float64(path))
         depth = wp.float64(0.0)
         if r > depth:
-            depth = point(sight, r)[2]
+            depth = point_at(sight, r)[2]
         return float(depth)
 
-    return depth_at
+    @wp.func
+    def background_depth(maps: PixelMaps, pixel: int, flat: bool, draw: float) -> float:
+        path = maps.nearest + draw * (maps.farthest - maps.nearest)
+        if not flat:
+            path = path_at_share(maps.paths, maps.cumulative, pixel, draw)
+        return depth_at(maps, pixel, path)
+
+    return depth_at, background_depth
 
 
-@made_once
-def _make_kernel(optics: Optics) -> wp.Kernel:
-    depth_at = make_depth_of_path(optics)
+@memoised
+def _make_sample_kernel(optics: Optics) -> wp.Kernel:
+    _, background_depth = _make_depths(optics)
 
     @wp.kernel(module="unique", enable_backward=False)
     def frames_kernel(
         first: int,
-        sampler: Sampler,
-        view: wp.array(dtype=wp.vec3),
-        depth: wp.array(dtype=float),
-        sigma_depth: wp.array(dtype=float),
-        probability: wp.array(dtype=float),
-        flat_share: wp.array(dtype=float),
-        paths: wp.array2d(dtype=float),
-        cumulative: wp.array2d(dtype=float),
-        ports: Ports,
+        maps: PixelMaps,
+        pixels: int,
+        first_frame: int,
+        frame_count: int,
+        seed: wp.uint64,
         # Out:
-        frames: wp.array2d(dtype=float),
-        labels: wp.array2d(dtype=wp.bool),
+        frames: wp.array2d[float],
+        labels: wp.array2d[wp.bool],
     ):
         """μ + N(0, σ*²), or with some probability a background photon. Launch grid: frame pairs x pixels.
 
         One block of random numbers serves two frames; a draw depends on seed, pixel and frame number alone.
         """
         tid = first + wp.tid()
-        pair = tid / sampler.pixels
-        pixel = tid - pair * sampler.pixels
-        pair += sampler.first_frame / 2
-        block = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair), STREAM_ANALYTIC)
-        radius = sigma_depth[pixel] * wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
+        pair = tid / pixels
+        pixel = tid - pair * pixels
+        pair += first_frame / 2
+        block = random_block(seed, wp.uint64(pixel), wp.uint32(2 * pair), STREAM_ANALYTIC)
+        radius = maps.sigma_depth[pixel] * wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
         angle = 6.283185307179586 * u01(block[1])
-        p = probability[pixel]
+        p = maps.probability[pixel]
         for k in range(2):
-            frame = 2 * pair + k - sampler.first_frame
-            if frame >= 0 and frame < sampler.frames:
+            frame = 2 * pair + k - first_frame
+            if frame >= 0 and frame < frame_count:
                 shift = radius * wp.cos(angle)
                 word = block[2]
                 if k == 1:
                     shift = radius * wp.sin(angle)
                     word = block[3]
-                value = depth[pixel] + shift
+                value = maps.depth[pixel] + shift
                 reports_background = u01(word) < p
                 if reports_background:
-                    extra = random_block(sampler.seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
+                    extra = random_block(seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
                     kind = u01(extra[0])
                     draw = u01(extra[1])
                     if k == 1:
                         kind = u01(extra[2])
                         draw = u01(extra[3])
-                    path = sampler.nearest + draw * (sampler.farthest - sampler.nearest)
-                    if kind >= flat_share[pixel]:
-                        path = path_at_share(paths, cumulative, pixel, draw)
-                    value = depth_at(sampler.laser, ports, view[pixel], path)
+                    value = background_depth(maps, pixel, kind < maps.flat_share[pixel], draw)
                 frames[frame, pixel] = value
                 labels[frame, pixel] = reports_background
 
     return frames_kernel
 
 
-def check_pixel_maps(maps: Mapping[str, Any], paths: Any, cumulative: Any, pixels: int, device: wp.Device) -> None:
-    """float32 maps `[pixel]`, and the two tables of backscatter over path."""
-    for name, array in maps.items():
-        check_array(name, array, wp.float32, (pixels,), device)
+def _pixel_maps(
+    optics: Any,
+    ports: Any,
+    laser: Sequence[float],
+    gate_paths: Sequence[float],
+    paths: Any,
+    cumulative: Any,
+    **maps: Any,
+) -> tuple[Optics, PixelMaps]:
+    """The maps of all pixels, view among them, if they fit each other; raises `ArgumentError`."""
+    check_array("view", maps["view"], wp.vec3, (None,))
+    pixels, device = maps["view"].shape[0], maps["view"].device
+    check_arrays(wp.float32, (pixels,), device, **{name: array for name, array in maps.items() if name != "view"})
+    check_arrays(wp.float32, (None, None), device, paths=paths, cumulative=cumulative)
     for name, array in {"paths": paths, "cumulative": cumulative}.items():
-        check_array(name, array, wp.float32, (None, None), device)
         check_integer(f"rows of {name}", array.shape[0], 1)
         check_integer(f"columns of {name}", array.shape[1], 2)
     if paths.shape[1] != cumulative.shape[1]:
         raise ArgumentError(f"paths {paths.shape} and cumulative {cumulative.shape} have not as many columns")
-
-
-def check_gate_paths(gate_paths: Sequence[float]) -> None:
-    """Two rising path lengths [m]."""
+    check_vector("laser", laser)
     check_vector("gate_paths", gate_paths, size=2)
     check_number("gate_paths[1]", gate_paths[1], f"[{float(gate_paths[0])}, inf)")
+    optics, ports = check_ports("ports", ports, optics)
+    made = PixelMaps()
+    made.laser, made.ports = wp.vec3(*map(float, laser)), ports
+    made.nearest, made.farthest = gate_paths
+    for name, array in (maps | {"paths": paths, "cumulative": cumulative}).items():
+        setattr(made, name, array)
+    return optics, made
 
 
 def sample_frames(
@@ -212,13 +230,9 @@ def sample_frames(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    check_array("view", view, wp.vec3, (None,))
-    pixels, device = view.shape[0], view.device
     maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
-    check_pixel_maps(maps, paths, cumulative, pixels, device)
-    check_vector("laser", laser)
-    optics, ports = check_ports("ports", ports, optics)
-    check_gate_paths(gate_paths)
+    optics, drawn = _pixel_maps(optics, ports, laser, gate_paths, paths, cumulative, view=view, **maps)
+    pixels, device = view.shape[0], view.device
     frames = check_integer("frames", frames, 0)
     first_frame, seed = check_integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check_seed(seed)
     if out is None:
@@ -230,19 +244,159 @@ def sample_frames(
         raise ArgumentError("out is not a pair of arrays, of depth and of labels")
     check_array("out[0]", out[0], wp.float32, (frames, pixels), device)
     check_array("out[1]", out[1], wp.bool, (frames, pixels), device)
-    kernel = _make_kernel(optics)
+    kernel = _make_sample_kernel(optics)
     # wp.tid() is a 32-bit integer, and a thread draws two frames.
     step = 2 * max((1 << 30) // max(pixels, 1), 1)
     for start in range(0, frames, step):
         stop = min(start + step, frames)
-        sampler = Sampler()
-        sampler.laser = wp.vec3(*map(float, laser))
-        sampler.nearest, sampler.farthest = gate_paths
-        sampler.pixels = pixels
-        sampler.first_frame = first_frame + start
-        sampler.frames = stop - start
-        sampler.seed = wp.uint64(seed)
         pairs = (first_frame + stop + 1) // 2 - (first_frame + start) // 2
-        inputs = [sampler, view, depth, sigma_depth, probability, flat_share, paths, cumulative, ports]
-        launch_pixels(kernel, pairs * pixels, [*inputs, out[0][start:stop], out[1][start:stop]], device=device)
+        inputs = [drawn, pixels, first_frame + start, stop - start, seed, out[0][start:stop], out[1][start:stop]]
+        launch_pixels(kernel, pairs * pixels, inputs, device=device)
     return out
+
+
+# ---- Frames as a dataset stores them.
+
+
+@wp.struct
+class FrameCoding:
+    """What is drawn, and how it is written.
+
+    Attributes:
+        laser: Position of the laser [m].
+        nearest, farthest: Paths at which the gate opens and closes [m].
+        width, pixels: Of a row, of a frame.
+        seed: Of the random numbers.
+        first_sample: Id of the first frame; the others follow.
+        depth_offset, depth_step: depth = offset + step · code [m]; code 0 is no return.
+        pulses: Pulses of a frame.
+        intensity_step: Recorded photons per unit of the intensity code.
+    """
+
+    laser: wp.vec3
+    nearest: float
+    farthest: float
+    width: int
+    pixels: int
+    seed: wp.uint64
+    first_sample: wp.int64
+    depth_offset: float
+    depth_step: float
+    pulses: float
+    intensity_step: float
+
+
+@memoised
+def _make_coding_kernel(optics: Optics) -> wp.Kernel:
+    depth_at, background_depth = _make_depths(optics)
+
+    @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
+    def frames_kernel(
+        first: int,
+        coding: FrameCoding,
+        maps: PixelMaps,
+        alpha: wp.array[float],
+        fraction: wp.array[float],
+        # Out:
+        depth_codes: wp.array2d[wp.uint16],
+        intensity_codes: wp.array2d[wp.uint8],
+        label_bytes: wp.array2d[wp.uint8],
+    ):
+        """Launch grid: frames x bytes of labels. A thread draws the eight pixels of one byte."""
+        tid = first + wp.tid()
+        frame = tid / label_bytes.shape[1]
+        byte = tid - frame * label_bytes.shape[1]
+        row_bytes = (coding.width + 7) / 8
+        row = byte / row_bytes
+        column = 8 * (byte - row * row_bytes)
+        bits = int(0)
+        for k in range(8):
+            if column + k < coding.width:
+                pixel = row * coding.width + column + k
+                sample = wp.uint64(coding.first_sample + wp.int64(frame))
+                block = random_block(coding.seed, sample, wp.uint32(pixel), STREAM_FRAMES)
+                radius = wp.sqrt(-2.0 * wp.log(u01_open(block[0])))
+                angle = 6.283185307179586 * u01(block[1])
+                low = depth_at(maps, pixel, maps.nearest)
+                high = depth_at(maps, pixel, maps.farthest)
+                # NaN, no estimate, stays NaN.
+                value = maps.depth[pixel] + maps.sigma_depth[pixel] * radius * wp.cos(angle)
+                chance = maps.probability[pixel] * fraction[frame]
+                kind = u01(block[2])
+                if kind < chance:
+                    bits |= 128 >> k
+                    draw = u01(block[3])
+                    # Of the pixels that report background, kind / chance is uniform again.
+                    value = background_depth(maps, pixel, kind < maps.flat_share[pixel] * chance, draw)
+                code = int(0)
+                if value == value:
+                    # A fit does not leave the gate.
+                    value = wp.clamp(value, low, high)
+                    code = wp.clamp(int((value - coding.depth_offset) / coding.depth_step + 0.5), 1, 65535)
+                depth_codes[frame, pixel] = wp.uint16(code)
+                count = count_quantile(radius * wp.sin(angle), coding.pulses, alpha[pixel])
+                level = wp.min(int(count / coding.intensity_step + 0.5), 255)
+                intensity_codes[frame, pixel] = wp.uint8(level)
+        label_bytes[frame, byte] = wp.uint8(bits)
+
+    return frames_kernel
+
+
+def _check_coding(coding: Any) -> None:
+    check_struct("coding", coding, FrameCoding)
+    width = check_integer("coding.width", coding.width, 1)
+    if check_integer("coding.pixels", coding.pixels, 1) % width:
+        raise ArgumentError(f"coding.width = {width} does not divide coding.pixels = {coding.pixels}")
+    check_fields("coding", coding, {"depth_offset": "(-inf, inf)", "depth_step": "(0, inf)"})
+    check_fields("coding", coding, {"intensity_step": "(0, inf)", "pulses": "[0, inf)"})
+
+
+def draw_frames(
+    coding: FrameCoding,
+    view: wp.array,
+    depth: wp.array,
+    sigma_depth: wp.array,
+    alpha: wp.array,
+    probability: wp.array,
+    flat_share: wp.array,
+    paths: wp.array,
+    cumulative: wp.array,
+    fraction: wp.array,
+    *,
+    optics: Optics | None = None,
+    ports: Any = None,
+) -> Sequence[wp.array]:
+    """Frames `coding.first_sample` and on, one for each entry of `fraction`.
+
+    A frame depends on seed, sample id and the pixels' own values alone, whatever it is drawn with.
+
+    Args:
+        coding: A `FrameCoding`.
+        view, depth, sigma_depth, flat_share, paths, cumulative, optics, ports: As for `sample_frames`.
+        alpha: float32 `[pixel]`, expected detections per pulse.
+        probability: float32 `[pixel]`; times `fraction` the probability that a pixel reports background.
+        fraction: float32 `[frame]`, in [0, 1].
+
+    Returns:
+        Depth codes uint16 `[frame, pixel]`, intensity codes uint8 `[frame, pixel]`, labels uint8 `[frame, byte]`: rows
+        of (width + 7)/8 bytes, the first pixel in the highest bit, as `np.packbits` has them.
+
+    Raises:
+        ArgumentError: A number out of range, or arrays that do not fit each other.
+    """
+    _check_coding(coding)
+    check_array("view", view, wp.vec3, (coding.pixels,))
+    maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
+    gate = (coding.nearest, coding.farthest)
+    optics, drawn = _pixel_maps(optics, ports, coding.laser, gate, paths, cumulative, view=view, **maps)
+    check_array("alpha", alpha, wp.float32, (coding.pixels,), view.device)
+    check_array("fraction", fraction, wp.float32, (None,), view.device)
+    device, frames = view.device, fraction.size
+    row_bytes = (coding.width + 7) // 8
+    label_count = coding.pixels // coding.width * row_bytes
+    depth_codes = wp.empty((frames, coding.pixels), dtype=wp.uint16, device=device)
+    intensity_codes = wp.empty((frames, coding.pixels), dtype=wp.uint8, device=device)
+    labels = wp.empty((frames, label_count), dtype=wp.uint8, device=device)
+    inputs = [coding, drawn, alpha, fraction, depth_codes, intensity_codes, labels]
+    launch_pixels(_make_coding_kernel(optics), frames * label_count, inputs, device=device)
+    return depth_codes, intensity_codes, labels

@@ -8,12 +8,12 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_array
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.arguments import check_array, check_arrays
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 
 from .lidar import Lidar
-from .optics import IN_WATER, Optics, check_optics
+from .optics import IN_WATER, Optics, SightRay, check_optics, point_at
 
 __all__ = ["signal_map"]
 
@@ -86,13 +86,11 @@ def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin:
     return lidar.axis
 
 
-@made_once
+@memoised
 def make_radiometric_signal(optics: Optics) -> wp.Function:
     """The Warp function ``(lidar, sight, distance, normal, reflectance)`` -> signal detections per pulse, `distance`
     being the range."""
-    Sight = optics.sight
     emit, receive, light_at, beside = optics.emit, optics.receive, optics.light, optics.beside
-    point, optics_view, from_lens, in_front_of_lens = optics.point, optics.view, optics.from_lens, optics.collected
     spot, footprint = optics.spot, optics.footprint
 
     @wp.func
@@ -122,19 +120,19 @@ def make_radiometric_signal(optics: Optics) -> wp.Function:
 
     @wp.func
     def radiometric_signal(
-        lidar: Lidar, sight: Sight, distance: wp.float64, normal: wp.vec3d, reflectance: wp.float64
+        lidar: Lidar, sight: SightRay, distance: wp.float64, normal: wp.vec3d, reflectance: wp.float64
     ) -> wp.float64:
         """Signal detections per pulse by radiometry: eq 7 with K = 4, cos(theta_in) cos^4(psi), the beam's own fluence.
 
         A surface that fills the pixel has no cos(theta_out), because its footprint grows by the inverse. A beam
         narrower than the pixel carries cos(theta_out) and not cos(theta_in).
         """
-        x = point(sight, distance)
-        view = optics_view(sight)
+        x = point_at(sight, distance)
+        view = sight.view
         light = light_at(lidar, x)
         if light.path <= ZERO:
             return ZERO
-        if spot(lidar, light.path) < TWO * footprint(lidar, from_lens(sight, distance)):
+        if spot(lidar, light.path) < TWO * footprint(lidar, sight.distance + distance):
             return small_spot_signal(lidar, x, view, normal, reflectance)
         fluence = light.fluence
         if lidar.profile != 1:
@@ -155,31 +153,31 @@ def make_radiometric_signal(optics: Optics) -> wp.Function:
         collected = lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent * cos_psi2 * cos_psi2
         attenuation = wp.exp(-lidar.extinction * (light.water + distance))
         signal = lidar.photons * lidar.pde * fluence * cos_in * reflectance / PI * collected * attenuation
-        return in_front_of_lens(sight, signal)
+        return signal * sight.radiance
 
     return radiometric_signal
 
 
 radiometric_signal = make_radiometric_signal(IN_WATER)
-"""That of a camera and a laser in the water, `sight` being the unit line of sight."""
+"""That of a camera and a laser in the water."""
 
 
-@made_once
+@memoised
 def _make_kernel(optics: Optics) -> wp.Kernel:
-    see, point, light_at, whole_path = optics.see, optics.point, optics.light, optics.whole_path
+    see, light_at = optics.see, optics.light
     radiometric = make_radiometric_signal(optics)
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
     def signal_kernel(
         first: int,
         lidar: Lidar,
-        view: wp.array(dtype=wp.vec3d),
-        distance: wp.array(dtype=wp.float64),
-        normal: wp.array(dtype=wp.vec3d),
-        reflectance: wp.array(dtype=wp.float64),
+        view: wp.array[wp.vec3d],
+        distance: wp.array[wp.float64],
+        normal: wp.array[wp.vec3d],
+        reflectance: wp.array[wp.float64],
         # Out:
-        signal: wp.array(dtype=wp.float64),
-        arrival: wp.array(dtype=wp.float64),
+        signal: wp.array[wp.float64],
+        arrival: wp.array[wp.float64],
     ):
         """Launch grid: pixels."""
         i = first + wp.tid()
@@ -189,7 +187,7 @@ def _make_kernel(optics: Optics) -> wp.Kernel:
         time = wp.float64(wp.nan)
         if r > ZERO:
             sight = see(lidar.ports, view[i])
-            time = whole_path(sight, light_at(lidar, point(sight, r)).path + r) / lidar.speed
+            time = (light_at(lidar, point_at(sight, r)).path + r + sight.delay) / lidar.speed
             if lidar.lu2024 == 1:
                 value = lu2024_signal(lidar, r, gamma)
             else:
@@ -232,12 +230,10 @@ def signal_map(
     optics = check_optics(lidar, optics)
     check_array("view", view, wp.vec3d, (None,))
     count, device = view.shape[0], view.device
-    check_array("distance", distance, wp.float64, (count,), device)
+    check_arrays(wp.float64, (count,), device, distance=distance, reflectance=reflectance)
     check_array("normal", normal, wp.vec3d, (count,), device)
-    check_array("reflectance", reflectance, wp.float64, (count,), device)
     signal = wp.empty(count, dtype=wp.float64, device=device)
     arrival = wp.empty(count, dtype=wp.float64, device=device)
-    launch_pixels(
-        _make_kernel(optics), count, [lidar, view, distance, normal, reflectance, signal, arrival], device=device
-    )
+    inputs = [lidar, view, distance, normal, reflectance, signal, arrival]
+    launch_pixels(_make_kernel(optics), count, inputs, device=device)
     return signal, arrival

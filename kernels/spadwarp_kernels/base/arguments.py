@@ -44,6 +44,12 @@ def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
     return number
 
 
+def check_range(interval: str, **values: Any) -> None:
+    """`check_number` for several numbers of one interval, by name."""
+    for name, value in values.items():
+        check_number(name, value, interval)
+
+
 def check_integer(name: str, value: Any, low: int, high: int = 2**31 - 1) -> int:
     """An integer from low to high, also one that is written as a float."""
     try:
@@ -143,11 +149,17 @@ def check_array(
     return array
 
 
-def check_arrays(name: str, struct: Any, device: wp.Device, **shapes: tuple[int | None, ...]) -> None:
+def check_attributes(name: str, struct: Any, device: wp.Device, **shapes: tuple[int | None, ...]) -> None:
     """Arrays of a Warp struct, each with the dtype of its attribute and of such a shape, see `check_array`."""
     for attribute, shape in shapes.items():
         dtype = struct._cls.vars[attribute].type.dtype
         check_array(f"{name}.{attribute}", getattr(struct, attribute), dtype, shape, device)
+
+
+def check_arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **arrays: Any) -> None:
+    """`check_array` for several arrays of one kind, by name."""
+    for name, array in arrays.items():
+        check_array(name, array, dtypes, shape, device)
 
 
 def _fits(sizes: Sequence[int], shape: Sequence[int | None]) -> bool:

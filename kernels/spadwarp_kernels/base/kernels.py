@@ -34,7 +34,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_free)  # a thread that made something is not in the child
 
 
-def made_once(make: Callable[P, R]) -> Callable[P, R]:
+def memoised(make: Callable[P, R]) -> Callable[P, R]:
     """`functools.cache` for what makes Warp functions and kernels: in all threads one after the other.
 
     Where two threads make a function of one name, Warp may give both the later one, and a kernel is then made of the

@@ -43,7 +43,7 @@ def zeros(size: int, dtype: type, device: wp.DeviceLike) -> wp.array:
 
 
 @wp.func_native("return values.data[index];")
-def load_float(values: wp.array(dtype=float), index: int) -> float:
+def load_float(values: wp.array[float], index: int) -> float:
     """`values[index]` of an array without gaps, 0 <= index: a quarter of the instructions."""
     ...
 
@@ -56,7 +56,7 @@ def load_float(values: wp.array(dtype=float), index: int) -> float:
     return values.data[index];
 #endif
 """)
-def load_vec2(values: wp.array(dtype=wp.vec2), index: int) -> wp.vec2:
+def load_vec2(values: wp.array[wp.vec2], index: int) -> wp.vec2:
     """As `load_float`, by one instruction instead of two; the array begins at a multiple of 8 bytes."""
     ...
 

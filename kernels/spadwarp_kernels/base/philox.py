@@ -6,10 +6,10 @@ one id gives the same numbers however a launch is cut up.
 
 import warp as wp
 
-from .kernels import made_once
+from .kernels import memoised
 from .native import held_word
 
-__all__ = ["philox4x32", "random_block", "u01", "u01_fine", "u01_tail"]
+__all__ = ["random_block", "u01"]
 
 _M0 = wp.constant(wp.uint32(0xD2511F53))
 _M1 = wp.constant(wp.uint32(0xCD9E8D57))
@@ -170,7 +170,7 @@ def u01_tail(word: wp.uint32, more: wp.uint32) -> float:
 
 # Philox blocks that are computed together, and their 32-bit words.
 _BLOCKS = 8
-WORDS_AHEAD = wp.constant(4 * _BLOCKS)
+PREFETCHED_WORDS = wp.constant(4 * _BLOCKS)
 
 # `random_block_keyed` in 64-bit lanes, each with 32 bits of a counter.
 _CODE = """
@@ -196,10 +196,10 @@ _CODE = """
 """
 
 
-@made_once
-def make_draw_ahead(*streams: int) -> tuple[int, wp.Function]:
+@memoised
+def make_prefetch(*streams: int) -> tuple[int, wp.Function]:
     """How many events, a power of 2, and the Warp function ``(words, keys, id, event)`` that writes the blocks of these
-    events, from `event` on, of each stream into an array of WORDS_AHEAD integers, see `block_ahead`.
+    events, from `event` on, of each stream into an array of PREFETCHED_WORDS integers, see `prefetched_block`.
 
     The number of streams must divide 8.
     """
@@ -208,14 +208,14 @@ def make_draw_ahead(*streams: int) -> tuple[int, wp.Function]:
     ids = [str(int(streams[lane // events])) for lane in range(_BLOCKS)]
 
     @wp.func_native(_CODE.replace("EVENTS", ", ".join(steps)).replace("STREAMS", ", ".join(ids)))
-    def draw_ahead(words: wp.array(dtype=int), keys: RoundKeys, id: wp.uint64, event: wp.uint32): ...
+    def prefetch(words: wp.array[int], keys: RoundKeys, id: wp.uint64, event: wp.uint32): ...
 
-    return events, draw_ahead
+    return events, prefetch
 
 
 @wp.func
-def block_ahead(words: wp.array(dtype=int), lane: int) -> wp.vec4ui:
-    """Block `lane` of what `draw_ahead` has written: the number of the stream times the number of events, plus that of
+def prefetched_block(words: wp.array[int], lane: int) -> wp.vec4ui:
+    """Block `lane` of what `prefetch` has written: the number of the stream times the number of events, plus that of
     the event."""
     return wp.vec4ui(
         wp.uint32(words[lane]), wp.uint32(words[lane + 8]), wp.uint32(words[lane + 16]), wp.uint32(words[lane + 24])

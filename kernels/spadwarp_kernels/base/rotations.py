@@ -2,7 +2,7 @@
 
 import warp as wp
 
-__all__ = ["one_minus_cosine", "orthonormal_basis", "rotate_direction", "snap_direction"]
+__all__ = ["one_minus_cosine", "rotate_direction"]
 
 
 @wp.func_native("""

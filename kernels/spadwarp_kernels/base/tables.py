@@ -36,17 +36,13 @@ _NEAREST = wp.constant(1.0e-12)  # least distance of a folded coordinate of the 
 
 @wp.struct
 class DensityTables:
-    """Densities on [0, 1], one a row, from `make_density_tables`.
+    """Densities on [0, 1], one a row, from `make_density_tables`."""
 
-    Attributes:
-        cells: `[row, cell]`, cells in ascending order of x: probability below the cell, below its upper end, density at
-            its end nearer to 0 or 1, density at its other end.
-        guide: `[row, cell]`: for each cell of a uniform number, on the same grid, the first cell that its sample can
-            lie in.
-    """
-
-    cells: wp.array2d(dtype=wp.vec4)
-    guide: wp.array2d(dtype=int)
+    # `[row, cell]`, cells in ascending order of x: probability below the cell, below its upper end, density at its end
+    # nearer to 0 or 1, density at its other end
+    cells: wp.array2d[wp.vec4]
+    # `[row, cell]`: for each cell of a uniform number, on the same grid, the first cell that its sample can lie in
+    guide: wp.array2d[int]
 
 
 @wp.func

@@ -3,10 +3,8 @@
 from typing import TYPE_CHECKING
 
 from .arrival_time import *
-from .events import *
+from .counts import *
 from .expected import *
-from .first_photon import *
-from .rates import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = arrival_time.__all__ + events.__all__ + expected.__all__ + first_photon.__all__ + rates.__all__
+    __all__ = arrival_time.__all__ + counts.__all__ + expected.__all__

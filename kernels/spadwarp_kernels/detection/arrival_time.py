@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 
-from .rates import RATES
+from .expected import RATES
 
 __all__ = ["PHASES", "arrival_bins"]
 
@@ -47,18 +47,18 @@ def _parabola_vertex(left: float, centre: float, right: float) -> float:
     return wp.clamp(0.5 * (left - right) / curvature, -0.5, 0.5)
 
 
-@made_once
+@memoised
 def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def peak(
         first_pixel: int,
-        histogram: wp.array2d(dtype=dtype),
-        background: wp.array2d(dtype=float),
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
         first: int,
         stop: int,
         half_width: int,
         # Out:
-        arrival: wp.array(dtype=float),
+        arrival: wp.array[float],
     ):
         pixel = first_pixel + wp.tid()
         level = pixel % background.shape[0]
@@ -91,81 +91,45 @@ def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     return peak
 
 
-@made_once
-def _matched_kernel(dtype: Any) -> wp.Kernel:
+@memoised
+def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
+    """The score of a delay: by the log-matched filter, whose `response` is its gain, or the likelihood."""
+
     @wp.func
-    def score_of(
-        histogram: wp.array2d(dtype=dtype),
-        gain: wp.array2d(dtype=float),
+    def filter_score(
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
+        response: wp.array2d[float],
         pixel: int,
-        first: int,
-        stop: int,
-        lowest_tap: int,
+        window: wp.vec3i,
         phases: int,
+        least: float,
+        beat: float,
     ) -> float:
         phase = phases & (PHASES - 1)
-        base = (phases >> _PHASE_BITS) + lowest_tap
+        base = (phases >> _PHASE_BITS) + window[2]
         score = float(0.0)
-        for tap in range(wp.max(0, first - base), wp.min(gain.shape[1], stop - base)):
-            score += float(histogram[pixel, base + tap]) * gain[phase, tap]
+        for tap in range(wp.max(0, window[0] - base), wp.min(response.shape[1], window[1] - base)):
+            score += float(histogram[pixel, base + tap]) * response[phase, tap]
         return score
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def matched(
-        first_pixel: int,
-        histogram: wp.array2d(dtype=dtype),
-        gain: wp.array2d(dtype=float),
-        first: int,
-        stop: int,
-        lowest_tap: int,
-        coarse_step: int,
-        # Out:
-        arrival: wp.array(dtype=float),
-    ):
-        pixel = first_pixel + wp.tid()
-        best = wp.vec3(0.0, -1.0, -1.0)
-        for step in range(first * PHASES / coarse_step, stop * PHASES / coarse_step):
-            score = score_of(histogram, gain, pixel, first, stop, lowest_tap, step * coarse_step)
-            best = _offer(float(step * coarse_step), score, best)
-        if best[1] < 0.0:
-            arrival[pixel] = wp.nan
-            return
-        middle = int(0.5 * (best[1] + wp.min(best[2], best[1] + float(coarse_step))))
-        fine = wp.vec3(-1.0, 0.0, 0.0)
-        for phases in range(middle - coarse_step, middle + coarse_step + 1):
-            score = score_of(histogram, gain, pixel, first, stop, lowest_tap, phases)
-            fine = _offer(float(phases), score, fine)
-        top = 0.5 * (fine[1] + fine[2])
-        if fine[1] == fine[2]:
-            left = score_of(histogram, gain, pixel, first, stop, lowest_tap, int(fine[1]) - 1)
-            right = score_of(histogram, gain, pixel, first, stop, lowest_tap, int(fine[1]) + 1)
-            top += _parabola_vertex(left, fine[0], right)
-        arrival[pixel] = top / float(PHASES)
-
-    return matched
-
-
-@made_once
-def _likelihood_kernel(dtype: Any) -> wp.Kernel:
     @wp.func
     def profile_likelihood(
-        histogram: wp.array2d(dtype=dtype),
-        background: wp.array2d(dtype=float),
-        response: wp.array2d(dtype=float),
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
+        response: wp.array2d[float],
         pixel: int,
-        level: int,
-        first: int,
-        stop: int,
-        lowest_tap: int,
+        window: wp.vec3i,
         phases: int,
         least: float,
         beat: float,
     ) -> float:
         # max over S >= 0 of sum n ln(1 + S h / B) - S sum h: the log-likelihood ratio of a return at this delay.
         phase = phases & (PHASES - 1)
-        base = (phases >> _PHASE_BITS) + lowest_tap
-        low = wp.max(0, first - base)
-        high = wp.min(response.shape[1], stop - base)
+        base = (phases >> _PHASE_BITS) + window[2]
+        low = wp.max(0, window[0] - base)
+        high = wp.min(response.shape[1], window[1] - base)
+        level = pixel % background.shape[0]
         last = background.shape[1] - 1
         counts = float(0.0)
         slope = float(0.0)
@@ -204,67 +168,56 @@ def _likelihood_kernel(dtype: Any) -> wp.Kernel:
                 value += n * wp.log(1.0 + signal * response[phase, tap] / floor)
         return value
 
+    return profile_likelihood if likelihood else filter_score
+
+
+@memoised
+def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
+    """The delay of the largest score."""
+    score_of = _make_score(dtype, likelihood)
+
     @wp.kernel(enable_backward=False, module="unique")
-    def likelihood(
+    def search(
         first_pixel: int,
-        histogram: wp.array2d(dtype=dtype),
-        background: wp.array2d(dtype=float),
-        response: wp.array2d(dtype=float),
+        histogram: wp.array2d[dtype],
+        background: wp.array2d[float],
+        response: wp.array2d[float],
         response_floor: float,
-        first: int,
-        stop: int,
-        lowest_tap: int,
+        window: wp.vec3i,
         coarse_step: int,
         # Out:
-        arrival: wp.array(dtype=float),
+        arrival: wp.array[float],
     ):
+        """`window`: the first bin, the one after the last, the bin of the first tap. Launch: pixels."""
         pixel = first_pixel + wp.tid()
-        level = pixel % background.shape[0]
         total = float(0.0)
-        for k in range(first, stop):
+        for k in range(window[0], window[1]):
             total += float(histogram[pixel, k])
         least = response_floor * total
         best = wp.vec3(0.0, -1.0, -1.0)
         if total > 0.0:
-            for step in range(first * PHASES / coarse_step, stop * PHASES / coarse_step):
-                score = profile_likelihood(
-                    histogram,
-                    background,
-                    response,
-                    pixel,
-                    level,
-                    first,
-                    stop,
-                    lowest_tap,
-                    step * coarse_step,
-                    least,
-                    best[0],
-                )
+            for step in range(window[0] * PHASES / coarse_step, window[1] * PHASES / coarse_step):
+                phases = step * coarse_step
+                score = score_of(histogram, background, response, pixel, window, phases, least, best[0])
                 if score > 0.0:
-                    best = _offer(float(step * coarse_step), score, best)
+                    best = _offer(float(phases), score, best)
         if best[1] < 0.0:
             arrival[pixel] = wp.nan
             return
         middle = int(0.5 * (best[1] + wp.min(best[2], best[1] + float(coarse_step))))
         fine = wp.vec3(-1.0, 0.0, 0.0)
         for phases in range(middle - coarse_step, middle + coarse_step + 1):
-            score = profile_likelihood(
-                histogram, background, response, pixel, level, first, stop, lowest_tap, phases, least, 0.0
-            )
+            score = score_of(histogram, background, response, pixel, window, phases, least, 0.0)
             fine = _offer(float(phases), score, fine)
         top = 0.5 * (fine[1] + fine[2])
         if fine[1] == fine[2]:
             centre = int(fine[1])
-            left = profile_likelihood(
-                histogram, background, response, pixel, level, first, stop, lowest_tap, centre - 1, least, 0.0
-            )
-            right = profile_likelihood(
-                histogram, background, response, pixel, level, first, stop, lowest_tap, centre + 1, least, 0.0
-            )
+            left = score_of(histogram, background, response, pixel, window, centre - 1, least, 0.0)
+            right = score_of(histogram, background, response, pixel, window, centre + 1, least, 0.0)
             top += _parabola_vertex(left, fine[0], right)
         arrival[pixel] = top / float(PHASES)
 
-    return likelihood
+    return search
 
 
 class ArrivalEstimator:
@@ -304,8 +257,8 @@ class ArrivalEstimator:
         check_array("background", background, wp.float32, (None, None), self.device)
         if background.shape[0] < 1 or background.shape[1] not in (1, bins):
             raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {bins}) is needed")
+        self._inputs = [background, first, stop, half_width]
         if method in ("peak", "centroid"):
-            self._inputs = [background, first, stop, half_width]
             return
         response = _check_response(method, response)
         floor = RESPONSE_FLOOR * float(response.max())
@@ -313,26 +266,17 @@ class ArrivalEstimator:
         coarse_step = PHASES if response.max() < 0.25 else PHASES // 2 if response.max() < 0.5 else PHASES // 4
         if method == "matched":
             # ln(h / floor): counts outside the response add the same to every delay.
-            gain = np.log(np.maximum(response, floor) / floor)
-            self._inputs = [self._on_device(gain), first, stop, lowest_tap, coarse_step]
-        else:
-            taps = self._on_device(response)
-            self._inputs = [background, taps, floor, first, stop, lowest_tap, coarse_step]
-
-    def _on_device(self, table: np.ndarray) -> wp.array:
-        return wp.array(table.astype(np.float32), device=self.device)
+            response = np.log(np.maximum(response, floor) / floor)
+        taps = wp.array(response.astype(np.float32), device=self.device)
+        self._inputs = [background, taps, floor, wp.vec3i(first, stop, lowest_tap), coarse_step]
 
     def __call__(self, histogram: wp.array, arrival: wp.array) -> None:
         """Writes the arrival times of a histogram `[pixel, bin]` into `arrival`, float32 `[pixel]`."""
         check_array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
         check_array("arrival", arrival, wp.float32, (pixels,), self.device)
-        if self.method == "matched":
-            kernel = _matched_kernel(histogram.dtype)
-        elif self.method == "likelihood":
-            kernel = _likelihood_kernel(histogram.dtype)
-        else:
-            kernel = _peak_kernel(histogram.dtype, self.method == "centroid")
+        make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
+        kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
         launch_pixels(kernel, pixels, [histogram, *self._inputs, arrival], device=self.device)
 
 

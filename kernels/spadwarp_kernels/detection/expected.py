@@ -16,19 +16,19 @@ from spadwarp_kernels.base.arguments import (
     check_integer,
     check_number,
     check_numbers,
+    check_range,
     check_seed,
 )
 from spadwarp_kernels.base.binomial import PURPOSE_DARK_COUNTS, uniforms
-from spadwarp_kernels.base.kernels import launch_pixels, made_once
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import expm1, log1p
-
-from .rates import RATES
 
 __all__ = [
     "add_crosstalk",
     "coates",
     "dark_count_rates",
     "expected_detections",
+    "first_invalid_row",
     "first_photon_probabilities",
     "free_running_probabilities",
 ]
@@ -37,21 +37,49 @@ wp.set_module_options({"enable_backward": False})
 
 _ONE = wp.constant(wp.uint32(1))
 
+RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
+"""What rows of counts, tallies or rates may be."""
 
-@made_once
+
+@memoised
+def _invalid_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def invalid(first_pixel: int, values: wp.array2d[dtype], worst: wp.array[int]):
+        pixel = first_pixel + wp.tid()
+        for k in range(values.shape[1]):
+            value = float(values[pixel, k])
+            if value < 0.0 or not wp.isfinite(value):
+                wp.atomic_min(worst, 0, pixel)
+                return
+
+    return invalid
+
+
+def first_invalid_row(values: wp.array) -> int | None:
+    """The first row of `values` `[pixel, bin]` that holds a negative or non-finite number, or None."""
+    check_array("values", values, RATES, (None, None))
+    if values.shape[0] == 0:
+        return None
+    worst = wp.full(1, 2**31 - 1, dtype=int, device=values.device)
+    launch_pixels(_invalid_kernel(values.dtype), values.shape[0], [values, worst], device=values.device)
+    row = int(worst.numpy()[0])
+    return None if row == 2**31 - 1 else row
+
+
+@memoised
 def _response_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def respond(
         first_pixel: int,
-        source: wp.array2d(dtype=dtype),
+        source: wp.array2d[dtype],
         # Sparse rows, one a detector bin:
-        row_start: wp.array(dtype=int),
-        source_bin: wp.array(dtype=int),
-        weight: wp.array(dtype=float),
-        width: wp.array(dtype=float),
-        noise_rate: wp.array(dtype=float),
+        row_start: wp.array[int],
+        source_bin: wp.array[int],
+        weight: wp.array[float],
+        width: wp.array[float],
+        noise_rate: wp.array[float],
         # Out:
-        hazard: wp.array2d(dtype=float),
+        hazard: wp.array2d[float],
     ):
         pixel = first_pixel + wp.tid()
         noise = noise_rate[pixel]
@@ -74,7 +102,7 @@ def _dark_count_kernel(
     hot_rate: float,
     offset: float,
     # Out:
-    rate: wp.array(dtype=float),
+    rate: wp.array[float],
 ):
     pixel = first_pixel + wp.tid()
     id = wp.uint64(pixel)
@@ -94,9 +122,9 @@ def _crosstalk_kernel(
     first_pixel: int,
     width: int,
     probability: float,
-    detections: wp.array2d(dtype=float),
+    detections: wp.array2d[float],
     # In and out:
-    hazard: wp.array2d(dtype=float),
+    hazard: wp.array2d[float],
 ):
     pixel = first_pixel + wp.tid()
     x = pixel % width
@@ -113,10 +141,10 @@ def _crosstalk_kernel(
         hazard[pixel, k] = hazard[pixel, k] + probability * light
 
 
-@made_once
+@memoised
 def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
-    def law(first_pixel: int, hazard: wp.array2d(dtype=dtype), probability: wp.array2d(dtype=dtype)):
+    def law(first_pixel: int, hazard: wp.array2d[dtype], probability: wp.array2d[dtype]):
         pixel = first_pixel + wp.tid()
         before = wp.float64(0.0)
         for k in range(hazard.shape[1]):
@@ -129,11 +157,7 @@ def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
 
 @wp.kernel(enable_backward=False)
 def _free_running_kernel(
-    first_pixel: int,
-    hazard: wp.array2d(dtype=float),
-    dead_time: float,
-    period: float,
-    probability: wp.array2d(dtype=float),
+    first_pixel: int, hazard: wp.array2d[float], dead_time: float, period: float, probability: wp.array2d[float]
 ):
     pixel = first_pixel + wp.tid()
     total = float(0.0)
@@ -145,9 +169,7 @@ def _free_running_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _coates_kernel(
-    first_pixel: int, counts: wp.array2d(dtype=int), pulses: wp.float64, hazard: wp.array2d(dtype=wp.float64)
-):
+def _coates_kernel(first_pixel: int, counts: wp.array2d[int], pulses: wp.float64, hazard: wp.array2d[wp.float64]):
     pixel = first_pixel + wp.tid()
     left = wp.float64(pulses)
     for k in range(counts.shape[1]):
@@ -176,8 +198,7 @@ def dark_count_rates(
     `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure. Raises `ArgumentError`.
     """
     pixels, seed = check_integer("pixels", pixels, 0), check_seed(seed)
-    for name, value in {"median": median, "spread": spread, "hot_rate": hot_rate, "offset": offset}.items():
-        check_number(name, value, "[0, inf)")
+    check_range("[0, inf)", median=median, spread=spread, hot_rate=hot_rate, offset=offset)
     check_number("hot_fraction", hot_fraction, "[0, 1]")
     device = check_device("device", device)
     rate = wp.empty(pixels, dtype=float, device=device)
@@ -213,12 +234,8 @@ def expected_detections(
     check_array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
     _check_matrix(source.shape[1], row_start, source_bin, weight, width)
     hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
-    matrix = [
-        wp.array(row_start, dtype=int, device=device),
-        wp.array(source_bin, dtype=int, device=device),
-        wp.array(weight, dtype=float, device=device),
-        wp.array(width, dtype=float, device=device),
-    ]
+    kinds = ((row_start, int), (source_bin, int), (weight, float), (width, float))
+    matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
     inputs = [source, *matrix, noise_rate, hazard]
     launch_pixels(_response_kernel(source.dtype), source.shape[0], inputs, device=device)
     return hazard

@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.port_view import port_view
+from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
@@ -90,7 +90,7 @@ def _value_behind_port(camera: Camera, extinction: float, weight: float, scatter
     return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
 
 
-@made_once
+@memoised
 def make_link(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(camera, x, o) -> Link`` from x to the lens point o, and ``(camera, extinction, weight,
     scattering, link) -> float``, the fraction of the photon that arrives."""
@@ -118,7 +118,7 @@ def _lens_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
     return o
 
 
-@made_once
+@memoised
 def make_apparent_lens(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(camera, x, o) -> vec3``: from where the light of the lens point o seems to come at x."""
     if spec.port is None:
@@ -146,7 +146,7 @@ def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
     return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
 
 
-@made_once
+@memoised
 def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions: ``(camera, x, o) -> vec3``, the unit direction at x in which light gets to the lens point o,
     and ``(camera, x) -> vec3`` about that to the lens's centre; the straight one where there is no way."""
@@ -194,7 +194,7 @@ class ScoredPoint:
     ahead: float
 
 
-@made_once
+@memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     view_of = spec.lens.view
@@ -247,7 +247,7 @@ def scores_collision(word: wp.uint32) -> bool:
     return (word >> wp.uint32(31)) > wp.uint32(0)
 
 
-@made_once
+@memoised
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, world) -> ScoredPoint`` that draws the point of a flight to be scored."""
     local_albedo = spec.varies and not spec.random_albedo
@@ -312,7 +312,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     return flight_point
 
 
-@made_once
+@memoised
 def make_point_of(points: int) -> wp.Function:
     """The Warp function ``(request, number) -> Request``: of a flight, that of another of its `points`, at least 2.
 
@@ -332,7 +332,7 @@ def make_point_of(points: int) -> wp.Function:
     return point_of
 
 
-@made_once
+@memoised
 def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
     request scatters at x into the direction v."""
@@ -340,7 +340,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     water_at = spec.water.at
     phase_pdf = spec.phase.pdf
     reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
-    face_at = patch_face if spec.brute_force and not spec.public_tree else tree_face
+    face_at = patch_face if spec.brute_force and not spec.use_warp_bvh else tree_face
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
@@ -363,7 +363,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     return scattering_density
 
 
-@made_once
+@memoised
 def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(request, world) -> Scored`` of next events, with what rides along.
 

@@ -5,12 +5,11 @@ After Kulla & Fajardo 2012 (equi-angular sampling) and Georgiev et al. 2013 (joi
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import cos_sin_turn, cotangent
 from spadwarp_kernels.optics.camera import Camera, lens_point
 from spadwarp_kernels.optics.port import PortKind
-from spadwarp_kernels.water.layers import Layers, Profile
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium, Profile
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
 
 
@@ -61,7 +60,7 @@ def lens_about(camera: Camera, p: wp.vec2, xi1: float, xi2: float) -> LensSample
     return sample
 
 
-@made_once
+@memoised
 def make_sample_lens(port: PortKind | None) -> wp.Function:
     """`sample_lens` for a lens behind a port: it is where the flight's line, refracted, passes the lens."""
     if port is None:
@@ -119,7 +118,7 @@ def _chord_slope(d: float, along: float, r: float) -> float:
     return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
 
 
-@made_once
+@memoised
 def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Profile | None = None) -> wp.Function:
     """`sample_flight` for a guide: a Warp function ``(x, u, interval, extinction, medium, xi_choice, xi)``; with a
     profile ``(..., layers, begin_point)``, the latter where the interval begins. With a profile that draws nothing xi

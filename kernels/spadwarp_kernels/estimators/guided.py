@@ -6,12 +6,12 @@ al. 2013 (joint distance-angle sampling).
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
 from spadwarp_kernels.optics.camera import lens_point
-from spadwarp_kernels.optics.port_view import port_view
+from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState
@@ -20,9 +20,8 @@ from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import reflection_pdf, sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import exit_distance, exit_distance_rotated
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import (
     HENYEY_GREENSTEIN,
     HENYEY_GREENSTEIN_GUIDE,
@@ -151,7 +150,7 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     return request_flight, make_event_request(spec, flights=True)
 
 
-@made_once
+@memoised
 def make_sample_angle(phase: PhaseFunction) -> wp.Function:
     """The Warp function ``(word, to_lens, directed, here, medium, guiding) -> float``: t = 1 - cos(theta) from the axis
     of the lobe towards the lens, of other directed light (back into the view), or of what the water scatters."""
@@ -202,7 +201,7 @@ def guided_part(weight: float, analog_weight: float, surfaces_met: int, probabil
     return wp.clamp(bound / wp.max(probability, 1.0e-6), 0.0, 1.0 / (1.0 + vessel))
 
 
-@made_once
+@memoised
 def _make_extinction_at(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(here, wanted, medium, layers, x) -> float``: the extinction at x, where the water is `here`;
     of a grid only if it is wanted, since a cell must be looked up for it."""
@@ -220,7 +219,7 @@ def _make_extinction_at(spec: TransportSpec) -> wp.Function:
     return extinction_at
 
 
-@made_once
+@memoised
 def _make_lens_chance(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(u, guiding) -> float``: chance that a water collision guides light that came along u towards
     the lens.

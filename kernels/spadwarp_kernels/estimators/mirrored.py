@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import join_words, u01, u01_high, u01_low
 from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.photon.queue import Request
@@ -12,18 +12,20 @@ from spadwarp_kernels.photon.state import PhotonState
 from spadwarp_kernels.photon.world import World
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
-from spadwarp_kernels.surface.box import segment_meets_box
+from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
-from spadwarp_kernels.water.boundary import (
+from spadwarp_kernels.water.limits import (
+    Limits,
     face_index,
     flipped,
     image_direction,
     image_point,
     image_reflectance,
+    next_face,
     reflections_of,
+    to_next_face,
 )
-from spadwarp_kernels.water.limits import Limits, next_face, to_next_face
 
 from .contribution import make_link, make_scattering
 
@@ -64,7 +66,7 @@ def _no_origin(limits: Limits) -> wp.vec3:
     return wp.vec3(0.0)
 
 
-@made_once
+@memoised
 def _make_follow(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(found, request, x, v, length, reflections, end, inside, world, seed)`` that follows the
     light of a request's event, which leaves x along v in the domain's axes and is reflected so many times within that
@@ -128,7 +130,7 @@ def _make_follow(spec: TransportSpec, brute_force: bool) -> wp.Function:
     return follow
 
 
-@made_once
+@memoised
 def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, world) -> Mirrored`` of an event by way of one of `Boundary.images`."""
     confocal, measured = spec.confocal, spec.mesh or spec.varies
@@ -180,7 +182,7 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
     return score_image
 
 
-@made_once
+@memoised
 def make_score_images(spec: TransportSpec, brute_force: bool, split: bool) -> wp.Function:
     """The Warp function ``(s, request, world, sink)`` that scores a request's event by way of all images; a point of a
     flight is not scored so: events are."""

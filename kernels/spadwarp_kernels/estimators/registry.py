@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from spadwarp_kernels.base.arguments import check_choice
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.spec import TransportSpec
 
 from .analog import make_analog
@@ -39,7 +39,7 @@ ESTIMATORS: dict[str, Callable[[TransportSpec], Estimator]] = {
 """A function of a spec for each name that `TransportSpec.estimator` may have; add a line for one of your own."""
 
 
-@made_once
+@memoised
 def make_estimator(spec: TransportSpec) -> Estimator:
     """The estimator of a spec, made once: each launch asks for it, and its Warp functions take milliseconds to make."""
     check_choice("estimator", spec.estimator, ESTIMATORS)

@@ -3,20 +3,9 @@
 from typing import TYPE_CHECKING
 
 from .camera import *
-from .gate import *
 from .laser import *
 from .polarisation import *
 from .port import *
-from .projection import *
-from .visibility import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = (
-        camera.__all__
-        + gate.__all__
-        + laser.__all__
-        + polarisation.__all__
-        + port.__all__
-        + projection.__all__
-        + visibility.__all__
-    )
+    __all__ = camera.__all__ + laser.__all__ + polarisation.__all__ + port.__all__

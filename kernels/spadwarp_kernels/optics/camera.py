@@ -1,9 +1,9 @@
-"""The camera: origin at the lens centre, +z along the optical axis, +x right, +y down.
+"""The camera, its lens and its gate: origin at the lens centre, +z along the optical axis, +x right, +y down.
 
 Image coordinates are in pixels, (0.5, 0.5) is the first pixel's centre. Tangents are x/z and y/z of a direction.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
 
-__all__ = ["Camera", "lens_point", "pixel_direction", "project", "project_calibrated"]
+__all__ = ["C0", "CALIBRATED", "PLAIN", "Camera", "Gate", "Lens"]
 
 
 @wp.struct
@@ -250,3 +250,118 @@ def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     check_vector(f"{name}.view", camera.view, size=4)
     check_number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
     check_number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")
+
+
+# ---- The time gate: arrival times are kept as optical path lengths, path = time * c0 / n_g.
+
+
+C0 = 299_792_458.0
+
+
+@wp.struct
+class Gate:
+    """Equal bins of geometric path.
+
+    Attributes:
+        start: Path of the gate's begin [m]; bin k covers [start + k w, start + (k + 1) w).
+        stop: Path at which it ends [m], before the last bin does if histories may not be as long.
+        bins_per_metre: 1/w [1/m].
+        bins: Number of bins.
+    """
+
+    start: float
+    stop: float
+    bins_per_metre: float
+    bins: int
+
+
+BEFORE = wp.constant(-1)
+AFTER = wp.constant(-2)
+
+
+@wp.func
+def gate_bin(gate: Gate, path: float) -> int:
+    """Bin of a path length [m], or BEFORE or AFTER the gate."""
+    # Selected rather than branched to: the lanes of a warp go either way.
+    k = (path - gate.start) * gate.bins_per_metre
+    inside = wp.where(k >= float(gate.bins) or path >= gate.stop, AFTER, int(k))
+    return wp.where(path < gate.start, BEFORE, inside)
+
+
+@wp.func
+def clip_to_gate(gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, interval: wp.vec2) -> wp.vec2:
+    """The part of the interval [s0, s1] of the flight x + s u whose light arrives within the gate by way of a lens
+    point; empty where s0 >= s1.
+
+    The arrival path s + r(s) rises with s, so the gate cuts out an interval: s + r = L at
+    s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u.
+    """
+    if interval[0] >= interval[1]:
+        return interval
+
+    y = x - lens
+    distance = wp.length(y)
+    t_c = -wp.dot(y, u)
+    to_stop = gate.stop - path
+    if to_stop <= distance:
+        return wp.vec2(0.0, -1.0)
+    lower = interval[0]
+    # (L^2 - |x|^2) as a product: the difference of squares would cancel near the gate's end.
+    upper = wp.min(interval[1], 0.5 * (to_stop - distance) * (to_stop + distance) / wp.max(to_stop - t_c, 1.0e-12))
+    to_start = gate.start - path
+    if to_start > distance:
+        lower = wp.max(lower, 0.5 * (to_start - distance) * (to_start + distance) / wp.max(to_start - t_c, 1.0e-12))
+    return wp.vec2(lower, upper)
+
+
+# ---- Ways of imaging, as the transport kernels take them: with square pixels, and what a calibrated camera does.
+# `view` holds the tangents (left, top, right, bottom) of what the photon at hand may be seen in: the view of the
+# camera, or in a scan that of one pixel, `target` (else -1). o is a point of the lens.
+
+
+class Lens(NamedTuple):
+    """A way of imaging; its name identifies it in the kernel cache.
+
+    Attributes:
+        name: "plain" or "calibrated".
+        project: Warp function (camera, view, target, x, o) -> the pixel that images x by way of o, or -1.
+        view: Warp function (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image,
+            or the pixel of a scan, shows.
+        shows: As `in_view`, for such a view without a port.
+        image: As `project`, for the camera that the transport kernel gets, see `Camera.focal`; None: `project`.
+        toward_middle: As the function of that name, for such a view.
+    """
+
+    name: str
+    project: wp.Function
+    view: wp.Function
+    shows: wp.Function = in_view
+    image: wp.Function | None = None
+    toward_middle: wp.Function = toward_middle
+
+
+@wp.func
+def _project_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    return project(camera, x, o)
+
+
+@wp.func
+def _image_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    return project_about_axis(camera, x, o)
+
+
+@wp.func
+def _view_plain(camera: Camera, view: wp.vec4) -> wp.vec4:
+    return camera.view
+
+
+@wp.func
+def _view_calibrated(camera: Camera, view: wp.vec4) -> wp.vec4:
+    return view
+
+
+PLAIN = Lens("plain", _project_plain, _view_plain, in_field, _image_plain, toward_axis)
+"""Square pixels about the optical axis: the first six attributes of `Camera`, the others stay 0."""
+
+CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated)
+"""Focal lengths and principal point in pixels, Brown's distortion: all of `Camera`."""

@@ -39,8 +39,8 @@ class Laser:
     spread: float
     tan2: float
     radius: float
-    rows: wp.array(dtype=float)
-    columns: wp.array2d(dtype=float)
+    rows: wp.array[float]
+    columns: wp.array2d[float]
     extent: wp.vec2
     port: Port
 
@@ -118,7 +118,7 @@ def beam_frame(axis: wp.vec3):
 
 
 @wp.func
-def _first_above(table: wp.array(dtype=float), u: float) -> int:
+def _first_above(table: wp.array[float], u: float) -> int:
     """Index of the first entry above u of a rising table that ends with 1, for u in [0, 1)."""
     low = int(0)
     high = int(table.shape[0] - 1)
@@ -160,5 +160,5 @@ class Scan:
     """
 
     count: int
-    axis: wp.array(dtype=wp.vec3)
-    view: wp.array(dtype=wp.vec4)
+    axis: wp.array[wp.vec3]
+    view: wp.array[wp.vec4]

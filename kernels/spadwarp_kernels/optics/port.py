@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_vector
+from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_range, check_vector
 
 __all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
 
@@ -54,45 +54,28 @@ class Port:
 
 @wp.struct
 class Connection:
-    """The one way of light from a point in the water to a point inside.
+    """The one way of light from a point in the water to a point inside."""
 
-    Attributes:
-        to_port: Unit direction in the water.
-        inside: Unit direction in which it arrives.
-        exit: Where it leaves the water [m].
-        water: Length of its way in the water [m].
-        path: Length in water that takes as long as the whole way [m].
-        transmission: Fraction of unpolarised light that gets through.
-        density: Solid angle at the point in the water over the area that its light covers inside, across the ray
-            [sr/m^2]; 0: there is no such way. 1/r^2 where all indices are equal.
-    """
-
-    to_port: wp.vec3
-    inside: wp.vec3
-    exit: wp.vec3
-    water: float
-    path: float
-    transmission: float
+    to_port: wp.vec3  # unit direction in the water
+    inside: wp.vec3  # unit direction in which it arrives
+    exit: wp.vec3  # where it leaves the water [m]
+    water: float  # length of its way in the water [m]
+    path: float  # length in water that takes as long as the whole way [m]
+    transmission: float  # fraction of unpolarised light that gets through
+    # solid angle at the point in the water over the area that its light covers inside, across the ray [sr/m^2]; 0:
+    # there is no such way. 1/r^2 where all indices are equal
     density: float
 
 
 @wp.struct
-class Passage:
-    """A ray that has gone through a port.
+class PortRay:
+    """A ray that has gone through a port."""
 
-    Attributes:
-        x: Where it leaves the port [m]; of a ray from the water, where it meets the plane z = 0 inside.
-        u: Its unit direction there.
-        water: Length of its way in the water up to the port [m]; negative if the ray began behind that.
-        path: Length in water that takes as long as the way behind that [m].
-        transmission: Fraction of unpolarised light that gets through; 0: none.
-    """
-
-    x: wp.vec3
-    u: wp.vec3
-    water: float
-    path: float
-    transmission: float
+    x: wp.vec3  # where it leaves the port [m]; of a ray from the water, where it meets the plane z = 0 inside
+    u: wp.vec3  # its unit direction there
+    water: float  # length of its way in the water up to the port [m]; negative if the ray began behind that
+    path: float  # length in water that takes as long as the way behind that [m]
+    transmission: float  # fraction of unpolarised light that gets through; 0: none
 
 
 @wp.func
@@ -215,10 +198,10 @@ def apparent_centre_flat(port: Port) -> wp.vec3:
 
 
 @wp.func
-def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
     ray as it goes straight on."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     cosine = -wp.dot(u, port.normal)
     behind = wp.dot(x, port.normal) - port.distance - port.thickness
@@ -243,9 +226,9 @@ def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
 
 
 @wp.func
-def enter_flat(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def enter_flat(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x inside along u, up to where it enters the water."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     cosine = wp.dot(u, port.normal)
     before = port.distance - wp.dot(x, port.normal)
@@ -399,10 +382,10 @@ def apparent_centre_dome(port: Port) -> wp.vec3:
 
 
 @wp.func
-def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
     ray as it goes straight on."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     inner = port.radius
     outer = port.radius + port.thickness
@@ -434,9 +417,9 @@ def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
 
 
 @wp.func
-def enter_dome(port: Port, x: wp.vec3, u: wp.vec3) -> Passage:
+def enter_dome(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
     """What comes of a ray from x inside along u, up to where it enters the water."""
-    p = Passage()
+    p = PortRay()
     n = port.index
     inner = port.radius
     outer = port.radius + port.thickness
@@ -473,8 +456,8 @@ class PortKind(NamedTuple):
         connect: Warp function (port, x, o) -> Connection from x in the water to o inside.
         apparent: Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m].
         apparent_centre: Warp function (port) -> about that point for the lens's centre, at once [m].
-        leave: Warp function (port, x, u) -> Passage of a ray from the water to the plane z = 0 inside.
-        enter: Warp function (port, x, u) -> Passage of a ray from inside into the water.
+        leave: Warp function (port, x, u) -> PortRay of a ray from the water to the plane z = 0 inside.
+        enter: Warp function (port, x, u) -> PortRay of a ray from inside into the water.
         cosines: Warp function (port, x, u) -> vec4: index times cosine to the normal before and behind both interfaces,
             in the order of `transmission`, of the ray through x in the water along u, on its way in or out.
     """
@@ -522,8 +505,7 @@ def make_flat_port(
     """
     check_number("distance", distance, "(-inf, inf)")
     check_vector("normal", normal, unit=True)
-    _check_layers(thickness, index, group_index, origin, aperture_radius)
-    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
+    port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     tilt = aperture_radius * math.hypot(normal[0], normal[1])
     inside = distance - sum(x * n for x, n in zip(origin, normal, strict=True))
     if tilt >= inside:
@@ -531,7 +513,6 @@ def make_flat_port(
             f"distance = {distance} m: a lens or laser at {tuple(origin)} m of radius {aperture_radius} m reaches "
             "through the port"
         )
-    port = _port(thickness, index, group_index)
     port.normal, port.distance = wp.vec3(*normal), distance
     n = tuple(port.index)
     slopes = [_slopes(n[0], n[k], largest_angle) for k in (1, 2)]
@@ -557,11 +538,8 @@ def make_dome_port(
 
     Args:
         radius: Of the inner sphere [m], > 0.
-        thickness: Of the window [m], >= 0.
         centre: Of the spheres, from the camera's lens centre [m].
-        index, group_index: Of what is inside, of the window, of the water; >= 1.
-        origin: The lens centre, or the position of a laser, which must be inside [m].
-        aperture_radius: Of the camera [m].
+        thickness, index, group_index, origin, aperture_radius: As for `make_flat_port`.
         largest_angle: Between the optical axis and any ray of the view, inside, in [0, pi/2) [rad].
 
     Raises:
@@ -570,9 +548,7 @@ def make_dome_port(
     """
     check_number("radius", radius, "(0, 1e9]")
     check_vector("centre", centre)
-    _check_layers(thickness, index, group_index, origin, aperture_radius)
-    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
-    port = _port(thickness, index, group_index)
+    port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     port.radius, port.centre = radius, wp.vec3(*centre)
     n = tuple(port.index)
     furthest = math.dist(centre, origin) + aperture_radius
@@ -605,23 +581,22 @@ def check_port(name: str, port: Port, kind: PortKind) -> None:
         check_vector(f"{name}.centre", port.centre)
 
 
-def _check_layers(
+def _port(
     thickness: float,
     index: Sequence[float],
     group_index: Sequence[float],
     origin: Sequence[float],
     aperture_radius: float,
-) -> None:
+    largest_angle: float,
+) -> Port:
+    """What both kinds have, whose numbers are in range."""
     check_vector("origin", origin)
-    check_number("thickness", thickness, "[0, 1e9]")
-    check_number("aperture_radius", aperture_radius, "[0, 1e9]")
+    check_range("[0, 1e9]", thickness=thickness, aperture_radius=aperture_radius)
     for name, values in (("index", index), ("group_index", group_index)):
         check_vector(name, values)
         for k, value in enumerate(values):
             check_number(f"{name}[{k}]", value, "[1, inf)")
-
-
-def _port(thickness: float, index: Sequence[float], group_index: Sequence[float]) -> Port:
+    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
     port = Port()
     port.thickness = thickness
     # A window without thickness has no faces, and must not be the layer of the least index.

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 
 # Threads of a block of the transport kernel on CUDA.
 BLOCK_SIZE = 128
@@ -73,7 +73,7 @@ def fits_in_block(vectors: int, kib: int) -> bool:
 _HELD = "__shfl_sync(0xffffffffu, begin, threadIdx.x & 31u)"
 
 
-@made_once
+@memoised
 def make_warp_memory(vectors: int, held: bool = False) -> wp.Function:
     """The Warp function ``() -> int``: where the shared memory of a warp begins, with so many vec4 in its queue; CUDA
     alone. Kernels take no more than they need, since the cache has the rest. `held`: in a register, come what may."""
@@ -115,7 +115,7 @@ def exchange(memory: int, put: bool, entry: int, value: wp.spatial_vector) -> wp
     return 0;
 #endif
 """)
-def take_photons(cursor: wp.array(dtype=int)) -> int:
+def take_photons(cursor: wp.array[int]) -> int:
     """First of the next 32 photons, which are this warp's; every lane must take part. Warps come for more as they get
     done, so that all end together; CUDA alone."""
     ...

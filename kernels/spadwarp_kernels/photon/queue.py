@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of, from_bits
 from spadwarp_kernels.tally.tally import BACKSCATTER
 
@@ -97,7 +97,7 @@ def long_queue_fits(spec: TransportSpec, in_tree: bool) -> bool:
     return spec.grid is None and fits_in_block(vectors, _KIB_IN_TREE if in_tree else 48)
 
 
-@made_once
+@memoised
 def _make_words(confocal: bool, short: bool, begin: int) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions that write, ``(memory, entry, request)``, and read, ``(memory, entry, request) -> Request``,
     what a request has beside x, u, weight and path; `confocal`, `short`: see `make_queue`, `begin`: where it is."""
@@ -147,7 +147,7 @@ def _make_words(confocal: bool, short: bool, begin: int) -> tuple[wp.Function, w
     return (write_pair, read_pair) if short else (write_vector, read_vector)
 
 
-@made_once
+@memoised
 def make_queue(
     flights: bool,
     used: bool,

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
-from spadwarp_kernels.optics.gate import BEFORE
+from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.optics.camera import BEFORE
 from spadwarp_kernels.tally.blocks import met_count, met_entry, score_entry
 from spadwarp_kernels.tally.ledger import (
     AFTER_GATE,
@@ -27,16 +27,16 @@ class Sink:
 
     Attributes:
         tally: Histograms [component, pixel, bin], fixed point.
-        low: Their low words, where those are apart, see `tally.low_words_pay`.
+        low: Their low words, where those are apart, see `tally.splitting_pays`.
         gradients: The tallies that have signs [voxel, parameter].
         ledger: The energy balance and counters, see `add_to_ledger`.
         scale: Tally units per emitted photon.
     """
 
-    tally: wp.array(dtype=wp.int64)
-    low: wp.array(dtype=wp.uint32)
-    gradients: wp.array(dtype=wp.int64)
-    ledger: wp.array(dtype=wp.int64)
+    tally: wp.array[wp.int64]
+    low: wp.array[wp.uint32]
+    gradients: wp.array[wp.int64]
+    ledger: wp.array[wp.int64]
     scale: float
 
 
@@ -127,7 +127,7 @@ def _deposit_signed(account: wp.ref[Account], sink: wp.ref[Sink], index: int, un
         book(account, sink, wp.where(wp.abs(units) > DEPOSIT_LIMIT, CLIPPED, INVALID), wp.int64(1))
 
 
-@made_once
+@memoised
 def make_deposit(signed: int, kinds: int, split: bool) -> wp.Function:
     """The Warp function ``(account, sink, world, contribution)`` that adds a contribution to the tally, with so many
     parameters or channels that have signs and so many kinds of derivatives by block; `split`: the low words of the

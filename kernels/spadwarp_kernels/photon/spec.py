@@ -3,12 +3,12 @@
 from typing import Any, NamedTuple
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer
+from spadwarp_kernels.optics.camera import PLAIN, Lens
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
 from spadwarp_kernels.optics.port import PortKind
-from spadwarp_kernels.optics.projection import PLAIN, Lens
 from spadwarp_kernels.tally.blocks import BLOCK_DERIVATIVES
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES
-from spadwarp_kernels.water.layers import HOMOGENEOUS, LAYERED, Water
+from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
 
 __all__ = ["TransportSpec"]
@@ -36,7 +36,7 @@ class TransportSpec(NamedTuple):
         confocal: Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED.
         rotated_domain: The domain has axes of its own.
         reflecting: Faces of the domain reflect, as `Limits.boundary` says; needs `bounded`.
-        public_tree: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
+        use_warp_bvh: Rays take `wp.mesh_query_ray`, see `make_surfaces`.
         stepped: Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new
             ones.
         merged: The tally is [pixel, bin], for the light of all components together. The ledger's counts of what is
@@ -74,7 +74,7 @@ class TransportSpec(NamedTuple):
     confocal: bool = False
     rotated_domain: bool = False
     reflecting: bool = False
-    public_tree: bool = False
+    use_warp_bvh: bool = False
     stepped: bool = False
     merged: bool = False
     port: PortKind | None = None

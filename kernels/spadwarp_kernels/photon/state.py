@@ -210,13 +210,13 @@ class Records:
         log_derivatives: Of what the history has met, [photons, derivatives]; empty without them.
     """
 
-    position: wp.array(dtype=wp.vec3)
-    direction: wp.array(dtype=wp.vec3)
-    weight: wp.array(dtype=float)
-    path: wp.array(dtype=float)
-    collisions: wp.array(dtype=int)
-    reason: wp.array(dtype=int)
-    log_derivatives: wp.array2d(dtype=float)
+    position: wp.array[wp.vec3]
+    direction: wp.array[wp.vec3]
+    weight: wp.array[float]
+    path: wp.array[float]
+    collisions: wp.array[int]
+    reason: wp.array[int]
+    log_derivatives: wp.array2d[float]
 
 
 def make_records(count: int, *, device: wp.DeviceLike = None, derivatives: int = 0) -> Records:

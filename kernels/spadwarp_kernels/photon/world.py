@@ -3,15 +3,13 @@
 import warp as wp
 
 from spadwarp_kernels.base.philox import RoundKeys
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import Laser, Scan
 from spadwarp_kernels.optics.polarisation import Polarisation
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.tally.scores import Derivatives
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 

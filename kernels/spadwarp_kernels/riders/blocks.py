@@ -12,7 +12,7 @@ that the thread keeps a list of them.
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Carried
 from spadwarp_kernels.photon.world import World
@@ -31,7 +31,7 @@ def _forget(blocks: Blocks, half: int):
     blocks.memory[met_entry(blocks, half, blocks.count)] = 0.0
 
 
-@made_once
+@memoised
 def _make_meet(kinds: int) -> wp.Function:
     @wp.func
     def meet(blocks: Blocks, half: int, block: int):
@@ -46,7 +46,7 @@ def _make_meet(kinds: int) -> wp.Function:
     return meet
 
 
-@made_once
+@memoised
 def make_blocks_rider(spec: TransportSpec) -> Rider:
     """Of the blocks of a spec."""
     kinds = len(spec.blocks)

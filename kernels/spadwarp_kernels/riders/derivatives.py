@@ -6,7 +6,7 @@ the Lambertian reflectance.
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Carried
@@ -14,8 +14,8 @@ from spadwarp_kernels.photon.world import World
 from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
 from spadwarp_kernels.surface.triangle import face_in, face_normal
 from spadwarp_kernels.tally.tally import Contribution, LogDerivatives
-from spadwarp_kernels.water.layers import boundary_ahead, layer_index
-from spadwarp_kernels.water.phase_functions import henyey_greenstein_score
+from spadwarp_kernels.water.medium import boundary_ahead, layer_index
+from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
 
 from .rider import NOTHING, Rider
 
@@ -28,7 +28,7 @@ def parameters_of(spec: TransportSpec, *kinds: str) -> int:
     return sum(1 << p for p, kind in enumerate(spec.derivatives) if kind in kinds)
 
 
-@made_once
+@memoised
 def make_derivatives_rider(spec: TransportSpec) -> Rider:
     """Of the parameters of a spec."""
     return NOTHING._replace(begin=_begin, fly=_make_fly(spec), event=_make_event(spec), deliver=_deliver)
@@ -95,7 +95,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
             if (wp.static(by_scattering) >> p) & 1 == 1:
                 d[p] = d[p] + wp.where((here >> p) & 1 == 1, 1.0 / world.derivatives.value[p], 0.0)
             if (wp.static(by_anisotropy) >> p) & 1 == 1:
-                slope = henyey_greenstein_score(t, world.derivatives.value[p])
+                slope = henyey_greenstein_log_derivative(t, world.derivatives.value[p])
                 d[p] = d[p] + wp.where((here >> p) & 1 == 1, slope, 0.0)
         return d
 

@@ -9,7 +9,7 @@ is turned by an angle a from e1 towards e2 gives Q' = Q cos 2a + U sin 2a and U'
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis, set_apart
 from spadwarp_kernels.optics.laser import beam_frame
 from spadwarp_kernels.optics.port import Port, PortKind
@@ -39,7 +39,7 @@ class Elements:
 
 
 @wp.func
-def table_elements(first: wp.array(dtype=wp.vec4), last: wp.array(dtype=float), t: float) -> Elements:
+def table_elements(first: wp.array[wp.vec4], last: wp.array[float], t: float) -> Elements:
     """Of tables at `matrix_cosines`, for t = 1 - cos(theta) in [0, 2]; linear in between."""
     steps = first.shape[0] - 1
     position = 0.5 * float(steps) * wp.sqrt(wp.min(t, 2.0 - t))
@@ -166,7 +166,7 @@ def window_elements(n: wp.vec4, q: wp.vec4) -> Elements:
     return m
 
 
-@made_once
+@memoised
 def make_port_elements(port: PortKind | None) -> wp.Function | None:
     """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u; None without a port."""
     if port is None:
@@ -184,7 +184,7 @@ def make_port_elements(port: PortKind | None) -> wp.Function | None:
 # ---- The light of a photon, from the laser to the receiver.
 
 
-@made_once
+@memoised
 def make_polarisation_rider(spec: TransportSpec) -> Rider:
     """The Stokes vector of a polarised spec."""
     return NOTHING._replace(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.state import Carried
 from spadwarp_kernels.photon.world import World
 from spadwarp_kernels.tally.tally import Contribution
@@ -71,7 +71,7 @@ class Rider(NamedTuple):
 NOTHING = Rider()
 
 
-@made_once
+@memoised
 def join(first: Rider, second: Rider) -> Rider:
     """Both, one after the other."""
     begin_first, fork_first, fly_first, event_first, mirror_first, deliver_first = first

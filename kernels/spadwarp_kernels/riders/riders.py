@@ -1,6 +1,6 @@
 """The riders of a spec."""
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.spec import TransportSpec
 
 from .blocks import make_blocks_rider
@@ -9,7 +9,7 @@ from .polarisation import make_polarisation_rider
 from .rider import NOTHING, Rider, join
 
 
-@made_once
+@memoised
 def make_rider(spec: TransportSpec) -> Rider:
     """All that rides along for a spec; `NOTHING` where nothing does."""
     rider = NOTHING

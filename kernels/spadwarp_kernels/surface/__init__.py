@@ -2,11 +2,9 @@
 
 from typing import TYPE_CHECKING
 
-from .box import *
 from .mesh import *
 from .patches import *
 from .ray_cast import *
-from .reflectance import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = box.__all__ + mesh.__all__ + patches.__all__ + ray_cast.__all__ + reflectance.__all__
+    __all__ = mesh.__all__ + patches.__all__ + ray_cast.__all__

@@ -7,35 +7,452 @@ a kernel moves on by a step, `step_node` or `step_leaf`: all lanes that are in n
 leaves, and new rays join while old ones still walk (Aila & Laine, High-Performance Graphics 2009, on what the order of
 steps is worth). `intersect_surfaces` walks a tree with the same steps from its root to the end.
 
-A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice; `nodes` says
-how it is kept. Faces are three vec4 each, see `meet_planes`, in the order of the leaves; two that make a parallelogram
-may be tried as one, see `leaves`.
+A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice; their boxes
+are in bytes (Ylitie, Karras & Laine, High Performance Graphics 2017). It is four vec4, half a line of a GPU's cache:
+
+- origin x, y, z, scale x; scale y, z, lower x, y; lower z, upper x, y, z: of the boxes a byte k for each child, the
+  first in the lowest, that stands for origin + scale (1 + k / 32768), rounded outwards;
+- the bits of the children: the index of a node, NO_NODE, or below it a leaf, see `leaf_at`.
+
+Faces are three vec4 each, see `meet_planes`, in the order of the leaves; two that make a parallelogram may be tried as
+one, see `join_leaves`.
 """
 
+import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.native import bits_of, from_bits
 
-from .nodes import (
-    Corners,
-    box_entries,
-    box_of,
-    child_of,
-    children_of,
-    empty_nodes,
-    leaf_at,
-    set_node,
-    slot_of,
-)
-from .patches import DEEPEST, NO_NODE, NOWHERE, join_leaves, read_tree
-from .triangle import box_padding, face_in, meet_face, pack_faces, set_faces
+from .patches import SAME, shared_corner
+from .triangle import box_padding, face_in, meet_face, number_in, pack_faces, set_faces, set_row
+
+
+@wp.func_native("""
+    float in[3], out[3];
+    for (int i = 0; i < 3; ++i) {
+        // Infinite for a segment parallel to these two sides: in and out are then infinite as well, and their signs
+        // decide. In the plane of a side 0 * infinity is no number; any answer is right there, within the padding.
+        const float inverse = 1.0f / u[i], a = (lower[i] - x[i]) * inverse, b = (upper[i] - x[i]) * inverse;
+        in[i] = wp::min(a, b);
+        out[i] = wp::max(a, b);
+    }
+#if defined(__CUDA_ARCH__)
+    // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
+    // negative counts only as that.
+    const auto bits = [](float number) { return __float_as_int(number); };
+    const int enters = __vimax3_s32_relu(bits(in[0]), bits(in[1]), bits(in[2]));
+    return enters <= min(__vimin3_s32(bits(out[0]), bits(out[1]), bits(out[2])), bits(length));
+#else
+    const float enters = wp::max(wp::max(in[0], in[1]), wp::max(in[2], 0.0f));
+    return enters <= wp::min(wp::min(out[0], out[1]), wp::min(out[2], length));
+#endif
+""")
+def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
+    """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    typedef float row __attribute__((vector_size(16)));
+    const auto least = [](row p, row q) { return p < q ? p : q; };
+    const auto most = [](row p, row q) { return p > q ? p : q; };
+    // The fourth lane is the segment itself, from 0 to its length.
+    const row start = {x[0], x[1], x[2], 0.0f}, low = {lower[0], lower[1], lower[2], 0.0f};
+    const row high = {upper[0], upper[1], upper[2], length}, heading = {u[0], u[1], u[2], 1.0f};
+    const row tiny = row{} + 1.0e-12f;
+    const row inverse = 1.0f / (__builtin_elementwise_abs(heading) < tiny ? tiny : heading);
+    const row a = (low - start) * inverse, b = (high - start) * inverse;
+    row near = least(a, b), far = most(a, b);
+    near = most(near, __builtin_shufflevector(near, near, 2, 3, 0, 1));
+    far = least(far, __builtin_shufflevector(far, far, 2, 3, 0, 1));
+    near = most(near, __builtin_shufflevector(near, near, 1, 0, 3, 2));
+    far = least(far, __builtin_shufflevector(far, far, 1, 0, 3, 2));
+    return near[0] <= far[0];
+#else
+    return true;
+#endif
+""")
+def segment_meets_box_on_cpu(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
+    """`segment_meets_box`, its three axes in one vector register; CPU alone."""
+    ...
+
+
+@wp.func
+def _inverse(d: float) -> float:
+    return 1.0 / wp.where(wp.abs(d) < 1.0e-18, 1.0e-18, d)
+
+
+@wp.func
+def inverse_direction(u: wp.vec3) -> wp.vec3:
+    """1/u by components, finite."""
+    return wp.vec3(_inverse(u[0]), _inverse(u[1]), _inverse(u[2]))
+
+
+# ---- The tree of a `wp.Mesh`, read from Warp's private structs: what the trees of GPUs and CPUs are made of.
+
+
+# In place of a child that is not there, and of a walk's node at its end: nodes are above, leaves below.
+NO_NODE = wp.constant(-1)
+
+# Where no ray comes to [m].
+NOWHERE = wp.constant(1.0e30)
+
+# Warp's trees are at most so deep.
+DEEPEST = 32
+
+
+@wp.func_native("""
+    const wp::Mesh m = wp::mesh_get(mesh);
+    const wp::BVHPackedNodeHalf half = upper ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
+    union { float number; int bits; } both;
+    both.bits = static_cast<int32_t>(half.i);
+    return wp::vec4(half.x, half.y, half.z, both.number);
+""")
+def _tree_node(mesh: wp.uint64, node: int, upper: bool) -> wp.vec4:
+    """A corner of a node's box and the bits of its child, or of the first and last face of a leaf."""
+    ...
+
+
+@wp.func_native("""
+    const wp::Mesh m = wp::mesh_get(mesh);
+    // The linear builder fills all nodes that there are room for, the others count theirs.
+    const bool linear = m.bvh.constructor_type == BVH_CONSTRUCTOR_LBVH;
+    if (node >= (linear ? m.bvh.max_nodes : m.bvh.num_nodes)) return -1;
+    return m.bvh.node_lowers[node].b ? 1 : 0;
+""")
+def _tree_kind(mesh: wp.uint64, node: int) -> int:
+    """0 for a node with children, 1 for a leaf, -1 beyond the tree."""
+    ...
+
+
+@wp.func_native("return *wp::mesh_get(mesh).bvh.root;")
+def _tree_root(mesh: wp.uint64) -> int: ...
+
+
+@wp.func_native("return wp::mesh_get(mesh).bvh.primitive_indices[slot];")
+def _tree_face(mesh: wp.uint64, slot: int) -> int: ...
+
+
+@wp.func
+def _with_bits(corner: wp.vec3, bits: int) -> wp.vec4:
+    return wp.vec4(corner[0], corner[1], corner[2], from_bits(bits))
+
+
+@wp.kernel(enable_backward=False)
+def _count_kernel(mesh: wp.uint64, has_children: wp.array[int]):
+    """Launch: nodes that the tree may have."""
+    node = wp.tid()
+    has_children[node] = wp.where(_tree_kind(mesh, node) == 0, 1, 0)
+
+
+@wp.func
+def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array[int]):
+    for slot in range(start, stop):
+        face = _tree_face(mesh, slot)
+        order[slot] = wp.where(slot + 1 < stop, ~face, face)
+
+
+@wp.kernel(enable_backward=False)
+def _pack_kernel(
+    mesh: wp.uint64, padding: float, before: wp.array[int], nodes: wp.array[wp.vec4], order: wp.array[int]
+):
+    """Launch: nodes that the tree may have. The root's pair is the first; the others stand in the tree's order."""
+    node = wp.tid()
+    kind = _tree_kind(mesh, node)
+    root = _tree_root(mesh)
+    pad = wp.vec3(padding)
+    if kind == 1 and node == root:  # a tree of one leaf
+        lower = _tree_node(mesh, node, False)
+        upper = _tree_node(mesh, node, True)
+        _order_leaf(mesh, bits_of(lower[3]), bits_of(upper[3]), order)
+        nodes[0] = _with_bits(wp.vec3(lower[0], lower[1], lower[2]) - pad, -2 - bits_of(lower[3]))
+        nodes[1] = _with_bits(wp.vec3(upper[0], upper[1], upper[2]) + pad, 0)
+        nodes[2] = _with_bits(wp.vec3(NOWHERE), NO_NODE)
+        nodes[3] = _with_bits(wp.vec3(NOWHERE), NO_NODE)
+    if kind == 0:
+        # Leaves are written by their parents: a tree may hold more, within leaves that it has merged.
+        pair = wp.where(node == root, 0, before[node] + 1)
+        for k in range(2):
+            child = bits_of(_tree_node(mesh, node, k == 1)[3])
+            low = _tree_node(mesh, child, False)
+            high = _tree_node(mesh, child, True)
+            entry = before[child] + 1
+            if _tree_kind(mesh, child) == 1:
+                entry = -2 - bits_of(low[3])
+                _order_leaf(mesh, bits_of(low[3]), bits_of(high[3]), order)
+            nodes[4 * pair + 2 * k] = _with_bits(wp.vec3(low[0], low[1], low[2]) - pad, entry)
+            nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
+
+
+def read_tree(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array]:
+    """Pairs of nodes and order of a mesh's tree.
+
+    Args:
+        mesh: Any `wp.Mesh`.
+        extent: Its largest coordinate [m], for the padding of the boxes.
+
+    Returns:
+        nodes: vec4 [4 * pairs], see above; boxes are padded against rounding.
+        order: int32 [faces]: the face in each slot, or ~face where the next slot belongs to the same leaf.
+    """
+    count, device = mesh.indices.size // 3, mesh.device
+    has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
+    before = wp.zeros_like(has_children)
+    nodes = wp.zeros(4 * (count + 1), dtype=wp.vec4, device=device)
+    order = wp.zeros(count, dtype=int, device=device)
+    wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
+    wp.utils.array_scan(has_children, before, inclusive=False)
+    inputs = [mesh.id, box_padding(extent), before]
+    wp.launch(_pack_kernel, has_children.size, inputs, outputs=[nodes, order], device=device)
+    return nodes, order
+
+
+# ---- Leaves of the tree on CUDA: two faces that make a parallelogram are tried as one.
+
+
+# Leaves of more faces are left as they are: all pairs of a leaf's faces are compared.
+LARGEST_LEAF = wp.constant(8)
+
+
+@wp.func
+def _leaf(nodes: wp.array[wp.vec4], node: int) -> int:
+    """The slot of a leaf's first face, below 0 for other nodes."""
+    return -2 - bits_of(nodes[2 * node][3])
+
+
+@wp.kernel(enable_backward=False)
+def _siblings_kernel(
+    mesh: wp.uint64, same: float, nodes: wp.array[wp.vec4], order: wp.array[int], joined: wp.array[int]
+):
+    """Two leaves of a face each that make a parallelogram become a leaf of two, which is marked. Launch: pairs."""
+    pair = wp.tid()
+    first = _leaf(nodes, 2 * pair)
+    if pair == 0 or first < 0 or _leaf(nodes, 2 * pair + 1) != first + 1:
+        return
+    if order[first] < 0 or order[first + 1] < 0:
+        return
+    if shared_corner(mesh, order[first], order[first + 1], same) >= 0:
+        order[first] = ~order[first]
+        joined[pair] = 1
+
+
+@wp.kernel(enable_backward=False)
+def _parents_kernel(joined: wp.array[int], nodes: wp.array[wp.vec4]):
+    """In place of a pair that has become one leaf, that. Launch: nodes."""
+    node = wp.tid()
+    child = bits_of(nodes[2 * node][3])
+    if child > NO_NODE and joined[wp.max(child, 0)] > 0:
+        nodes[2 * node][3] = nodes[4 * child][3]
+
+
+@wp.kernel(enable_backward=False)
+def _leaves_kernel(mesh: wp.uint64, same: float, found: wp.array[int], order: wp.array[int], faces: wp.array[wp.vec4]):
+    """Writes the faces of each leaf anew: behind a face the one with which it makes a parallelogram, if there is one.
+    Launch: slots."""
+    start = wp.tid()
+    if start > 0 and found[wp.max(start - 1, 0)] < 0:
+        return
+    stop = start + 1
+    while found[stop - 1] < 0 and stop - start <= LARGEST_LEAF:
+        stop += 1
+    if stop - start > LARGEST_LEAF:
+        return
+    taken = int(0)
+    slot = int(start)
+    for i in range(start, stop):
+        if ((taken >> (i - start)) & 1) == 0:
+            first = face_in(found, i)
+            second = int(-1)
+            corner = int(-1)
+            for j in range(i + 1, stop):
+                if corner < 0 and ((taken >> (j - start)) & 1) == 0:
+                    second = face_in(found, j)
+                    corner = shared_corner(mesh, first, second, same)
+                    taken = wp.where(corner >= 0, taken | (1 << (j - start)), taken)
+            width = wp.where(corner >= 0, 2, 1)
+            more = slot + width < stop
+            order[slot] = wp.where(more, ~first, first)
+            set_row(mesh, first, wp.max(corner, 0), wp.where(corner >= 0, 0.0, 1.0), slot, faces)
+            if corner >= 0:
+                order[slot + 1] = wp.where(more, ~second, second)
+                set_row(mesh, second, 0, 1.0, slot + 1, faces)
+            slot += width
+
+
+def join_leaves(mesh: wp.Mesh, extent: float, nodes: wp.array, order: wp.array, faces: wp.array) -> None:
+    """Faces that are tried as one where two of a leaf, or of two leaves of a face each, make a parallelogram.
+
+    Args:
+        mesh: Whose points will not move.
+        extent: Its largest coordinate [m].
+        nodes, order: From `read_tree`; both change.
+        faces: The faces in their slots as CUDA takes them, see `pack_faces`; they change, too.
+    """
+    count, device, same = nodes.size // 4, mesh.device, SAME * extent
+    joined = wp.zeros(count, dtype=int, device=device)
+    wp.launch(_siblings_kernel, count, [mesh.id, same, nodes], [order, joined], device=device)
+    wp.launch(_parents_kernel, 2 * count, [joined], [nodes], device=device)
+    wp.launch(_leaves_kernel, order.size, [mesh.id, same, wp.clone(order)], [order, faces], device=device)
+
+
+# ---- Nodes.
+
+
+# Corners of four boxes, a row each.
+Corners = wp.types.matrix(shape=(4, 3), dtype=float)
+
+# Bytes of a box are this part of a node's scale apart.
+_BYTE = wp.constant(1.0 / 32768.0)
+
+# A box is wider by this part of a byte, for what a step rounds, which is a 256th.
+_SLACK = wp.constant(1.0 / 64.0)
+
+
+@wp.func
+def child_of(nodes: wp.array[wp.vec4], node: int, k: int) -> int:
+    """One of the four children of a node."""
+    return bits_of(nodes[4 * node + 3][k])
+
+
+@wp.func
+def leaf_at(order: wp.array[int], slot: int) -> int:
+    """A slot's face and those after it in its leaf, as a child of a node: -2 - 2 slot, one less if there are more."""
+    return -2 - 2 * slot - wp.where(number_in(order, slot) < 0, 1, 0)
+
+
+@wp.func
+def slot_of(leaf: int) -> int:
+    """The slot of a leaf's first face."""
+    return (-2 - leaf) >> 1
+
+
+@wp.func
+def _byte(bits: int, k: int) -> int:
+    return (bits >> (8 * k)) & 255
+
+
+@wp.func
+def set_node(nodes: wp.array[wp.vec4], node: int, children: wp.vec4i, low: Corners, high: Corners):
+    """Writes a node of boxes with these corners; those of children that are not there do not matter."""
+    origin, scale = wp.vec3(), wp.vec3()
+    lower, upper = wp.vec3i(), wp.vec3i()
+    for axis in range(3):
+        least = float(NOWHERE)
+        most = float(-NOWHERE)
+        for k in range(4):
+            if children[k] != NO_NODE:
+                least = wp.min(least, low[k, axis])
+                most = wp.max(most, high[k, axis])
+        step = wp.max((most - least) / 254.9, 2.0e-7 * wp.max(wp.abs(least), wp.abs(most)))
+        scale[axis] = step / _BYTE
+        origin[axis] = (least - 2.0 * _SLACK * step) - scale[axis]
+        zero = origin[axis] + scale[axis]
+        for k in range(4):
+            first = int(255)  # of a child that is not there the sides stand the wrong way round
+            last = int(0)
+            if children[k] != NO_NODE:
+                first = wp.clamp(int(wp.floor((low[k, axis] - zero) / step - _SLACK)), 0, 255)
+                last = wp.clamp(int(wp.ceil((high[k, axis] - zero) / step + _SLACK)), 0, 255)
+            lower[axis] = lower[axis] | (first << (8 * k))
+            upper[axis] = upper[axis] | (last << (8 * k))
+    nodes[4 * node] = wp.vec4(origin[0], origin[1], origin[2], scale[0])
+    nodes[4 * node + 1] = wp.vec4(scale[1], scale[2], from_bits(lower[0]), from_bits(lower[1]))
+    nodes[4 * node + 2] = wp.vec4(from_bits(lower[2]), from_bits(upper[0]), from_bits(upper[1]), from_bits(upper[2]))
+    nodes[4 * node + 3] = wp.vec4(
+        from_bits(children[0]), from_bits(children[1]), from_bits(children[2]), from_bits(children[3])
+    )
+
+
+@wp.func
+def box_of(nodes: wp.array[wp.vec4], node: int):
+    """Lower and upper corner of a box around all children of a node."""
+    p = nodes[4 * node]
+    q = nodes[4 * node + 1]
+    r = nodes[4 * node + 2]
+    origin = wp.vec3(p[0], p[1], p[2])
+    scale = wp.vec3(p[3], q[0], q[1])
+    lower = wp.vec3i(bits_of(q[2]), bits_of(q[3]), bits_of(r[0]))
+    upper = wp.vec3i(bits_of(r[1]), bits_of(r[2]), bits_of(r[3]))
+    low = wp.vec3()
+    high = wp.vec3()
+    for axis in range(3):
+        first = int(255)
+        last = int(0)
+        for k in range(4):
+            if child_of(nodes, node, k) != NO_NODE:
+                first = wp.min(first, _byte(lower[axis], k))
+                last = wp.max(last, _byte(upper[axis], k))
+        zero = origin[axis] + scale[axis]
+        a = zero + float(first) * (_BYTE * scale[axis])
+        b = zero + float(last) * (_BYTE * scale[axis])
+        low[axis] = a - 2.0e-7 * wp.abs(a)
+        high[axis] = b + 2.0e-7 * wp.abs(b)
+    return low, high
+
+
+def empty_nodes(device: wp.DeviceLike) -> wp.array:
+    """A root whose four children no ray meets."""
+    x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
+    return wp.array([[x, x, x, 0.0], [0.0, 0.0, bits, bits], [bits] * 4, [bits] * 4], dtype=wp.vec4, device=device)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4* row = reinterpret_cast<const float4*>(nodes.data) + 4 * static_cast<int64_t>(node);
+    const float4 p = __ldg(row), q = __ldg(row + 1), r = __ldg(row + 2);
+    // A byte k of the boxes becomes the float 1 + k / 32768, so that a slab costs one multiplication and addition.
+    const float mx = p.w * inverse[0], my = q.x * inverse[1], mz = q.y * inverse[2];
+    const float bx = p.x * inverse[0] - shift[0], by = p.y * inverse[1] - shift[1], bz = p.z * inverse[2] - shift[2];
+    const unsigned lx = __float_as_uint(q.z), ly = __float_as_uint(q.w), lz = __float_as_uint(r.x);
+    const unsigned hx = __float_as_uint(r.y), hy = __float_as_uint(r.z), hz = __float_as_uint(r.w);
+    // Of the lower and upper sides, those that a ray in this direction meets first.
+    const bool x = inverse[0] < 0.0f, y = inverse[1] < 0.0f, z = inverse[2] < 0.0f;
+    const unsigned x0 = x ? hx : lx, y0 = y ? hy : ly, z0 = z ? hz : lz;
+    const unsigned x1 = x ? lx : hx, y1 = y ? ly : hy, z1 = z ? lz : hz;
+    // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
+    // negative counts only as that. A ray that leaves a box before it enters misses it: its sign is put in front.
+    const auto at = [](unsigned bytes, int pick, float scale, float start) {
+        return __float_as_int(__uint_as_float(__byte_perm(bytes, 0x3f800000u, pick)) * scale + start);
+    };
+    const auto entry = [&](int pick) {
+        const int in = __vimax3_s32_relu(at(x0, pick, mx, bx), at(y0, pick, my, by), at(z0, pick, mz, bz));
+        const int out = __vimin3_s32(at(x1, pick, mx, bx), at(y1, pick, my, by), at(z1, pick, mz, bz));
+        return in | (__float_as_uint(__int_as_float(out) - __int_as_float(in)) & 0x80000000u);
+    };
+    return wp::vec4ui(entry(0x7604), entry(0x7614), entry(0x7624), entry(0x7634));
+#else
+    return wp::vec4ui(0xffffffffu);
+#endif
+""")
+def box_entries(nodes: wp.array[wp.vec4], node: int, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4ui:
+    """Bits of the distances at which a ray enters the boxes of four children; 2^31 more for those that it misses. CUDA
+    alone."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const uint4 child = __ldg(reinterpret_cast<const uint4*>(nodes.data) + 4 * static_cast<int64_t>(node) + 3);
+    return wp::vec4ui(child.x, child.y, child.z, child.w);
+#else
+    return wp::vec4ui(0xffffffffu);
+#endif
+""")
+def children_of(nodes: wp.array[wp.vec4], node: int) -> wp.vec4ui:
+    """The bits of the four children of a node. CUDA alone."""
+    ...
+
+
+# ---- The tree.
+
 
 # Nodes that a walk will return to: three a level, and NO_NODE.
 Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
 
 
 @wp.func
-def _surface(nodes: wp.array(dtype=wp.vec4), node: int) -> float:
+def _surface(nodes: wp.array[wp.vec4], node: int) -> float:
     """Of the box of a node [m²]; -1 for a leaf, which cannot be opened."""
     size = nodes[2 * node + 1] - nodes[2 * node]
     area = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
@@ -43,7 +460,7 @@ def _surface(nodes: wp.array(dtype=wp.vec4), node: int) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def _open_kernel(pairs: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4)):
+def _open_kernel(pairs: wp.array[wp.vec4], nodes: wp.array[wp.vec4]):
     """A node of four children for each pair; the largest are opened first. Launch: pairs."""
     pair = wp.tid()
     held = wp.vec4i(2 * pair, 2 * pair + 1, -1, -1)
@@ -75,7 +492,7 @@ def _open_kernel(pairs: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4))
 
 
 @wp.kernel(enable_backward=False)
-def _depth_kernel(nodes: wp.array(dtype=wp.vec4), level: int, depth: wp.array(dtype=int)):
+def _depth_kernel(nodes: wp.array[wp.vec4], level: int, depth: wp.array[int]):
     """Launch: nodes."""
     node = wp.tid()
     if depth[node] == level:
@@ -95,18 +512,14 @@ def node_depths(nodes: wp.array) -> wp.array:
 
 
 @wp.kernel(enable_backward=False)
-def _flag_kernel(depth: wp.array(dtype=int), used: wp.array(dtype=int)):
+def _flag_kernel(depth: wp.array[int], used: wp.array[int]):
     """Launch: nodes."""
     used[wp.tid()] = wp.where(depth[wp.tid()] >= 0, 1, 0)
 
 
 @wp.kernel(enable_backward=False)
 def _gather_kernel(
-    wide: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
-    used: wp.array(dtype=int),
-    place: wp.array(dtype=int),
-    nodes: wp.array(dtype=wp.vec4),
+    wide: wp.array[wp.vec4], order: wp.array[int], used: wp.array[int], place: wp.array[int], nodes: wp.array[wp.vec4]
 ):
     """The nodes that are used, in their order. Launch: nodes."""
     node = wp.tid()
@@ -142,7 +555,7 @@ def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array,
     Args:
         mesh: Any `wp.Mesh` on a GPU.
         extent: Its largest coordinate [m], for the padding of the boxes.
-        join: Whether two faces may be tried as one, see `leaves`: not where the points will move.
+        join: Whether two faces may be tried as one, see `join_leaves`: not where the points will move.
 
     Returns:
         nodes: vec4 [4 * nodes], see above; boxes are padded against rounding.
@@ -158,12 +571,7 @@ def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array,
 
 @wp.kernel(enable_backward=False)
 def _refit_kernel(
-    mesh: wp.uint64,
-    padding: float,
-    level: int,
-    depth: wp.array(dtype=int),
-    order: wp.array(dtype=int),
-    nodes: wp.array(dtype=wp.vec4),
+    mesh: wp.uint64, padding: float, level: int, depth: wp.array[int], order: wp.array[int], nodes: wp.array[wp.vec4]
 ):
     """Boxes of the children of one level's nodes, those below being done. Launch: nodes."""
     node = wp.tid()
@@ -215,19 +623,12 @@ def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
 
 @wp.struct
 class TreeWalk:
-    """A ray on its way down the tree; its stack is a `Stack` beside it.
+    """A ray on its way down the tree; its stack is a `Stack` beside it."""
 
-    Attributes:
-        node: Where it is; NO_NODE when it has come to its end.
-        depth: Size of the stack.
-        nearest: Distance of the nearest face so far, or the length of the ray [m].
-        found: Slot of that face; -1 for none.
-    """
-
-    node: int
-    depth: int
-    nearest: float
-    found: int
+    node: int  # where it is; NO_NODE when it has come to its end
+    depth: int  # size of the stack
+    nearest: float  # distance of the nearest face so far, or the length of the ray [m]
+    found: int  # slot of that face; -1 for none
 
 
 @wp.func_native("__builtin_assume(depth >= 0); return depth;")
@@ -245,21 +646,15 @@ def _first(near: wp.vec2ui, far: wp.vec2ui):
 
 @wp.struct
 class NodeStep:
-    """The children of a node against a ray, the nearest first.
+    """The children of a node against a ray, the nearest first."""
 
-    Attributes:
-        child: Nodes; of no meaning for those that the ray misses.
-        entry: Bits of the distances at which it enters their boxes [m]; 2^31 more for those that it misses.
-        reach: Bits of the largest distance that counts.
-    """
-
-    child: wp.vec4i
-    entry: wp.vec4ui
-    reach: wp.uint32
+    child: wp.vec4i  # nodes; of no meaning for those that the ray misses
+    entry: wp.vec4ui  # bits of the distances at which it enters their boxes [m]; 2^31 more for those that it misses
+    reach: wp.uint32  # bits of the largest distance that counts
 
 
 @wp.func
-def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> NodeStep:
+def step_node(nodes: wp.array[wp.vec4], walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> NodeStep:
     """The children of a node that a ray meets.
 
     Args:
@@ -282,25 +677,16 @@ def step_node(nodes: wp.array(dtype=wp.vec4), walk: TreeWalk, inverse: wp.vec3, 
 
 @wp.struct
 class LeafStep:
-    """A face of a leaf, or two that are one leaf, against a ray.
+    """A face of a leaf, or two that are one leaf, against a ray."""
 
-    Attributes:
-        slot: Of the face, of two that which the ray would hit.
-        distance: At which the ray meets it [m]; of no meaning for a miss.
-        hit: Whether it does, nearer than the nearest face so far.
-        node: The next face of the leaf, or NO_NODE after the last: then the walk returns to its stack.
-    """
-
-    slot: int
-    distance: float
-    hit: bool
-    node: int
+    slot: int  # of the face, of two that which the ray would hit
+    distance: float  # at which the ray meets it [m]; of no meaning for a miss
+    hit: bool  # whether it does, nearer than the nearest face so far
+    node: int  # the next face of the leaf, or NO_NODE after the last: then the walk returns to its stack
 
 
 @wp.func
-def step_leaf(
-    faces: wp.array(dtype=wp.vec4), order: wp.array(dtype=int), walk: TreeWalk, x: wp.vec3, u: wp.vec3
-) -> LeafStep:
+def step_leaf(faces: wp.array[wp.vec4], order: wp.array[int], walk: TreeWalk, x: wp.vec3, u: wp.vec3) -> LeafStep:
     """Tries the face that a walk has come to.
 
     Args:

@@ -38,10 +38,10 @@ class Textures:
         texels: Reflectance factors in [0, 1], row after row from the top.
     """
 
-    face: wp.array(dtype=int)
-    coordinates: wp.array2d(dtype=wp.vec2)
-    region: wp.array(dtype=wp.vec3i)
-    texels: wp.array(dtype=float)
+    face: wp.array[int]
+    coordinates: wp.array2d[wp.vec2]
+    region: wp.array[wp.vec3i]
+    texels: wp.array[float]
 
 
 @wp.struct
@@ -67,20 +67,20 @@ class Surfaces:
     mesh: wp.uint64
     lower: wp.vec3
     upper: wp.vec3
-    nodes: wp.array(dtype=wp.vec4)
-    faces: wp.array(dtype=wp.vec4)
-    order: wp.array(dtype=int)
-    reflectance: wp.array(dtype=float)
-    near_depth: wp.array2d(dtype=float)
-    corner_reflectance: wp.array(dtype=wp.vec3)
+    nodes: wp.array[wp.vec4]
+    faces: wp.array[wp.vec4]
+    order: wp.array[int]
+    reflectance: wp.array[float]
+    near_depth: wp.array2d[float]
+    corner_reflectance: wp.array[wp.vec3]
     textures: Textures
-    specular: wp.array(dtype=float)
-    roughness: wp.array(dtype=float)
-    depth: wp.array(dtype=int)
+    specular: wp.array[float]
+    roughness: wp.array[float]
+    depth: wp.array[int]
     levels: int
     extent: float
-    patches: wp.array(dtype=wp.vec4)
-    normals: wp.array(dtype=wp.vec4)
+    patches: wp.array[wp.vec4]
+    normals: wp.array[wp.vec4]
 
 
 def make_surfaces(
@@ -94,7 +94,7 @@ def make_surfaces(
     camera: "Camera | None" = None,
     device: wp.DeviceLike = None,
     extent: float | None = None,
-    public_tree: bool = False,
+    use_warp_bvh: bool = False,
 ) -> Surfaces:
     """The kernel's view of a mesh.
 
@@ -113,7 +113,7 @@ def make_surfaces(
         camera: Saves most of the rays between scattering events and its lens.
         device: Where the empty arrays go if there is no mesh.
         extent: Largest coordinate that a moving mesh will have [m]; then its bounding box is taken to be this large.
-        public_tree: Rays take `wp.mesh_query_ray` instead of a tree that is read from Warp's private structs: slower,
+        use_warp_bvh: Rays take `wp.mesh_query_ray` instead of a tree that is read from Warp's private structs: slower,
             and the way back when another version of Warp changes these.
 
     Raises:
@@ -168,7 +168,7 @@ def make_surfaces(
     surfaces.extent = float(abs(points).max()) if extent is None else float(extent)
     padding = 1e-6 * surfaces.extent + 1e-6
     surfaces.mesh = mesh.id
-    if public_tree:
+    if use_warp_bvh:
         slots = face_count if device.is_cuda else -(-face_count // LANES) * LANES
         numbers = np.where(np.arange(slots) < face_count, np.arange(slots), -1)
         surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
@@ -198,8 +198,8 @@ def _few_patches(mesh: wp.Mesh, order: wp.array, pairs: bool) -> tuple[wp.array,
 
 
 def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" = None) -> None:
-    """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `public_tree` the
-    mesh's own; and the map of what the camera cannot miss, where the surfaces have one.
+    """Follows the points of a mesh that have moved, on the device: refits the surfaces' tree, or with `use_warp_bvh`
+    the mesh's own; and the map of what the camera cannot miss, where the surfaces have one.
 
     Nothing is allocated or read, so that a CUDA graph can hold it. The tree keeps its shape: where faces have gone far
     from each other, surfaces made from a new `wp.Mesh` are faster.
@@ -277,7 +277,7 @@ def _check_sum(surfaces: Surfaces) -> None:
 
 
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
-    """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `public_tree`."""
+    """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `use_warp_bvh`."""
     check_struct("surfaces", surfaces, Surfaces)
     for name in ("corner_reflectance", "specular", "nodes"):
         if not isinstance(getattr(surfaces, name), wp.array):
@@ -285,17 +285,21 @@ def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
     return {
         "pattern": surfaces.corner_reflectance.size > 0,
         "specular": surfaces.specular.size > 0,
-        "public_tree": surfaces.nodes.size == 0,
+        "use_warp_bvh": surfaces.nodes.size == 0,
     }
 
 
 def no_textures(device: wp.DeviceLike = None) -> Textures:
     """Empty arrays in place of `make_textures`."""
+    return _textures(np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3)), np.zeros(0), device)
+
+
+def _textures(face: Any, coordinates: Any, region: Any, texels: Any, device: wp.DeviceLike) -> Textures:
     textures = Textures()
-    textures.face = wp.zeros(0, dtype=int, device=device)
-    textures.coordinates = wp.zeros((0, 3), dtype=wp.vec2, device=device)
-    textures.region = wp.zeros(0, dtype=wp.vec3i, device=device)
-    textures.texels = wp.zeros(0, dtype=float, device=device)
+    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
+    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
+    textures.region = wp.array(np.asarray(region, np.int32), dtype=wp.vec3i, device=device)
+    textures.texels = wp.array(np.asarray(texels, np.float32), dtype=float, device=device)
     return textures
 
 
@@ -336,10 +340,4 @@ def make_textures(
         raise ArgumentError("coordinates are not all finite")
     ends = np.cumsum([0, *(image.size for image in images)])
     region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
-    textures = Textures()
-    textures.face = wp.array(np.asarray(face, np.int32), dtype=int, device=device)
-    textures.coordinates = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2, device=device)
-    textures.region = wp.array(np.array(region, np.int32), dtype=wp.vec3i, device=device)
-    texels = np.concatenate([image.ravel() for image in images])
-    textures.texels = wp.array(texels, dtype=float, device=device)
-    return textures
+    return _textures(face, coordinates, region, np.concatenate([image.ravel() for image in images]), device)

@@ -13,9 +13,9 @@ A patch is a triangle or a parallelogram, in five vec4 (rows) of `patches`:
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.native import bits_of, from_bits
+from spadwarp_kernels.base.native import bits_of
 
-from .triangle import WIDENING, box_padding, face_in, middle_planes, set_row
+from .triangle import WIDENING, middle_planes
 
 __all__ = ["BRUTE_FORCE_FACES"]
 
@@ -30,47 +30,68 @@ SAME = 5.0e-7
 LEAST_HEIGHT = 100.0
 
 
-def pair_faces(points: np.ndarray, faces: np.ndarray) -> list[tuple[int, int, int]]:
-    """A mesh's faces as (face, second face, corner) of patches: where two make a parallelogram, the lower index first
-    and the corner (0 to 2) of the first that is not on the diagonal; else (face, face, 0).
-
-    Args:
-        points: Vertices [m], [vertices, 3].
-        faces: Indices of vertices, integers [faces, 3]. Faces that turn opposite ways are not paired.
-    """
-    corners = np.asarray(points, np.float64)[np.asarray(faces)]
-    same = SAME * np.abs(corners).max(initial=0.0)
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    free = [bool(one) for one in doubled > LEAST_HEIGHT * same * longest]
-    patches = []
-    taken: set[int] = set()
-    for first in range(len(corners)):
-        if first in taken:
-            continue
-        patch = (first, first, 0)
-        for second in (k for k in range(first + 1, len(corners)) if free[first] and free[k] and k not in taken):
-            corner = _corner(corners[first], corners[second], same)
-            if corner is not None:
-                patch = (first, second, corner)
-                taken.add(second)
-                break
-        patches.append(patch)
-    return patches
+@wp.func
+def _point(mesh: wp.uint64, face: int, corner: int) -> wp.vec3:
+    m = wp.mesh_get(mesh)
+    return m.points[m.indices[3 * face + corner % 3]]
 
 
-def _corner(first: np.ndarray, second: np.ndarray, same: float) -> int | None:
-    """The corner of a triangle across which another one completes it to a parallelogram, if it does."""
-    for corner in range(3):
-        opposite, a, b = np.roll(first, -corner, axis=0)
-        expected = np.array([a + b - opposite, b, a])
-        if any(np.abs(np.roll(second, turn, axis=0) - expected).max() <= same for turn in range(3)):
-            return corner
-    return None
+@wp.func
+def _apart(p: wp.vec3, q: wp.vec3) -> float:
+    return wp.max(wp.abs(p - q))
+
+
+@wp.func
+def shared_corner(mesh: wp.uint64, first: int, second: int, same: float) -> int:
+    """The corner (0 to 2) of a face that is not on the diagonal of the parallelogram that another one completes; -1 if
+    it does not, or is less high than LEAST_HEIGHT; points so far from each other [m] are taken for one."""
+    found = int(-1)
+    p = _point(mesh, first, 0)
+    q = _point(mesh, first, 1)
+    r = _point(mesh, first, 2)
+    longest = wp.max(wp.max(wp.length(q - p), wp.length(r - q)), wp.length(p - r))
+    if wp.length(wp.cross(q - p, r - p)) > wp.static(LEAST_HEIGHT) * same * longest:
+        for corner in range(3):
+            a = _point(mesh, first, corner + 1)
+            b = _point(mesh, first, corner + 2)
+            across = a + (b - _point(mesh, first, corner))
+            for turn in range(3):
+                apart = _apart(_point(mesh, second, turn), across)
+                apart = wp.max(apart, _apart(_point(mesh, second, turn + 1), b))
+                apart = wp.max(apart, _apart(_point(mesh, second, turn + 2), a))
+                if apart <= same and found < 0:
+                    found = corner
+    return found
 
 
 @wp.kernel(enable_backward=False)
-def _patches_kernel(mesh: wp.uint64, patches: wp.array(dtype=wp.vec4), normals: wp.array(dtype=wp.vec4)):
+def _corners_kernel(mesh: wp.uint64, same: float, corners: wp.array2d[int]):
+    """Launch: (faces, faces)."""
+    first, second = wp.tid()
+    corners[first, second] = wp.where(first < second, shared_corner(mesh, first, second, same), -1)
+
+
+def pair_faces(mesh: wp.Mesh) -> list[tuple[int, int, int]]:
+    """A mesh's faces as (face, second face, corner) of patches: where two make a parallelogram, the lower index first
+    and the corner (0 to 2) of the first that is not on the diagonal; else (face, face, 0). Faces that turn opposite
+    ways are not paired."""
+    count = mesh.indices.size // 3
+    found = wp.empty((count, count), dtype=int, device=mesh.device)
+    same = SAME * float(np.abs(mesh.points.numpy()[mesh.indices.numpy()]).max(initial=0.0))
+    wp.launch(_corners_kernel, found.shape, [mesh.id, same], [found], device=mesh.device)
+    corners, patches = found.numpy(), []
+    taken: set[int] = set()
+    for first in range(count):
+        if first not in taken:
+            seconds = (k for k in range(first + 1, count) if k not in taken and corners[first, k] >= 0)
+            second = next(seconds, first)
+            taken.add(second)
+            patches.append((first, second, max(int(corners[first, second]), 0)))
+    return patches
+
+
+@wp.kernel(enable_backward=False)
+def _patches_kernel(mesh: wp.uint64, patches: wp.array[wp.vec4], normals: wp.array[wp.vec4]):
     """Rows 0 to 3 from row 4 and what row 3 says of the patch. Launch: patches."""
     row = PATCH_ROWS * wp.tid()
     m = wp.mesh_get(mesh)
@@ -111,7 +132,7 @@ def pack_patches(mesh: wp.Mesh, order: np.ndarray, pairs: bool = True) -> tuple[
         pairs: Whether to look for parallelograms: not where the points will move.
     """
     faces = mesh.indices.numpy().reshape(-1, 3)
-    found = pair_faces(mesh.points.numpy(), faces) if pairs else [(face, face, 0) for face in range(len(faces))]
+    found = pair_faces(mesh) if pairs else [(face, face, 0) for face in range(len(faces))]
     slots = np.zeros(len(faces), int)
     slots[np.where(order < 0, ~order, order)] = np.arange(len(order))
     rows = np.zeros((len(found), PATCH_ROWS, 4), np.float32)
@@ -167,7 +188,7 @@ def empty_patches(device: wp.DeviceLike) -> tuple[wp.array, wp.array]:
     both.bits = found;
     return wp::vec4(nearest, rate_there, side, both.number);
 """)
-def nearest_patch(patches: wp.array(dtype=wp.vec4), x: wp.vec3, u: wp.vec3, reach: float) -> wp.vec4:
+def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: float) -> wp.vec4:
     """The nearest patch along a ray from x in the unit direction u.
 
     Returns:
@@ -186,7 +207,7 @@ def nearest_patch(patches: wp.array(dtype=wp.vec4), x: wp.vec3, u: wp.vec3, reac
     return second ? wp::vec2i(v[2], v[3]) : wp::vec2i(v[0], v[1]);
 #endif
 """)
-def patch_faces(patches: wp.array(dtype=wp.vec4), row: int, second: bool) -> wp.vec2i:
+def patch_faces(patches: wp.array[wp.vec4], row: int, second: bool) -> wp.vec2i:
     """Slot and index of the first or the second face of the patch that begins at a row."""
     ...
 
@@ -202,7 +223,7 @@ def patch_faces(patches: wp.array(dtype=wp.vec4), row: int, second: bool) -> wp.
     return wp::vec3(against * v[0], against * v[1], against * v[2]);
 #endif
 """)
-def patch_normal(patches: wp.array(dtype=wp.vec4), row: int, rate: float) -> wp.vec3:
+def patch_normal(patches: wp.array[wp.vec4], row: int, rate: float) -> wp.vec3:
     """The unit normal of the patch that begins at a row, against a ray with that rate, see `nearest_patch`."""
     ...
 
@@ -219,261 +240,6 @@ def patch_normal(patches: wp.array(dtype=wp.vec4), row: int, rate: float) -> wp.
     return normals.data[slot];
 #endif
 """)
-def normal_and_face(normals: wp.array(dtype=wp.vec4), slot: int) -> wp.vec4:
+def normal_and_face(normals: wp.array[wp.vec4], slot: int) -> wp.vec4:
     """The unit normal of the face in a slot, and bits of its index."""
     ...
-
-
-# ---- Leaves of the tree on CUDA: two faces that make a parallelogram are tried as one.
-
-
-# Leaves of more faces are left as they are: all pairs of a leaf's faces are compared.
-LARGEST_LEAF = wp.constant(8)
-
-
-@wp.func
-def _point(mesh: wp.uint64, face: int, corner: int) -> wp.vec3:
-    m = wp.mesh_get(mesh)
-    return m.points[m.indices[3 * face + corner % 3]]
-
-
-@wp.func
-def _apart(p: wp.vec3, q: wp.vec3) -> float:
-    return wp.max(wp.abs(p - q))
-
-
-@wp.func
-def shared_corner(mesh: wp.uint64, first: int, second: int, same: float) -> int:
-    """The corner (0 to 2) of a face that is not on the diagonal of the parallelogram that another one completes; -1 if
-    it does not. As `pair_faces`; points so far from each other [m] are taken for one."""
-    found = int(-1)
-    p = _point(mesh, first, 0)
-    q = _point(mesh, first, 1)
-    r = _point(mesh, first, 2)
-    longest = wp.max(wp.max(wp.length(q - p), wp.length(r - q)), wp.length(p - r))
-    if wp.length(wp.cross(q - p, r - p)) > wp.static(LEAST_HEIGHT) * same * longest:
-        for corner in range(3):
-            a = _point(mesh, first, corner + 1)
-            b = _point(mesh, first, corner + 2)
-            across = a + (b - _point(mesh, first, corner))
-            for turn in range(3):
-                apart = _apart(_point(mesh, second, turn), across)
-                apart = wp.max(apart, _apart(_point(mesh, second, turn + 1), b))
-                apart = wp.max(apart, _apart(_point(mesh, second, turn + 2), a))
-                if apart <= same and found < 0:
-                    found = corner
-    return found
-
-
-@wp.func
-def _leaf(nodes: wp.array(dtype=wp.vec4), node: int) -> int:
-    """The slot of a leaf's first face, below 0 for other nodes."""
-    return -2 - bits_of(nodes[2 * node][3])
-
-
-@wp.kernel(enable_backward=False)
-def _siblings_kernel(
-    mesh: wp.uint64,
-    same: float,
-    nodes: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
-    joined: wp.array(dtype=int),
-):
-    """Two leaves of a face each that make a parallelogram become a leaf of two, which is marked. Launch: pairs."""
-    pair = wp.tid()
-    first = _leaf(nodes, 2 * pair)
-    if pair == 0 or first < 0 or _leaf(nodes, 2 * pair + 1) != first + 1:
-        return
-    if order[first] < 0 or order[first + 1] < 0:
-        return
-    if shared_corner(mesh, order[first], order[first + 1], same) >= 0:
-        order[first] = ~order[first]
-        joined[pair] = 1
-
-
-@wp.kernel(enable_backward=False)
-def _parents_kernel(joined: wp.array(dtype=int), nodes: wp.array(dtype=wp.vec4)):
-    """In place of a pair that has become one leaf, that. Launch: nodes."""
-    node = wp.tid()
-    child = bits_of(nodes[2 * node][3])
-    if child > NO_NODE and joined[wp.max(child, 0)] > 0:
-        nodes[2 * node][3] = nodes[4 * child][3]
-
-
-@wp.kernel(enable_backward=False)
-def _leaves_kernel(
-    mesh: wp.uint64,
-    same: float,
-    found: wp.array(dtype=int),
-    order: wp.array(dtype=int),
-    faces: wp.array(dtype=wp.vec4),
-):
-    """Writes the faces of each leaf anew: behind a face the one with which it makes a parallelogram, if there is one.
-    Launch: slots."""
-    start = wp.tid()
-    if start > 0 and found[wp.max(start - 1, 0)] < 0:
-        return
-    stop = start + 1
-    while found[stop - 1] < 0 and stop - start <= LARGEST_LEAF:
-        stop += 1
-    if stop - start > LARGEST_LEAF:
-        return
-    taken = int(0)
-    slot = int(start)
-    for i in range(start, stop):
-        if ((taken >> (i - start)) & 1) == 0:
-            first = face_in(found, i)
-            second = int(-1)
-            corner = int(-1)
-            for j in range(i + 1, stop):
-                if corner < 0 and ((taken >> (j - start)) & 1) == 0:
-                    second = face_in(found, j)
-                    corner = shared_corner(mesh, first, second, same)
-                    taken = wp.where(corner >= 0, taken | (1 << (j - start)), taken)
-            width = wp.where(corner >= 0, 2, 1)
-            more = slot + width < stop
-            order[slot] = wp.where(more, ~first, first)
-            set_row(mesh, first, wp.max(corner, 0), wp.where(corner >= 0, 0.0, 1.0), slot, faces)
-            if corner >= 0:
-                order[slot + 1] = wp.where(more, ~second, second)
-                set_row(mesh, second, 0, 1.0, slot + 1, faces)
-            slot += width
-
-
-def join_leaves(mesh: wp.Mesh, extent: float, nodes: wp.array, order: wp.array, faces: wp.array) -> None:
-    """Faces that are tried as one where two of a leaf, or of two leaves of a face each, make a parallelogram.
-
-    Args:
-        mesh: Whose points will not move.
-        extent: Its largest coordinate [m].
-        nodes, order: From `read_tree`; both change.
-        faces: The faces in their slots as CUDA takes them, see `pack_faces`; they change, too.
-    """
-    count, device, same = nodes.size // 4, mesh.device, SAME * extent
-    joined = wp.zeros(count, dtype=int, device=device)
-    wp.launch(_siblings_kernel, count, [mesh.id, same, nodes], [order, joined], device=device)
-    wp.launch(_parents_kernel, 2 * count, [joined], [nodes], device=device)
-    wp.launch(_leaves_kernel, order.size, [mesh.id, same, wp.clone(order)], [order, faces], device=device)
-
-
-# ---- The tree of a `wp.Mesh`, read from Warp's private structs: what the trees of GPUs and CPUs are made of.
-
-
-# In place of a child that is not there, and of a walk's node at its end: nodes are above, leaves below.
-NO_NODE = wp.constant(-1)
-
-# Where no ray comes to [m].
-NOWHERE = wp.constant(1.0e30)
-
-# Warp's trees are at most so deep.
-DEEPEST = 32
-
-
-@wp.func_native("""
-    const wp::Mesh m = wp::mesh_get(mesh);
-    const wp::BVHPackedNodeHalf half = upper ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
-    union { float number; int bits; } both;
-    both.bits = static_cast<int32_t>(half.i);
-    return wp::vec4(half.x, half.y, half.z, both.number);
-""")
-def _tree_node(mesh: wp.uint64, node: int, upper: bool) -> wp.vec4:
-    """A corner of a node's box and the bits of its child, or of the first and last face of a leaf."""
-    ...
-
-
-@wp.func_native("""
-    const wp::Mesh m = wp::mesh_get(mesh);
-    // The linear builder fills all nodes that there are room for, the others count theirs.
-    const bool linear = m.bvh.constructor_type == BVH_CONSTRUCTOR_LBVH;
-    if (node >= (linear ? m.bvh.max_nodes : m.bvh.num_nodes)) return -1;
-    return m.bvh.node_lowers[node].b ? 1 : 0;
-""")
-def _tree_kind(mesh: wp.uint64, node: int) -> int:
-    """0 for a node with children, 1 for a leaf, -1 beyond the tree."""
-    ...
-
-
-@wp.func_native("return *wp::mesh_get(mesh).bvh.root;")
-def _tree_root(mesh: wp.uint64) -> int: ...
-
-
-@wp.func_native("return wp::mesh_get(mesh).bvh.primitive_indices[slot];")
-def _tree_face(mesh: wp.uint64, slot: int) -> int: ...
-
-
-@wp.func
-def _with_bits(corner: wp.vec3, bits: int) -> wp.vec4:
-    return wp.vec4(corner[0], corner[1], corner[2], from_bits(bits))
-
-
-@wp.kernel(enable_backward=False)
-def _count_kernel(mesh: wp.uint64, has_children: wp.array(dtype=int)):
-    """Launch: nodes that the tree may have."""
-    node = wp.tid()
-    has_children[node] = wp.where(_tree_kind(mesh, node) == 0, 1, 0)
-
-
-@wp.func
-def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array(dtype=int)):
-    for slot in range(start, stop):
-        face = _tree_face(mesh, slot)
-        order[slot] = wp.where(slot + 1 < stop, ~face, face)
-
-
-@wp.kernel(enable_backward=False)
-def _pack_kernel(
-    mesh: wp.uint64,
-    padding: float,
-    before: wp.array(dtype=int),
-    nodes: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
-):
-    """Launch: nodes that the tree may have. The root's pair is the first; the others stand in the tree's order."""
-    node = wp.tid()
-    kind = _tree_kind(mesh, node)
-    root = _tree_root(mesh)
-    pad = wp.vec3(padding)
-    if kind == 1 and node == root:  # a tree of one leaf
-        lower = _tree_node(mesh, node, False)
-        upper = _tree_node(mesh, node, True)
-        _order_leaf(mesh, bits_of(lower[3]), bits_of(upper[3]), order)
-        nodes[0] = _with_bits(wp.vec3(lower[0], lower[1], lower[2]) - pad, -2 - bits_of(lower[3]))
-        nodes[1] = _with_bits(wp.vec3(upper[0], upper[1], upper[2]) + pad, 0)
-        nodes[2] = _with_bits(wp.vec3(NOWHERE), NO_NODE)
-        nodes[3] = _with_bits(wp.vec3(NOWHERE), NO_NODE)
-    if kind == 0:
-        # Leaves are written by their parents: a tree may hold more, within leaves that it has merged.
-        pair = wp.where(node == root, 0, before[node] + 1)
-        for k in range(2):
-            child = bits_of(_tree_node(mesh, node, k == 1)[3])
-            low = _tree_node(mesh, child, False)
-            high = _tree_node(mesh, child, True)
-            entry = before[child] + 1
-            if _tree_kind(mesh, child) == 1:
-                entry = -2 - bits_of(low[3])
-                _order_leaf(mesh, bits_of(low[3]), bits_of(high[3]), order)
-            nodes[4 * pair + 2 * k] = _with_bits(wp.vec3(low[0], low[1], low[2]) - pad, entry)
-            nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
-
-
-def read_tree(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array]:
-    """Pairs of nodes and order of a mesh's tree.
-
-    Args:
-        mesh: Any `wp.Mesh`.
-        extent: Its largest coordinate [m], for the padding of the boxes.
-
-    Returns:
-        nodes: vec4 [4 * pairs], see above; boxes are padded against rounding.
-        order: int32 [faces]: the face in each slot, or ~face where the next slot belongs to the same leaf.
-    """
-    count, device = mesh.indices.size // 3, mesh.device
-    has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
-    before = wp.zeros_like(has_children)
-    nodes = wp.zeros(4 * (count + 1), dtype=wp.vec4, device=device)
-    order = wp.zeros(count, dtype=int, device=device)
-    wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
-    wp.utils.array_scan(has_children, before, inclusive=False)
-    inputs = [mesh.id, box_padding(extent), before]
-    wp.launch(_pack_kernel, has_children.size, inputs, outputs=[nodes, order], device=device)
-    return nodes, order

@@ -5,22 +5,14 @@ import warp as wp
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.optics.camera import Camera, pixel_direction
 
-from .box import inverse_direction
-from .bvh import NO_NODE, Stack, TreeWalk, place, step_leaf, step_node
+from .bvh import NO_NODE, Stack, TreeWalk, inverse_direction, place, step_leaf, step_node
 from .mesh import Surfaces
 from .patches import nearest_patch, normal_and_face, patch_faces, patch_normal
 from .reflectance import reflectance_at
 from .triangle import face_in, face_normal
 from .wide import walk_wide
 
-__all__ = [
-    "SurfaceHit",
-    "intersect_mesh",
-    "intersect_surfaces",
-    "offset_from_surface",
-    "truth_along_kernel",
-    "truth_kernel",
-]
+__all__ = ["SurfaceHit", "intersect_mesh", "intersect_surfaces", "offset_from_surface", "truth_kernel"]
 
 
 @wp.struct
@@ -120,7 +112,7 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
     """As `intersect_mesh`, with the tree of `make_surfaces`; `any_hit` is content with the first face that is found.
 
     Boxes and faces are a hair wider than they are, so that also rays aimed at vertices and along edges are caught.
-    Surfaces of `public_tree` take `intersect_mesh`.
+    Surfaces of `use_warp_bvh` take `intersect_mesh`.
     """
     if surfaces.nodes.shape[0] == 0:
         hit = intersect_mesh(surfaces.mesh, x, u, max_distance)
@@ -178,65 +170,38 @@ def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def truth_along_kernel(
+def truth_kernel(
+    camera: Camera,
     surfaces: Surfaces,
-    origins: wp.array2d(dtype=wp.vec3),
-    directions: wp.array2d(dtype=wp.vec3),
+    origins: wp.array2d[wp.vec3],
+    directions: wp.array2d[wp.vec3],
     # Out, [height, width]:
-    depth: wp.array2d(dtype=float),
-    range: wp.array2d(dtype=float),
-    normal: wp.array2d(dtype=wp.vec3),
-    reflectance: wp.array2d(dtype=float),
+    depth: wp.array2d[float],
+    range: wp.array2d[float],
+    normal: wp.array2d[wp.vec3],
+    reflectance: wp.array2d[float],
 ):
-    """As `truth_kernel` along rays of any origins [m], from which the range counts, such as those behind a port.
+    """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
+    width).
 
-    Launch: (height, width).
+    Rays go from `origins` [m], from which the range counts, such as those behind a port; where there are none, from the
+    lens. They go along `directions` (unit vectors through the pixel centres); where there are none, the camera has
+    square pixels about its axis.
     """
     row, column = wp.tid()
-    x = origins[row, column]
-    u = directions[row, column]
+    x = wp.vec3(0.0)
+    if origins.shape[0] > 0:
+        x = origins[row, column]
+    u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)
+    if directions.shape[0] > 0:
+        u = directions[row, column]
     hit = intersect_surfaces(surfaces, x, u, 1.0e29, False)
+    depth[row, column] = wp.NAN
+    range[row, column] = wp.NAN
+    normal[row, column] = wp.vec3(wp.NAN)
+    reflectance[row, column] = wp.NAN
     if hit.face >= 0:
         depth[row, column] = x[2] + hit.distance * u[2]
         range[row, column] = hit.distance
         normal[row, column] = hit.normal
         reflectance[row, column] = reflectance_at(surfaces, hit.face, x + hit.distance * u)
-    else:
-        depth[row, column] = wp.NAN
-        range[row, column] = wp.NAN
-        normal[row, column] = wp.vec3(wp.NAN)
-        reflectance[row, column] = wp.NAN
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def truth_kernel(
-    camera: Camera,
-    surfaces: Surfaces,
-    directions: wp.array2d(dtype=wp.vec3),
-    # Out, [height, width]:
-    depth: wp.array2d(dtype=float),
-    range: wp.array2d(dtype=float),
-    normal: wp.array2d(dtype=wp.vec3),
-    reflectance: wp.array2d(dtype=float),
-):
-    """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
-    width).
-
-    Rays go along `directions` (unit vectors through the pixel centres); where there are none, the camera has
-    square pixels about its axis.
-    """
-    row, column = wp.tid()
-    u = pixel_direction(camera, float(column) + 0.5, float(row) + 0.5)
-    if directions.shape[0] > 0:
-        u = directions[row, column]
-    hit = intersect_surfaces(surfaces, wp.vec3(0.0), u, 1.0e29, False)
-    if hit.face >= 0:
-        depth[row, column] = hit.distance * u[2]
-        range[row, column] = hit.distance
-        normal[row, column] = hit.normal
-        reflectance[row, column] = reflectance_at(surfaces, hit.face, hit.distance * u)
-    else:
-        depth[row, column] = wp.NAN
-        range[row, column] = wp.NAN
-        normal[row, column] = wp.vec3(wp.NAN)
-        reflectance[row, column] = wp.NAN

@@ -7,17 +7,6 @@ from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rot
 
 from .mesh import Surfaces, Textures
 
-__all__ = [
-    "ggx_brdf",
-    "ggx_normals",
-    "ggx_pdf",
-    "lambert_brdf",
-    "reflectance_at",
-    "sample_ggx",
-    "sample_lambert",
-    "unshadowed",
-]
-
 _INV_PI = wp.constant(0.3183098861837907)
 
 

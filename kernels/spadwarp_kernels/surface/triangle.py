@@ -30,7 +30,7 @@ _MOST_SLOTS = (2**31 - 1) // 144 * 8
     return wp::vec4(row[0], row[8], row[16], row[24]);
 #endif
 """)
-def load_plane(faces: wp.array(dtype=wp.vec4), slot: int, plane: int) -> wp.vec4:
+def load_plane(faces: wp.array[wp.vec4], slot: int, plane: int) -> wp.vec4:
     """Plane 0, 1 or 2 of the face in a slot; in one load on CUDA."""
     ...
 
@@ -68,13 +68,13 @@ def _times_sign(x: float, sign: float) -> float:
     return order.data[slot];
 #endif
 """)
-def number_in(order: wp.array(dtype=int), slot: int) -> int:
+def number_in(order: wp.array[int], slot: int) -> int:
     """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
     ...
 
 
 @wp.func
-def face_in(order: wp.array(dtype=int), slot: int) -> int:
+def face_in(order: wp.array[int], slot: int) -> int:
     """Index of the face in a slot."""
     face = number_in(order, slot)
     return wp.where(face < 0, ~face, face)
@@ -124,7 +124,7 @@ def middle_planes(p: wp.vec3, e1: wp.vec3, e2: wp.vec3, triangle: float):
 
 
 @wp.func
-def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int, faces: wp.array(dtype=wp.vec4)):
+def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int, faces: wp.array[wp.vec4]):
     """Writes a face, or the parallelogram that it is a half of: then `triangle` is 0, and the corner is the one that is
     not on the diagonal."""
     m = wp.mesh_get(mesh)
@@ -142,7 +142,7 @@ def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int,
 
 
 @wp.kernel(enable_backward=False)
-def _rows_kernel(mesh: wp.uint64, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
+def _rows_kernel(mesh: wp.uint64, order: wp.array[int], faces: wp.array[wp.vec4]):
     """Launch: slots."""
     slot = wp.tid()
     set_row(mesh, face_in(order, slot), 0, 1.0, slot, faces)
@@ -154,13 +154,13 @@ def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array) -> None:
 
 
 @wp.func_native("return reinterpret_cast<const float*>(rows.data)[index];")
-def number_at(rows: wp.array(dtype=wp.vec4), index: int) -> float:
+def number_at(rows: wp.array[wp.vec4], index: int) -> float:
     """A number of contiguous rows."""
     ...
 
 
 @wp.func_native("reinterpret_cast<float*>(rows.data)[index] = value;")
-def set_number(rows: wp.array(dtype=wp.vec4), index: int, value: float):
+def set_number(rows: wp.array[wp.vec4], index: int, value: float):
     """Writes a number of contiguous rows."""
     ...
 
@@ -172,7 +172,7 @@ def face_number(slot: int, row: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array(dtype=int), faces: wp.array(dtype=wp.vec4)):
+def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces: wp.array[wp.vec4]):
     """Launch: slots; CPU. A slot without a face keeps planes of zeros and a box that no ray meets."""
     slot = wp.tid()
     face = order[slot]
@@ -255,7 +255,7 @@ def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> w
 
 
 @wp.func
-def meet_face(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3):
+def meet_face(faces: wp.array[wp.vec4], slot: int, x: wp.vec3, u: wp.vec3):
     """What is kept in a slot against a ray, see `meet_planes`.
 
     Returns:
@@ -271,7 +271,7 @@ def meet_face(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3)
 
 
 @wp.func
-def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.vec3) -> float:
+def face_distance(faces: wp.array[wp.vec4], slot: int, x: wp.vec3, u: wp.vec3) -> float:
     """Distance from x along the unit vector u at which the ray meets the face in a slot, >= 0, or -1 for a miss; on
     CUDA, in the first of two slots whose faces are kept as a parallelogram, that."""
     distance, _, _ = meet_face(faces, slot, x, u)
@@ -279,7 +279,7 @@ def face_distance(faces: wp.array(dtype=wp.vec4), slot: int, x: wp.vec3, u: wp.v
 
 
 @wp.func
-def face_normal(faces: wp.array(dtype=wp.vec4), slot: int, u: wp.vec3) -> wp.vec3:
+def face_normal(faces: wp.array[wp.vec4], slot: int, u: wp.vec3) -> wp.vec3:
     """The unit normal of a face, against u."""
     n = load_plane(faces, slot, 2)
     normal = wp.normalize(wp.vec3(n[0], n[1], n[2]))

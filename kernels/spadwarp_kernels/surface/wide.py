@@ -16,8 +16,10 @@ import warp as wp
 
 from spadwarp_kernels.base.native import bits_of
 
-from .patches import NO_NODE, read_tree
+from .bvh import NO_NODE, read_tree
 from .triangle import LANES, face_number, number_at, pack_faces, set_faces, set_number
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 # Entries of the stack of `_faces_in_order_kernel`: three a level of Warp's trees, which are at most 32 deep.
 _Stack = wp.types.vector(length=104, dtype=int)
@@ -25,27 +27,17 @@ _Stack = wp.types.vector(length=104, dtype=int)
 
 @wp.struct
 class _Part:
-    """Faces that follow each other in the tree's order.
+    """Faces that follow each other in the tree's order, from start to stop."""
 
-    Attributes:
-        pair: Of Warp's nodes below it, see `pairs`; -1 for none: then they are parted in the middle.
-        start, stop: The faces.
-        area: Half the surface of their box [m²].
-    """
-
-    pair: int
+    pair: int  # of Warp's nodes below it, see `read_tree`; -1 for none: then they are parted in the middle
     start: int
     stop: int
-    area: float
+    area: float  # half the surface of their box [m²]
 
 
 @wp.kernel(enable_backward=False)
 def _faces_in_order_kernel(
-    nodes: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
-    start: wp.array(dtype=int),
-    stop: wp.array(dtype=int),
-    sorted: wp.array(dtype=int),
+    nodes: wp.array[wp.vec4], order: wp.array[int], start: wp.array[int], stop: wp.array[int], sorted: wp.array[int]
 ):
     """The faces from left to right, and where those below each of Warp's nodes start and stop. Launch: 1."""
     stack = _Stack()
@@ -76,7 +68,7 @@ def _faces_in_order_kernel(
 
 
 @wp.func
-def _half(nodes: wp.array(dtype=wp.vec4), start: wp.array(dtype=int), stop: wp.array(dtype=int), part: _Part, k: int):
+def _half(nodes: wp.array[wp.vec4], start: wp.array[int], stop: wp.array[int], part: _Part, k: int):
     half = _Part()
     if part.pair >= 0:
         node = 2 * part.pair + k
@@ -96,7 +88,7 @@ def _half(nodes: wp.array(dtype=wp.vec4), start: wp.array(dtype=int), stop: wp.a
 
 
 @wp.func
-def _largest(parts: wp.array(dtype=_Part), count: int) -> int:
+def _largest(parts: wp.array[_Part], count: int) -> int:
     """The part with the largest surface of those that are no leaves; -1 for none."""
     found = int(-1)
     for k in range(count):
@@ -107,15 +99,15 @@ def _largest(parts: wp.array(dtype=_Part), count: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def _open_kernel(
-    nodes: wp.array(dtype=wp.vec4),
-    start: wp.array(dtype=int),
-    stop: wp.array(dtype=int),
-    sorted: wp.array(dtype=int),
-    parts: wp.array(dtype=_Part),
-    waiting: wp.array(dtype=_Part),
-    children: wp.array(dtype=int),
-    order: wp.array(dtype=int),
-    counts: wp.array(dtype=int),
+    nodes: wp.array[wp.vec4],
+    start: wp.array[int],
+    stop: wp.array[int],
+    sorted: wp.array[int],
+    parts: wp.array[_Part],
+    waiting: wp.array[_Part],
+    children: wp.array[int],
+    order: wp.array[int],
+    counts: wp.array[int],
 ):
     """Children of all nodes, level after level, and the faces in their slots; `counts`: nodes, leaves. Launch: 1."""
     root = _Part()
@@ -153,7 +145,7 @@ def _open_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _boxes_kernel(faces: wp.array(dtype=wp.vec4), nodes: wp.array(dtype=wp.vec4)):
+def _boxes_kernel(faces: wp.array[wp.vec4], nodes: wp.array[wp.vec4]):
     """Boxes of all children, from the last node to the first, which stand after their parents. Launch: 1."""
     count = nodes.shape[0] / 14
     for i in range(count):
@@ -307,9 +299,9 @@ def empty_wide() -> tuple[wp.array, wp.array, wp.array]:
 #endif
 """)
 def walk_wide(
-    nodes: wp.array(dtype=wp.vec4),
-    faces: wp.array(dtype=wp.vec4),
-    order: wp.array(dtype=int),
+    nodes: wp.array[wp.vec4],
+    faces: wp.array[wp.vec4],
+    order: wp.array[int],
     x: wp.vec3,
     u: wp.vec3,
     inverse: wp.vec3,

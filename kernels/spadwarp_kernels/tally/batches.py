@@ -28,7 +28,7 @@ _RUN = 32
         any |= values[i];
     return any != 0;
 """)
-def _has_light(batch: wp.array(dtype=wp.int64), first: int, count: int) -> bool:
+def _has_light(batch: wp.array[wp.int64], first: int, count: int) -> bool:
     """Whether one of `count` neighbours in a contiguous array is not zero."""
     ...
 
@@ -40,13 +40,13 @@ def close_batch_kernel(
     first: int,
     stop: int,
     run: int,
-    batch: wp.array(dtype=wp.int64),
+    batch: wp.array[wp.int64],
     # Out:
-    total: wp.array(dtype=wp.int64),
-    squares_low: wp.array(dtype=wp.uint64),
-    squares_high: wp.array(dtype=wp.uint64),
-    sums: wp.array(dtype=wp.int64),
-    overflow: wp.array(dtype=int),
+    total: wp.array[wp.int64],
+    squares_low: wp.array[wp.uint64],
+    squares_high: wp.array[wp.uint64],
+    sums: wp.array[wp.int64],
+    overflow: wp.array[int],
 ):
     """Adds a batch to the total and the square of its sum over components to a 128-bit sum, and empties it.
 
@@ -95,10 +95,10 @@ def close_batch_kernel(
 
 @wp.kernel(enable_backward=False)
 def add_squares_kernel(
-    more_low: wp.array(dtype=wp.uint64),
-    more_high: wp.array(dtype=wp.uint64),
-    squares_low: wp.array(dtype=wp.uint64),
-    squares_high: wp.array(dtype=wp.uint64),
+    more_low: wp.array[wp.uint64],
+    more_high: wp.array[wp.uint64],
+    squares_low: wp.array[wp.uint64],
+    squares_high: wp.array[wp.uint64],
 ):
     """Adds 128-bit integers. Launch: voxels."""
     voxel = wp.tid()

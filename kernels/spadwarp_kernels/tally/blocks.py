@@ -42,7 +42,7 @@ class Blocks:
     count: int
     kinds: int
     scale: wp.vec3
-    memory: wp.array(dtype=float)
+    memory: wp.array[float]
     threads: int
     thread: int
 

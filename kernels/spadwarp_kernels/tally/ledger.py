@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.water.limits import EXIT_FACES
 
-__all__ = ["COUNTERS", "LEDGER_ENTRIES", "LEDGER_UNIT"]
+__all__ = ["LEDGER_ENTRIES", "LEDGER_UNIT"]
 
 # Ledger weights are counted in units of 2^-22 photon: 1e12 photons stay below 2^63, and a cut-off of 2e-4 is 839 units.
 LEDGER_ONE = wp.constant(4194304.0)
@@ -73,7 +73,7 @@ ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT,
     __ATOMIC_RELAXED);
 #endif
 """)
-def atomic_add_int64(tally: wp.array(dtype=wp.int64), index: int, value: wp.int64):
+def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
     """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the
     CPU)."""
     ...
@@ -86,7 +86,7 @@ def to_ledger(weight: float) -> wp.int64:
 
 
 @wp.func
-def add_to_ledger(ledger: wp.array(dtype=wp.int64), thread: int, entry: int, value: wp.int64):
+def add_to_ledger(ledger: wp.array[wp.int64], thread: int, entry: int, value: wp.int64):
     """Adds to one entry in the slot of a thread; neighbouring threads write to neighbouring addresses."""
     atomic_add_int64(ledger, entry * LEDGER_SLOTS + thread % LEDGER_SLOTS, value)
 
@@ -97,7 +97,7 @@ def slot_of_core(first_id: wp.uint64) -> int:
     return 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
 
 
-@made_once
+@memoised
 def make_ledger_slot(cuda: bool) -> wp.Function:
     """The Warp function ``(thread, first_id) -> int``: what `add_to_ledger` takes as its thread."""
 

@@ -47,8 +47,8 @@ class Derivatives:
 
     value: LogDerivatives
     scale: LogDerivatives
-    waters: wp.array(dtype=int)
-    faces: wp.array(dtype=int)
+    waters: wp.array[int]
+    faces: wp.array[int]
     blocks: Blocks
 
 

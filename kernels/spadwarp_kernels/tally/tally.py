@@ -6,10 +6,9 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
 from spadwarp_kernels.base.kernels import launch_pixels
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate, gate_bin
+from spadwarp_kernels.optics.camera import Camera, Gate, gate_bin
 
-__all__ = ["COMPONENTS", "add_tallies", "has_overflowed", "tally_rates", "to_fixed_point"]
+__all__ = ["COMPONENTS", "add_tallies", "has_overflowed", "tally_rates"]
 
 # What a history's events make of its light: the first axis of the tally.
 COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
@@ -55,7 +54,7 @@ DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
     return wp::vec2l(index, value);
 #endif
 """)
-def add_pending(tally: wp.array(dtype=wp.int64), pending: wp.vec2l, index: int, value: wp.int64) -> wp.vec2l:
+def add_pending(tally: wp.array[wp.int64], pending: wp.vec2l, index: int, value: wp.int64) -> wp.vec2l:
     """`atomic_add_int64`, on the CPU one call later: a core stands still while a voxel comes from memory, so the
     (index, value) that the call before returned is added now, and the memory of this one is requested."""
     ...
@@ -81,7 +80,7 @@ VOXEL_LIMIT = wp.constant(wp.int64(1 << 62))
 
 
 @wp.kernel(enable_backward=False)
-def find_overflow_kernel(tally: wp.array(dtype=wp.int64), least: wp.int64, found: wp.array(dtype=int)):
+def find_overflow_kernel(tally: wp.array[wp.int64], least: wp.int64, found: wp.array[int]):
     """Launch: voxels."""
     voxel = wp.tid()
     if tally[voxel] < least or tally[voxel] >= VOXEL_LIMIT:
@@ -113,7 +112,7 @@ def pieces(size: int) -> list[slice]:
 
 
 @wp.kernel(enable_backward=False)
-def add_kernel(more: wp.array(dtype=wp.int64), total: wp.array(dtype=wp.int64)):
+def add_kernel(more: wp.array[wp.int64], total: wp.array[wp.int64]):
     """Launch: integers."""
     i = wp.tid()
     total[i] += more[i]
@@ -152,7 +151,7 @@ CACHE_BYTES = 50_000_000
 PHOTONS_PER_VOXEL = 4
 
 
-def low_words_pay(voxels: int, photon_count: int) -> bool:
+def splitting_pays(voxels: int, photon_count: int) -> bool:
     """Whether low words make a launch of so many photons faster, with so many voxels in a component of the tally."""
     return 8 * voxels > CACHE_BYTES and photon_count >= PHOTONS_PER_VOXEL * voxels
 
@@ -160,30 +159,30 @@ def low_words_pay(voxels: int, photon_count: int) -> bool:
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const unsigned low = static_cast<unsigned>(value);
-    const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(low_words.data) + index, low);
+    const unsigned before = atomicAdd(reinterpret_cast<unsigned*>(split_accumulators.data) + index, low);
     const unsigned high = static_cast<unsigned>(value >> 32) + (before + low < low ? 1u : 0u);
     // 32 bits are enough: a carry out of the high half is lost in an addition of 64 bits, too.
     if (high)
         atomicAdd(reinterpret_cast<unsigned*>(reinterpret_cast<long long*>(tally.data) + index) + 1, high);
 #endif
 """)
-def add_to_words(tally: wp.array(dtype=wp.int64), low_words: wp.array(dtype=wp.uint32), index: int, value: wp.int64):
+def add_to_words(tally: wp.array[wp.int64], split_accumulators: wp.array[wp.uint32], index: int, value: wp.int64):
     """Adds value >= 0 to a voxel whose low word is apart; on CUDA alone."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def fold_kernel(low_words: wp.array(dtype=wp.uint32), tally: wp.array(dtype=wp.int64)):
+def fold_kernel(split_accumulators: wp.array[wp.uint32], tally: wp.array[wp.int64]):
     """Launch: voxels of all components. Takes the low words and adds them to the tally; other launches may add to both
     meanwhile."""
     voxel = wp.tid()
-    if low_words[voxel] != wp.uint32(0):
-        wp.atomic_add(tally, voxel, wp.int64(wp.atomic_exch(low_words, voxel, wp.uint32(0))))
+    if split_accumulators[voxel] != wp.uint32(0):
+        wp.atomic_add(tally, voxel, wp.int64(wp.atomic_exch(split_accumulators, voxel, wp.uint32(0))))
 
 
-def fold_low_words(low_words: wp.array, tally: wp.array) -> None:
+def fold_accumulators(split_accumulators: wp.array, tally: wp.array) -> None:
     """Adds the low words of a tally to it and sets them to zero; asynchronous on CUDA."""
-    wp.launch(fold_kernel, dim=tally.size, inputs=[low_words, tally], device=tally.device)
+    wp.launch(fold_kernel, dim=tally.size, inputs=[split_accumulators, tally], device=tally.device)
 
 
 # ---- Tallies as rates on their device: sums over components in single precision.
@@ -195,14 +194,14 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel(enable_backward=False)
 def _rates_kernel(
     first_pixel: int,
-    tally: wp.array(dtype=wp.int64),
-    scale: wp.array(dtype=wp.float64),
+    tally: wp.array[wp.int64],
+    scale: wp.array[wp.float64],
     component: int,
     stop_component: int,
     parameters: int,
     parameter: int,
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     pixel = first_pixel + wp.tid()
     bins = rates.shape[1]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.sink import Sink
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import END, SCATTER, PhotonState, next_bounce
@@ -12,12 +12,12 @@ from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.ray_cast import offset_from_surface
 from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
 from spadwarp_kernels.tally.tally import TOO_LONG
-from spadwarp_kernels.water.boundary import face_index
 from spadwarp_kernels.water.limits import (
     exit_distance,
     exit_distance_rotated,
     exit_face,
     exit_face_rotated,
+    face_index,
     first_exit,
     first_exit_rotated,
     is_outside,
@@ -40,7 +40,7 @@ class Collision:
     mirror: int
 
 
-@made_once
+@memoised
 def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world)``: takes a photon to the end of its flight, and on to SCATTER or to END.
 
@@ -113,7 +113,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     return collide
 
 
-@made_once
+@memoised
 def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Function) -> wp.Function:
     """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
     estimator says so, with what rides along."""

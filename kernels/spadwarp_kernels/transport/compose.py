@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.estimators.contribution import Scored, make_point_of
 from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.registry import make_estimator
@@ -14,7 +14,7 @@ from spadwarp_kernels.photon.sink import Sink, make_deposit
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, is_planned
 from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.surface.box import segment_meets_box
+from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 
 from .collide import make_collide, make_cross
@@ -81,16 +81,16 @@ class Queue(NamedTuple):
 def alone(spec: TransportSpec, cuda: bool) -> bool:
     """Whether a thread moves its photons without others: on a CPU, with Warp's own rays, and where blocks of cells keep
     what they score with the thread."""
-    return not cuda or bool(spec.blocks) or (spec.mesh and spec.public_tree)
+    return not cuda or bool(spec.blocks) or (spec.mesh and spec.use_warp_bvh)
 
 
 def tries_every_face(spec: TransportSpec, cuda: bool) -> bool:
     """Whether a handful of faces is tried on the spot. A core walks the tree of a box in a third of the time that its
     twelve faces take."""
-    return spec.mesh and spec.brute_force and cuda and not spec.public_tree
+    return spec.mesh and spec.brute_force and cuda and not spec.use_warp_bvh
 
 
-@made_once
+@memoised
 def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     """The stages of a spec; `split`: on CUDA, the low words of the tally are apart."""
     estimator = make_estimator(spec)
@@ -115,7 +115,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     )
 
 
-@made_once
+@memoised
 def compose_queue(spec: TransportSpec, split: bool) -> Queue:
     """How the warps of a spec share requests on CUDA."""
     estimator = make_estimator(spec)
@@ -187,12 +187,12 @@ def _make_score_event(spec: TransportSpec, score: wp.Function | None) -> wp.Func
 
 
 @wp.func
-def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d(dtype=float), x: wp.vec3) -> bool:
+def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
     """True: the map is of straight lines to the lens."""
     return True
 
 
-@made_once
+@memoised
 def _make_is_seen(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(s, found, world) -> bool``: whether the lens sees a scored point for certain, without a walk
     down the tree; of a handful of faces each is tried, and what they hide is set to 0."""
@@ -218,7 +218,7 @@ def _make_is_seen(spec: TransportSpec, brute_force: bool) -> wp.Function:
     return is_seen
 
 
-@made_once
+@memoised
 def make_serve(spec: TransportSpec, cuda: bool, split: bool, waits: bool) -> wp.Function:
     """The Warp function ``(s, request, world, sink)`` that adds what a request comes to.
 

@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import (
     STREAM_FLIGHT_SAMPLE,
     STREAM_ROULETTE,
     STREAM_TRANSPORT,
-    block_ahead,
     join_words,
-    make_draw_ahead,
+    make_prefetch,
+    prefetched_block,
     random_block_keyed,
     u01,
     u01_tail,
@@ -17,28 +17,28 @@ from spadwarp_kernels.base.philox import (
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import EVENT, RAY, PhotonState, is_planned, shorten
 from spadwarp_kernels.photon.world import Draws, World
-from spadwarp_kernels.surface.box import segment_meets_box, segment_meets_box_on_cpu
-from spadwarp_kernels.surface.patches import NOWHERE, nearest_patch
+from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box, segment_meets_box_on_cpu
+from spadwarp_kernels.surface.patches import nearest_patch
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, patch_hit
 
 
-@made_once
+@memoised
 def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: bool, cuda: bool) -> wp.Function:
     """The Warp function ``(s, world, draws, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
     in its way, to RAY.
 
-    On a CPU `words`, WORDS_AHEAD of them, keep the random words of the photon's next flights. They are drawn for
+    On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
     several flights at once, so that it must be called for each flight of a photon in turn. `brute_force`: every face
     is tried on the spot.
     """
     plans, random_albedo, water_free_path = plan_flight is not None, spec.random_albedo, spec.water.free_path
-    events, draw_ahead = make_draw_ahead(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
+    events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
     has_bvh = spec.mesh and not brute_force
     meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
 
     @wp.func
-    def fly(s: wp.ref[PhotonState], world: wp.ref[World], draws: wp.ref[Draws], words: wp.array(dtype=int)):
+    def fly(s: wp.ref[PhotonState], world: wp.ref[World], draws: wp.ref[Draws], words: wp.array[int]):
         id = draws.base + wp.uint64(s.photon)
         event = wp.uint32(s.collisions + 1)
         if wp.static(cuda):
@@ -46,8 +46,8 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
         else:
             k = s.collisions & last
             if k == 0:
-                draw_ahead(words, draws.keys, id, event)
-            s.flight.block = block_ahead(words, k)
+                prefetch(words, draws.keys, id, event)
+            s.flight.block = prefetched_block(words, k)
         seed = join_words(s.flight.block[0], s.flight.block[2])
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
         s.flight.distance = water_free_path(world.medium, world.layers, s.x, s.u, xi, seed)
@@ -56,7 +56,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
             if wp.static(cuda):
                 s.flight.sample_block = random_block_keyed(draws.keys, id, event, STREAM_FLIGHT_SAMPLE)
             else:
-                s.flight.sample_block = block_ahead(words, events + k)
+                s.flight.sample_block = prefetched_block(words, events + k)
             plan = plan_flight(s, s.flight.sample_block, world)
             s.flight.lens = plan.lens
             s.flight.lens_weight = plan.lens_weight
@@ -81,7 +81,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
     return fly
 
 
-@made_once
+@memoised
 def make_trace(has_bvh: bool) -> wp.Function:
     """The Warp function ``(s, world)``: the surface before a photon that waits for a ray, without other threads."""
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.optics.laser import emit_along, emit_measured
 from spadwarp_kernels.photon.sink import Sink, book, book_weight, reweigh
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -26,13 +26,13 @@ from spadwarp_kernels.tally.ledger import (
 )
 
 
-@made_once
+@memoised
 def make_prepare(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(world, thread, first_id, offset) -> uint64``: the id of a launch's first photon."""
     stepped, in_blocks = spec.stepped, bool(spec.blocks)
 
     @wp.func
-    def prepare(world: wp.ref[World], thread: int, first_id: wp.uint64, offset: wp.array(dtype=wp.uint64)) -> wp.uint64:
+    def prepare(world: wp.ref[World], thread: int, first_id: wp.uint64, offset: wp.array[wp.uint64]) -> wp.uint64:
         if wp.static(in_blocks):
             world.derivatives.blocks.thread = thread
         base = wp.uint64(first_id)
@@ -43,7 +43,7 @@ def make_prepare(spec: TransportSpec) -> wp.Function:
     return prepare
 
 
-@made_once
+@memoised
 def make_emit(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(world, id) -> spatial_vector``: start position [m], then unit direction."""
     confocal = spec.confocal
@@ -60,7 +60,7 @@ def make_emit(spec: TransportSpec) -> wp.Function:
     return emit
 
 
-@made_once
+@memoised
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
     confocal, has_port, begin_carried = spec.confocal, spec.laser_port is not None, make_rider(spec).begin
@@ -95,7 +95,7 @@ def make_begin(spec: TransportSpec) -> wp.Function:
     return begin
 
 
-@made_once
+@memoised
 def make_finish(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, sink, out)``: writes the photon's record, and the ledger entry that takes the rest of its
     weight."""
@@ -122,7 +122,7 @@ def make_finish(spec: TransportSpec) -> wp.Function:
     return finish
 
 
-@made_once
+@memoised
 def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     """The Warp function ``(s, sink)``: adds what a thread has summed up to the ledger, and with `adds` to the tally
     what `add_pending` has left."""

@@ -11,7 +11,7 @@ import warp as wp
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
-    check_arrays,
+    check_attributes,
     check_device,
     check_fields,
     check_integer,
@@ -26,12 +26,10 @@ from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.base.tables import TABLE_CELLS
 from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.optics.camera import Camera, check_camera, with_field
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import PLAIN, Camera, Gate, check_camera, with_field
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
 from spadwarp_kernels.optics.polarisation import MATRIX_POINTS, Polarisation
 from spadwarp_kernels.optics.port import check_port
-from spadwarp_kernels.optics.projection import PLAIN
 from spadwarp_kernels.photon.lanes import BLOCK_SIZE
 from spadwarp_kernels.photon.sink import Sink
 from spadwarp_kernels.photon.spec import TransportSpec, check_spec
@@ -54,11 +52,16 @@ from spadwarp_kernels.tally.ledger import (
     PORT_ENTRY,
 )
 from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
-from spadwarp_kernels.tally.tally import COMPONENTS, find_overflow_kernel, fold_kernel, fold_low_words, low_words_pay
+from spadwarp_kernels.tally.tally import (
+    COMPONENTS,
+    find_overflow_kernel,
+    fold_accumulators,
+    fold_kernel,
+    splitting_pays,
+)
 from spadwarp_kernels.water.grid import Grid
-from spadwarp_kernels.water.layers import Layers
 from spadwarp_kernels.water.limits import Limits, ready_limits
-from spadwarp_kernels.water.medium import Medium, ready_medium
+from spadwarp_kernels.water.medium import Layers, Medium, ready_medium
 from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
 
 from .loops import make_transport_kernel
@@ -80,8 +83,8 @@ class Model:
         scan: Raster of a confocal spec; empty otherwise.
         derivatives: The parameters of a spec with derivatives or channels, from `make_derivatives`.
         polarisation: Those of a polarised spec, from `make_polarisation`.
-        low_words: Whether large launches on CUDA may take half the tally's memory more where that makes them faster,
-            with the same sums.
+        split_accumulators: Whether large launches on CUDA may take half the tally's memory more where that makes them
+            faster, with the same sums.
 
     Raises:
         ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
@@ -101,7 +104,7 @@ class Model:
     scan: Scan = field(default_factory=Scan)
     derivatives: Derivatives = field(default_factory=Derivatives)
     polarisation: Polarisation = field(default_factory=Polarisation)
-    low_words: bool = False
+    split_accumulators: bool = False
 
     def __post_init__(self) -> None:
         check_model(self)
@@ -126,8 +129,8 @@ class Data:
         reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
         gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None
             without them.
-        low_words: uint32, as long as the tally, zero between launches; made by the first launch that is large enough,
-            see `tally.low_words`, and used by those after it.
+        split_accumulators: uint32, as long as the tally, zero between launches; made by the first launch that is large
+            enough, see `tally.splitting_pays`, and used by those after it.
     """
 
     tally: wp.array
@@ -137,7 +140,7 @@ class Data:
     offset: wp.array | None = None
     reflecting: bool = False
     gradients: wp.array | None = None
-    low_words: wp.array | None = None
+    split_accumulators: wp.array | None = None
 
 
 def make_data(
@@ -246,14 +249,14 @@ def _check_water(spec: TransportSpec, model: Model) -> None:
     medium, device = model.medium, model.device
     check_fields("model.medium", medium, _MEDIUM)
     if spec.phase.name == TABULATED.name:
-        check_arrays("model.medium.phase", medium.phase, device, cells=(3, TABLE_CELLS), guide=(3, TABLE_CELLS))
+        check_attributes("model.medium.phase", medium.phase, device, cells=(3, TABLE_CELLS), guide=(3, TABLE_CELLS))
     if spec.layered:
         layers = model.layers
-        check_arrays("model.layers", layers, device, start=(None,))
+        check_attributes("model.layers", layers, device, start=(None,))
         check_integer("number of model.layers", layers.start.size, 1)
         check_vector("model.layers.axis", layers.axis, unit=True)
         shape = layers.start.shape
-        check_arrays("model.layers", layers, device, extinction=shape, albedo=shape, anisotropy=shape)
+        check_attributes("model.layers", layers, device, extinction=shape, albedo=shape, anisotropy=shape)
     if spec.grid is not None:
         _check_grid(model.layers.grid, device)
 
@@ -264,14 +267,14 @@ def _check_grid(grid: Grid, device: wp.Device) -> None:
         for count in size:
             check_integer(f"model.layers.grid.{name}", count, 1)
     cells, blocks = (math.prod(size) for size in sizes.values())
-    check_arrays("model.layers.grid", grid, device, extinction=(cells,), albedo=(cells,), residual=(cells,))
-    check_arrays("model.layers.grid", grid, device, anisotropy=(None,))
+    check_attributes("model.layers.grid", grid, device, extinction=(cells,), albedo=(cells,), residual=(cells,))
+    check_attributes("model.layers.grid", grid, device, anisotropy=(None,))
     if grid.anisotropy.size:
-        check_arrays("model.layers.grid", grid, device, anisotropy=(cells,))
+        check_attributes("model.layers.grid", grid, device, anisotropy=(cells,))
     edge = check_integer("model.layers.grid.block_edge", grid.block_edge, 1)
     if sizes["block_size"] != [-(-count // edge) for count in sizes["size"]]:
         raise ArgumentError(f"model.layers.grid: {sizes['block_size']} blocks of {edge} cells; see make_grid")
-    check_arrays("model.layers.grid", grid, device, block_majorant=(blocks,), block_control=(blocks,))
+    check_attributes("model.layers.grid", grid, device, block_majorant=(blocks,), block_control=(blocks,))
 
 
 def _check_laser(spec: TransportSpec, model: Model) -> None:
@@ -280,9 +283,9 @@ def _check_laser(spec: TransportSpec, model: Model) -> None:
     if not spec.confocal:
         check_vector("model.laser.axis", laser.axis, unit=True)
     if spec.measured_beam:
-        check_arrays("model.laser", laser, device, rows=(None,))
+        check_attributes("model.laser", laser, device, rows=(None,))
         check_integer("rows of the laser's profile", laser.rows.size, 1)
-        check_arrays("model.laser", laser, device, columns=(laser.rows.size, None))
+        check_attributes("model.laser", laser, device, columns=(laser.rows.size, None))
         check_integer("columns of the laser's profile", laser.columns.shape[1], 1)
         for extent in laser.extent:
             check_number("model.laser.extent", extent, "(0, inf)")
@@ -306,7 +309,7 @@ def _check_limits(spec: TransportSpec, model: Model) -> None:
             for axis in range(3):
                 check_number(f"model.limits.boundary.{name}[{axis}]", indices[axis], "[0, 1e9]")
         check_integer("model.limits.boundary.max_reflections", boundary.max_reflections, 0)
-        check_arrays("model.limits.boundary", boundary, model.device, images=(None,))
+        check_attributes("model.limits.boundary", boundary, model.device, images=(None,))
     if spec.rotated_domain:
         check_vector("model.limits.origin", limits.origin)
         rows = [[limits.rotation[i, j] for j in range(3)] for i in range(3)]
@@ -316,7 +319,7 @@ def _check_limits(spec: TransportSpec, model: Model) -> None:
 
 def _check_surfaces(spec: TransportSpec, model: Model) -> None:
     surfaces, device = model.surfaces, model.device
-    check_arrays("model.surfaces", surfaces, device, reflectance=(None,), nodes=(None,), near_depth=(None, None))
+    check_attributes("model.surfaces", surfaces, device, reflectance=(None,), nodes=(None,), near_depth=(None, None))
     faces = surfaces.reflectance.size
     if faces == 0:
         raise ArgumentError("spec.mesh = True needs surfaces of a mesh, see make_surfaces; model.surfaces has no faces")
@@ -330,21 +333,21 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
     check_faces("model.surfaces", surfaces, faces, device)
-    if spec.public_tree and (model.mesh is None or model.mesh.id != surfaces.mesh):
+    if spec.use_warp_bvh and (model.mesh is None or model.mesh.id != surfaces.mesh):
         raise ArgumentError(
-            "spec.public_tree = True reads the mesh that the surfaces were made of, which has to be model.mesh: the "
+            "spec.use_warp_bvh = True reads the mesh that the surfaces were made of, which has to be model.mesh: the "
             "model keeps it"
         )
     if spec.brute_force and device.is_cuda:
         check_patches("model.surfaces", surfaces, faces, device)
     if spec.pattern:
         textures = surfaces.textures
-        check_arrays("model.surfaces", surfaces, device, corner_reflectance=(faces,))
-        check_arrays("model.surfaces.textures", textures, device, face=(None,))
+        check_attributes("model.surfaces", surfaces, device, corner_reflectance=(faces,))
+        check_attributes("model.surfaces.textures", textures, device, face=(None,))
         if textures.face.size:
-            check_arrays("model.surfaces.textures", textures, device, face=(faces,), coordinates=(faces, 3))
+            check_attributes("model.surfaces.textures", textures, device, face=(faces,), coordinates=(faces, 3))
     if spec.specular:
-        check_arrays("model.surfaces", surfaces, device, specular=(faces,), roughness=(faces,))
+        check_attributes("model.surfaces", surfaces, device, specular=(faces,), roughness=(faces,))
 
 
 def _check_derivatives(spec: TransportSpec, model: Model) -> None:
@@ -362,9 +365,9 @@ def _check_derivatives(spec: TransportSpec, model: Model) -> None:
         for q in range(len(spec.blocks)):
             check_number(f"model.derivatives.blocks.scale[{q}]", blocks.scale[q], "(0, inf)")
     if spec.layered:
-        check_arrays("model.derivatives", derivatives, device, waters=(model.layers.start.size,))
+        check_attributes("model.derivatives", derivatives, device, waters=(model.layers.start.size,))
     if "reflectance" in spec.derivatives:
-        check_arrays("model.derivatives", derivatives, device, faces=(model.surfaces.reflectance.size,))
+        check_attributes("model.derivatives", derivatives, device, faces=(model.surfaces.reflectance.size,))
 
 
 def _check_polarisation(spec: TransportSpec, model: Model) -> None:
@@ -374,18 +377,18 @@ def _check_polarisation(spec: TransportSpec, model: Model) -> None:
             f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.polarised = True needs 1, without the "
             "near-axis rule, which has no plane of scattering"
         )
-    check_arrays("model.polarisation", polarisation, device, first=(MATRIX_POINTS,), last=(MATRIX_POINTS,))
+    check_attributes("model.polarisation", polarisation, device, first=(MATRIX_POINTS,), last=(MATRIX_POINTS,))
     for k in range(spec.channels):
         check_number(f"model.derivatives.scale[{k}]", model.derivatives.scale[k], "(0, inf)")
     if spec.specular:
-        check_arrays("model.polarisation", polarisation, device, facet_index=(model.surfaces.reflectance.size,))
+        check_attributes("model.polarisation", polarisation, device, facet_index=(model.surfaces.reflectance.size,))
 
 
 def _check_scan(model: Model, estimator: Estimator) -> None:
     scan, camera = model.scan, model.camera
     most = camera.width * camera.height if estimator.scores else 2**31 - 1
     count = check_integer("model.scan.count", scan.count, 1, most)
-    check_arrays("model.scan", scan, model.device, axis=(None,), view=(None,))
+    check_attributes("model.scan", scan, model.device, axis=(None,), view=(None,))
     for name in ("axis", "view"):
         check_integer(f"entries of model.scan.{name}", getattr(scan, name).size, count)
 
@@ -401,8 +404,10 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estima
         check_array("data.gradients", data.gradients, wp.int64, (size,), device, contiguous=True)
     elif data.gradients is not None:
         check_array("data.gradients", data.gradients, wp.int64, (None,), device)
-    if data.low_words is not None:
-        check_array("data.low_words", data.low_words, wp.uint32, (data.tally.size,), device, contiguous=True)
+    if data.split_accumulators is not None:
+        check_array(
+            "data.split_accumulators", data.split_accumulators, wp.uint32, (data.tally.size,), device, contiguous=True
+        )
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
     check_array("data.cursor", data.cursor, wp.int32, (1,), device)
     if spec.stepped or data.offset is not None:
@@ -437,29 +442,29 @@ def load_transport_kernel(
     """Compiles the kernel of a spec for a device, or loads it from Warp's cache, ahead of the first launch.
 
     With `model`, the kernel of a first launch of `photon_count` photons, which later launches into the same data take,
-    too: with a large tally on CUDA it may be another one, see `Model.low_words`.
+    too: with a large tally on CUDA it may be another one, see `Model.split_accumulators`.
     """
     check_spec(spec)
     device = check_device("device", device)
-    low_words = False
+    split_accumulators = False
     if model is not None:
         check_kind("model", model, Model)
         photon_count = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
-        low_words = uses_low_words(spec, model, photon_count)
-    kernel = make_transport_kernel(spec, device.is_cuda, low_words)
+        split_accumulators = splits_accumulators(spec, model, photon_count)
+    kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators)
     kernel.module.load(device, BLOCK_SIZE if device.is_cuda else 1)
-    if low_words:
+    if split_accumulators:
         wp.load_module(fold_kernel.module, device=device)
     # Loaded here and not by a worker: each thread that compiles makes Warp prepare its headers anew, 1.5 s on a CPU.
     wp.load_module(find_overflow_kernel.module, device=device)
 
 
-def uses_low_words(spec: TransportSpec, model: Model, photon_count: int) -> bool:
-    """Whether a launch into a tally of the model keeps its low words apart; see `tally.low_words`."""
-    if not (model.low_words and model.device.is_cuda and make_estimator(spec).scores):
+def splits_accumulators(spec: TransportSpec, model: Model, photon_count: int) -> bool:
+    """Whether a launch into a tally of the model keeps its low words apart; see `tally.split_accumulators`."""
+    if not (model.split_accumulators and model.device.is_cuda and make_estimator(spec).scores):
         return False
     voxels = model.tally_size // len(COMPONENTS)
-    return not (spec.signed or spec.blocks) and low_words_pay(voxels, photon_count)
+    return not (spec.signed or spec.blocks) and splitting_pays(voxels, photon_count)
 
 
 def launch_transport(
@@ -500,27 +505,27 @@ def launch_transport(
     if spec.blocks:
         threads = threads_of_blocks(threads, model.derivatives.blocks)
     data.cursor.zero_()
-    low_words = _low_words(spec, model, data, photon_count)
-    world, sink = _make_world(spec, model, seed, threads), _make_sink(model, data, low_words)
+    split_accumulators = _split_accumulators(spec, model, data, photon_count)
+    world, sink = _make_world(spec, model, seed, threads), _make_sink(model, data, split_accumulators)
     wp.launch(
-        make_transport_kernel(spec, model.device.is_cuda, low_words is not None),
+        make_transport_kernel(spec, model.device.is_cuda, split_accumulators is not None),
         dim=threads,
         inputs=[world, sink, data.records, first_id, photon_count, threads, data.cursor, data.offset],
         device=model.device,
         block_dim=BLOCK_SIZE,
     )
-    if low_words is not None:
-        fold_low_words(low_words, data.tally)
+    if split_accumulators is not None:
+        fold_accumulators(split_accumulators, data.tally)
 
 
-def _low_words(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
+def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
     """Those of `data` for a launch that uses them: a large one, and after it also smaller ones, which would need
     another kernel otherwise."""
-    if not uses_low_words(spec, model, photon_count if data.low_words is None else _MOST_PHOTONS):
+    if not splits_accumulators(spec, model, photon_count if data.split_accumulators is None else _MOST_PHOTONS):
         return None
-    if data.low_words is None and not model.device.is_capturing:  # what is made there belongs to the graph
-        data.low_words = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)
-    return data.low_words
+    if data.split_accumulators is None and not model.device.is_capturing:  # what is made there belongs to the graph
+        data.split_accumulators = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)
+    return data.split_accumulators
 
 
 def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> World:
@@ -536,13 +541,13 @@ def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> W
     return world
 
 
-def _make_sink(model: Model, data: Data, low_words: wp.array | None) -> Sink:
+def _make_sink(model: Model, data: Data, split_accumulators: wp.array | None) -> Sink:
     sink = Sink()
     sink.tally, sink.ledger, sink.scale = data.tally, data.ledger, model.scale
     if data.gradients is not None:
         sink.gradients = data.gradients
-    if low_words is not None:
-        sink.low = low_words
+    if split_accumulators is not None:
+        sink.low = split_accumulators
     return sink
 
 

@@ -7,8 +7,8 @@ a mesh together, so that none waits for another at work that is its own.
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
-from spadwarp_kernels.base.philox import WORDS_AHEAD, hold_keys
+from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.philox import PREFETCHED_WORDS, hold_keys
 from spadwarp_kernels.photon.lanes import (
     MOST_LEFT,
     READ_SIZE,
@@ -39,8 +39,7 @@ from spadwarp_kernels.photon.state import (
     shorten,
 )
 from spadwarp_kernels.photon.world import Draws, World
-from spadwarp_kernels.surface.box import inverse_direction
-from spadwarp_kernels.surface.bvh import NO_NODE, Stack, place, step_leaf, step_node
+from spadwarp_kernels.surface.bvh import NO_NODE, Stack, inverse_direction, place, step_leaf, step_node
 from spadwarp_kernels.surface.ray_cast import surface_hit
 from spadwarp_kernels.tally.ledger import make_ledger_slot
 
@@ -50,12 +49,12 @@ from .history import make_prepare
 __all__ = ["make_transport_kernel"]
 
 
-@made_once
-def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bool = False) -> wp.Kernel:
+@memoised
+def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumulators: bool = False) -> wp.Kernel:
     """The transport kernel for a spec; launch grid: any number of threads, which share the photons among them.
 
-    On CUDA they must be a multiple of the block size, since whole warps vote. `low_words`: on CUDA, those of the tally
-    are apart, see `tally.low_words_pay`.
+    On CUDA they must be a multiple of the block size, since whole warps vote. `split_accumulators`: on CUDA, the low
+    words of the tally are apart, see `tally.splitting_pays`.
 
     Raises:
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
@@ -64,8 +63,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, low_words: bo
     if alone(spec, cuda):
         return make_loop_alone(spec, cuda)
     if spec.mesh and not tries_every_face(spec, cuda):
-        return make_loop_tree(spec, low_words)
-    return make_loop_flat(spec, low_words)
+        return make_loop_tree(spec, split_accumulators)
+    return make_loop_flat(spec, split_accumulators)
 
 
 def _options(stages: Stages, cuda: bool) -> dict:
@@ -78,7 +77,7 @@ def _options(stages: Stages, cuda: bool) -> dict:
     }
 
 
-@made_once
+@memoised
 def make_loop_alone(spec: TransportSpec, cuda: bool) -> wp.Kernel:
     """Each thread moves photon after photon from its emission to its end. Launch grid: threads, one on a CPU."""
     stages = compose(spec, cuda, False)
@@ -93,8 +92,8 @@ def make_loop_alone(spec: TransportSpec, cuda: bool) -> wp.Kernel:
         first_id: wp.uint64,
         photon_count: int,
         threads: int,
-        cursor: wp.array(dtype=int),
-        offset: wp.array(dtype=wp.uint64),
+        cursor: wp.array[int],
+        offset: wp.array[wp.uint64],
     ):
         draws = Draws()
         base = prepare(world, wp.tid(), first_id, offset)
@@ -103,7 +102,7 @@ def make_loop_alone(spec: TransportSpec, cuda: bool) -> wp.Kernel:
         if wp.static(cuda):  # noqa: SIM108, Warp has no such choice between arrays
             words = cursor  # any: it is not used
         else:
-            words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
+            words = wp.zeros(shape=PREFETCHED_WORDS, dtype=int)
         s = first_state(world, slot_of(wp.tid(), first_id))
         for number in range(wp.tid(), photon_count, threads):
             s.photon = number
@@ -149,7 +148,7 @@ class WarpStatus:
     enough: int
 
 
-@made_once
+@memoised
 def _make_renew(stages: Stages) -> wp.Function:
     """The Warp function ``(s, world, sink, out, memory, lane, base, photon_count, cursor)`` that finishes the photons
     of a warp that have ended and gives the next to their lanes. All lanes take part."""
@@ -165,7 +164,7 @@ def _make_renew(stages: Stages) -> wp.Function:
         lane: int,
         base: wp.uint64,
         photon_count: int,
-        cursor: wp.array(dtype=int),
+        cursor: wp.array[int],
     ):
         if s.stage == END:
             finish(s, sink, out)
@@ -190,7 +189,7 @@ def _make_renew(stages: Stages) -> wp.Function:
     return renew
 
 
-@made_once
+@memoised
 def make_loop_flat(spec: TransportSpec, split: bool) -> wp.Kernel:
     """Warps without a tree to walk: what is scored waits for nothing but the other lanes."""
     stages, queue = compose(spec, True, split), compose_queue(spec, split)
@@ -213,8 +212,8 @@ def make_loop_flat(spec: TransportSpec, split: bool) -> wp.Kernel:
         first_id: wp.uint64,
         photon_count: int,
         threads: int,
-        cursor: wp.array(dtype=int),
-        offset: wp.array(dtype=wp.uint64),
+        cursor: wp.array[int],
+        offset: wp.array[wp.uint64],
     ):
         lane = wp.tid() % 32
         draws = Draws()
@@ -302,7 +301,7 @@ def next_ray(s: wp.ref[PhotonState]) -> int:
     return ray
 
 
-@made_once
+@memoised
 def _make_ray_geometry(scores: bool) -> wp.Function:
     """The Warp function ``s -> Ray``: the flight, or the way from the scored point to the lens."""
 
@@ -322,7 +321,7 @@ def _make_ray_geometry(scores: bool) -> wp.Function:
     return ray_geometry
 
 
-@made_once
+@memoised
 def _make_end_walk(stages: Stages) -> wp.Function:
     """The Warp function ``(s, world, sink)`` at the end of a ray's walk down the tree."""
     deposit = stages.deposit
@@ -346,7 +345,7 @@ def _make_end_walk(stages: Stages) -> wp.Function:
     return end_walk
 
 
-@made_once
+@memoised
 def make_loop_tree(spec: TransportSpec, split: bool) -> wp.Kernel:
     """Warps that leave the water when enough of their lanes wait for a ray, and walk down the tree together."""
     stages, queue = compose(spec, True, split), compose_queue(spec, split)
@@ -367,8 +366,8 @@ def make_loop_tree(spec: TransportSpec, split: bool) -> wp.Kernel:
         first_id: wp.uint64,
         photon_count: int,
         threads: int,
-        cursor: wp.array(dtype=int),
-        offset: wp.array(dtype=wp.uint64),
+        cursor: wp.array[int],
+        offset: wp.array[wp.uint64],
     ):
         lane = wp.tid() % 32
         draws = Draws()

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import STREAM_ROULETTE, STREAM_SURFACE, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
@@ -19,7 +19,7 @@ from spadwarp_kernels.surface.reflectance import (
     unshadowed,
 )
 from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF
-from spadwarp_kernels.water.boundary import face_index, flipped, fresnel_reflectance
+from spadwarp_kernels.water.limits import face_index, flipped, fresnel_reflectance
 
 
 @wp.struct
@@ -39,7 +39,7 @@ class Outcome:
     reason: int
 
 
-@made_once
+@memoised
 def make_survive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
     has_mesh, specular = spec.mesh, spec.specular
@@ -61,7 +61,7 @@ def make_survive(spec: TransportSpec) -> wp.Function:
     return survive
 
 
-@made_once
+@memoised
 def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, reflected, lobe, world, id) -> Direction``.
 
@@ -95,7 +95,7 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     return sample_direction
 
 
-@made_once
+@memoised
 def make_continues(flies_on: bool) -> wp.Function:
     """The Warp function ``reason -> bool``: whether there is a flight after an event.
 
@@ -109,7 +109,7 @@ def make_continues(flies_on: bool) -> wp.Function:
     return continues
 
 
-@made_once
+@memoised
 def make_terminate(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(new, s, world, sink, id)``: the end of a history for its analog weight or its events."""
     roulette = spec.roulette
@@ -134,7 +134,7 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
     return terminate
 
 
-@made_once
+@memoised
 def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink, id)`` of a photon that a face of the domain reflects; what is not reflected
     leaves by the face.
@@ -175,7 +175,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     return bounce
 
 
-@made_once
+@memoised
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink, draws)``: takes a photon from its event to FLIGHT, or to END.
 

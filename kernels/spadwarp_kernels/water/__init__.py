@@ -2,21 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from .boundary import *
 from .grid import *
-from .layers import *
 from .limits import *
 from .medium import *
 from .phase_functions import *
 from .tracking import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = (
-        boundary.__all__
-        + grid.__all__
-        + layers.__all__
-        + limits.__all__
-        + medium.__all__
-        + phase_functions.__all__
-        + tracking.__all__
-    )
+    __all__ = grid.__all__ + limits.__all__ + medium.__all__ + phase_functions.__all__ + tracking.__all__

@@ -47,54 +47,39 @@ class Grid:
     turn: wp.mat33
     shift: wp.vec3
     size: wp.vec3i
-    extinction: wp.array(dtype=float)
-    albedo: wp.array(dtype=float)
-    anisotropy: wp.array(dtype=float)
+    extinction: wp.array[float]
+    albedo: wp.array[float]
+    anisotropy: wp.array[float]
     block_edge: int
     block_size: wp.vec3i
-    block_majorant: wp.array(dtype=float)
-    block_control: wp.array(dtype=wp.vec2)
-    residual: wp.array(dtype=float)
+    block_majorant: wp.array[float]
+    block_control: wp.array[wp.vec2]
+    residual: wp.array[float]
 
 
 @wp.struct
 class GridLine:
-    """A line x + t u through the cells of a grid.
+    """A line x + t u through the cells of a grid."""
 
-    Attributes:
-        begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it.
-        inverse, shift: The plane of number k across an axis is met at t = k inverse + shift.
-        first: The cell in which it begins.
-        stride: What a step along each axis adds to the index of the cell.
-        last: Index of the last cell.
-    """
-
+    # begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it
     begin: float
     end: float
-    inverse: wp.vec3
+    inverse: wp.vec3  # inverse, shift: the plane of number k across an axis is met at t = k inverse + shift
     shift: wp.vec3
-    first: wp.vec3
-    stride: wp.vec3i
-    last: int
+    first: wp.vec3  # the cell in which it begins
+    stride: wp.vec3i  # what a step along each axis adds to the index of the cell
+    last: int  # index of the last cell
 
 
 @wp.struct
 class GridPlace:
-    """A place on a line.
+    """A place on a line."""
 
-    Attributes:
-        t: Where the cell begins, or a place within it [m].
-        leave: Where the line leaves the cell [m].
-        cell: Its index.
-        ahead: Numbers of the planes that the line meets next, by axis.
-        at: Where it meets them [m].
-    """
-
-    t: float
-    leave: float
-    cell: int
-    ahead: wp.vec3
-    at: wp.vec3
+    t: float  # where the cell begins, or a place within it [m]
+    leave: float  # where the line leaves the cell [m]
+    cell: int  # its index
+    ahead: wp.vec3  # numbers of the planes that the line meets next, by axis
+    at: wp.vec3  # where it meets them [m]
 
 
 @wp.func
@@ -192,38 +177,25 @@ def cell_on_line(grid: Grid, p: wp.vec3, d: wp.vec3, t: float) -> int:
 
 @wp.struct
 class BlockLine:
-    """A line x + t u through the blocks of a grid.
+    """A line x + t u through the blocks of a grid."""
 
-    Attributes:
-        begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it.
-        p, d: x and u in cells.
-        step: By which t rises through a block, by axis [m].
-        stride: What a step along each axis adds to the index of the block.
-    """
-
+    # begin, end: t at which it enters and leaves the box, within [0, length] [m]; begin >= end where it misses it
     begin: float
     end: float
-    p: wp.vec3
+    p: wp.vec3  # p, d: x and u in cells
     d: wp.vec3
-    step: wp.vec3
-    stride: wp.vec3i
+    step: wp.vec3  # by which t rises through a block, by axis [m]
+    stride: wp.vec3i  # what a step along each axis adds to the index of the block
 
 
 @wp.struct
 class BlockPlace:
-    """A place on a line.
+    """A place on a line."""
 
-    Attributes:
-        t: Where it is [m].
-        stop: Where it leaves the block, or the line ends [m].
-        block: Index of the block.
-        at: Where the line meets the next planes between blocks, by axis [m].
-    """
-
-    t: float
-    stop: float
-    block: int
-    at: wp.vec3
+    t: float  # where it is [m]
+    stop: float  # where it leaves the block, or the line ends [m]
+    block: int  # index of the block
+    at: wp.vec3  # where the line meets the next planes between blocks, by axis [m]
 
 
 @wp.func
@@ -384,7 +356,7 @@ def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArra
 
 
 @wp.kernel(enable_backward=False)
-def voxel_values_kernel(volume: wp.uint64, voxels: wp.array(dtype=wp.vec3i), values: wp.array(dtype=float)):
+def voxel_values_kernel(volume: wp.uint64, voxels: wp.array[wp.vec3i], values: wp.array[float]):
     """Values of a `wp.Volume` of float32 at the indices of `Volume.get_voxels`. Launch: voxels."""
     i = wp.tid()
     v = voxels[i]

@@ -1,14 +1,32 @@
-"""The scattering medium and the free flight through it."""
+"""Water, the same everywhere or in plane layers, and the three questions that transport asks of any water.
+
+How far does a photon fly, what does a flight let through, and which water is at a point: `HOMOGENEOUS` answers from the
+medium alone, `LAYERED` from the layers, `REGULAR_TRACKING` and `DELTA_TRACKING` from a grid of cells. A boundary
+between equal extinctions is none: layers of one water give the bits of the homogeneous one. Light passes boundaries
+straight on; one index holds for all water.
+"""
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_device,
+    check_integer,
+    check_number,
+    check_numbers,
+    check_vector,
+)
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
-__all__ = ["Medium", "free_path"]
+from .grid import Grid
+
+__all__ = ["Layers", "Medium", "free_path", "make_layers"]
 
 
 @wp.struct
@@ -62,3 +80,190 @@ def free_path(xi: float, extinction: float) -> float:
 def ready_free_path(xi: float, medium: Medium) -> float:
     """`free_path` in a medium from `ready_medium`."""
     ...
+
+
+# ---- Layers.
+
+
+_RANGES = {"start": "(-inf, inf)", "extinction": "(0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)"}
+
+
+@wp.struct
+class Layers:
+    """Layers across an axis, in the order in which the axis meets them.
+
+    In the frame of the photons: where a photon at x is at R x + o of the water's frame, with the axis a there, the axis
+    here is R^T a, and each start is less by a·o. A layer reaches to the start of the next, the first back without end.
+
+    Attributes:
+        axis: Unit vector.
+        start: Position along the axis, x·axis, at which each layer begins [m], ascending; the first is not read.
+        extinction: c [1/m], > 0.
+        albedo: Single-scattering albedo in [0, 1].
+        anisotropy: g in (-1, 1), for phase functions that use the medium's.
+        grid: Of a spec with a grid, which has no layers: cells in a box; the medium is outside it.
+    """
+
+    axis: wp.vec3
+    start: wp.array[float]
+    extinction: wp.array[float]
+    albedo: wp.array[float]
+    anisotropy: wp.array[float]
+    grid: Grid
+
+
+@wp.func
+def layer_index(layers: Layers, along: float) -> int:
+    """The layer at a position along the axis [m]."""
+    k = int(0)
+    for i in range(1, layers.start.shape[0]):
+        if along >= layers.start[i]:
+            k = i
+    return k
+
+
+@wp.func
+def boundary_ahead(layers: Layers, layer: int, step: int, along: float, slope: float) -> float:
+    """Distance [m] from `along`, at `slope` per metre, to the end of a layer; 1e30 where there is none."""
+    ahead = layer + step
+    if slope == 0.0 or ahead < 0 or ahead >= layers.start.shape[0]:
+        return 1.0e30
+    return (layers.start[wp.max(layer, ahead)] - along) / slope
+
+
+@wp.func
+def layered_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
+    """Free flight [m] from x along u for uniform xi in (0, 1]: where the optical depth reaches -ln(xi)."""
+    along = wp.dot(layers.axis, x)
+    slope = wp.dot(layers.axis, u)
+    step = wp.where(slope > 0.0, 1, -1)
+    layer = layer_index(layers, along)
+    extinction = float(layers.extinction[layer])
+    depth = -wp.log(xi)
+    begin = float(0.0)  # of the stretch of this extinction
+    boundary = boundary_ahead(layers, layer, step, along, slope)
+    while boundary < 1.0e30 and extinction * (boundary - begin) < depth:
+        layer += step
+        if layers.extinction[layer] != extinction:
+            depth -= extinction * (boundary - begin)
+            begin = boundary
+            extinction = layers.extinction[layer]
+        boundary = boundary_ahead(layers, layer, step, along, slope)
+    return begin + depth / extinction
+
+
+@wp.func
+def layered_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
+    """Mean extinction [1/m] between x and x + length u, so that exp(-mean length) is what passes."""
+    along = wp.dot(layers.axis, x)
+    slope = wp.dot(layers.axis, u)
+    step = wp.where(slope > 0.0, 1, -1)
+    layer = layer_index(layers, along)
+    extinction = float(layers.extinction[layer])
+    depth = float(0.0)
+    begin = float(0.0)
+    boundary = boundary_ahead(layers, layer, step, along, slope)
+    while boundary < length:
+        layer += step
+        if layers.extinction[layer] != extinction:
+            depth += extinction * (boundary - begin)
+            begin = boundary
+            extinction = layers.extinction[layer]
+        boundary = boundary_ahead(layers, layer, step, along, slope)
+    if begin == 0.0:
+        return extinction
+    return (depth + extinction * (length - begin)) / length
+
+
+@wp.func
+def layered_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
+    """The medium with the coefficients of the layer at x."""
+    layer = layer_index(layers, wp.dot(layers.axis, x))
+    water = medium
+    water.extinction = layers.extinction[layer]
+    water.albedo = layers.albedo[layer]
+    water.anisotropy = layers.anisotropy[layer]
+    return water
+
+
+@wp.func
+def _free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
+    return ready_free_path(xi, medium)
+
+
+@wp.func
+def _extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, length: float, seed: wp.uint64) -> float:
+    return medium.extinction
+
+
+@wp.func
+def _water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
+    return medium
+
+
+@wp.struct
+class ProfileSample:
+    """A point of a line: its distance s [m], the density over s of the draw [1/m], and the optical depth up to it."""
+
+    s: float
+    density: float
+    depth: float
+
+
+class Profile(NamedTuple):
+    """Extinction along a line, by which `guided` takes a point of a flight, as Warp functions."""
+
+    depth: wp.Function  # ``(medium, layers, x, u, length) -> float``, the optical depth
+    # ``(medium, layers, x, u, width, given, xi) -> ProfileSample``, a point of [0, width] from c(s) exp(-depth(s)); or,
+    # where that is not negative, the point `given` with the density that it would have. None: the point is where the
+    # photon collides, and `depth` is a guess without chance
+    draw: wp.Function | None = None
+
+
+class Water(NamedTuple):
+    """What transport asks of water, as Warp functions; `seed` has 64 random bits for those that answer by chance."""
+
+    free_path: wp.Function  # ``(medium, layers, x, u, xi, seed) -> float``, free flight [m]
+    # ``(medium, layers, x, u, length, seed) -> float``, mean extinction of a flight [1/m]; by chance, one whose
+    # exp(-extinction length) has the expectation of what passes
+    extinction: wp.Function
+    at: wp.Function  # ``(medium, layers, x) -> Medium``, the water at a point
+    profile: Profile | None = None  # how `guided` draws a point of a flight; None: with the mean extinction
+
+
+HOMOGENEOUS = Water(_free_path, _extinction, _water)
+LAYERED = Water(layered_free_path, layered_extinction, layered_water)
+
+
+def make_layers(
+    start: Sequence[float],
+    extinction: Sequence[float],
+    albedo: Sequence[float],
+    anisotropy: Sequence[float],
+    *,
+    axis: Sequence[float] = (0.0, 0.0, 1.0),
+    device: wp.DeviceLike = None,
+) -> Layers:
+    """The layers of a layered spec, one entry of each list for a layer; see `Layers` for their meaning and ranges.
+
+    Raises `ArgumentError`.
+    """
+    columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
+    for name, column in columns.items():
+        check_numbers(name, column, 1)
+    device = check_device("device", device)
+    if len({len(column) for column in columns.values()}) > 1:
+        sizes = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
+        raise ArgumentError(f"layers: {sizes} entries; one each for every layer are needed")
+    check_integer("number of layers", len(start), 1)
+    check_vector("axis", axis, unit=True)
+    for name, interval in _RANGES.items():
+        for k, value in enumerate(columns[name]):
+            check_number(f"{name}[{k}]", value, interval)
+    for k in range(2, len(start)):
+        check_number(f"start[{k}]", start[k], f"[{float(start[k - 1])}, inf)")
+    layers = Layers()
+    layers.axis = wp.vec3(*axis)
+    for name, column in columns.items():
+        setattr(layers, name, wp.array(column, dtype=float, device=device))
+    return layers

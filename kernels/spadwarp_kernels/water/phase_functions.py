@@ -33,7 +33,6 @@ __all__ = [
     "fournier_forand_density",
     "henyey_greenstein_density",
     "henyey_greenstein_pdf",
-    "henyey_greenstein_score",
     "interpolated_density",
     "make_phase_tables",
     "rayleigh_density",
@@ -228,7 +227,7 @@ def henyey_greenstein_pdf(t: float, g: float) -> float:
 
 
 @wp.func
-def henyey_greenstein_score(t: float, g: float) -> float:
+def henyey_greenstein_log_derivative(t: float, g: float) -> float:
     """d ln p/dg of the Henyey-Greenstein density at t = 1 - cos(theta) in [0, 2], for g in (-1, 1); nothing cancels at
     the forward peak."""
     d = 1.0 - g

@@ -11,18 +11,8 @@ import warp as wp
 from spadwarp_kernels.base.native import load_float, load_vec2
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_open
 
-from .grid import (
-    block_line,
-    cell_on_line,
-    first_block,
-    first_place,
-    grid_cell,
-    grid_line,
-    next_block,
-    next_place,
-)
-from .layers import Layers, Profile, ProfileSample, Water
-from .medium import Medium
+from .grid import block_line, cell_on_line, first_block, first_place, grid_cell, grid_line, next_block, next_place
+from .medium import Layers, Medium, Profile, ProfileSample, Water
 
 __all__ = ["DELTA_TRACKING", "REGULAR_TRACKING"]
 

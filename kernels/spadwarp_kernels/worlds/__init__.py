@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 from .closed_forms import *
 from .config import *
-from .frames import *
 from .shapes import *
 from .simulators import *
 from .spad_camera import *
@@ -14,7 +13,6 @@ if not TYPE_CHECKING:  # type checkers follow the stars
     __all__ = (
         closed_forms.__all__
         + config.__all__
-        + frames.__all__
         + shapes.__all__
         + simulators.__all__
         + spad_camera.__all__

@@ -16,19 +16,12 @@ _FAR = wp.constant(1.0e30)
 
 @wp.struct
 class ShapeHit:
-    """Where a ray meets a shape.
+    """Where a ray meets a shape."""
 
-    Attributes:
-        distance: Along the ray [m]; -1 for a miss.
-        normal: Unit vector, either side, in the frame of the ray.
-        face: Of a mesh; -1 for other shapes.
-        corner: Barycentric shares of the first two corners of the face.
-    """
-
-    distance: float
-    normal: wp.vec3
-    face: int
-    corner: wp.vec2
+    distance: float  # along the ray [m]; -1 for a miss
+    normal: wp.vec3  # unit vector, either side, in the frame of the ray
+    face: int  # of a mesh; -1 for other shapes
+    corner: wp.vec2  # barycentric shares of the first two corners of the face
 
 
 @wp.func

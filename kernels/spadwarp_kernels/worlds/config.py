@@ -1,24 +1,59 @@
-"""What a single-photon camera in water is made of."""
+"""What a single-photon camera in water is made of: laser, detector, water, and the frame of its pose.
+
+Everything that stands in a camera here (laser, normals, points) is in the optical frame; poses are given in the frame
+that the caller's simulator uses.
+"""
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.analytic.backscatter import check_phase, single_scatter_rate, spectral_lines
+from spadwarp_kernels.analytic.backscatter import Scattering, make_scattering, single_scatter_rate
 from spadwarp_kernels.analytic.lidar import BACKSCATTER_SOURCES, Lidar
-from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_number, check_vector
+from spadwarp_kernels.analytic.optics import IN_WATER
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_choice,
+    check_fields,
+    check_integer,
+    check_kind,
+    check_number,
+    check_vector,
+)
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES
-from spadwarp_kernels.optics.gate import C0
+from spadwarp_kernels.optics.camera import C0
 from spadwarp_kernels.optics.laser import LASER_PROFILES
+from spadwarp_kernels.water.phase_functions import henyey_greenstein_density
 
-__all__ = ["SpadConfig"]
+__all__ = ["CAMERA_FRAMES", "SpadConfig"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
+_see = IN_WATER.see
+
 PLANCK = 6.62607015e-34  # [J s]
+
+CAMERA_FRAMES = {
+    "optical": (0.0, 0.0, 0.0, 1.0),
+    "opengl": (1.0, 0.0, 0.0, 0.0),
+    "forward_left_up": (-0.5, 0.5, -0.5, 0.5),
+}
+"""Conventions of a camera's pose, and the rotation (x, y, z, w) that takes the optical frame there.
+
+``optical``: +x right, +y down, +z forward (OpenCV; ROS, REP 103, `_optical` frames). ``opengl``: +x right, +y up, -z
+forward (OpenGL, USD, Newton, MuJoCo). ``forward_left_up``: +x forward, +y left, +z up (ROS, REP 103, bodies).
+"""
+
+
+def optical_to(frame: Any) -> wp.transform:
+    """The pose of the optical frame in a camera frame of `CAMERA_FRAMES`; raises `ArgumentError`."""
+    check_choice("frame", frame, CAMERA_FRAMES)
+    return wp.transform(wp.vec3(0.0), wp.quat(*CAMERA_FRAMES[frame]))
+
 
 _RANGES = {
     "horizontal_fov": "(0, 3.1)",
@@ -92,8 +127,7 @@ class SpadConfig:
         for name in ("width", "height", "bins"):
             check_integer(f"config.{name}", getattr(self, name), 1)
         check_integer("config.pulses", self.pulses, 0)
-        for name, interval in _RANGES.items():
-            check_number(f"config.{name}", getattr(self, name), interval)
+        check_fields("config", self, _RANGES)
         check_vector("config.gate", self.gate, size=2)
         check_number("config.gate[0]", self.gate[0], "[0, inf)")
         check_number("config.gate[1]", self.gate[1], f"({float(self.gate[0])}, inf)")
@@ -172,9 +206,7 @@ class SpadConfig:
 
     def phase_table(self) -> np.ndarray:
         """The phase function at 4097 angles uniform on [0, π] [1/sr]."""
-        t = 1.0 - np.cos(np.linspace(0.0, np.pi, 4097))
-        g = self.anisotropy
-        return (1.0 - g * g) / (4.0 * np.pi * ((1.0 - g) ** 2 + 2.0 * g * t) ** 1.5)
+        return henyey_greenstein_density(1.0 - np.cos(np.linspace(0.0, np.pi, 4097)), self.anisotropy)
 
     def response(self) -> tuple[np.ndarray, int]:
         """The Gaussian response in bins for `arrival_bins`, `[PHASES, taps]`, and its lowest tap."""
@@ -201,12 +233,10 @@ def _normal_integral(z: float) -> float:
     return z * 0.5 * math.erfc(-z / math.sqrt(2.0)) + math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
 
 
-def check_config(config: object) -> SpadConfig:
+def check_config(config: Any) -> SpadConfig:
     """A `SpadConfig`, or the default for None."""
-    if config is None:
-        return SpadConfig()
-    if not isinstance(config, SpadConfig):
-        raise ArgumentError(f"config is {type(config).__name__}; a SpadConfig is needed")
+    config = SpadConfig() if config is None else config
+    check_kind("config", config, SpadConfig)
     return config
 
 
@@ -214,21 +244,21 @@ def check_config(config: object) -> SpadConfig:
 def _backscatter_kernel(
     first: int,
     lidar: Lidar,
-    lines: wp.array(dtype=wp.vec3d),
-    phase: wp.array(dtype=wp.float64),
-    view: wp.array(dtype=wp.vec3d),
+    water: Scattering,
+    view: wp.array[wp.vec3d],
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     """Mean over each bin of the single-scatter rate times its width. Launch: pixels."""
     i = first + wp.tid()
     bins = rates.shape[1]
     width = (lidar.stop - lidar.start) / wp.float64(bins)
+    sight = _see(lidar.ports, view[i])
     for k in range(bins):
         total = wp.float64(0.0)
         for n in range(4):
             time = lidar.start + (wp.float64(k) + (wp.float64(n) + wp.float64(0.5)) / wp.float64(4.0)) * width
-            total += single_scatter_rate(lidar, lines, phase, view[i], time)
+            total += single_scatter_rate(lidar, water, sight, time)
         rates[i, k] = float(total * width / wp.float64(4.0))
 
 
@@ -238,10 +268,9 @@ def backscatter_rates(config: SpadConfig, device: wp.Device) -> np.ndarray:
     rates = wp.zeros((config.width * config.height, config.bins), dtype=float, device=device)
     if config.scattering > 0.0:
         phase = wp.array(config.phase_table(), dtype=wp.float64, device=device)
-        check_phase(phase, device)
         view = wp.array(config.lines_of_sight(), dtype=wp.vec3d, device=device)
         lidar = config.lidar()
-        inputs = [lidar, spectral_lines(lidar, None, device), phase, view, rates]
+        inputs = [lidar, make_scattering(lidar, phase, device), view, rates]
         launch_pixels(_backscatter_kernel, rates.shape[0], inputs, device=device)
     taps, lowest = config.bin_response()
     padded = np.pad(rates.numpy(), ((0, 0), (-lowest, -lowest)))

@@ -1,5 +1,7 @@
 """What stands in the worlds: shapes on bodies, as the arrays that a simulator has on the device."""
 
+import gc
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +20,9 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.surface.mesh import Textures, no_textures
 from spadwarp_kernels.surface.reflectance import texture_at
 
-from .checks import check_shapes
-from .closed_forms import SHAPE_KINDS, ShapeHit, intersect_shape
+from .closed_forms import MESH, SHAPE_KINDS, ShapeHit, intersect_shape
 
-__all__ = ["Shapes", "make_shapes", "move_shapes"]
+__all__ = ["Shapes", "make_shapes"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -30,34 +31,23 @@ _FAR = wp.constant(1.0e10)
 
 @wp.struct
 class ShapeTable:
-    """Shapes of all worlds as kernels take them. The arrays may be the simulator's own, and may change in place.
+    """Shapes of all worlds as kernels take them. The arrays may be the simulator's own, and may change in place."""
 
-    Attributes:
-        kind: Index into SHAPE_KINDS, [shapes].
-        size: [m], [shapes]. Plane: full width along x and y, 0 for none. Sphere: radius. Capsule, cylinder, cone:
-            radius and half the height along z. Ellipsoid: half axes. Box: half edges. Mesh: factors of its points.
-        body: Index of the pose that carries the shape, -1 for none, [shapes].
-        local: Pose of the shape on its body, [shapes].
-        mesh: Id of a `wp.Mesh`, which shapes may share; 0 for the other kinds, [shapes].
-        albedo: Lambertian reflectance in [0, 1], [shapes].
-        first: Where each world's shapes begin in `member`, [worlds + 2]; those of all worlds are the last.
-        member: Shapes in the order of their worlds.
-        first_face: Of a textured mesh, its first row in `textures.face` and `textures.coordinates`; -1 for none.
-        textures: Images on the faces of meshes, which multiply the albedo; see `make_textures`.
-        pose: Of each shape in its world, written by `move_shapes`, [shapes].
-    """
-
-    kind: wp.array(dtype=int)
-    size: wp.array(dtype=wp.vec3)
-    body: wp.array(dtype=int)
-    local: wp.array(dtype=wp.transform)
-    mesh: wp.array(dtype=wp.uint64)
-    albedo: wp.array(dtype=float)
-    first: wp.array(dtype=int)
-    member: wp.array(dtype=int)
-    first_face: wp.array(dtype=int)
-    textures: Textures
-    pose: wp.array(dtype=wp.transform)
+    kind: wp.array[int]  # index into SHAPE_KINDS, [shapes]
+    # [m], [shapes]. Plane: full width along x and y, 0 for none. Sphere: radius. Capsule, cylinder, cone: radius and
+    # half the height along z. Ellipsoid: half axes. Box: half edges. Mesh: factors of its points
+    size: wp.array[wp.vec3]
+    body: wp.array[int]  # index of the pose that carries the shape, -1 for none, [shapes]
+    local: wp.array[wp.transform]  # pose of the shape on its body, [shapes]
+    mesh: wp.array[wp.uint64]  # id of a `wp.Mesh`, which shapes may share; 0 for the other kinds, [shapes]
+    reflectance: wp.array[float]  # Lambertian, in [0, 1], [shapes]
+    # where each world's shapes begin in `member`, [worlds + 2]; those of all worlds are the last
+    first: wp.array[int]
+    member: wp.array[int]  # shapes in the order of their worlds
+    # of a textured mesh, its first row in `textures.face` and `textures.coordinates`; -1 for none
+    first_face: wp.array[int]
+    textures: Textures  # images on the faces of meshes, which multiply the reflectance; see `make_textures`
+    pose: wp.array[wp.transform]  # of each shape in its world, written by `move_shapes`, [shapes]
 
 
 @dataclass(frozen=True)
@@ -89,7 +79,7 @@ def make_shapes(
     body: Any = None,
     local: Any = None,
     mesh: Any = None,
-    albedo: Any = 0.2,
+    reflectance: Any = 0.2,
     world: Any = None,
     worlds: int = 1,
     visible: Any = None,
@@ -105,7 +95,7 @@ def make_shapes(
         body: -1, the default, stands still in its world.
         local: Poses on the bodies (x, y, z, qx, qy, qz, qw).
         mesh: `wp.Mesh` objects, or ids of such; None or 0 for the other kinds. The shapes keep them alive.
-        albedo: A number, or one for each shape.
+        reflectance: A number, or one for each shape.
         world: Index of the world of each shape, -1 for a shape that stands in all; read once, on the host. By default
             all stand in world 0, or in all worlds if there are several.
         worlds: Number of worlds.
@@ -156,7 +146,7 @@ def make_shapes(
     table.body = on_device("body", body, wp.int32, -1)
     table.local = on_device("local", local, wp.transform, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
     table.mesh = on_device("mesh", mesh, wp.uint64, 0)
-    table.albedo = on_device("albedo", albedo, wp.float32, None)
+    table.reflectance = on_device("reflectance", reflectance, wp.float32, None)
     table.first_face = on_device("first_face", first_face, wp.int32, -1)
     if textures is not None:
         check_struct("textures", textures, Textures)
@@ -173,12 +163,96 @@ def make_shapes(
             kind_given = f"{visible.dtype} of shape {visible.shape}"
             raise ArgumentError(f"visible is {kind_given}; true or false for each of {count} shapes is needed")
         seen = np.flatnonzero(np.broadcast_to(visible, (count,)))
-    meshes = check_shapes(table, seen, meshes)
+    meshes = _check_shapes(table, seen, meshes)
     slot = np.where(world < 0, worlds, world)[seen]
     table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
     table.first = wp.array(np.searchsorted(np.sort(slot), np.arange(worlds + 2)), dtype=int, device=device)
     table.pose = wp.clone(table.local)
     return Shapes(table, worlds, device, meshes, int(table.body.numpy().max()) + 1)
+
+
+# ---- What is read on the host, once: values that kernels trust, and would crash or hang on.
+
+
+# Components of a size that say something; those of a mesh may be negative, which mirrors it.
+_COMPONENTS = {"plane": 2, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "cone": 2, "mesh": 0}
+
+
+def check_poses(name: str, poses: wp.array, count: int | None = None) -> None:
+    """Positions are finite and rotations unit quaternions; waits for the device. `count`: the first ones alone."""
+    rows = poses.numpy()[:count]
+    finite = np.isfinite(rows).all(axis=1)
+    if not finite.all():
+        k = int(finite.argmin())
+        raise ArgumentError(f"{name}[{k}] = {rows[k].tolist()} is not finite")
+    length = np.linalg.norm(rows[:, 3:].astype(np.float64), axis=1)
+    if (wrong := abs(length - 1.0) > 0.01).any():
+        k = int(wrong.argmax())
+        raise ArgumentError(
+            f"{name}[{k}] has the quaternion {rows[k, 3:].tolist()} (x, y, z, w) of length {length[k]:.3g}; one of "
+            "length 1 is needed"
+        )
+
+
+def _check_shapes(table: ShapeTable, seen: np.ndarray, given: tuple[wp.Mesh, ...]) -> tuple[wp.Mesh, ...]:
+    """Shapes that are in range; returns the meshes that they use, as far as they can be found by their ids."""
+    kind, mesh, size = table.kind.numpy(), table.mesh.numpy(), table.size.numpy()
+    if kind.min() < 0 or kind.max() >= len(SHAPE_KINDS):
+        raise ArgumentError(f"kind holds {kind.min()} to {kind.max()}, outside [0, {len(SHAPE_KINDS) - 1}]")
+    reflectance = table.reflectance.numpy()
+    if not ((reflectance >= 0.0) & (reflectance <= 1.0)).all():
+        raise ArgumentError(f"reflectance holds {reflectance.min()} to {reflectance.max()}, outside [0, 1]")
+    body = table.body.numpy()
+    if body.min() < -1:
+        raise ArgumentError(f"body[{body.argmin()}] = {body.min()} is outside [-1, 2147483647]")
+    check_poses("local", table.local)
+    needed = np.array([_COMPONENTS[name] for name in SHAPE_KINDS])[kind]
+    wrong = ~np.isfinite(size) | ((size < 0.0) & (np.arange(3) < needed[:, None]))
+    if (bad := seen[wrong[seen].any(axis=1)]).size:
+        k = int(bad[0])
+        raise ArgumentError(
+            f"size[{k}] = {size[k].tolist()} of a {SHAPE_KINDS[kind[k]]} is not finite and 0 or more [m]"
+        )
+    meshed = np.flatnonzero(kind == MESH)
+    without = meshed[mesh[meshed] == 0]
+    if without.size:
+        raise ArgumentError(f"kind[{without[0]}] is a mesh and mesh[{without[0]}] = 0 is none")
+    known = {one.id: one for one in given}
+    if not set(mesh[meshed].tolist()) <= set(known):
+        known |= _live_meshes()
+    for one in set(mesh[meshed].tolist()):
+        _check_mesh(int(meshed[mesh[meshed] == one][0]), known.get(one))
+    _check_faces(table, meshed, mesh, known)
+    return tuple(known[one] for one in dict.fromkeys(mesh[meshed].tolist()) if one in known)
+
+
+def _live_meshes() -> dict[int, wp.Mesh]:
+    """All meshes of this process by id: an id of none is a pointer to anything."""
+    return {one.id: one for one in gc.get_objects() if issubclass(type(one), wp.Mesh) and getattr(one, "id", None)}
+
+
+def _check_mesh(k: int, mesh: wp.Mesh | None) -> None:
+    if mesh is None:
+        if gc.get_freeze_count():  # some objects are not listed
+            return
+        raise ArgumentError(f"mesh[{k}] is not the id of a wp.Mesh that exists; keep the wp.Mesh, or give it instead")
+    indices = mesh.indices.numpy()
+    if indices.size and not (indices.min() >= 0 and indices.max() < mesh.points.size):
+        raise ArgumentError(
+            f"mesh[{k}] has indices {indices.min()} to {indices.max()}, outside [0, {mesh.points.size - 1}]"
+        )
+
+
+def _check_faces(table: ShapeTable, meshed: np.ndarray, mesh: np.ndarray, known: Mapping[int, wp.Mesh]) -> None:
+    """Textured meshes have a row of the textures for each face."""
+    first, rows = table.first_face.numpy(), table.textures.face.size
+    for k in meshed[first[meshed] >= 0]:
+        one = known.get(int(mesh[k]))
+        faces = 1 if one is None else one.indices.size // 3
+        if first[k] + faces > rows:
+            raise ArgumentError(
+                f"first_face[{k}] = {first[k]} and {faces} faces of mesh[{k}] reach beyond the {rows} faces of textures"
+            )
 
 
 def _plain_array(name: str, value: Any) -> np.ndarray:
@@ -189,7 +263,7 @@ def _plain_array(name: str, value: Any) -> np.ndarray:
 
 
 @wp.kernel(enable_backward=False)
-def _move_kernel(table: ShapeTable, body_q: wp.array(dtype=wp.transform)):
+def _move_kernel(table: ShapeTable, body_q: wp.array[wp.transform]):
     """Launch: table."""
     k = wp.tid()
     pose = table.local[k]
@@ -220,24 +294,17 @@ def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
 
 @wp.struct
 class SceneHit:
-    """The nearest shape along a ray.
+    """The nearest shape along a ray."""
 
-    Attributes:
-        distance: [m]; -1 for none.
-        normal: Unit vector against the ray.
-        albedo: At this point.
-        shape: Its index; -1 for none.
-    """
-
-    distance: float
-    normal: wp.vec3
-    albedo: float
-    shape: int
+    distance: float  # [m]; -1 for none
+    normal: wp.vec3  # unit vector against the ray
+    reflectance: float  # at this point
+    shape: int  # its index; -1 for none
 
 
 @wp.func
-def _albedo_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
-    albedo = table.albedo[k]
+def _reflectance_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
+    reflectance = table.reflectance[k]
     first = table.first_face[k]
     if hit.face >= 0 and first >= 0:
         row = first + hit.face
@@ -246,8 +313,8 @@ def _albedo_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
             uv = hit.corner[0] * table.textures.coordinates[row, 0]
             uv += hit.corner[1] * table.textures.coordinates[row, 1]
             uv += (1.0 - hit.corner[0] - hit.corner[1]) * table.textures.coordinates[row, 2]
-            albedo *= texture_at(table.textures, index, uv)
-    return albedo
+            reflectance *= texture_at(table.textures, index, uv)
+    return reflectance
 
 
 @wp.func
@@ -278,5 +345,5 @@ def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> S
         normal = wp.transform_vector(table.pose[found], nearest.normal)
         result.distance = nearest.distance
         result.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
-        result.albedo = _albedo_at(table, found, nearest)
+        result.reflectance = _reflectance_at(table, found, nearest)
     return result

@@ -31,7 +31,7 @@ def srgb_to_linear(value: np.ndarray) -> np.ndarray:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-def newton_shapes(model: Any, *, albedo: Any = None) -> Shapes:
+def newton_shapes(model: Any, *, reflectance: Any = None) -> Shapes:
     """The visible shapes of a finalised `newton.Model`, in all its worlds.
 
     Sizes, poses on bodies and meshes are the model's own arrays: what changes there is seen. Cameras are then updated
@@ -39,7 +39,7 @@ def newton_shapes(model: Any, *, albedo: Any = None) -> Shapes:
 
     Args:
         model: `newton.Model`.
-        albedo: A number, or one for each shape of the model; by default the green of `model.shape_color`.
+        reflectance: A number, or one for each shape of the model; by default the green of `model.shape_color`.
 
     Raises:
         ArgumentError: A model without shapes.
@@ -54,15 +54,15 @@ def newton_shapes(model: Any, *, albedo: Any = None) -> Shapes:
     types = model.shape_type.numpy().tolist()
     visible = (model.shape_flags.numpy() & int(newton.ShapeFlags.VISIBLE)) != 0
     visible &= np.array([kind in kinds for kind in types])  # neither empty nor made of Gaussians
-    if albedo is None:
-        albedo = srgb_to_linear(model.shape_color.numpy()[:, GREEN])
+    if reflectance is None:
+        reflectance = srgb_to_linear(model.shape_color.numpy()[:, GREEN])
     return make_shapes(
         np.array([kinds.get(kind, 0) for kind in types]),
         model.shape_scale,
         body=model.shape_body,
         local=model.shape_transform,
         mesh=model.shape_source_ptr,
-        albedo=albedo,
+        reflectance=reflectance,
         world=model.shape_world.numpy(),
         worlds=max(int(model.world_count), 1),
         visible=visible,
@@ -71,7 +71,7 @@ def newton_shapes(model: Any, *, albedo: Any = None) -> Shapes:
 
 
 def mujoco_shapes(
-    model: Any, worlds: int = 1, *, albedo: Any = None, groups: Any = (0, 1, 2), device: wp.DeviceLike = None
+    model: Any, worlds: int = 1, *, reflectance: Any = None, groups: Any = (0, 1, 2), device: wp.DeviceLike = None
 ) -> Shapes:
     """The geoms of a `mujoco.MjModel`, in as many worlds as MuJoCo Warp simulates.
 
@@ -81,7 +81,7 @@ def mujoco_shapes(
     Args:
         model: `mujoco.MjModel`, on the host.
         worlds: `nworld` of the data.
-        albedo: A number, or one for each geom; by default the green of its material or of `geom_rgba`.
+        reflectance: A number, or one for each geom; by default the green of its material or of `geom_rgba`.
         groups: Geom groups that are seen.
         device: Where the arrays go.
 
@@ -102,7 +102,7 @@ def mujoco_shapes(
     mesh = [meshes.get((int(k), int(one))) for k, one in zip(kind, model.geom_dataid, strict=True)]
     rgba, material = np.array(model.geom_rgba), np.asarray(model.geom_matid)
     rgba[material >= 0] = model.mat_rgba[material[material >= 0]]
-    albedo = np.broadcast_to(srgb_to_linear(rgba[:, GREEN]) if albedo is None else albedo, (count,))
+    reflectance = np.broadcast_to(srgb_to_linear(rgba[:, GREEN]) if reflectance is None else reflectance, (count,))
     quat = np.roll(np.asarray(model.geom_quat), -1, axis=1)
     body = np.arange(worlds)[:, None] * int(model.nbody) + np.asarray(model.geom_bodyid)
     return make_shapes(
@@ -111,7 +111,7 @@ def mujoco_shapes(
         body=body.ravel(),
         local=np.tile(np.concatenate([model.geom_pos, quat], axis=1), (worlds, 1)),
         mesh=mesh * worlds,
-        albedo=np.tile(albedo, worlds),
+        reflectance=np.tile(reflectance, worlds),
         world=np.repeat(np.arange(worlds), count),
         worlds=worlds,
         visible=np.tile(np.isin(model.geom_group, list(groups)) & (rgba[:, 3] > 0.0), worlds),
@@ -146,9 +146,7 @@ def _mujoco_mesh(model: Any, kind: int, index: int, device: wp.DeviceLike) -> wp
 
 
 @wp.kernel(enable_backward=False)
-def _from_matrix_kernel(
-    position: wp.array2d(dtype=wp.vec3), rotation: wp.array2d(dtype=wp.mat33), out: wp.array2d(dtype=wp.transform)
-):
+def _from_matrix_kernel(position: wp.array2d[wp.vec3], rotation: wp.array2d[wp.mat33], out: wp.array2d[wp.transform]):
     """Launch: (worlds, things)."""
     w, k = wp.tid()
     out[w, k] = wp.transform(position[w, k], wp.normalize(wp.quat_from_matrix(rotation[w, k])))
@@ -156,7 +154,7 @@ def _from_matrix_kernel(
 
 @wp.kernel(enable_backward=False)
 def _from_quaternion_kernel(
-    position: wp.array2d(dtype=wp.vec3), rotation: wp.array2d(dtype=wp.quat), out: wp.array2d(dtype=wp.transform)
+    position: wp.array2d[wp.vec3], rotation: wp.array2d[wp.quat], out: wp.array2d[wp.transform]
 ):
     """Launch: (worlds, things)."""
     w, k = wp.tid()

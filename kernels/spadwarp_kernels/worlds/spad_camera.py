@@ -1,38 +1,227 @@
-"""The fast camera: one surface and single scattering a pixel, in closed form, for many worlds in one launch."""
+"""Cameras in many worlds: what both kinds share, and the fast one, in closed form: one surface and single scattering a
+pixel, for all worlds in one launch."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 import warp as wp
 
+from spadwarp_kernels.analytic.depth_frames import depth_of_path
 from spadwarp_kernels.analytic.lidar import Lidar, beam_path
+from spadwarp_kernels.analytic.optics import IN_WATER
 from spadwarp_kernels.analytic.signal import radiometric_signal
-from spadwarp_kernels.base.arguments import check_array, check_number
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_device,
+    check_integer,
+    check_items,
+    check_kind,
+    check_number,
+)
+from spadwarp_kernels.detection.arrival_time import ArrivalEstimator
+from spadwarp_kernels.detection.counts import first_photon_step
 
-from .cameras import WorldCameras
-from .config import SpadConfig
-from .shapes import Shapes
+from .config import SpadConfig, backscatter_rates, check_config, optical_to
+from .shapes import Shapes, ShapeTable, check_poses, intersect_shapes, move_shapes
 
 __all__ = ["SpadCamera"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
+_see = IN_WATER.see
+
+
+@wp.kernel(enable_backward=False)
+def _trace_kernel(
+    shapes: ShapeTable,
+    camera_q: wp.array[wp.transform],
+    optical: wp.transform,
+    world: wp.array[int],
+    view: wp.array[wp.vec3],
+    # Out, [cameras, height, width]:
+    depth: wp.array3d[float],
+    normal: wp.array3d[wp.vec3],
+    reflectance: wp.array3d[float],
+):
+    """Launch: (cameras, height, width)."""
+    v, i, j = wp.tid()
+    pose = wp.transform_multiply(camera_q[v], optical)
+    u = view[i * depth.shape[2] + j]
+    hit = intersect_shapes(shapes, world[v], wp.transform_get_translation(pose), wp.transform_vector(pose, u))
+    depth[v, i, j] = wp.NAN
+    normal[v, i, j] = wp.vec3(wp.NAN)
+    reflectance[v, i, j] = wp.NAN
+    if hit.shape >= 0:
+        depth[v, i, j] = hit.distance * u[2]
+        normal[v, i, j] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), hit.normal)
+        reflectance[v, i, j] = hit.reflectance
+
+
+@wp.kernel(enable_backward=False)
+def _depth_kernel(
+    arrival: wp.array[float],
+    view: wp.array[wp.vec3],
+    laser: wp.vec3,
+    gate_start: float,
+    bin_path: float,
+    histogram: wp.array2d[int],
+    # Out:
+    depth: wp.array[float],
+    counts: wp.array[int],
+    step: wp.array[wp.int64],
+):
+    """Planar depth, the counts of all bins, and the next step. Launch: cameras x pixels."""
+    row = wp.tid()
+    if row == 0:
+        step[0] = step[0] + wp.int64(1)
+    pixel = row % view.shape[0]
+    total = int(0)
+    for k in range(histogram.shape[1]):
+        total += histogram[row, k]
+    counts[row] = total
+    depth[row] = wp.NAN
+    if wp.isfinite(arrival[row]):
+        z = depth_of_path(laser, view[pixel], gate_start + arrival[row] * bin_path)
+        if z > 0.0:
+            depth[row] = z
+
+
+@wp.kernel(enable_backward=False)
+def _points_kernel(depth: wp.array3d[float], view: wp.array[wp.vec3], pose: wp.transform, points: wp.array3d[wp.vec3]):
+    """Launch: (cameras, height, width)."""
+    v, i, j = wp.tid()
+    u = view[i * depth.shape[2] + j]
+    points[v, i, j] = wp.transform_point(pose, depth[v, i, j] / u[2] * u)
+
+
+def check_memory(what: str, sizes: Mapping[str, int], item_bytes: int, device: wp.Device, *, rows: int = 1) -> None:
+    """Arrays of so many items of so many bytes that the device can have; `rows`: how many of the sizes, from the first
+    on, make an index of kernels."""
+    values = list(sizes.values())
+    if (count := int(np.prod(values[:rows], dtype=object))) > 2**31 - 1:
+        names = " x ".join(list(sizes)[:rows])
+        raise ArgumentError(f"{names} = {count} is outside [1, 2147483647]")
+    needed = item_bytes * int(np.prod(values, dtype=object))
+    if device.is_cuda:
+        memory = device.total_memory
+    else:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**63
+    if needed > memory:
+        numbers = " x ".join(map(str, values))
+        found = f"{needed / 1e9:.3g} GB, and {device} has {memory / 1e9:.3g} GB"
+        raise ArgumentError(f"{' x '.join(sizes)} = {numbers}: {what} need {found}")
+
+
+class WorldCameras:
+    """The part that `SpadCamera` and `SpadTracer` share; see there."""
+
+    def __init__(
+        self,
+        config: SpadConfig | None,
+        cameras: int,
+        *,
+        world: wp.array | Sequence[int] | None,
+        frame: str,
+        device: wp.DeviceLike,
+    ) -> None:
+        self.config = config = check_config(config)
+        self.device = device = check_device("device", device)
+        self.cameras = check_integer("cameras", cameras, 1)
+        sizes = {"cameras": self.cameras, "config.height": config.height, "config.width": config.width}
+        image = tuple(sizes.values())
+        sizes["config.bins"] = config.bins
+        check_memory("rates, counts and background", sizes, 8 + 24 // self.cameras, device, rows=3)
+        self._optical = optical_to(frame)
+        self._world = _camera_worlds(world, self.cameras, device)
+        self._most_worlds = 0 if isinstance(world, wp.array) else int(self._world.numpy().max()) + 1
+        self._poses_checked = False
+        self.rates = wp.zeros((*image, config.bins), dtype=float, device=device)
+        self.histogram = wp.zeros((*image, config.bins), dtype=int, device=device)
+        self.counts = wp.zeros(image, dtype=int, device=device)
+        self.depth, self.true_depth = (wp.full(image, wp.nan, dtype=float, device=device) for _ in range(2))
+        self.normal = wp.zeros(image, dtype=wp.vec3, device=device)
+        self.reflectance = wp.zeros(image, dtype=float, device=device)
+        self.step = wp.zeros(1, dtype=wp.int64, device=device)
+        self._view = wp.array(config.lines_of_sight(), dtype=wp.vec3, device=device)
+        background = backscatter_rates(config, device)
+        self._background = wp.array(background, dtype=float, device=device)
+        self._rows = (self.cameras * config.height * config.width, config.bins)
+        self._arrival = wp.empty(self._rows[0], dtype=float, device=device)
+        self._dark = config.dark_rate * config.bin_path / config.speed
+        known = wp.array(config.pulses * (background + self._dark), dtype=float, device=device)
+        response, lowest_tap = config.response()
+        taps = {"response": response, "lowest_tap": lowest_tap, "half_width": -lowest_tap - 1}
+        self._estimate = ArrivalEstimator(config.bins, device=device, method=config.method, background=known, **taps)
+
+    def _cast_rays(self, shapes: Shapes, camera_q: wp.array, body_q: wp.array | None) -> None:
+        """Moves the shapes and casts a ray a pixel."""
+        check_kind("shapes", shapes, Shapes)
+        check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+        if self._most_worlds > shapes.worlds:
+            raise ArgumentError(f"world = {self._most_worlds - 1} is none of the {shapes.worlds} worlds of the shapes")
+        if not (self._poses_checked or self.device.is_capturing):  # once: later steps wait for nothing
+            check_poses("camera_q", camera_q)
+            if body_q is not None:
+                check_array("body_q", body_q, wp.transform, (None,), self.device)
+                check_poses("body_q", body_q, shapes.bodies)
+            self._poses_checked = True
+        move_shapes(shapes, body_q)
+        inputs = [shapes.table, camera_q, self._optical, self._world, self._view]
+        outputs = [self.true_depth, self.normal, self.reflectance]
+        wp.launch(_trace_kernel, self.true_depth.shape, inputs, outputs, device=self.device)
+
+    def _detect(self) -> None:
+        """Counts and depth of all cameras from their rates, and the next step; nothing is allocated or read."""
+        config = self.config
+        rates, counts = self.rates.reshape(self._rows), self.histogram.reshape(self._rows)
+        first_photon_step(rates, pulses=config.pulses, frame=self.step, seed=config.seed, counts=counts)
+        self._estimate(counts, self._arrival)
+        inputs = [self._arrival, self._view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
+        outputs = [self.depth.flatten(), self.counts.flatten(), self.step]
+        wp.launch(_depth_kernel, self._rows[0], [*inputs, counts], outputs, device=self.device)
+
+    def point_cloud(self, out: wp.array, *, frame: str = "optical") -> None:
+        """Points of the noisy depth, vec3 `[cameras, height, width]` [m], in a frame of CAMERA_FRAMES; NaN for none."""
+        check_array("out", out, wp.vec3, self.depth.shape, self.device)
+        inputs = [self.depth, self._view, optical_to(frame)]
+        wp.launch(_points_kernel, self.depth.shape, inputs, [out], device=self.device)
+
+
+def _camera_worlds(world: wp.array | Sequence[int] | None, cameras: int, device: wp.Device) -> wp.array:
+    """World of each camera on the device."""
+    if isinstance(world, wp.array):
+        return check_array("world", world, wp.int32, (cameras,), device)
+    world = (
+        list(range(cameras))
+        if world is None
+        else [check_integer("world", one, 0) for one in check_items("world", world)]
+    )
+    if len(world) != cameras:
+        raise ArgumentError(f"world has {len(world)} entries; one for each of {cameras} cameras is needed")
+    return wp.array(world, dtype=int, device=device)
+
+
+# ---- The fast camera.
+
 
 @wp.kernel(enable_backward=False)
 def _images_kernel(
-    view: wp.array(dtype=wp.vec3),
+    view: wp.array[wp.vec3],
     # In, [cameras, height, width]; those without an entry are left out:
-    depth_in: wp.array3d(dtype=float),
+    depth_in: wp.array3d[float],
     along_ray: int,
-    normal_in: wp.array3d(dtype=wp.vec3),
-    camera_q: wp.array(dtype=wp.transform),
+    normal_in: wp.array3d[wp.vec3],
+    camera_q: wp.array[wp.transform],
     optical: wp.transform,
-    albedo_in: wp.array3d(dtype=float),
-    one_albedo: float,
+    reflectance_in: wp.array3d[float],
+    one_reflectance: float,
     # Out:
-    depth: wp.array3d(dtype=float),
-    normal: wp.array3d(dtype=wp.vec3),
-    albedo: wp.array3d(dtype=float),
+    depth: wp.array3d[float],
+    normal: wp.array3d[wp.vec3],
+    reflectance: wp.array3d[float],
 ):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
@@ -42,10 +231,10 @@ def _images_kernel(
     if along_ray == 1:
         z = z * u[2]
     depth[v, i, j] = wp.where(wp.isfinite(z) and z > 0.0, z, wp.NAN)
-    value = one_albedo
-    if albedo_in.shape[0] > 0:
-        value = albedo_in[v, i, j]
-    albedo[v, i, j] = value
+    value = one_reflectance
+    if reflectance_in.shape[0] > 0:
+        value = reflectance_in[v, i, j]
+    reflectance[v, i, j] = value
     n = wp.vec3(0.0)
     if normal_in.shape[0] > 0:
         n = normal_in[v, i, j]
@@ -59,21 +248,14 @@ def _images_kernel(
 
 
 @wp.func
-def _point(view: wp.array(dtype=wp.vec3), depth: wp.array3d(dtype=float), along_ray: int, v: int, i: int, j: int):
+def _point(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int):
     u = view[i * depth.shape[2] + j]
     return wp.where(along_ray == 1, depth[v, i, j], depth[v, i, j] / u[2]) * u
 
 
 @wp.func
 def _neighbour_step(
-    view: wp.array(dtype=wp.vec3),
-    depth: wp.array3d(dtype=float),
-    along_ray: int,
-    v: int,
-    i: int,
-    j: int,
-    di: int,
-    dj: int,
+    view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int, di: int, dj: int
 ) -> wp.vec3:
     """From a pixel to the nearer in depth of its two neighbours along one axis: not across an edge of a thing."""
     here = _point(view, depth, along_ray, v, i, j)
@@ -93,9 +275,7 @@ def _neighbour_step(
 
 
 @wp.func
-def _slope(
-    view: wp.array(dtype=wp.vec3), depth: wp.array3d(dtype=float), along_ray: int, v: int, i: int, j: int
-) -> wp.vec3:
+def _slope(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int) -> wp.vec3:
     """Normal of the surface through a pixel and its neighbours; towards the camera where it has none."""
     across = _neighbour_step(view, depth, along_ray, v, i, j, 0, 1)
     down = _neighbour_step(view, depth, along_ray, v, i, j, 1, 0)
@@ -106,13 +286,13 @@ def _slope(
 @wp.kernel(enable_backward=False)
 def _signal_kernel(
     lidar: Lidar,
-    view: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    normal: wp.array(dtype=wp.vec3),
-    albedo: wp.array(dtype=float),
+    view: wp.array[wp.vec3],
+    depth: wp.array[float],
+    normal: wp.array[wp.vec3],
+    reflectance: wp.array[float],
     # Out:
-    signal: wp.array(dtype=float),
-    path: wp.array(dtype=float),
+    signal: wp.array[float],
+    path: wp.array[float],
 ):
     """Detections per pulse of the surface, and its path, infinite where there is none. Launch: cameras x pixels."""
     row = wp.tid()
@@ -121,7 +301,7 @@ def _signal_kernel(
     path[row] = wp.inf
     if depth[row] > 0.0:
         r = wp.float64(depth[row]) / u[2]
-        value = radiometric_signal(lidar, u, r, wp.vec3d(normal[row]), wp.float64(albedo[row]))
+        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(normal[row]), wp.float64(reflectance[row]))
         path[row] = float(beam_path(lidar, r * u) + r)
         if value > wp.float64(0.0) and wp.isfinite(value):
             signal[row] = float(value)
@@ -135,15 +315,15 @@ def _below(z: float) -> float:
 
 @wp.kernel(enable_backward=False)
 def _rates_kernel(
-    signal: wp.array(dtype=float),
-    path: wp.array(dtype=float),
-    background: wp.array2d(dtype=float),
+    signal: wp.array[float],
+    path: wp.array[float],
+    background: wp.array2d[float],
     gate_start: float,
     bin_path: float,
     sigma_path: float,
     dark: float,
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     """Expected detections per pulse: surface, backscatter up to it, dark counts. Launch: (cameras x pixels, bins)."""
     row, k = wp.tid()
@@ -180,7 +360,7 @@ class SpadCamera(WorldCameras):
         counts: Sum of the histogram, int32 `[cameras, height, width]`.
         depth: Planar depth (z of the optical frame) from the histogram [m], float32 `[cameras, height, width]`; NaN for
             none.
-        true_depth, normal, albedo: What is there, `[cameras, height, width]`: planar depth [m], unit normals towards
+        true_depth, normal, reflectance: What is there, `[cameras, height, width]`: planar depth [m], unit normals to
             the camera in the optical frame, reflectance; NaN for none.
         step: Number of the next step, int64 `[1]`. A step's random numbers depend on `config.seed` and it alone.
 
@@ -199,8 +379,7 @@ class SpadCamera(WorldCameras):
     ) -> None:
         super().__init__(config, cameras, world=world, frame=frame, device=device)
         self._lidar = self.config.lidar()
-        rows = self._detection.rows[0]
-        self._signal, self._path = (wp.zeros(rows, dtype=float, device=self.device) for _ in range(2))
+        self._signal, self._path = (wp.zeros(self._rows[0], dtype=float, device=self.device) for _ in range(2))
         self._none = wp.empty((0, 0, 0), dtype=float, device=self.device)
         self._no_normal = wp.empty((0, 0, 0), dtype=wp.vec3, device=self.device)
         self._no_pose = wp.empty(0, dtype=wp.transform, device=self.device)
@@ -213,14 +392,14 @@ class SpadCamera(WorldCameras):
             camera_q: Poses of the cameras in their worlds, `wp.transform` `[cameras]`.
             body_q: Poses of the bodies, `wp.transform` `[bodies]`, as Newton's `state.body_q`.
         """
-        self._look(shapes, camera_q, body_q)
+        self._cast_rays(shapes, camera_q, body_q)
         self._draw()
 
     def update_from_images(
         self,
         depth: wp.array,
         normal: wp.array | None = None,
-        albedo: wp.array | float = 0.2,
+        reflectance: wp.array | float = 0.2,
         *,
         along_ray: bool = False,
         camera_q: wp.array | None = None,
@@ -231,35 +410,34 @@ class SpadCamera(WorldCameras):
             depth: float32 [m], planar; 0, negative, NaN or infinite where nothing is.
             normal: vec3, either side, in the camera's frame or, with `camera_q`, in the world's; None takes them from
                 the slope of the depth.
-            albedo: float32 in [0, 1], or a number.
+            reflectance: float32 in [0, 1], or a number.
             along_ray: Depth is the distance from the lens, as Newton's `depth_image` is.
             camera_q: As in `update`.
         """
-        shape, view = self.true_depth.shape, self._detection.view
+        shape = self.true_depth.shape
         check_array("depth", depth, wp.float32, shape, self.device)
         number = 0.0
-        if isinstance(albedo, wp.array):
-            check_array("albedo", albedo, wp.float32, shape, self.device)
+        if isinstance(reflectance, wp.array):
+            check_array("reflectance", reflectance, wp.float32, shape, self.device)
         else:
-            number, albedo = check_number("albedo", albedo, "[0, 1]"), self._none
+            number, reflectance = check_number("reflectance", reflectance, "[0, 1]"), self._none
         if normal is not None:
             check_array("normal", normal, wp.vec3, shape, self.device)
         if camera_q is not None:
             check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
-        inputs = [view, depth, int(bool(along_ray)), self._no_normal if normal is None else normal]
-        inputs += [self._no_pose if camera_q is None else camera_q, self._optical, albedo, number]
-        outputs = [self.true_depth, self.normal, self.albedo]
+        inputs = [self._view, depth, int(bool(along_ray)), self._no_normal if normal is None else normal]
+        inputs += [self._no_pose if camera_q is None else camera_q, self._optical, reflectance, number]
+        outputs = [self.true_depth, self.normal, self.reflectance]
         wp.launch(_images_kernel, shape, inputs, outputs, device=self.device)
         self._draw()
 
     def _draw(self) -> None:
         """Signal, rates, counts and depth from the images of what is there."""
-        config, detection = self.config, self._detection
-        inputs = [self._lidar, detection.view, self.true_depth.flatten(), self.normal.flatten(), self.albedo.flatten()]
+        config = self.config
+        inputs = [self._lidar, self._view, self.true_depth.flatten(), self.normal.flatten(), self.reflectance.flatten()]
         outputs = [self._signal, self._path]
-        wp.launch(_signal_kernel, detection.rows[0], inputs, outputs, device=self.device)
-        inputs = [self._signal, self._path, detection.background, config.gate_paths[0], config.bin_path]
-        inputs += [config.timing_sigma * config.speed, config.dark_rate * config.bin_path / config.speed]
-        rates = self.rates.reshape(detection.rows)
-        wp.launch(_rates_kernel, detection.rows, inputs, [rates], device=self.device)
-        detection.launch()
+        wp.launch(_signal_kernel, self._rows[0], inputs, outputs, device=self.device)
+        inputs = [self._signal, self._path, self._background, config.gate_paths[0], config.bin_path]
+        inputs += [config.timing_sigma * config.speed, self._dark]
+        wp.launch(_rates_kernel, self._rows, inputs, [self.rates.reshape(self._rows)], device=self.device)
+        self._detect()

@@ -3,13 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_kind
-from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.gate import Gate
+from spadwarp_kernels.optics.camera import Camera, Gate
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choices, update_surfaces
@@ -18,17 +18,234 @@ from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
-from .cameras import WorldCameras
-from .checks import check_room
+from .closed_forms import BOX, CAPSULE, CONE, CYLINDER, ELLIPSOID, MESH, PLANE, SPHERE
 from .config import SpadConfig, check_config
-from .shapes import Shapes
-from .triangles import CameraMeshes, _albedo_kernel
+from .shapes import Shapes, ShapeTable
+from .spad_camera import WorldCameras, check_memory
 
 __all__ = ["SpadTracer"]
 
 wp.set_module_options({"enable_backward": False})
 
 ESTIMATORS = ("guided", "next_event")
+
+# ---- The shapes of each camera's world as one triangle mesh in the camera's optical frame, placed anew on the device.
+
+
+SEGMENTS, RINGS = 48, 24
+
+
+def _revolution(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A surface of revolution from (radius, height, lift) rows: vertices [n, 4] of x, y, z and lift, and faces."""
+    angle = 2.0 * np.pi * np.arange(SEGMENTS) / SEGMENTS
+    # As much cross-section as the circle has: half of the polygon lies outside.
+    size = math.sqrt(2.0 * np.pi / SEGMENTS / math.sin(2.0 * np.pi / SEGMENTS))
+    radius = size * profile[:, :1]
+    columns = [radius * np.cos(angle), radius * np.sin(angle)]
+    columns += [np.broadcast_to(profile[:, k : k + 1], columns[0].shape) for k in (1, 2)]
+    vertices = np.stack(columns, axis=-1).reshape(-1, 4)
+    row = np.arange(len(profile) - 1)[:, None] * SEGMENTS
+    here, there = np.arange(SEGMENTS), (np.arange(SEGMENTS) + 1) % SEGMENTS
+    quads = np.stack([row + here, row + there, row + SEGMENTS + here, row + SEGMENTS + there], axis=-1).reshape(-1, 4)
+    faces = quads[:, [0, 1, 2, 2, 1, 3]].reshape(-1, 3)
+    corners = vertices[faces, :4]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3]), axis=1
+    )
+    lifted = np.ptp(corners[..., 3], axis=1) > 0.0
+    return vertices, faces[(area > 1e-9) | lifted]
+
+
+def _profile(kind: int) -> np.ndarray:
+    """(radius, height, lift) from the bottom to the top, of a shape of size 1."""
+    if kind == CYLINDER:
+        return np.array([(0.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
+    if kind == CONE:
+        return np.array([(0.0, -1.0, 0.0), (1.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, RINGS + 1)
+    rows = np.stack([np.abs(np.cos(angle)), np.sin(angle), np.zeros_like(angle)], axis=1)
+    rows[[0, -1], 0] = 0.0
+    if kind == CAPSULE:
+        low, high = rows[: RINGS // 2 + 1].copy(), rows[RINGS // 2 :].copy()
+        low[:, 2], high[:, 2] = -1.0, 1.0
+        return np.concatenate([low, high])
+    return rows
+
+
+def _unit_triangles(kind: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [n, 4] and faces [m, 3] of a shape of size 1, see `_corner`."""
+    if kind == PLANE:
+        corners = [(-1, -1, 0, 0), (1, -1, 0, 0), (1, 1, 0, 0), (-1, 1, 0, 0)]
+        return np.array(corners, float), np.array([(0, 1, 2), (0, 2, 3)])
+    if kind == BOX:
+        corners = np.array([(x, y, z, 0) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+        quads = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
+        return corners, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    return _revolution(_profile(kind))
+
+
+@wp.struct
+class Corners:
+    """Vertices of all cameras' meshes."""
+
+    camera: wp.array[int]
+    shape: wp.array[int]
+    unit: wp.array[wp.vec4]  # x, y, z for a shape of size 1, and on which end of a capsule it is (lift)
+    source: wp.array[int]  # index in the shape's own `wp.Mesh`; -1 for other shapes
+
+
+@wp.func
+def _corner(kind: int, size: wp.vec3, unit: wp.vec4) -> wp.vec3:
+    scale = size  # of a box or an ellipsoid
+    lift = float(0.0)
+    if kind == SPHERE:
+        scale = wp.vec3(size[0])
+    elif kind == CAPSULE:
+        scale = wp.vec3(size[0])
+        lift = size[1] * unit[3]
+    elif kind == PLANE:
+        scale = wp.vec3(0.5 * size[0], 0.5 * size[1], 0.0)
+    elif kind != BOX and kind != ELLIPSOID:
+        scale = wp.vec3(size[0], size[0], size[1])
+    return wp.cw_mul(scale, wp.vec3(unit[0], unit[1], unit[2])) + wp.vec3(0.0, 0.0, lift)
+
+
+@wp.kernel(enable_backward=False)
+def _place_kernel(
+    corners: Corners,
+    table: ShapeTable,
+    camera_q: wp.array[wp.transform],
+    optical: wp.transform,
+    reach: float,
+    # Out:
+    points: wp.array[wp.vec3],
+):
+    """Launch: vertices."""
+    i = wp.tid()
+    k = corners.shape[i]
+    kind = table.kind[k]
+    size = table.size[k]
+    camera = wp.transform_multiply(camera_q[corners.camera[i]], optical)
+    x = wp.vec3(0.0)
+    if corners.source[i] >= 0:
+        mesh = wp.mesh_get(table.mesh[k])
+        x = wp.cw_mul(size, mesh.points[corners.source[i]])
+    else:
+        x = _corner(kind, size, corners.unit[i])
+        if kind == PLANE:
+            # Without a width it goes as far as the camera can see.
+            below = wp.transform_point(wp.transform_inverse(table.pose[k]), wp.transform_get_translation(camera))
+            for axis in range(2):
+                if size[axis] <= 0.0:
+                    x[axis] = below[axis] + reach * corners.unit[i][axis]
+    points[i] = wp.transform_point(wp.transform_inverse(camera), wp.transform_point(table.pose[k], x))
+
+
+@wp.kernel(enable_backward=False)
+def _reflectance_kernel(
+    shape: wp.array[int],
+    table: ShapeTable,
+    # Out:
+    reflectance: wp.array[float],
+    corner_reflectance: wp.array[wp.vec3],
+):
+    """Launch: faces."""
+    i = wp.tid()
+    value = table.reflectance[shape[i]]
+    reflectance[i] = value
+    if corner_reflectance.shape[0] > 0:
+        corner_reflectance[i] = wp.vec3(value)
+
+
+class CameraMeshes:
+    """A triangle mesh for each camera, of what stands in its world.
+
+    Attributes:
+        meshes: A `wp.Mesh` for each camera, made by the first `place`.
+        reflectance: Of each camera's faces.
+        faces: Number of faces of each camera.
+    """
+
+    def __init__(self, shapes: Shapes, world: list[int], device: wp.Device) -> None:
+        table = shapes.table
+        kind, first, member = table.kind.numpy(), table.first.numpy(), table.member.numpy()
+        ids = table.mesh.numpy()
+        self.shapes, self.device = shapes, device
+        own = {one.id: one for one in shapes.meshes}
+        parts: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        camera, shape, unit, source, self._indices, self.face_shape = [], [], [], [], [], []
+        for v, w in enumerate(world):
+            seen = np.concatenate([member[first[w] : first[w + 1]], member[first[-2] : first[-1]]])
+            indices, owner, start = [], [], 0
+            for k in seen.tolist():
+                key = (int(kind[k]), int(ids[k]) if kind[k] == MESH else 0)
+                if key not in parts:
+                    parts[key] = _mesh_triangles(key[1], own, device) if kind[k] == MESH else _unit_triangles(key[0])
+                vertices, faces = parts[key]
+                count = len(vertices)
+                camera.append(np.full(count, v))
+                shape.append(np.full(count, k))
+                unit.append(vertices)
+                source.append(np.arange(count) if kind[k] == MESH else np.full(count, -1))
+                indices.append(faces + start)
+                owner.append(np.full(len(faces), k))
+                start += count
+            self._indices.append(np.concatenate(indices) if indices else np.zeros((0, 3), int))
+            self.face_shape.append(np.concatenate(owner) if owner else np.zeros(0, int))
+        self._ends = np.cumsum(
+            [0, *(int(np.count_nonzero(np.concatenate([[], *camera]) == v)) for v in range(len(world)))]
+        )
+        self.corners = Corners()
+        for name, rows, dtype in (("camera", camera, int), ("shape", shape, int), ("source", source, int)):
+            setattr(self.corners, name, wp.array(np.concatenate([[], *rows]), dtype=dtype, device=device))
+        self.corners.unit = wp.array(np.concatenate([np.zeros((0, 4)), *unit]), dtype=wp.vec4, device=device)
+        self.points = wp.zeros(int(self._ends[-1]), dtype=wp.vec3, device=device)
+
+    def place(self, camera_q: wp.array, optical: wp.transform, reach: float) -> None:
+        """Writes all points for the poses of shapes and cameras."""
+        inputs = [self.corners, self.shapes.table, camera_q, optical, reach]
+        wp.launch(_place_kernel, self.points.size, inputs, [self.points], device=self.device)
+
+    def build(self) -> list[wp.Mesh]:
+        """Meshes, whose trees are built for where the points are now."""
+        meshes = []
+        for v, indices in enumerate(self._indices):
+            points = self.points[int(self._ends[v]) : int(self._ends[v + 1])]
+            indices = wp.array(indices.ravel(), dtype=int, device=self.device)
+            # The fastest to walk, by measurement.
+            kind: dict[str, Any] = {"bvh_constructor": "cubql", "bvh_leaf_size": 1} if self.device.is_cuda else {}
+            meshes.append(wp.Mesh(points, indices, **kind))
+        return meshes
+
+
+def _mesh_triangles(mesh_id: int, own: dict[int, wp.Mesh], device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
+    """Stand-in vertices and the faces of a mesh that is known by its id."""
+    if mesh_id in own:
+        mesh = own[mesh_id]
+        return np.zeros((mesh.points.size, 4)), mesh.indices.numpy().reshape(-1, 3)
+    sizes = wp.zeros(2, dtype=int, device=device)
+    wp.launch(_mesh_size_kernel, 1, [wp.uint64(mesh_id)], [sizes], device=device)
+    points, count = sizes.numpy().tolist()
+    indices = wp.zeros(count, dtype=int, device=device)
+    wp.launch(_mesh_indices_kernel, count, [wp.uint64(mesh_id)], [indices], device=device)
+    return np.zeros((points, 4)), indices.numpy().reshape(-1, 3)
+
+
+@wp.kernel(enable_backward=False)
+def _mesh_size_kernel(mesh: wp.uint64, sizes: wp.array[int]):
+    m = wp.mesh_get(mesh)
+    sizes[0] = m.points.shape[0]
+    sizes[1] = m.indices.shape[0]
+
+
+@wp.kernel(enable_backward=False)
+def _mesh_indices_kernel(mesh: wp.uint64, indices: wp.array[int]):
+    i = wp.tid()
+    indices[i] = wp.mesh_get(mesh).indices[i]
+
+
+# ---- The camera.
+
 
 # Weight below which a photon plays Russian roulette. In water of 0.3 / m before a wall at 6 m: a third of the events
 # less, 4 % more noise.
@@ -42,13 +259,13 @@ _Run = wp.types.vector(length=2, dtype=float)
 
 @wp.kernel(enable_backward=False)
 def _rates_kernel(
-    tally: wp.array2d(dtype=wp.int64),
+    tally: wp.array2d[wp.int64],
     factor: wp.float64,
     dark: float,
-    taps: wp.array(dtype=float),
+    taps: wp.array[float],
     lowest: int,
     # Out:
-    rates: wp.array2d(dtype=float),
+    rates: wp.array2d[float],
 ):
     """Expected detections per pulse of one camera: light of the tally, blurred by the response.
 
@@ -70,21 +287,16 @@ def _rates_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _advance_kernel(offset: wp.array(dtype=wp.uint64), count: wp.uint64):
+def _advance_kernel(offset: wp.array[wp.uint64], count: wp.uint64):
     offset[0] = offset[0] + count
 
 
 @dataclasses.dataclass(frozen=True)
 class _Lane:
-    """What cameras that are traced one after the other share; lanes run side by side on a GPU.
+    """What cameras that are traced one after the other share; lanes run side by side on a GPU."""
 
-    Attributes:
-        stream: None for the device's current one.
-        data: Its tally and cursor; the ledger and the offset are those of all lanes.
-    """
-
-    stream: wp.Stream | None
-    data: Data
+    stream: wp.Stream | None  # none for the device's current one
+    data: Data  # its tally and cursor; the ledger and the offset are those of all lanes
 
 
 class SpadTracer(WorldCameras):
@@ -96,7 +308,7 @@ class SpadTracer(WorldCameras):
     48 sides. The light of a photon depends on `config.seed` and its number, and every step has new photons.
 
     Args:
-        shapes: What stands in the worlds. Kinds and meshes stay; poses, sizes, albedo and the points of meshes may
+        shapes: What stands in the worlds. Kinds and meshes stay; poses, sizes, reflectance and the points of meshes may
             change in place.
         config, cameras, frame, device: As for `SpadCamera`.
         world: World of each camera, a list; by default camera k is in world k.
@@ -104,11 +316,11 @@ class SpadTracer(WorldCameras):
         estimator: "guided" or "next_event".
         oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
         lanes: Cameras that a GPU traces side by side, each with memory of its own: 8 B a pixel and bin of the tally.
-        public_tree: See `make_surfaces`.
+        use_warp_bvh: See `make_surfaces`.
 
     Attributes:
-        rates, histogram, counts, depth, true_depth, normal, albedo, step: As of `SpadCamera`; `rates` have the noise of
-            the photons that were traced.
+        rates, histogram, counts, depth, true_depth, normal, reflectance, step: As of `SpadCamera`; `rates` have the
+            noise of the photons that were traced.
         data: Ledger of the last step, for `read_ledger`, and the tally of one of the cameras.
 
     Raises:
@@ -127,20 +339,20 @@ class SpadTracer(WorldCameras):
         estimator: str = "guided",
         oversampling: int = 4,
         lanes: int = 8,
-        public_tree: bool = False,
+        use_warp_bvh: bool = False,
         device: wp.DeviceLike = None,
     ) -> None:
         check_kind("shapes", shapes, Shapes)
         config = check_config(config)
         self._parts = check_integer("oversampling", oversampling, 1, 1024)
         sizes = {"config.height": config.height, "config.width": config.width, "config.bins": config.bins}
-        check_room("tallies", {**sizes, "oversampling": self._parts}, 8, shapes.device, rows=4)
+        check_memory("tallies", {**sizes, "oversampling": self._parts}, 8, shapes.device, rows=4)
         super().__init__(config, cameras, world=world, frame=frame, device=shapes.device if device is None else device)
         if self.device != shapes.device:
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
         check_choice("estimator", estimator, ESTIMATORS)
         self.photons = check_integer("photons", photons, 1, 1 << 26)
-        self.shapes, self._public_tree = shapes, public_tree
+        self.shapes, self._use_warp_bvh = shapes, use_warp_bvh
         worlds = self._world.numpy().tolist()
         if max(worlds) >= shapes.worlds:
             raise ArgumentError(f"world = {max(worlds)} is none of the {shapes.worlds} worlds of the shapes")
@@ -158,7 +370,7 @@ class SpadTracer(WorldCameras):
 
     def update(self, camera_q: wp.array, body_q: wp.array | None = None) -> None:
         """A step; see `SpadCamera.update`."""
-        self._look(self.shapes, camera_q, body_q)
+        self._cast_rays(self.shapes, camera_q, body_q)
         self._meshes.place(camera_q, self._optical, self.config.gate_paths[1])
         if not self._models:
             self._build()
@@ -173,14 +385,14 @@ class SpadTracer(WorldCameras):
         for lane in self._lanes[1:]:
             self.device.stream.wait_stream(lane.stream)
         wp.launch(_advance_kernel, 1, [data.offset, self.cameras * self.photons], device=self.device)
-        self._detection.launch()
+        self._detect()
 
     def _trace(self, v: int, model: Model, lane: _Lane) -> None:
         """Expected detections of one camera, on the device's current stream."""
         config, surfaces, photons = self.config, model.surfaces, self.photons
         inputs = [self._face_shape[v], self.shapes.table]
         outputs = [surfaces.reflectance, surfaces.corner_reflectance]
-        wp.launch(_albedo_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
+        wp.launch(_reflectance_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
         update_surfaces(surfaces, model.mesh, model.camera)
         lane.data.tally.zero_()
         launch_transport(
@@ -194,11 +406,10 @@ class SpadTracer(WorldCameras):
         )
         pixels = config.height * config.width
         factor = config.photons * config.pde / (model.scale * photons)
-        dark = config.dark_rate * config.bin_path / config.speed
         tally = lane.data.tally.reshape((pixels, model.gate.bins))
         rates = self.rates[v].reshape((pixels, config.bins))
         runs = (pixels, -(-config.bins // int(_RUN)))
-        inputs = [tally, factor, dark, self._taps, self._lowest]
+        inputs = [tally, factor, self._dark, self._taps, self._lowest]
         wp.launch(_rates_kernel, runs, inputs, [rates], device=self.device)
 
     def rebuild(self) -> None:
@@ -242,7 +453,7 @@ class SpadTracer(WorldCameras):
                 textures=textures,
                 camera=camera,
                 extent=extent,
-                public_tree=self._public_tree,
+                use_warp_bvh=self._use_warp_bvh,
             )
             models.append(Model(self.device, medium, laser, camera, gate, limits, guiding, mesh, surfaces, scale))
         self._models = models

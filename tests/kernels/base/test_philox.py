@@ -1,18 +1,24 @@
-"""Philox4x32-10 against the known answers of its authors' Random123 library."""
+"""Random numbers: Philox4x32-10 against the known answers of its authors' Random123 library, and sequences."""
 
 import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import Floats, launched, on_device
-from spadwarp_kernels.base import philox4x32, random_block, u01, u01_fine
+from helpers.launch import Floats, Integers, launched, on_device
+from spadwarp_kernels.base import random_block, u01
 from spadwarp_kernels.base.philox import (
-    WORDS_AHEAD,
+    PREFETCHED_WORDS,
     RoundKeys,
-    block_ahead,
-    make_draw_ahead,
+    begin_sequence,
+    join_words,
+    make_prefetch,
+    philox4x32,
+    prefetched_block,
     random_block_keyed,
     round_keys,
+    sequence_word,
+    step_sequence,
+    u01_fine,
 )
 
 
@@ -80,14 +86,14 @@ def test_round_keys_give_the_blocks_of_their_seed(seed, device):
 
 
 def _ahead(*streams):
-    events, draw_ahead = make_draw_ahead(*streams)
+    events, prefetch = make_prefetch(*streams)
 
     @wp.kernel(enable_backward=False)
     def ahead(keys: RoundKeys, id: wp.uint64, event: wp.uint32, out: wp.array(dtype=wp.vec4ui)):
-        words = wp.zeros(shape=WORDS_AHEAD, dtype=int)
-        draw_ahead(words, keys, id, event)
+        words = wp.zeros(shape=PREFETCHED_WORDS, dtype=int)
+        prefetch(words, keys, id, event)
         for lane in range(8):
-            out[lane] = block_ahead(words, lane)
+            out[lane] = prefetched_block(words, lane)
             stream = wp.uint32(wp.static(streams[0]))
             if lane >= events:
                 stream = wp.uint32(wp.static(streams[-1]))
@@ -104,3 +110,24 @@ def test_words_of_events_ahead_are_those_of_each_event(streams):
         wp.launch(_ahead(*streams), dim=1, inputs=[keys, id, event], outputs=[out], device="cpu")
         together, alone = out.numpy().reshape(2, 8, 4)
         np.testing.assert_array_equal(together, alone)
+
+
+@wp.kernel(enable_backward=False)
+def _sequences(seeds: Integers, first: Floats, second: Floats, third: Floats):
+    i = wp.tid()
+    state = step_sequence(begin_sequence(join_words(wp.uint32(7), wp.uint32(seeds[i]))))
+    first[i] = u01(sequence_word(state))
+    state = step_sequence(state)
+    second[i] = u01(sequence_word(state))
+    third[i] = u01(sequence_word(step_sequence(state)))
+
+
+def test_sequences_of_seeds_that_follow_each_other_are_even_and_independent(device):
+    """Chi square of triples in 8 x 8 x 8 boxes, and correlations of neighbours; 4 standard deviations."""
+    count = 100_000
+    columns = np.array(launched(_sequences, [np.arange(count)], (float,) * 3, device))
+    boxes = np.histogramdd(columns.T, bins=8, range=[(0.0, 1.0)] * 3)[0]
+    chi2 = ((boxes - count / 512) ** 2).sum() / (count / 512)
+    assert abs(chi2 - 511) < 4.0 * (2 * 511) ** 0.5
+    neighbours = np.corrcoef(np.concatenate([columns[:, 1:], columns[:, :-1]]))
+    assert np.abs(neighbours - np.eye(6))[np.triu_indices(6, 1)].max() < 4.0 / count**0.5

@@ -5,15 +5,8 @@ import warp as wp
 
 from helpers.launch import Floats, Vectors, launched
 from helpers.statistics_of_samples import chi2_p
-from spadwarp_kernels import (
-    one_minus_cosine,
-    orthonormal_basis,
-    random_block,
-    rotate_direction,
-    snap_direction,
-    u01,
-)
-from spadwarp_kernels.base.rotations import cos_sin_turn
+from spadwarp_kernels import one_minus_cosine, random_block, rotate_direction, u01
+from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, snap_direction
 
 
 @wp.kernel(enable_backward=False)

@@ -8,16 +8,8 @@ import warp as wp
 from scipy import stats
 
 from helpers.launch import Floats, Vectors, launched
-from spadwarp_kernels import (
-    TABULATED,
-    Camera,
-    Medium,
-    fournier_forand_density,
-    make_phase_tables,
-    random_block,
-    u01,
-    u01_fine,
-)
+from spadwarp_kernels import TABULATED, Camera, Medium, fournier_forand_density, make_phase_tables, random_block, u01
+from spadwarp_kernels.base.philox import u01_fine
 from spadwarp_kernels.estimators.flight_sampling import make_sample_flight, sample_lens
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
 

@@ -6,16 +6,8 @@ import warp as wp
 
 from helpers.launch import Vectors, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
-from spadwarp_kernels import (
-    Camera,
-    Gate,
-    lens_point,
-    random_block,
-    u01,
-)
-from spadwarp_kernels.optics import project
-from spadwarp_kernels.optics.camera import clip_to_view, field, in_view
-from spadwarp_kernels.optics.gate import clip_to_gate
+from spadwarp_kernels import Camera, Gate, random_block, u01
+from spadwarp_kernels.optics.camera import clip_to_gate, clip_to_view, field, in_view, lens_point, project
 
 _LENS_POINT = wp.constant(wp.vec2(0.1, -0.25))
 

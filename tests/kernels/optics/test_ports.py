@@ -8,7 +8,7 @@ from helpers.launch import Vectors, launched
 from reference import refraction
 from spadwarp_kernels import ArgumentError
 from spadwarp_kernels.optics import DOME_PORT, FLAT_PORT, Port, make_dome_port, make_flat_port
-from spadwarp_kernels.optics.port import Connection, Passage
+from spadwarp_kernels.optics.port import Connection, PortRay
 
 AIR, GLASS, WATER = (1.0003, 1.0003), (1.5195, 1.5463), (1.3415, 1.3638)
 
@@ -23,7 +23,7 @@ def _kernels(kind):
         seen_from[i] = apparent(port, x[i], o[i], out[i])
 
     @wp.kernel(enable_backward=False, module="unique")
-    def passages(port: Port, x: Vectors, u: Vectors, out: wp.array(dtype=Passage), back: wp.array(dtype=Passage)):
+    def passages(port: Port, x: Vectors, u: Vectors, out: wp.array(dtype=PortRay), back: wp.array(dtype=PortRay)):
         i = wp.tid()
         out[i] = leave(port, x[i], u[i])
         back[i] = enter(port, out[i].x, -out[i].u)
@@ -153,7 +153,7 @@ def test_rays_through_a_port_and_back(kind, name, options, device):
     aim = rng.uniform(-0.25, 0.25, x.shape) * options.get("radius", options.get("distance"))
     u = aim - x
     u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
-    found, back = launched(KERNELS[kind][1], [port, x, u], [Passage, Passage], device)
+    found, back = launched(KERNELS[kind][1], [port, x, u], [PortRay, PortRay], device)
     passed = found["transmission"] > 0.0
     assert passed.sum() > 20
     faces, n, group = faces_of(options), options["index"][::-1], options["group_index"]
@@ -182,7 +182,7 @@ def test_what_lies_behind_the_port_has_no_way(device):
     assert not found["density"].any()
     # Beyond the critical angle water lets no light out.
     u = np.array([[0.8, 0.0, -0.6]], np.float32)
-    (lost, _) = launched(KERNELS["flat"][1], [made("flat", FLAT["surface"]), u * -9, u], [Passage, Passage], device)
+    (lost, _) = launched(KERNELS["flat"][1], [made("flat", FLAT["surface"]), u * -9, u], [PortRay, PortRay], device)
     assert lost["transmission"][0] == 0.0
 
 

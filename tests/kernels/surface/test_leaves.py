@@ -11,8 +11,7 @@ from helpers.launch import Vectors, launched, on_device
 from helpers.meshes import mesh_and_surfaces
 from spadwarp_kernels import intersect_mesh, intersect_surfaces
 from spadwarp_kernels.base.native import bits_of
-from spadwarp_kernels.surface.bvh import open_pairs
-from spadwarp_kernels.surface.patches import LARGEST_LEAF, SAME, join_leaves, pair_faces, read_tree, shared_corner
+from spadwarp_kernels.surface.bvh import LARGEST_LEAF, join_leaves, open_pairs, read_tree
 from spadwarp_kernels.surface.triangle import meet_planes, set_rows
 
 Rows = wp.array(dtype=wp.vec4)
@@ -45,11 +44,6 @@ def _warps_walk(mesh: wp.uint64, x: Vectors, u: Vectors, reach: float, met: wp.a
     i = wp.tid()
     hit = intersect_mesh(mesh, x[i], u[i], reach)
     met[i] = wp.vec2(hit.distance, float(hit.face))
-
-
-@wp.kernel(enable_backward=False)
-def _corners(mesh: wp.uint64, same: float, corners: wp.array(dtype=int)):
-    corners[wp.tid()] = shared_corner(mesh, 2 * wp.tid(), 2 * wp.tid() + 1, same)
 
 
 def packed(shape, leaf_size, device="cpu"):
@@ -200,22 +194,3 @@ def test_a_moving_mesh_has_leaves_of_triangles(leaf_size, device):
     assert (mine[:, 1] >= 0).mean() > 0.2
     assert (mine[:, 1] == hers[:, 1]).mean() > 0.999
     assert (np.abs(mine[:, 0] - hers[:, 0]) < 1e-4).mean() > 0.999
-
-
-def test_pairs_are_found_as_among_a_few_faces(device):
-    """Squares and slanted ones in any order of corners, others that are nearly such, faces without area."""
-    rng = np.random.default_rng(9)
-    points = []
-    for k in range(300):
-        o, a, b = rng.normal(size=(3, 3)).astype(np.float32)
-        quad = np.array([o, o + a, o + a + b, o + b])
-        quad[3] += [0.0, 0.0, 1e-4, 1e-2][k % 4] * rng.normal(size=3)
-        second = [(0, 2, 3), (0, 2, 3), (0, 3, 2), (0, 2, 3), (0, 0, 3)][k % 5]
-        points += [np.roll(quad[list(face)], rng.integers(3), axis=0) for face in ((0, 1, 2), second)]
-    points = np.concatenate(points).astype(np.float32)
-    mesh = wp.Mesh(on_device(points, device), on_device(np.arange(len(points)), device, int))
-    same = SAME * float(np.abs(points).max())
-    (corners,) = launched(_corners, [mesh.id, same], [int], device, 300)
-    expected = [pair_faces(six, [[0, 1, 2], [3, 4, 5]])[0] for six in points.reshape(300, 6, 3)]
-    assert 80 < sum(second for _, second, _ in expected) < 150
-    np.testing.assert_array_equal(corners, [corner if second else -1 for _, second, corner in expected])

@@ -45,9 +45,17 @@ def _cast(
         faces[i] = wp.vec3i(named[0], named[1], bits_of(normal_and_face(normals, named[0])[3]))
 
 
+def mesh_of(points, faces, device="cpu"):
+    return wp.Mesh(on_device(np.asarray(points), device), on_device(np.ravel(faces), device, int))
+
+
+def pairs_of(points, faces):
+    return pair_faces(mesh_of(np.asarray(points, float), faces))
+
+
 def packed(shape, pairs=True, device="cpu"):
     """The mesh, its patches, and the normals of its faces, which stand in slots in the opposite order."""
-    mesh = wp.Mesh(on_device(shape.vertices, device), on_device(np.ravel(shape.faces), device, int))
+    mesh = mesh_of(shape.vertices, shape.faces, device)
     return mesh, *pack_patches(mesh, np.arange(len(shape.faces))[::-1], pairs)
 
 
@@ -145,14 +153,14 @@ def test_a_box_has_six_patches_and_a_plane_one(scale):
         if turn % 2:  # faces that share no vertices, each beginning at any corner
             box = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
             faces = np.array([np.roll(face, rng.integers(3)) for face in box.faces])
-        patches = pair_faces(box.vertices.astype(np.float32), faces)
+        patches = pairs_of(box.vertices, faces)
         assert len(patches) == 6
         assert sorted(face for first, second, _ in patches for face in (first, second)) == list(range(12))
         for first, second, _ in patches:
             assert box.face_normals[first] @ box.face_normals[second] > 0.999
-    assert pair_faces(scale * SQUARE, [[0, 1, 2], [0, 2, 3]]) == [(0, 1, 1)]
+    assert pairs_of(scale * SQUARE, [[0, 1, 2], [0, 2, 3]]) == [(0, 1, 1)]
     slanted = scale * np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [2, -1, 0]])
-    assert pair_faces(slanted, [[0, 1, 2], [0, 3, 1]]) == [(0, 1, 2)]
+    assert pairs_of(slanted, [[0, 1, 2], [0, 3, 1]]) == [(0, 1, 2)]
 
 
 @pytest.mark.parametrize(
@@ -171,15 +179,15 @@ def test_a_box_has_six_patches_and_a_plane_one(scale):
     ],
 )
 def test_other_faces_stay_by_themselves(points, faces):
-    assert pair_faces(np.asarray(points, float), faces) == [(0, 0, 0), (1, 1, 0)]
+    assert pairs_of(points, faces) == [(0, 0, 0), (1, 1, 0)]
 
 
 def test_each_face_is_of_one_parallelogram():
     """Of three triangles that fit together pairwise, and of a square that is there twice."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [-1, 1, 0]], float)
-    assert pair_faces(points, [[0, 1, 2], [1, 3, 2], [0, 2, 4]]) == [(0, 1, 0), (2, 2, 0)]
+    assert pairs_of(points, [[0, 1, 2], [1, 3, 2], [0, 2, 4]]) == [(0, 1, 0), (2, 2, 0)]
     square = [[0, 1, 3], [1, 2, 3]]
-    assert pair_faces(SQUARE, square + square) == [(0, 1, 0), (2, 3, 0)]
+    assert pairs_of(SQUARE, square + square) == [(0, 1, 0), (2, 3, 0)]
 
 
 def test_patches_without_area_are_never_hit():

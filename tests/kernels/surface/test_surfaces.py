@@ -1,4 +1,7 @@
-"""Reflectance, gloss and textures of a mesh."""
+"""Surfaces: their arrays, surfaces that follow a moving mesh, and rays by Warp's own queries."""
+
+import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -7,6 +10,233 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from helpers.meshes import mesh_and_surfaces
+from spadwarp_kernels.optics.visibility import near_depth_map
+from spadwarp_kernels.surface.bvh import read_tree
+
+PRIVATE_LAYOUT = (
+    f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/surface/bvh.py reads "
+    "(members of wp::Mesh::bvh: node_lowers, node_uppers, root, primitive_indices, num_nodes, max_nodes). Mend "
+    "`_tree_node`, `_tree_kind`, `_tree_root` and `_tree_face` there; until then make_surfaces(..., use_warp_bvh=True) "
+    "takes wp.mesh_query_ray."
+)
+
+
+def ball(device, count=24):
+    """Points and triangles of a sphere of radius 1, a little dented."""
+    theta, phi = np.meshgrid(np.linspace(0.05, math.pi - 0.05, count), np.linspace(0.0, 2 * math.pi, 2 * count))
+    r = 1.0 + 0.1 * np.sin(3 * phi) * np.sin(2 * theta)
+    points = np.stack([r * np.sin(theta) * np.cos(phi), r * np.sin(theta) * np.sin(phi), r * np.cos(theta)], axis=-1)
+    first = (np.arange(2 * count - 1)[:, None] * count + np.arange(count - 1)).ravel()
+    faces = np.stack([first, first + count, first + 1, first + 1, first + count, first + count + 1], axis=1)
+    points = points.reshape(-1, 3).astype(np.float32)
+    mesh = wp.Mesh(wp.array(points, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=int, device=device))
+    return mesh, points
+
+
+@wp.kernel(enable_backward=False)
+def cast(
+    surfaces: sk.Surfaces,
+    x: wp.array(dtype=wp.vec3),
+    u: wp.array(dtype=wp.vec3),
+    mine: wp.array(dtype=float),
+    hers: wp.array(dtype=float),
+):
+    i = wp.tid()
+    mine[i] = sk.intersect_surfaces(surfaces, x[i], u[i], 100.0, False).distance
+    hers[i] = sk.intersect_mesh(surfaces.mesh, x[i], u[i], 100.0).distance
+
+
+@wp.kernel(enable_backward=False)
+def meets(surfaces: sk.Surfaces, x: wp.array(dtype=wp.vec3), way: wp.array(dtype=wp.vec3), met: wp.array(dtype=int)):
+    i = wp.tid()
+    hit = sk.intersect_surfaces(surfaces, x[i], wp.normalize(way[i]), wp.length(way[i]), True)
+    met[i] = wp.where(hit.slot >= 0, 1, 0)
+
+
+def distances(surfaces, device, count=20_000):
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=(count, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    x = rng.uniform(-2, 2, (count, 3)) - 5.0 * u
+    mine, hers = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    rays = [wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (x, u)]
+    wp.launch(cast, count, [surfaces, *rays], [mine, hers], device=device)
+    return mine.numpy(), hers.numpy()
+
+
+def test_the_tree_is_read_as_warp_writes_it(device):
+    """Warp's private structs: `read_tree` finds each face once, in boxes that hold it, whatever the builder."""
+    for constructor in ("sah", "median", "cubql", *(["lbvh"] if wp.get_device(device).is_cuda else [])):
+        mesh, points = ball(device)
+        mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor, bvh_leaf_size=1)
+        try:
+            nodes, order = (one.numpy() for one in read_tree(mesh, 1.2))
+        except Exception as error:
+            pytest.fail(f"{PRIVATE_LAYOUT} ({error})")
+        faces = np.where(order < 0, ~order, order)
+        corners = points[mesh.indices.numpy().reshape(-1, 3)]
+        pairs, seen, stack = nodes.reshape(-1, 2, 2, 4), [], [(0, np.full(3, -np.inf), np.full(3, np.inf))]
+        while stack and len(seen) <= len(faces):
+            pair, low, high = stack.pop()
+            for child in range(2):
+                lower, upper = pairs[pair, child, 0, :3], pairs[pair, child, 1, :3]
+                entry = int(pairs[pair, child, 0, 3].view(np.int32))
+                if entry == -1:
+                    continue
+                inside = (lower >= low - 1e-5).all() and (upper <= high + 1e-5).all()
+                assert inside, f"{PRIVATE_LAYOUT} (a child leaves its parent's box, {constructor})"
+                if entry >= 0:
+                    stack.append((entry, lower, upper))
+                    continue
+                slot = -2 - entry
+                while True:
+                    held = (corners[faces[slot]] >= lower).all() and (corners[faces[slot]] <= upper).all()
+                    assert held, f"{PRIVATE_LAYOUT} (a face leaves its box, {constructor})"
+                    seen.append(faces[slot])
+                    if order[slot] >= 0:
+                        break
+                    slot += 1
+        assert sorted(seen) == list(range(len(faces))), f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
+
+
+@pytest.mark.parametrize("use_warp_bvh", [False, True])
+def test_surfaces_follow_moving_points(use_warp_bvh, device):
+    mesh, points = ball(device)
+    surfaces = sk.make_surfaces(mesh, extent=5.0, use_warp_bvh=use_warp_bvh)
+    assert sk.surface_choices(surfaces)["use_warp_bvh"] == use_warp_bvh
+    before = distances(surfaces, device)[0]
+    moved = points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)
+    mesh.points.assign(moved.astype(np.float32))
+    sk.update_surfaces(surfaces, mesh)
+    mesh.refit()
+    mine, hers = distances(surfaces, device)
+    new = wp.Mesh(wp.array(moved.astype(np.float32), dtype=wp.vec3, device=device), mesh.indices)
+    fresh = distances(sk.make_surfaces(new), device)[0]
+    assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
+    assert (np.abs(mine - before) > 1e-3).mean() > 0.1
+
+
+@pytest.mark.parametrize("constructor", ["sah", "cubql"])
+def test_surfaces_of_a_refitted_mesh(constructor, device):
+    """`simulate(kept=...)` makes surfaces of the mesh that it has kept, refitted."""
+    kept, points = ball(device)
+    mesh = wp.Mesh(wp.clone(kept.points), kept.indices, bvh_constructor=constructor, bvh_leaf_size=1)
+    moved = (points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)).astype(np.float32)
+    for one in (mesh, kept):
+        one.points.assign(moved)
+    mesh.refit()
+    new = wp.Mesh(kept.points, kept.indices)
+    mine, hers = distances(sk.make_surfaces(mesh), device)
+    fresh = distances(sk.make_surfaces(new), device)[0]
+    assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
+
+
+def wide_camera():
+    camera = sk.Camera()
+    camera.width = camera.height = 64
+    camera.pixel_tangent, camera.aperture_radius, camera.aperture_area = 0.025, 0.1, math.pi * 1e-2
+    return camera
+
+
+def test_the_map_of_a_camera_follows(device):
+    mesh, points = ball(device)
+    camera = wide_camera()
+    surfaces = sk.make_surfaces(mesh, camera=camera, extent=9.0)
+    inside = surfaces.near_depth.numpy()  # the lens is in the ball
+    assert inside.min() > 0.3 and inside.max() < 1.1
+    for shift in (3.0, 5.0):
+        mesh.points.assign(points + np.array([0.5, 0.0, shift], np.float32))
+        sk.update_surfaces(surfaces, mesh, camera)
+        found = surfaces.near_depth.numpy()
+        assert np.array_equal(found, near_depth_map(mesh, camera).numpy())
+        assert found[64, 64] == pytest.approx(shift - 1.0, abs=0.25) and found[64, 0] > 1e29
+    with pytest.raises(sk.ArgumentError, match="made with a camera; update_surfaces needs the same"):
+        sk.update_surfaces(surfaces, mesh)
+    with pytest.raises(sk.ArgumentError, match="made without a camera"):
+        sk.update_surfaces(sk.make_surfaces(mesh, extent=9.0), mesh, camera)
+    with pytest.raises(sk.ArgumentError, match="make_surfaces needs an extent"):
+        sk.update_surfaces(sk.make_surfaces(mesh), mesh)
+    other, _ = ball(device)
+    with pytest.raises(sk.ArgumentError, match="not those of mesh"):
+        sk.update_surfaces(sk.make_surfaces(mesh), other)
+
+
+def test_nothing_hides_what_lies_before_the_map(device):
+    """A floor and a tilted wall that go past a wide lens, faces behind it, a small one: rays from points before the map
+    to all of the lens meet none, and the map reaches far along the floor."""
+    turn = np.array([[0.8, 0.1, 0.59], [0.0, 0.98, -0.17], [-0.6, 0.14, 0.79]])
+    square = np.array([(-20.0, 0, -20), (20, 0, -20), (20, 0, 20), (-20, 0, 20)])
+    small = np.array([(-0.3, -0.8, 2.0), (0.2, -0.7, 2.2), (0.0, -0.4, 1.9), (0.1, -0.9, 2.1)])
+    parts = [
+        np.array((0, 0.5, 0)) + square,
+        square[:, [1, 0, 2]] @ turn - (3.0, 0, 0),
+        0.1 * square - (0, 0, 2.5),
+        small,
+    ]
+    corners = np.concatenate(parts).astype(np.float32)
+    faces = (np.array([0, 1, 2, 0, 2, 3]) + 4 * np.arange(4)[:, None]).ravel()
+    points = wp.array(corners, dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(points, wp.array(faces, dtype=int, device=device))
+    camera = wide_camera()
+    near = near_depth_map(mesh, camera).numpy().astype(float)
+    assert near[100, 64] == pytest.approx(0.4 / (0.8 * 73.0 / 128), rel=0.05)  # of the floor, less the lens's radius
+    assert (near[:62] > 1.0).mean() > 0.5 and (near > 0.1).mean() > 0.9
+    rng = np.random.default_rng(4)
+    count = 20_000
+    row, column = rng.integers(0, 128, (2, count))
+    tangent = (np.stack([column, row], axis=1) + rng.uniform(0.01, 0.99, (count, 2)) - 64.0) / 80.0
+    depth = np.minimum(near[row, column], 15.0) * np.where(rng.random(count) < 0.5, 1.0 - 1e-6, rng.random(count))
+    start = np.concatenate([tangent, np.ones((count, 1))], axis=1) * depth[:, None]
+    turn = rng.uniform(0, 2 * np.pi, count)
+    lens = camera.aperture_radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
+    x, way = (wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (start, lens - start))
+    met = wp.zeros(count, dtype=int, device=device)
+    wp.launch(meets, count, [sk.make_surfaces(mesh), x, way], [met], device=device)
+    assert not met.numpy().any()
+
+
+def small_model(mesh, surfaces):
+    medium, laser, limits, camera, gate = sk.Medium(), sk.Laser(), sk.Limits(), sk.Camera(), sk.Gate()
+    medium.extinction, medium.albedo, medium.anisotropy, medium.axis_threshold = 0.2, 0.7, 0.9, 1.0
+    laser.position, laser.axis, laser.spread = wp.vec3(0.05, 0.0, 0.0), wp.vec3(0.0, 0.0, 1.0), 0.02
+    camera.width, camera.height, camera.pixel_tangent = 8, 8, 0.04
+    camera.aperture_radius, camera.aperture_area = 0.01, math.pi * 1e-4
+    gate.start, gate.stop, gate.bins, gate.bins_per_metre = 2.0, 10.0, 16, 2.0
+    limits.max_path, limits.max_collisions, limits.weight_cutoff = 10.0, 32, 1e-3
+    return sk.Model(mesh.device, medium, laser, camera, gate, limits, sk.Guiding(), mesh, surfaces, 2.0**50)
+
+
+def tally(model, spec, first_id=0, offset=0, count=20_000):
+    data = sk.make_data(model)
+    data.offset.fill_(offset)
+    sk.launch_transport(spec, model, data, seed=3, first_id=first_id, photon_count=count)
+    return data.tally.numpy()
+
+
+def test_transport_by_public_queries_and_by_steps(device):
+    """Warp's own queries give the light of our tree; photons are numbered from the offset on the device."""
+    mesh, points = ball(device)
+    mesh.points.assign(points + np.array([0.0, 0.0, 3.0], np.float32))
+    mesh.refit()
+    model = small_model(mesh, sk.make_surfaces(mesh, 0.5))
+    spec = sk.TransportSpec("next_event")
+    light = tally(model, spec)
+    public = dataclasses.replace(model, surfaces=sk.make_surfaces(mesh, 0.5, use_warp_bvh=True))
+    with pytest.raises(sk.ArgumentError, match="use_warp_bvh = False does not go with"):
+        tally(public, spec)
+    other = tally(public, spec._replace(use_warp_bvh=True))
+    # A ray on an edge may fall on either side of it: the same photons otherwise.
+    assert light.sum() > 0 and np.abs(light - other).sum() < 1e-3 * light.sum()
+    stepped = spec._replace(stepped=True)
+    assert np.array_equal(tally(model, stepped), light)
+    assert np.array_equal(tally(model, stepped, first_id=4, offset=2**40), tally(model, spec, first_id=2**40 + 4))
+    # One tally for all components.
+    small = wp.zeros(light.size // 3, dtype=wp.int64, device=device)
+    data = dataclasses.replace(sk.make_data(model, histogram=False), tally=small)
+    sk.launch_transport(spec._replace(merged=True), model, data, seed=3, first_id=0, photon_count=20_000)
+    assert np.array_equal(small.numpy(), light.reshape(3, -1).sum(axis=0))
+    with pytest.raises(sk.ArgumentError, match="merged goes with guided and next_event"):
+        tally(model, sk.TransportSpec("analog", merged=True))
 
 
 def test_surfaces_check_their_arrays_and_the_spec_that_goes_with_them():
@@ -16,11 +246,11 @@ def test_surfaces_check_their_arrays_and_the_spec_that_goes_with_them():
     image = np.linspace(0, 1, 6).reshape(2, 3)
     textures = sk.make_textures(np.full(12, -1), np.zeros((12, 3, 2)), [image], device="cpu")
     surfaces = sk.make_surfaces(mesh, 0.25, specular=0.5, roughness=0.1, textures=textures)
-    assert sk.surface_choices(surfaces) == {"pattern": True, "specular": True, "public_tree": False}
+    assert sk.surface_choices(surfaces) == {"pattern": True, "specular": True, "use_warp_bvh": False}
     assert (surfaces.corner_reflectance.numpy() == 0.25).all()
     np.testing.assert_allclose(surfaces.roughness.numpy(), 0.1)
     plain = sk.make_surfaces(mesh, 0.25)
-    assert sk.surface_choices(plain) == {"pattern": False, "specular": False, "public_tree": False}
+    assert sk.surface_choices(plain) == {"pattern": False, "specular": False, "use_warp_bvh": False}
     limits = sk.Limits()
     model = sk.Model(
         mesh.device, sk.Medium(), sk.Laser(), sk.Camera(), sk.Gate(), limits, sk.Guiding(), mesh, surfaces, 1.0

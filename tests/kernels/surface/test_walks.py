@@ -14,10 +14,9 @@ from spadwarp_kernels import (
     offset_from_surface,
     random_block,
     rotate_direction,
-    segment_meets_box,
     u01,
 )
-from spadwarp_kernels.surface.box import segment_meets_box_on_cpu
+from spadwarp_kernels.surface.bvh import segment_meets_box, segment_meets_box_on_cpu
 
 
 @wp.kernel(enable_backward=False)

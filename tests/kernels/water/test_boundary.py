@@ -7,8 +7,16 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from spadwarp_kernels.water.boundary import image_direction, image_point, image_reflectance
-from spadwarp_kernels.water.limits import Limits, next_face, to_next_face
+from spadwarp_kernels.water.limits import (
+    Limits,
+    fresnel_reflectance,
+    image_direction,
+    image_point,
+    image_reflectance,
+    next_face,
+    reflection_images,
+    to_next_face,
+)
 
 LOWER, UPPER = np.array([-0.7, -0.4, -1.0]), np.array([0.5, 0.9, 1.6])
 
@@ -27,7 +35,7 @@ def reflectance(cosine, index):
 @wp.kernel
 def reflectance_kernel(cosine: wp.array(dtype=float), index: wp.array(dtype=float), out: wp.array(dtype=float)):
     k = wp.tid()
-    out[k] = sk.fresnel_reflectance(cosine[k], index[k])
+    out[k] = fresnel_reflectance(cosine[k], index[k])
 
 
 def test_reflectance_is_fresnels(device):
@@ -64,7 +72,7 @@ def test_images_are_all_chains_of_reflections():
             met, _, end, _ = follow(x, image - x, count)
             if met == list(word) and np.allclose(end, o):
                 found.append(np.linalg.norm(image - x))
-    numbers = sk.reflection_images(low, high, 3)
+    numbers = reflection_images(low, high, 3)
     images = [np.linalg.norm(_image(x, number) - o) for number in numbers]
     assert len(found) == len(images) > 30
     np.testing.assert_allclose(sorted(found), sorted(images), rtol=1e-12)
@@ -123,7 +131,7 @@ def test_images_are_what_reflections_one_by_one_lead_to(device):
     reflections."""
     rng = np.random.default_rng(2)
     indices = np.array([[0.75, 1.3, 0.9], [1.1, 0.75, 2.0]])
-    numbers = sk.reflection_images(*indices, 4)
+    numbers = reflection_images(*indices, 4)
     x, o = rng.uniform(LOWER, UPPER, (2, len(numbers), 3))
     limits = Limits()
     limits.lower, limits.upper = wp.vec3(*LOWER), wp.vec3(*UPPER)
@@ -145,8 +153,8 @@ def test_images_are_what_reflections_one_by_one_lead_to(device):
 
 
 def test_a_single_face_is_met_once():
-    assert sk.reflection_images([0, 0.7, 0], [0, 0, 0], 4) == [(0, -1, 0)]
-    assert len(sk.reflection_images([1, 1, 1], [1, 1, 1], 2)) == 24
+    assert reflection_images([0, 0.7, 0], [0, 0, 0], 4) == [(0, -1, 0)]
+    assert len(reflection_images([1, 1, 1], [1, 1, 1], 2)) == 24
 
 
 @pytest.mark.parametrize(

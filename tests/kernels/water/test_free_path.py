@@ -8,11 +8,8 @@ import warp as wp
 
 from helpers.launch import Floats, launched, on_device
 from helpers.statistics_of_samples import chi2_p, sample_count
-from spadwarp_kernels import (
-    free_path,
-    random_block,
-    u01_tail,
-)
+from spadwarp_kernels import free_path, random_block
+from spadwarp_kernels.base.philox import u01_tail
 
 pytestmark = pytest.mark.physics
 

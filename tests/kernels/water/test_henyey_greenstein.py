@@ -6,7 +6,8 @@ import warp as wp
 
 from helpers.launch import Floats, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
-from spadwarp_kernels import henyey_greenstein_pdf, random_block, sample_henyey_greenstein, u01_fine
+from spadwarp_kernels import henyey_greenstein_pdf, random_block, sample_henyey_greenstein
+from spadwarp_kernels.base.philox import u01_fine
 
 pytestmark = pytest.mark.physics
 

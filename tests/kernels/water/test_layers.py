@@ -6,6 +6,7 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from helpers.launch import Floats, Integers, Vectors, launched
+from spadwarp_kernels.water.medium import layer_index, layered_extinction, layered_free_path
 
 AXIS = np.array([0.36, -0.48, 0.8])
 START = [-9.0, -1.0, 0.5, 0.6, 3.0]  # the first is not read
@@ -27,10 +28,10 @@ def fly(
 ):
     """Free path, that of the medium alone, mean extinction along it, layer at its begin. Launch: rays."""
     i = wp.tid()
-    distance[i] = sk.layered_free_path(medium, layers, x[i], u[i], xi[i])
+    distance[i] = layered_free_path(medium, layers, x[i], u[i], xi[i], wp.uint64(0))
     homogeneous[i] = sk.free_path(xi[i], medium.extinction)
-    mean[i] = sk.layered_extinction(medium, layers, x[i], u[i], distance[i])
-    index[i] = sk.layer_index(layers, wp.dot(layers.axis, x[i]))
+    mean[i] = layered_extinction(medium, layers, x[i], u[i], distance[i], wp.uint64(0))
+    index[i] = layer_index(layers, wp.dot(layers.axis, x[i]))
 
 
 def rays():

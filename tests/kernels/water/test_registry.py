@@ -6,6 +6,7 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from helpers.statistics_of_samples import chi2_p, sample_count
+from spadwarp_kernels.base.philox import u01_fine
 from spadwarp_kernels.water import PhaseFunction
 from spadwarp_kernels.water.phase_functions import PHASE_FUNCTIONS
 
@@ -31,7 +32,7 @@ def samples_and_density(sample, pdf, device):
     @wp.kernel(enable_backward=False, module="unique")
     def draw(water: sk.Medium, t: wp.array(dtype=float)):
         i = wp.tid()
-        t[i] = sample(sk.u01_fine(sk.random_block(wp.uint64(3), wp.uint64(i), wp.uint32(0), wp.uint32(1))[1]), water)
+        t[i] = sample(u01_fine(sk.random_block(wp.uint64(3), wp.uint64(i), wp.uint32(0), wp.uint32(1))[1]), water)
 
     @wp.kernel(enable_backward=False, module="unique")
     def evaluate(water: sk.Medium, t: wp.array(dtype=float), p: wp.array(dtype=float)):

@@ -12,7 +12,8 @@ import spadwarp_kernels as sk
 from helpers.launch import Floats, launched
 from helpers.statistics_of_samples import chi2_p
 from reference import fournier_forand
-from spadwarp_kernels import TABULATED, random_block, u01_fine
+from spadwarp_kernels import TABULATED, random_block
+from spadwarp_kernels.base.philox import u01_fine
 
 pytestmark = pytest.mark.physics
 

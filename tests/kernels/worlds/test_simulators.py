@@ -60,7 +60,7 @@ def test_depth_of_newtons_own_camera():
     seen = theirs > 0.0
 
     camera = sk.SpadCamera(MEASURED, 2, frame="opengl", device="cpu")
-    camera.update(sk.newton_shapes(model, albedo=0.3), poses, state.body_q)
+    camera.update(sk.newton_shapes(model, reflectance=0.3), poses, state.body_q)
     mine, measured = camera.true_depth.numpy().copy(), camera.depth.numpy().copy()
     own_normal = camera.normal.numpy().copy()
     assert mine.shape == theirs.shape and seen.mean() > 0.5
@@ -83,7 +83,7 @@ def test_colours_are_the_reflectance_at_532_nm():
     body = scene.add_body(xform=wp.transform((0.0, 0.0, 1.0), wp.quat_identity()))
     scene.add_shape_sphere(body, radius=0.3, color=(1.0, 0.5, 0.0))
     shapes = sk.newton_shapes(scene.finalize(device="cpu"))
-    assert shapes.table.albedo.numpy() == pytest.approx([0.2140], abs=1e-3)  # of sRGB 0.5
+    assert shapes.table.reflectance.numpy() == pytest.approx([0.2140], abs=1e-3)  # of sRGB 0.5
 
 
 MJCF = """<mujoco>
@@ -135,4 +135,4 @@ def test_depth_of_mujocos_own_rays():
     assert np.mean(np.isfinite(theirs) == np.isfinite(mine[0])) > 0.997
     assert np.nanquantile(abs(theirs - mine[0]), 0.99) < 1e-3
     assert np.isfinite(theirs).mean() > 0.3
-    assert shapes.table.albedo.numpy()[:3] == pytest.approx([0.2140, 0.2140, 0.3185], abs=1e-3)  # sRGB 0.5 and 0.6
+    assert shapes.table.reflectance.numpy()[:3] == pytest.approx([0.2140, 0.2140, 0.3185], abs=1e-3)  # sRGB 0.5 and 0.6

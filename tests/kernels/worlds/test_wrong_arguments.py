@@ -8,13 +8,14 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
+from helpers.worlds import STILL, garden, transforms
+from spadwarp_kernels.worlds.shapes import move_shapes
 
 SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
-STILL = (0, 0, 0, 0, 0, 0, 1)
 
 
 def poses(*rows):
-    return wp.array(np.array(rows, np.float32), dtype=wp.transform, device="cpu")
+    return transforms(rows, "cpu")
 
 
 def triangle(last=2):
@@ -62,6 +63,15 @@ def test_poses_of_a_first_step(kind, row, text):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
+        ({"kind": ["torus"] * 2}, "is not a list of plane, sphere"),
+        ({"kind": 3}, "kind is int; a list is needed"),
+        ({"kind": ["mesh"] * 2}, r"mesh\[0\] = 0 is none"),
+        ({"mesh": [-1, 0]}, r"mesh = -1 is outside"),
+        ({"mesh": 2}, "mesh is int; a list is needed"),
+        ({"world": [3, 0]}, "world is not one of -1 to 0"),
+        ({"body": [1, 2, 3]}, "body does not fit 2 shapes"),
+        ({"reflectance": 1.5}, r"reflectance holds .* outside \[0, 1\]"),
+        ({"visible": [True] * 3}, r"visible is bool of shape \(3,\)"),
         ({"size": [(0, 0, 0), (-1, 1, 1)]}, r"size\[1\] = \[-1.0, 1.0, 1.0\] of a box is not finite and 0 or more"),
         ({"size": wp.full(2, wp.vec3(np.nan), device="cpu")}, r"size\[0\] = \[nan, .* of a plane is not finite"),
         ({"body": [-1, 2.5]}, "body is not an integer of 32 bits for some of 2 shapes"),
@@ -81,17 +91,45 @@ def test_shapes(arguments, text):
         boxes(**arguments)
 
 
+BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
+
+
 @pytest.mark.parametrize(
-    ("arguments", "text"),
+    ("call", "text"),
     [
-        ({"pulse_energy": 1e30}, r"config.pulse_energy = 1e\+30 is outside \[0, 1e6\]"),
-        ({"timing_sigma": 1e3}, "config.timing_sigma = 1000.0 s is .* bins"),
-        ({"seed": None}, "config.seed = None is not an integer"),
+        (lambda: sk.SpadConfig(pde=1.5), r"config.pde = 1.5 is outside \[0, 1\]"),
+        (lambda: sk.SpadConfig(gate=(5.0, 2.0)), r"config.gate\[1\] = 2.0 is outside \(5.0, inf\)"),
+        (lambda: sk.SpadConfig(timing_sigma=1e3), "config.timing_sigma = 1000.0 s is .* bins"),
+        (lambda: sk.SpadConfig(seed=None), "config.seed = None is not an integer"),
+        (lambda: sk.SpadCamera(frame="usd", device="cpu"), "frame = 'usd' is not one of 'optical', 'opengl'"),
+        (lambda: sk.SpadCamera(3, device="cpu"), "config is int; a SpadConfig is needed"),
+        (lambda: sk.SpadCamera(cameras=2, world=[0], device="cpu"), "one for each of 2 cameras"),
+        (lambda: sk.SpadCamera(world=3, device="cpu"), "world is int; a list is needed"),
+        (lambda: move_shapes(3, None), "shapes is int; a Shapes is needed"),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, world=["a"], device="cpu"), "world = 'a' is not an integer"),
+        (lambda: sk.SpadTracer(garden("cpu")[0], cameras=3), "world = 2 is none of the 2 worlds"),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, photons=0), r"photons = 0 is outside \[1, 67108864\]"),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, estimator="analog"), "estimator = 'analog' is not one of 'guided'"),
+        (lambda: sk.write_poses(None, poses(STILL), poses(STILL)), "position is None"),
     ],
 )
-def test_configs(arguments, text):
+def test_errors_name_the_argument(call, text):
     with pytest.raises(sk.ArgumentError, match=text):
-        sk.SpadConfig(**arguments)
+        call()
+
+
+def test_poses_worlds_and_images_that_there_are_not_are_refused():
+    """Kernels would read beyond the arrays."""
+    for body_q in (None, poses(STILL, STILL)):
+        with pytest.raises(sk.ArgumentError, match=r"body_q has [02] poses; the shapes are on 3 bodies"):
+            sk.SpadCamera(SMALL, device="cpu").update(BOX_ON_BODY_2, poses(STILL), body_q)
+    camera = sk.SpadCamera(SMALL, world=[1], device="cpu")
+    with pytest.raises(sk.ArgumentError, match="world = 1 is none of the 1 worlds"):
+        camera.update(BOX_ON_BODY_2, poses(STILL), poses(STILL, STILL, STILL))
+    with pytest.raises(sk.ArgumentError, match=r"reflectance = 'dark' is not a number"):
+        camera.update_from_images(camera.true_depth, reflectance="dark")
+    with pytest.raises(sk.ArgumentError, match=r"depth is a wp.array of float32, shape \(2, 6, 8\)"):
+        camera.update_from_images(wp.zeros((2, 6, 8), dtype=float, device="cpu"))
 
 
 def test_arrays_that_no_device_holds():

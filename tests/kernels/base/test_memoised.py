@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import warp as wp
 
-from spadwarp_kernels.base.kernels import made_once
+from spadwarp_kernels.base.kernels import memoised
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def hasty():
 
 
 def test_each_thread_gets_its_own_function(hasty):
-    @made_once
+    @memoised
     def make(number):
         @wp.func
         def one() -> int:

@@ -1,4 +1,4 @@
-"""The specular lobe against quadrature in float64: sampler, density and BRDF are one law, reciprocal and passive."""
+"""Reflection: diffuse by Lambert's law, and the rough specular lobe."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,9 @@ import warp as wp
 from scipy import stats
 
 from helpers.launch import Floats, Vectors, launched
-from spadwarp_kernels import ggx_brdf, ggx_normals, ggx_pdf, random_block, sample_ggx, unshadowed
+from helpers.statistics_of_samples import chi2_p, sample_count
+from spadwarp_kernels import random_block, u01
+from spadwarp_kernels.surface.reflectance import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, sample_lambert, unshadowed
 
 pytestmark = pytest.mark.physics
 
@@ -155,3 +157,19 @@ def test_nothing_is_reflected_through_the_surface():
     below = incoming(40.0)
     brdf, pdf, _ = evaluate(incoming(20.0), np.array([below, -NORMAL]), 0.5)
     assert (brdf == 0).all() and np.isfinite(pdf).all()
+
+
+@wp.kernel(enable_backward=False)
+def _lambert(normal: wp.vec3, v: Vectors):
+    i = wp.tid()
+    block = random_block(wp.uint64(9), wp.uint64(i), wp.uint32(0), wp.uint32(1))
+    v[i] = sample_lambert(normal, u01(block[0]), u01(block[1]))
+
+
+def test_lambert_follows_the_cosine_law(device):
+    normal = np.array([0.48, -0.6, 0.64])
+    (v,) = launched(_lambert, [wp.vec3(*normal)], [wp.vec3], device, sample_count(device))
+    cosine = v @ normal
+    assert cosine.min() > -1e-6
+    # cos^2 is uniform under the cosine law.
+    assert chi2_p(cosine, lambda c: np.clip(c, 0, 1) ** 2) > 1e-4

@@ -1,30 +1,228 @@
-"""Counts of a detector that is followed event by event: dead time and afterpulses.
+"""Counts of a SPAD: first-photon TCSPC, with at most one count a pulse and pixel, and a detector that is followed event
+by event, with dead time and afterpulses.
 
 Every draw is keyed by (seed, frame · pixels + pixel), so that counts do not depend on how a launch is cut up.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_integer, check_number, check_numbers
-from spadwarp_kernels.base.binomial import PURPOSE_EVENTS, uniforms
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_integer,
+    check_number,
+    check_numbers,
+    check_range,
+    check_seed,
+)
+from spadwarp_kernels.base.binomial import PURPOSE_COUNTS, PURPOSE_EVENTS, binomial, uniforms
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.base.native import log1p
 
-from .first_photon import check_exposure, check_rates, zeroed_counts
+from .expected import first_invalid_row
 
-__all__ = ["event_counts"]
+__all__ = ["event_counts", "first_photon_counts"]
 
 wp.set_module_options({"enable_backward": False})
 
 _ONE = wp.constant(wp.uint32(1))
 
+# Mean counts in a bin below which waiting times are cheaper than a binomial draw.
+_SPARSE = wp.constant(wp.float64(2.0))
+
 EVENT_LIMIT = 2**27
 """Most detections of a pixel in one frame of the event-driven detector: random blocks are numbered in 28 bits."""
 
 
+class _Exposure(NamedTuple):
+    """The numbers of an exposure, in range, and the largest count of a bin."""
+
+    pulses: int
+    frames: int
+    first_frame: int
+    depth: int
+    seed: int
+
+
+def _check_exposure(
+    hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int = 1, first_frame: int = 0
+) -> _Exposure:
+    """At most 2^31 - 1 rows in one call; raises `ArgumentError`."""
+    check_array("hazard", hazard, wp.float32, (None, None))
+    return _Exposure(
+        check_integer("pulses", pulses, 0),
+        check_integer("frames", frames, 1, (2**31 - 1) // max(hazard.shape[0], 1)),
+        check_integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31),
+        check_integer("counter_depth", counter_depth, 0) or 2**31 - 1,
+        check_seed(seed),
+    )
+
+
+def _check_rates(hazard: wp.array) -> None:
+    """Every rate is one, on the CPU, where nobody has to wait for it."""
+    check_array("hazard", hazard, wp.float32, (None, None))
+    if hazard.device.is_cpu and (row := first_invalid_row(hazard)) is not None:
+        raise ArgumentError(f"hazard of pixel {row} holds numbers that are negative or not finite")
+
+
+def _zeroed_counts(array: wp.array | None, shape: tuple[int, int], device: Any) -> wp.array:
+    """The caller's array of counts, or a new one, set to zero."""
+    if array is None:
+        return wp.zeros(shape, dtype=int, device=device)
+    if not isinstance(array, wp.array) or array.size != shape[0] * shape[1]:
+        raise ArgumentError(f"counts do not have the {shape[0] * shape[1]} entries of a contiguous int32 array {shape}")
+    check_array("counts", array, wp.int32, tuple(array.shape), device, contiguous=True)
+    array.zero_()
+    return array.reshape(shape)
+
+
+# ---- First photons.
+
+
 @wp.func
-def _last_not_above(values: wp.array2d(dtype=wp.float64), row: int, x: wp.float64) -> int:
+def _exponential(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.uint32) -> wp.float64:
+    """Waiting time of unit rate, finite."""
+    u = uniforms(seed, id, purpose, block)
+    return -wp.log(wp.float64(1.0) - u[0])
+
+
+@wp.func
+def _draw_row(
+    hazard: wp.array2d[float],
+    pixel: int,
+    row: int,
+    pulses: int,
+    depth: int,
+    seed: wp.uint64,
+    id: wp.uint64,
+    # Out, zero before or counts to add to:
+    counts: wp.array2d[int],
+):
+    """Adds the counts of `pulses` pulses of a pixel to a row; `id` names the draw."""
+    block = wp.uint32(0)
+    left = int(pulses)  # pulses without a count so far
+    waiting = int(0)
+    wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
+    for k in range(hazard.shape[1]):
+        h = wp.float64(hazard[pixel, k])
+        if h > wp.float64(0.0) and left > 0:
+            count = int(0)
+            if wp.float64(left) * h < _SPARSE:
+                # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
+                if waiting == 0:
+                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                    block = block + _ONE
+                    waiting = 1
+                while left > 0 and wait < wp.float64(left) * h:
+                    h = h - wait / wp.float64(left)
+                    left = left - 1
+                    count = count + 1
+                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                    block = block + _ONE
+                wait = wait - wp.float64(left) * h
+            else:
+                # Exponential waits have no memory: the one begun may be dropped.
+                waiting = 0
+                count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
+                left = left - count
+            if count > 0:
+                counts[row, k] = counts[row, k] + wp.min(count, depth)
+
+
+@wp.kernel(enable_backward=False)
+def _first_photon_kernel(
+    first_row: int,
+    hazard: wp.array2d[float],
+    pulses: int,
+    first_frame: wp.array[wp.int64],
+    summed: int,
+    depth: int,
+    seed: wp.uint64,
+    # Out, zero before:
+    counts: wp.array2d[int],
+):
+    row = first_row + wp.tid()
+    pixels = hazard.shape[0]
+    pixel = row % pixels
+    for part in range(summed):
+        frame = wp.uint64(first_frame[0]) + wp.uint64(row / pixels * summed + part)
+        id = frame * wp.uint64(pixels) + wp.uint64(pixel)
+        _draw_row(hazard, pixel, row, pulses, depth, seed, id, counts)
+
+
+def first_photon_counts(
+    hazard: wp.array,
+    *,
+    pulses: int,
+    frames: int = 1,
+    first_frame: int = 0,
+    summed: bool = False,
+    counter_depth: int = 0,
+    seed: int,
+    counts: wp.array | None = None,
+) -> wp.array:
+    """Counts of first-photon TCSPC, drawn exactly: bin after bin a binomial of the pulses that have not counted yet.
+
+    Args:
+        hazard: λ, float32 `[pixel, bin]`, finite and not negative, which is checked on the CPU alone: on a GPU every
+            call would wait for it.
+        pulses: per frame, below 2^31.
+        frames, first_frame: numbers of the frames; a frame's counts depend on its number, not on the call.
+        summed: add the frames up.
+        counter_depth: largest count of a bin and frame, 0: unlimited.
+        seed: 64 bits.
+        counts: the caller's own contiguous array of that size to write into.
+
+    Returns:
+        int32 `[frames · pixel, bin]`, or `[pixel, bin]` if summed. At most one count per pulse and pixel.
+
+    Raises:
+        ArgumentError: A number out of range, or an array of another kind.
+    """
+    _check_rates(hazard)
+    shot = _check_exposure(hazard, pulses, counter_depth, seed, frames, first_frame)
+    pixels, bins = hazard.shape
+    rows = pixels if summed else shot.frames * pixels
+    counts = _zeroed_counts(counts, (rows, bins), hazard.device)
+    first = wp.array([shot.first_frame], dtype=wp.int64, device=hazard.device)
+    inputs = [hazard, shot.pulses, first, shot.frames if summed else 1, shot.depth, shot.seed, counts]
+    launch_pixels(_first_photon_kernel, rows, inputs, device=hazard.device)
+    return counts
+
+
+def first_photon_step(
+    hazard: wp.array, *, pulses: int, frame: wp.array, counter_depth: int = 0, seed: int, counts: wp.array
+) -> None:
+    """One frame of `first_photon_counts` whose number is on the device, for a step that is captured in a graph.
+
+    Nothing is allocated and no value is read on the host: the counts are those of `first_photon_counts` with
+    `first_frame` = frame[0].
+
+    Args:
+        hazard: As there; its values are not checked.
+        frame: int64 `[1]`, the number of the frame, which the caller moves on.
+        counts: int32 `[pixel, bin]`, overwritten.
+        pulses, counter_depth, seed: As there.
+
+    Raises:
+        ArgumentError: A number out of range, or an array of another kind.
+    """
+    shot = _check_exposure(hazard, pulses, counter_depth, seed)
+    check_array("frame", frame, wp.int64, (1,), hazard.device)
+    check_array("counts", counts, wp.int32, hazard.shape, hazard.device, contiguous=True)
+    counts.zero_()
+    inputs = [hazard, shot.pulses, frame, 1, shot.depth, shot.seed, counts]
+    launch_pixels(_first_photon_kernel, hazard.shape[0], inputs, device=hazard.device)
+
+
+# ---- Event by event.
+
+
+@wp.func
+def _last_not_above(values: wp.array2d[wp.float64], row: int, x: wp.float64) -> int:
     """Index i of the interval [values[i], values[i + 1]) of a rising row that holds x, clamped to the row."""
     low = int(0)
     high = values.shape[1] - 1
@@ -38,9 +236,7 @@ def _last_not_above(values: wp.array2d(dtype=wp.float64), row: int, x: wp.float6
 
 
 @wp.kernel(enable_backward=False)
-def _cumulative_kernel(
-    first_pixel: int, offset: int, hazard: wp.array2d(dtype=float), cumulative: wp.array2d(dtype=wp.float64)
-):
+def _cumulative_kernel(first_pixel: int, offset: int, hazard: wp.array2d[float], cumulative: wp.array2d[wp.float64]):
     pixel = first_pixel + wp.tid()
     total = wp.float64(0.0)
     cumulative[pixel, 0] = total
@@ -61,8 +257,8 @@ class Moment:
 
 @wp.func
 def _next_primary(
-    cumulative: wp.array2d(dtype=wp.float64),
-    edges: wp.array2d(dtype=wp.float64),
+    cumulative: wp.array2d[wp.float64],
+    edges: wp.array2d[wp.float64],
     local: int,
     pulses: wp.int64,
     pulse: wp.int64,
@@ -118,10 +314,10 @@ def _next_afterpulse(
 def _event_kernel(
     first_row: int,
     # Pixels `offset` … of an image of `pixels`:
-    cumulative: wp.array2d(dtype=wp.float64),
+    cumulative: wp.array2d[wp.float64],
     offset: int,
     pixels: int,
-    edges: wp.array2d(dtype=wp.float64),
+    edges: wp.array2d[wp.float64],
     recorded: int,
     pulses: wp.int64,
     period: wp.float64,
@@ -133,12 +329,12 @@ def _event_kernel(
     depth: int,
     seed: wp.uint64,
     write_tags: int,
-    tag_start: wp.array(dtype=wp.int64),
+    tag_start: wp.array[wp.int64],
     # Out, counts zero before:
-    counts: wp.array2d(dtype=int),
-    tag_count: wp.array(dtype=int),
-    tag_pulse: wp.array(dtype=wp.int64),
-    tag_bin: wp.array(dtype=int),
+    counts: wp.array2d[int],
+    tag_count: wp.array[int],
+    tag_pulse: wp.array[wp.int64],
+    tag_bin: wp.array[int],
 ):
     tid = first_row + wp.tid()
     local = tid % cumulative.shape[0]
@@ -246,20 +442,17 @@ def event_counts(
     Raises:
         ArgumentError: A number out of range, an array of another kind, or too many detections in a frame.
     """
-    check_rates("hazard", hazard)
-    device = hazard.device
+    _check_rates(hazard)
+    shot = _check_exposure(hazard, pulses, counter_depth, seed, frames, first_frame)
+    pulses, frames, device = shot.pulses, shot.frames, hazard.device
     pixels, bins = hazard.shape
-    pulses, frames, first_frame, counter_depth, seed = check_exposure(
-        hazard, pulses, frames, first_frame, counter_depth, seed
-    )
     recorded = check_integer("recorded", recorded, 1, bins)
-    check_number("period", period, "(0, inf)")
+    check_range("(0, inf)", period=period, afterpulsing_time_constant=afterpulsing_time_constant)
     check_number("dead_time", dead_time, "[0, inf)")
     check_number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
-    check_number("afterpulsing_time_constant", afterpulsing_time_constant, "(0, inf)")
     edges = _rising_edges(edges, bins, period)
     rows = frames * pixels
-    counts = zeroed_counts(counts, (rows, recorded), device)
+    counts = _zeroed_counts(counts, (rows, recorded), device)
     number = wp.zeros(rows, dtype=int, device=device)
     # A period without dead time holds any number of detections: only then does the mean have to be looked up.
     most = 1.0 if gated else period / dead_time + 1.0 if dead_time > 0 else np.inf
@@ -279,8 +472,8 @@ def event_counts(
             cumulative = wp.empty((size, bins + 1), dtype=wp.float64, device=device)
             launch_pixels(_cumulative_kernel, size, [offset, hazard, cumulative], device=device)
             inputs = [cumulative, offset, pixels, edge_row, recorded, pulses, period, int(bool(gated)), dead_time]
-            inputs += [afterpulsing_probability, afterpulsing_time_constant, first_frame]
-            inputs += [counter_depth or 2**31 - 1, seed, write, start, counts, number, pulse, bin]
+            inputs += [afterpulsing_probability, afterpulsing_time_constant, shot.first_frame]
+            inputs += [shot.depth, shot.seed, write, start, counts, number, pulse, bin]
             launch_pixels(_event_kernel, frames * size, inputs, device=device)
 
     none = wp.zeros(1, dtype=wp.int64, device=device)
