@@ -27,7 +27,7 @@ import spadwarp
 from spadwarp.cli import app
 from spadwarp.dataset import Distribution, Recipe
 from spadwarp.scene import Scene
-from spadwarp.scene.load import COEFFICIENTS
+from spadwarp.scene.tables import COEFFICIENTS
 
 FOLDER = Path(__file__).parent / "reference"
 MADE = "<!-- Made by docs/reference.py from the code. -->\n\n"

@@ -50,7 +50,7 @@ def time_from_path(path: Any, group_index: float) -> Any:
 
 
 def range_from_time(time: Any, group_index: float) -> Any:
-    """Range [m] of a round trip of a time [s], laser at the lens; `spadwarp.scene.geometry` has it for any laser."""
+    """Range [m] of a round trip of a time [s], laser at the lens; `spadwarp.scene.sight` has it for any laser."""
     return 0.5 * pulse_speed(group_index) * time
 
 

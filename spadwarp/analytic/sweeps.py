@@ -18,10 +18,10 @@ from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 from spadwarp.io.parsing import parse_toml
 from spadwarp.limits import check_choice, check_integer, parse_number, shown
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.load import parse_key
 from spadwarp.scene.messages import locate
-from spadwarp.scene.quantities import field_unit, takes_integers
+from spadwarp.scene.sections import field_unit, takes_integers
+from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.tables import parse_key
 from spadwarp.transport import truth_maps
 from spadwarp.units import quantity
 

@@ -38,10 +38,9 @@ from spadwarp.errors import ConfigError
 from spadwarp.io.examples import example_or_path
 from spadwarp.io.parsing import read_toml
 from spadwarp.scene import Scene, parse_override
-from spadwarp.scene.load import toml_text
 from spadwarp.scene.messages import describe
-from spadwarp.scene.renamed import current_fields, current_path
 from spadwarp.scene.sections import Whole
+from spadwarp.scene.tables import toml_text
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 
@@ -226,7 +225,7 @@ class Recipe(Table):
         """
         name = None if source is None else str(source)
         try:
-            recipe = cls.model_validate(_with_paths(_current(tables), source))
+            recipe = cls.model_validate(_with_paths(tables, source))
         except ValidationError as error:
             raise ConfigError(describe(error, cls, {}), source=name) from None
         recipe._source = None if source is None else Path(source)
@@ -268,7 +267,7 @@ class Recipe(Table):
         pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
         tables = self.to_dict()
         for key, value in pairs:
-            parts = current_path(key if isinstance(key, str) else ".".join(map(str, key))).split(".")
+            parts = (key if isinstance(key, str) else ".".join(map(str, key))).split(".")
             inner = tables
             for part in parts[:-1]:
                 inner = inner.setdefault(part, {})
@@ -290,12 +289,6 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
             "a scene, not a recipe; a recipe has such tables in [scene], see `spadwarp examples`", source=str(path)
         )
     return Recipe.from_dict(tables, source=path)
-
-
-def _current(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe's own tables with former names replaced; a scene replaces its own."""
-    exposure = tables.get("exposure")
-    return {**tables, "exposure": current_fields("exposure", exposure)} if isinstance(exposure, Mapping) else {**tables}
 
 
 def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:

@@ -16,8 +16,7 @@ from spadwarp.device import pick_device
 from spadwarp.errors import kernel_errors
 from spadwarp.result import Truth
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import gate_deviation, pixel_directions
-from spadwarp.scene.sight import lines_of_sight
+from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
 
 __all__ = ["render_analytic"]

@@ -21,7 +21,6 @@ from spadwarp.dataset.recipe import SPLITS, Recipe
 from spadwarp.dataset.targets import TargetSource, check_extents, find_targets
 from spadwarp.errors import ConfigError
 from spadwarp.scene import Camera, Scene, Trajectory, load_trajectory
-from spadwarp.scene.renamed import former_path
 from spadwarp.scene.sight import port_advance
 from spadwarp.units import time_from_range
 
@@ -138,7 +137,7 @@ class Plan:
             distance = float(draw("pose.distance", recipe.pose.distance))
         else:
             distance = self._export_distance(source)
-        changes = {name: draw(f"vary.{former_path(name)}", values) for name, values in recipe.vary.items()}
+        changes = {name: draw(f"vary.{name}", values) for name, values in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
         lengths = draw("water.attenuation_lengths", recipe.water.attenuation_lengths)
         if lengths is None:

@@ -21,7 +21,7 @@ from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, n
 from spadwarp.io.hdf5_file import Hdf5File
 from spadwarp.result.result import Result
 from spadwarp.scene import Scene
-from spadwarp.scene.intrinsics import camera_attributes
+from spadwarp.scene.camera import camera_attributes
 
 __all__ = ["FORMAT", "FORMAT_VERSION", "FramesFile", "FramesWriter", "is_frames_file"]
 

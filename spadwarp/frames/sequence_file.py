@@ -19,7 +19,7 @@ from spadwarp.io.hdf5 import read_hdf5, write_hdf5
 from spadwarp.io.hdf5_dimensions import PIXELS, Coordinate, image_coordinates, name_dimensions
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, Trajectory
-from spadwarp.scene.intrinsics import camera_attributes
+from spadwarp.scene.camera import camera_attributes
 
 __all__ = ["FORMAT", "SequenceFile", "SequenceWriter"]
 

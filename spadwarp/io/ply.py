@@ -21,7 +21,7 @@ def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.
 
     Args:
         distance: Along the lines of sight `[H, W]` [m]; NaN where there is nothing.
-        directions: Unit vectors `[H, W, 3]`, such as `spadwarp.scene.geometry.pixel_directions` gives.
+        directions: Unit vectors `[H, W, 3]`, such as `spadwarp.scene.sight.pixel_directions` gives.
 
     Returns:
         float32 `[P, 3]`, row after row of the pixels that have a range, and their mask, bool `[H, W]`.

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.scene.frustum import points_inside, view_planes
-from spadwarp.scene.port_rays import PortGeometry, camera_port
+from spadwarp.scene.port import PortGeometry
+from spadwarp.scene.scene import camera_port
+from spadwarp.scene.sight import points_inside, view_planes
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh

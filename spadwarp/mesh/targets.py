@@ -18,7 +18,8 @@ from spadwarp.mesh.builtins import SIZED_BUILTINS, make_builtin
 from spadwarp.mesh.colours import Images, Pattern, read_coloured_mesh
 from spadwarp.mesh.files import check_sizes, check_triangles
 from spadwarp.mesh.usd import USD_ENDINGS, read_usd
-from spadwarp.scene.pose import rotation_matrix, to_camera
+from spadwarp.scene.camera import to_camera
+from spadwarp.scene.pose import rotation_matrix
 
 if TYPE_CHECKING:
     import trimesh

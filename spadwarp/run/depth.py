@@ -13,7 +13,8 @@ from spadwarp.io.atomic import atomic_path
 from spadwarp.io.exr import write_exr
 from spadwarp.io.ply import point_cloud, point_normals, write_ply
 from spadwarp.limits import check_choice
-from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.pose import rotation_matrix
 
 __all__ = ["write_depth"]
 

@@ -9,17 +9,17 @@ the water. Surfaces reflect sun, sky and the light of the water.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ConfigError
-from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.medium import Medium
-from spadwarp.scene.phase import PhaseFunction, phase_function
-from spadwarp.scene.port_rays import camera_port
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scattering import PhaseFunction, phase_function
+from spadwarp.scene.scene import Scene, camera_port
+from spadwarp.scene.sight import pixel_directions
 from spadwarp.scene.spectrum import filter_band, filter_transmission
 from spadwarp.units import PLANCK, SPEED_OF_LIGHT
 from spadwarp.water.daylight import (
@@ -29,9 +29,6 @@ from spadwarp.water.daylight import (
     refracted_cosine,
     surface_reflectance,
 )
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["daylight_radiance", "daylight_rate", "downwelling_irradiance", "noise_rate"]
 

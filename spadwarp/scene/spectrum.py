@@ -7,29 +7,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.parsing import read_columns
+from spadwarp.errors import ConfigError
+from spadwarp.scene.detector import Detector
+from spadwarp.scene.laser import Laser
+from spadwarp.scene.sections import read_table
 
-if TYPE_CHECKING:
-    from spadwarp.scene import Detector, Laser, Scene
-
-__all__ = [
-    "FILTER_COLUMNS",
-    "SPECTRUM_COLUMNS",
-    "SpectralLine",
-    "WaterLine",
-    "detection_efficiency",
-    "filter_band",
-    "filter_transmission",
-    "spectral_lines",
-    "water_lines",
-]
+__all__ = ["SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]
 
 Floats = NDArray[np.float64]
 
@@ -53,40 +41,6 @@ class SpectralLine(NamedTuple):
 
     wavelength_nm: float
     share: float
-
-
-class WaterLine(NamedTuple):
-    """A line of the light that passes the filter, in the water.
-
-    Attributes:
-        share: Photons, over those of a pulse of one line at `laser.wavelength_nm`.
-        extinction, scattering: [1/m].
-        speed: Of a pulse [m/s].
-    """
-
-    share: float
-    extinction: float
-    scattering: float
-    speed: float
-
-
-def water_lines(scene: Scene) -> list[WaterLine]:
-    """What passes the filter of a pulse, line by line; one line where nothing of the water follows the wavelength.
-
-    Raises `FileError` or `ConfigError` for a table, and `ConfigError` for a spectrum beyond where the water is known.
-    """
-    medium, lines = scene.medium, spectral_lines(scene.laser, scene.detector)
-    if len(lines) == 1 or not medium.follows_wavelength:
-        whole = math.fsum(line.share for line in lines)
-        return [WaterLine(whole, medium.extinction, medium.scattering, medium.pulse_speed)]
-    try:
-        waters = [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
-    except ArgumentError as error:
-        raise ConfigError(
-            f"laser: the spectrum reaches beyond where medium.chlorophyll, temperature and salinity hold: {error}",
-            source=None if scene.source is None else str(scene.source),
-        ) from None
-    return [WaterLine(share, water.extinction, water.scattering, water.pulse_speed) for share, water in waters]
 
 
 def filter_transmission(laser: Laser, detector: Detector, wavelength_nm: ArrayLike) -> Floats:
@@ -166,12 +120,10 @@ def _gaussian(offset: Any) -> Any:
 
 
 def _table(field: str, path: str, columns: dict[str, str]) -> tuple[Floats, Floats]:
-    try:
-        rows = read_columns(Path(path), columns)
-    except FileError as error:
-        raise FileError(f"{field} = {error}") from None
-    if len(rows) < 2 or (np.diff(rows[:, 0]) <= 0.0).any():
+    """Two columns of rising wavelengths and what is not all 0."""
+    at, values = read_table(field, path, columns)
+    if len(at) < 2 or (np.diff(at) <= 0.0).any():
         raise ConfigError(f"{field}: {path}: two rows or more with rising wavelengths are needed")
-    if not rows[:, 1].max() > 0.0:
+    if not values.max() > 0.0:
         raise ConfigError(f"{field}: {path}: holds no {next(reversed(columns))} above 0")
-    return rows[:, 0], rows[:, 1]
+    return at, values

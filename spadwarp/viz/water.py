@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from spadwarp.mesh import TriangleMesh, build_mesh
 from spadwarp.scene import Scene
-from spadwarp.scene.grid_cells import grid_cells
-from spadwarp.scene.pose import to_camera, to_world
+from spadwarp.scene.camera import to_camera, to_world
+from spadwarp.scene.medium import grid_cells
 from spadwarp.viz.style import BLUE, BOUND_MAP, GREEN, PAGE, new_figure, paper, save
 
 __all__ = ["draw_slice", "draw_water"]

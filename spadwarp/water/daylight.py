@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.limits import check_real
-from spadwarp.water.seawater import check_ranges, table_columns
+from spadwarp.water.seawater import RANGES, check_ranges, table_columns
 
 __all__ = ["Skylight", "clear_sky_irradiance", "daylight_attenuation", "surface_reflectance"]
 
@@ -66,8 +66,8 @@ def clear_sky_irradiance(
     Raises:
         ArgumentError: A value outside its range.
     """
-    elevation = check_real("sun_elevation_deg", sun_elevation_deg, "(0, 90]")
-    turbidity = check_real("aerosol_optical_depth", aerosol_optical_depth, "[0, 5]")
+    elevation = check_real("sun_elevation_deg", sun_elevation_deg, RANGES["sun_elevation_deg"])
+    turbidity = check_real("aerosol_optical_depth", aerosol_optical_depth, RANGES["aerosol_optical_depth"])
     check_ranges(wavelength_nm=wavelength_nm)
     nm = np.asarray(wavelength_nm, np.float64)
     rows = table_columns("clear_sky")
@@ -162,6 +162,6 @@ def daylight_attenuation(absorption: ArrayLike, backscattering: ArrayLike, *, su
         sun_elevation_deg: (0, 90] [°].
     """
     a, backward = np.asarray(absorption, np.float64), np.asarray(backscattering, np.float64)
-    zenith = 90.0 - check_real("sun_elevation_deg", sun_elevation_deg, "(0, 90]")
+    zenith = 90.0 - check_real("sun_elevation_deg", sun_elevation_deg, RANGES["sun_elevation_deg"])
     attenuation = (1.0 + 0.005 * zenith) * a + 4.18 * (1.0 - 0.52 * np.exp(-10.8 * a)) * backward
     return attenuation if attenuation.ndim else float(attenuation)

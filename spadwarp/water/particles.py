@@ -36,18 +36,8 @@ from spadwarp.water.seawater import (
     table_columns,
 )
 
-__all__ = [
-    "ParticleOptics",
-    "SizeDistribution",
-    "kopelevich_particles",
-    "log_normal",
-    "mie_particles",
-    "mixture",
-    "power_law",
-    "save_matrix_table",
-    "save_phase_table",
-    "single_size",
-]
+__all__ = ["ParticleOptics", "SizeDistribution", "kopelevich_particles", "log_normal", "mie_particles", "mixture"]
+__all__ += ["power_law", "save_matrix_table", "save_phase_table", "single_size"]
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from reference import crlb
 from spadwarp.analytic import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result.result import Truth
-from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import pixel_directions
 
 MAPS = (
     *("signal", "arrival", "backscatter", "alpha", "fisher", "sigma_time", "sigma_depth"),

@@ -537,18 +537,3 @@ def test_plan_needs_no_order():
     assert plan.scene(3).scene == plan.scene(3).scene != plan.scene(2).scene
     assert plan.scene(3).fractions == tuple(plan.fraction(9 + k) for k in range(3))
     assert not math.isnan(plan.scene(0).fractions[0])
-
-
-def test_older_words_in_a_recipe_mean_and_draw_the_same():
-    pulses = {"low": 1000.0, "high": 9000.0}
-    words = (("pulses", "detector.fold", "paper"), ("pulses_per_depth_frame", "detector.wrap", "lu2024"))
-    tables = (
-        {**TABLES, "exposure": {name: pulses}, "vary": {path: [True, False], "analytic.form": [form, "radiometric"]}}
-        for name, path, form in words
-    )
-    older, now = (Plan(Recipe.from_dict(table)) for table in tables)
-    drawn = [older.scene(index).scene for index in range(older.scene_count)]
-    assert drawn == [now.scene(index).scene for index in range(now.scene_count)]
-    assert {scene.detector.wrap for scene in drawn} == {True, False}
-    changed = now.recipe.with_overrides({"exposure.pulses": 7.0})
-    assert changed.exposure.pulses_per_depth_frame.choices == (7.0,)

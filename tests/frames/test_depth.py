@@ -9,9 +9,9 @@ from spadwarp.frames.measured import read_histograms
 from spadwarp.io.ply import point_cloud, point_normals, write_ply
 from spadwarp.run import write_depth
 from spadwarp.scene import Camera
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.pose import rotation_matrix, to_camera
-from spadwarp.scene.sight import lines_of_camera
+from spadwarp.scene.camera import to_camera
+from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.sight import lines_of_camera, pixel_directions
 
 COUNTS = np.random.default_rng(3).poisson(2.0, (3, 5, 40)).astype(np.uint16)
 

@@ -220,7 +220,7 @@ def test_sensor_fusion_as_its_loader_reads_it(frames, detection, result, tmp_pat
         seen = item["bins"][0] >= 0
         assert seen.sum() > WIDTH * HEIGHT // 2
         assert np.abs(middle["bins_hr"] - item["bins"][0])[seen].max() * (BINS - 1) < 0.5 + 1e-3
-        view = spadwarp.scene.geometry.pixel_directions(result.scene.camera)
+        view = spadwarp.scene.sight.pixel_directions(result.scene.camera)
         light = -result.truth.reflectance * (result.truth.normal * view).sum(axis=-1)
         there = np.isfinite(light)
         ratio = (middle["intensity"] / light)[there]

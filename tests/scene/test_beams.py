@@ -15,7 +15,7 @@ from helpers.scenes import scene
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.exr import write_exr
 from spadwarp.mesh import build_mesh
-from spadwarp.scene import beam_profile
+from spadwarp.scene import laser as beam_profile
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import photon_capacity, tally_scale
 from spadwarp_kernels import profile_tables
@@ -61,7 +61,7 @@ def test_photons_leave_as_the_profile_was_measured(direction, device, tmp_path):
 def test_a_profile_can_be_an_image(tmp_path):
     import matplotlib.image
 
-    from spadwarp.scene.beam_profile import load_profile
+    from spadwarp.scene.laser import load_profile
 
     levels = np.round(255 * PROFILE / PROFILE.max()).astype(np.uint8)
     np.save(tmp_path / "beam.npy", PROFILE.astype(np.float32))
@@ -94,7 +94,7 @@ def test_what_is_no_profile_is_refused(image, problem, tmp_path):
     if image is not None:
         with pytest.raises(ValueError):
             profile_tables(image)
-    with pytest.raises(ConfigError, match="does not go with profile = 'gaussian'"):
+    with pytest.raises(ConfigError, match="goes with profile = 'measured' only"):
         scene(laser={"profile": "gaussian", "profile_image": "beam.npy"})
     with pytest.raises(ConfigError, match=r"\(0, 90\), the range of a measured profile"):
         scene(laser=measured("beam.npy", half_angle_deg=95.0))

@@ -10,9 +10,8 @@ import warp as wp
 import spadwarp
 from helpers.scenes import scene
 from spadwarp.scene import Scene
-from spadwarp.scene.grid_cells import grid_cells
-from spadwarp.scene.grid_files import read_grid
-from spadwarp.scene.grid_shapes import SHAPES, turbulent_field
+from spadwarp.scene.grid import SHAPES, read_grid, turbulent_field
+from spadwarp.scene.medium import grid_cells
 
 RNG = np.random.default_rng(11)
 DENSITY = RNG.random((3, 4, 5))

@@ -9,9 +9,9 @@ from helpers.opencv import project_points
 from spadwarp import load_scene
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.scene import Camera, look_at, opencv_pose, save_calibration
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.intrinsics import image_points, image_tangents, pixel_views, view_box
-from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_camera, to_world
+from spadwarp.scene.camera import image_points, image_tangents, pixel_views, to_camera, to_world, view_box
+from spadwarp.scene.pose import rotation_angles, rotation_matrix
+from spadwarp.scene.sight import pixel_directions
 
 # Calibrations of a barrel, a pincushion and a decentred lens.
 LENSES = {

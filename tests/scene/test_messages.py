@@ -23,7 +23,10 @@ def message(tmp_path, *overrides):
         ),
         ('camera.port={distance=0.05, thickness=0.01, material="glass"}', "is not one of 'BK7', 'fused silica'"),
         ('camera.port={preset="dome-acryl"}', "did you mean 'dome-acrylic'?"),
-        ('camera.port={preset="dome-acrylic", distance=0.05}', "a flat port has distance, a dome has radius"),
+        (
+            'camera.port={preset="dome-acrylic", distance=0.05}',
+            "distance = 0.05 goes with shape = 'flat' only",
+        ),
         (
             'camera.port={preset="dome-acrylic", offset=[0, 0, 0.06]}',
             "the lens is outside: it is 0.06 m from the dome's centre, the radius is 0.05 m; change offset or radius",

@@ -12,8 +12,8 @@ from reference.single_scatter import henyey_greenstein
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.parsing import read_columns
 from spadwarp.scene import Medium
-from spadwarp.scene.phase import PHASE_COLUMNS
-from spadwarp.scene.preset import PHASE_TABLES
+from spadwarp.scene.scattering import PHASE_COLUMNS
+from spadwarp.scene.tables import PHASE_TABLES
 
 WATER = {"extinction": 0.3, "albedo": 0.8}
 PETZOLD = Medium(**WATER, phase_function="tabulated", phase_table="petzold-average-particle")

@@ -3,7 +3,7 @@
 import pytest
 
 from spadwarp.scene import Camera, Medium, Scene, presets
-from spadwarp.scene.preset import PRESETS
+from spadwarp.scene.tables import PRESETS
 from spadwarp.water import pure_water_absorption
 
 MEDIA = presets("medium")

@@ -9,7 +9,7 @@ import pytest
 import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.scene import Camera, Gate, Laser, Medium, Scene
-from spadwarp.scene.quantities import field_unit
+from spadwarp.scene.sections import field_unit
 from spadwarp.units import percent, quantity, with_prefix
 
 

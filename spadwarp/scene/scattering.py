@@ -1,9 +1,9 @@
-"""The phase function of a scene's water as a density of the scattering angle, in float64."""
+"""Scattering by a scene's water, in float64: the phase function and the scattering matrix of polarised light."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,12 +13,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ConfigError
-from spadwarp.io.parsing import read_columns
 from spadwarp.scene.medium import Medium
-from spadwarp.scene.preset import PHASE_TABLES
-from spadwarp.water import molecular_density
+from spadwarp.scene.sections import read_table
+from spadwarp.scene.settings import Transport
+from spadwarp.scene.surroundings import Target
+from spadwarp.scene.tables import PHASE_TABLES
+from spadwarp.water import (
+    molecular_density,
+    rayleigh_matrix,
+    read_matrix_table,
+    scaled_rayleigh_matrix,
+    voss_fry_matrix,
+)
 
-__all__ = ["PHASE_COLUMNS", "PhaseFunction", "phase_function"]
+__all__ = ["Matrix", "PhaseFunction", "phase_function", "scattering_matrix"]
 
 Floats = NDArray[np.float64]
 
@@ -83,16 +91,10 @@ def phase_function(medium: Medium) -> PhaseFunction:
     first_angle = 0.0
     name, parameters = medium.phase_function, medium.phase_parameters
     if name == "tabulated":
-        table = str(medium.phase_table)
-        path = (
-            Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[table][0]
-            if table in PHASE_TABLES
-            else Path(table)
-        )
-        try:
-            angles, values = read_columns(path, PHASE_COLUMNS).T
-        except ConfigError as error:
-            raise ConfigError(f"medium.phase_table: {error}") from None
+        path = Path(str(medium.phase_table))
+        if str(path) in PHASE_TABLES:
+            path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)][0]
+        angles, values = read_table("medium.phase_table", path, PHASE_COLUMNS)
         try:
             density = sk.interpolated_density(np.radians(angles), values)
             first_angle = math.radians(float(angles[0]))
@@ -109,3 +111,47 @@ def phase_function(medium: Medium) -> PhaseFunction:
             return (1.0 - share) * of_particles(t) + share * molecular_density(t)
 
     return PhaseFunction(name, parameters, share, density, first_angle)
+
+
+Matrix = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Cosines of the scattering angle `[n]` → m12, m22, m33, m34 and m44, each over m11, `[n, 5]`: I′ = I + m12 Q,
+Q′ = m12 I + m22 Q, U′ = m33 U + m34 V, V′ = −m34 U + m44 V with respect to the plane of scattering (Bohren & Huffman
+1983, eq 4.77)."""
+
+
+def scattering_matrix(medium: Medium) -> Matrix | None:
+    """The scattering matrix of a scene's medium, over its phase function, `scattering_matrix(scene.medium)`; None for
+    "none".
+
+    Raises `FileError` or `ConfigError` if its table cannot be read.
+    """
+    if medium.scattering_matrix == "rayleigh":
+        return partial(rayleigh_matrix, depolarisation_ratio=medium.depolarisation_ratio)
+    if medium.scattering_matrix == "scaled_rayleigh":
+        return partial(scaled_rayleigh_matrix, largest=medium.largest_polarisation)
+    if medium.scattering_matrix == "tabulated":
+        try:
+            return read_matrix_table(str(medium.matrix_table))
+        except ConfigError as error:
+            raise ConfigError(f"medium.matrix_table: {error}") from None
+    return voss_fry_matrix if medium.scattering_matrix == "voss_fry" else None
+
+
+def check_polarisation(medium: Medium, transport: Transport, targets: Sequence[Target]) -> None:
+    """Raises `ValueError` for sections of a scene that do not go with polarised light."""
+    if transport.axis_threshold < 1.0:
+        raise ValueError(
+            f"transport.axis_threshold = {transport.axis_threshold} does not go with polarised light: set it to 1, "
+            "for directions without the near-axis rule"
+        )
+    if medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
+        raise ValueError(
+            "medium.scattering_matrix = 'none' does not go with polarised light in water that scatters: choose "
+            "'rayleigh', 'scaled_rayleigh', 'voss_fry' or 'tabulated'"
+        )
+    for k, target in enumerate(targets):
+        if target.specular > 0.0 and abs(target.specular_index / medium.phase_index - 1.0) < 1e-3:
+            raise ValueError(
+                f"targets[{k}].specular_index = {target.specular_index} is that of the water, "
+                f"{medium.phase_index:.4g}: such facets reflect nothing"
+            )
