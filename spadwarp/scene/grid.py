@@ -17,7 +17,7 @@ from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.npy import read_npz
 from spadwarp.io.paths import existing_file
 from spadwarp.limits import Interval
-from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field_range
 from spadwarp.scene.tables import COEFFICIENTS
 
@@ -437,8 +437,9 @@ def cells_of(grid: Grid, water: tuple[float, float, float], has_table: bool, sta
     rotation = rotation_matrix(grid.rotation_deg)
     own = np.zeros(3) if origin is None else (np.array(origin) + 0.5 * np.array(edges)) * grid.scale
     centre = rotation @ own + grid.translation
-    arrays = [None if one is None else np.ascontiguousarray(one, np.float32) for one in (c, omega, g)]
-    return GridCells(*arrays, tuple(size.tolist()), tuple(centre.tolist()), rotation)  # type: ignore[arg-type]
+    c, omega = np.ascontiguousarray(c, np.float32), np.ascontiguousarray(omega, np.float32)
+    g = None if g is None else np.ascontiguousarray(g, np.float32)
+    return GridCells(c, omega, g, vector_of(size), vector_of(centre), rotation)
 
 
 @functools.lru_cache(maxsize=2)

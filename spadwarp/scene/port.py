@@ -229,7 +229,7 @@ class PortGeometry:
 
     def transmission(self, x: ArrayLike, u: ArrayLike) -> Floats:
         """Fraction of unpolarised light that gets through, of rays from x inside along unit vectors u; 0: none."""
-        s = p = 1.0
+        s = p = np.ones(())
         with np.errstate(invalid="ignore"):
             for k, (_, q0, q1, _, _) in enumerate(self._faces(x, u)):
                 before, behind = self.index[k], self.index[k + 1]
