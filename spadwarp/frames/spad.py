@@ -237,7 +237,7 @@ def _draw(
     if as_torch:
         out = output_tensor(out, name="out", shape=shape, device=light.hazard.device)
     in_place = as_torch and not add_frames
-    common: dict[str, Any] = {**numbers, "counter_depth": detector.counter_depth}
+    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count}
     common["counts"] = wp.from_torch(out).flatten() if in_place else None
     events = None
     if by_event:

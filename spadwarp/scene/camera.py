@@ -83,7 +83,7 @@ class Camera(Section):
     """what it records of polarisation: nothing; light through an analyser and one across; the Stokes vector"""
     analyser_angle_deg: float = Field(0.0, ge=-180, le=180)
     """analyser: direction of the field that it lets through, in the image from +x towards +y [°]"""
-    extinction_ratio: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True), Infinite] = math.inf
+    analyser_extinction_ratio: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True), Infinite] = math.inf
     """analyser: light that it lets through along its direction over light across; inf or "infinity" is ideal"""
     port: Port | None = None
     """what it looks through; view and focus are those in the air behind it. Without one it is in the water"""

@@ -59,7 +59,7 @@ class Detector(Section):
     """time of flight modulo the pulse period (range aliasing), as a detector sees it"""
     pulses_per_frame: Whole = Field(20_000, ge=1, le=2**63 - 1)
     """laser pulses in one frame of counts"""
-    counter_depth: Whole = Field(0, ge=0, le=2**31 - 1)
+    max_count: Whole = Field(0, ge=0, le=2**31 - 1)
     """largest count a histogram bin holds; 0 is unlimited"""
 
     @model_validator(mode="after")

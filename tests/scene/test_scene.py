@@ -407,7 +407,7 @@ def kinds(annotation):
 
 
 # Fields that document infinity.
-INFINITE = {"extinction_ratio", "focus_distance", "distance", "lower", "upper", "lateral_limit"}
+INFINITE = {"analyser_extinction_ratio", "focus_distance", "distance", "lower", "upper", "lateral_limit"}
 
 
 @pytest.mark.parametrize("info", [*number_fields(Scene), *number_fields(Recipe), *number_fields(TrainingRecipe)])
