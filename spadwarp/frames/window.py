@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import TIME, check_integer, check_real, shown
+from spadwarp.scene import Gate
+from spadwarp.scene.sections import field_range
 
 __all__ = ["Window", "detector_window", "missing_light"]
 
@@ -43,7 +45,7 @@ def detector_window(
     if not (isinstance(window, tuple | list) and len(window) == 2):
         raise ArgumentError(f"window = {shown(window)} is not (start [s], bins)")
     start = check_real("start of window", window[0], TIME)
-    bins = check_integer("bins of window", window[1], "[1, 1000000]")
+    bins = check_integer("bins of window", window[1], field_range(Gate, "bins"))
     if wrap:
         # The detector knows no time beyond that from one pulse to the next.
         bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))

@@ -30,8 +30,8 @@ def received(result: Result, channel: Channel) -> Result:
     """The result with the light of one channel alone, for all that takes a result: counts, depth, bounds, pictures.
 
     "I" is the result itself, without an analyser; "co" passes an analyser at `camera.analyser_angle_deg` of the
-    camera's `analyser_extinction_ratio`, "cross" one across it. A camera of four Stokes cubes has both. Ambient light counts as
-    unpolarised: ½(1 + 1/E) of it passes, of `detector.ambient_rate` and of daylight.
+    camera's `analyser_extinction_ratio`, "cross" one across it. A camera of four Stokes cubes has both. Ambient light
+    counts as unpolarised: ½(1 + 1/E) of it passes, of `detector.ambient_rate` and of daylight.
 
     The ledger and the counters stay those of all light; from Stokes cubes the channel has no standard errors.
 
