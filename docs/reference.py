@@ -301,7 +301,7 @@ def python() -> str:
     homes: dict[str, list[str]] = {}
     for name, home in spadwarp._HOMES.items():
         homes.setdefault(home, []).append(name)
-    for room in sorted(spadwarp._ROOMS):
+    for room in sorted(spadwarp._PACKAGES):
         module = import_module(f"spadwarp.{room}")
         names = [name for name in getattr(module, "__all__", ()) if name not in spadwarp._HOMES]
         homes.setdefault(room, []).extend(name for name in names if callable(getattr(module, name)))

@@ -107,7 +107,7 @@ def sweep(
     found = Sweep(field=field, values=tuple(values), rows=tuple(rows))
     if found.is_flat:
         hint = ""
-        if field in ("detector.pulses_per_frame", "detector.pulses"):
+        if field == "detector.pulses_per_frame":
             hint = "; analytic.pulses_per_depth_frame or a count law per frame takes its place in this scene"
         warnings.warn(
             f"no number depends on {field}: the analytic model does not use it{hint}", SpadwarpWarning, stacklevel=2

@@ -295,7 +295,7 @@ def test_command(frames, tmp_path):
 
 RECIPE = {
     **{"name": "both kinds", "seed": 3, "scenes_per_target": 2, "scenes_per_shard": 2},
-    **{"pose": {"distance": 5.0}, "exposure": {"pulses": 3000}, "frames": {"per_scene": 2}},
+    **{"pose": {"distance": 5.0}, "exposure": {"pulses_per_depth_frame": 3000}, "frames": {"per_scene": 2}},
     "targets": {"builtin": ["staircase", "sphere"], "test": ["sphere"]},
     "gate": {"before": 1.5, "behind": 1.0, "bins": 40},
     "monte_carlo": {"share": 1.0, "photons": 20_000},
