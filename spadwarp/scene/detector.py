@@ -68,7 +68,7 @@ class Detector(Section):
             if getattr(self, name) == Detector.model_fields[name].default:
                 continue
             if self.filter_table is not None:
-                self._refuse(name, "goes without filter_table")
+                self._refuse(name, "cannot be combined with filter_table")
             if self.filter_fwhm_nm is None:
                 self._refuse(name, "needs filter_fwhm_nm")
         return self

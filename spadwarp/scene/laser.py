@@ -83,7 +83,7 @@ class Laser(Section):
             reason = f"is outside [0, {most:g}], a fifth of wavelength_nm; a broader source needs spectrum"
             self._refuse("linewidth_nm", reason)
         if self.spectrum is not None and self.linewidth_nm > 0.0:
-            self._refuse("linewidth_nm", "goes without spectrum")
+            self._refuse("linewidth_nm", "cannot be combined with spectrum")
         return self
 
     @model_validator(mode="after")

@@ -65,7 +65,7 @@ class Water(Section):
             if self.extinction not in (allowed := field_range(type(self), "extinction")):
                 raise ValueError(f"extinction = {self.extinction} is outside {allowed}")
         elif self.given or self.preset is not None:
-            self._refuse("chlorophyll", f"goes without {', '.join(self.given or ['preset'])}")
+            self._refuse("chlorophyll", f"cannot be combined with {', '.join(self.given or ['preset'])}")
         return self
 
     @property
