@@ -324,8 +324,7 @@ class Medium(Water):
         hidden = {"phase_index", "group_index"} - self.model_fields_set if self.follows_wavelength else set()
         if not self.layers:
             hidden |= {"layers", "layer_axis"}
-        fields = {name: value for name, value in super().to_dict().items() if name not in hidden}
-        return fields | ({"layers": [layer.to_dict() for layer in self.layers]} if self.layers else {})
+        return {name: value for name, value in super().to_dict().items() if name not in hidden}
 
 
 def grid_cells(medium: Medium) -> GridCells:

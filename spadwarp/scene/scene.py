@@ -25,7 +25,7 @@ from spadwarp.scene.messages import describe
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.scattering import check_polarisation
-from spadwarp.scene.sections import listed, with_paths, with_units
+from spadwarp.scene.sections import listed, plain, with_paths, with_units
 from spadwarp.scene.settings import Analytic, Gate, Output, Scan, Transport
 from spadwarp.scene.spectrum import detection_efficiency, spectral_lines
 from spadwarp.scene.surroundings import Daylight, Domain, Target
@@ -201,13 +201,7 @@ class Scene(BaseModel):
 
     def to_dict(self) -> dict[str, Any]:
         """Tables from which `from_dict` makes an equal scene."""
-        tables: dict[str, Any] = {}
-        for name, section in self:
-            if section is not None:
-                tables[name] = [target.to_dict() for target in section] if name == "targets" else section.to_dict()
-        if not tables["targets"]:
-            del tables["targets"]
-        return tables
+        return {name: plain(value) for name, value in self if value not in (None, ())}
 
     def to_toml(self, *, folder: str | os.PathLike[str] | None = None) -> str:
         """The full text that `load_scene` reads back to an equal scene.

