@@ -21,22 +21,6 @@ from spadwarp.scene.tables import *
 from spadwarp.scene.trajectory import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = [
-        name
-        for module in (
-            ambient_light,
-            camera,
-            detector,
-            laser,
-            medium,
-            pose,
-            scattering,
-            scene,
-            settings,
-            spectrum,
-            surroundings,
-            tables,
-            trajectory,
-        )
-        for name in module.__all__
-    ]
+    _MODULES = (ambient_light, camera, detector, laser, medium, pose, scattering)
+    _MODULES += (scene, settings, spectrum, surroundings, tables, trajectory)
+    __all__ = [name for module in _MODULES for name in module.__all__]

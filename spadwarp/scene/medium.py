@@ -278,26 +278,19 @@ class Medium(Water):
     @property
     def range(self) -> WaterRange:
         """Extremes over the medium, its layers and its grid. Raises what `grid_cells` raises."""
-        waters = self.waters
-        found = WaterRange(
-            max(water.extinction for water in waters),
-            max(water.scattering for water in waters),
-            max(0.0, min(water.extinction - water.scattering for water in waters)),
-            max(water.scattering / max(water.extinction, 1e-30) for water in waters),
-            tuple(layer.anisotropy for layer in self.layers if layer.anisotropy is not None),
-        )
-        if self.grid is None:
-            return found
-        cells = grid_cells(self)
-        scattering = cells.scattering
-        g = cells.anisotropy
-        return WaterRange(
-            max(found.extinction, float(cells.extinction.max())),
-            max(found.scattering, float(scattering.max())),
-            max(0.0, min(found.absorption, float((cells.extinction - scattering).min()))),
-            max(found.albedo, float(cells.albedo.max())),
-            () if g is None else (float(g.min()), float(g.max())),
-        )
+        extinction = [water.extinction for water in self.waters]
+        scattering = [water.scattering for water in self.waters]
+        absorption = [water.extinction - water.scattering for water in self.waters]
+        albedo = [water.scattering / max(water.extinction, 1e-30) for water in self.waters]
+        g = [layer.anisotropy for layer in self.layers if layer.anisotropy is not None]
+        if self.grid is not None:
+            cells = grid_cells(self)
+            extinction.append(float(cells.extinction.max()))
+            scattering.append(float(cells.scattering.max()))
+            absorption.append(float((cells.extinction - cells.scattering).min()))
+            albedo.append(float(cells.albedo.max()))
+            g += [] if cells.anisotropy is None else [float(cells.anisotropy.min()), float(cells.anisotropy.max())]
+        return WaterRange(max(extinction), max(scattering), max(0.0, min(absorption)), max(albedo), tuple(g))
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
         """∫c ds along the straight line between two points of the world [m]."""

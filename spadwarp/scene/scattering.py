@@ -59,25 +59,25 @@ class PhaseFunction:
     @cached_property
     def mean_cosine(self) -> float:
         """⟨cosθ⟩, the asymmetry parameter g."""
-        from spadwarp_kernels import sphere_integral
-
         if self.name == "henyey_greenstein":
             return (1.0 - self.molecular_share) * float(self.parameters["anisotropy"])
-        return sphere_integral(lambda t: self.over_t(t) * (1.0 - t))
+        return _sphere_integral(lambda t: self.over_t(t) * (1.0 - t))
 
     @cached_property
     def backscatter_fraction(self) -> float:
         """Part of the light that is scattered by more than 90°."""
-        from spadwarp_kernels import sphere_integral
-
-        return sphere_integral(lambda t: self.over_t(t) * (t > 1.0))
+        return _sphere_integral(lambda t: self.over_t(t) * (t > 1.0))
 
     def fraction_below(self, angle: float) -> float:
         """Part of the light that is scattered by less than an angle [rad] in (0, π]."""
-        from spadwarp_kernels import sphere_integral
-
         share = math.sin(0.5 * angle) ** 2
-        return share * sphere_integral(lambda t: self.over_t(share * t))
+        return share * _sphere_integral(lambda t: self.over_t(share * t))
+
+
+def _sphere_integral(density: Callable[[Floats], Floats]) -> float:
+    from spadwarp_kernels import sphere_integral
+
+    return sphere_integral(density)
 
 
 def phase_function(medium: Medium) -> PhaseFunction:

@@ -150,10 +150,6 @@ class LinesOfSight:
             along = np.maximum(along - (way + along - left) / slope, _LEAST)
         return np.where(left > least, along, np.nan) + self.lead
 
-    def light_to(self, distance: ArrayLike) -> Floats:
-        """Unit vectors in which the light of a laser that is a point comes to ranges."""
-        return self.light_at(self.points(distance))[0]
-
     def light_at(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Of the light of a laser that is a point, at points in the camera frame: unit vectors, the length of its way
         in the water, and the length in water that takes as long as all of its way [m]; NaN where none comes."""
@@ -211,7 +207,7 @@ def depth_per_time(scene: Scene, distance: Floats, view: Floats | None = None) -
         port = laser_port(scene)
         axis = np.array(beam.axis) if port is None else port.enter(beam.position, beam.axis)[1]
     lines = lines_of_sight(scene, view)
-    light = lines.light_to(distance) if axis is None else axis
+    light = lines.light_at(lines.points(distance))[0] if axis is None else axis
     # The path rises with the range by 1 + the cosine between both directions of light.
     return scene.medium.pulse_speed / (1.0 + (light * lines.direction).sum(axis=-1)) * lines.direction[..., 2]
 
