@@ -45,23 +45,12 @@ Value = Any  # a float for a float, else an array
 
 
 @dataclass(frozen=True)
-class WaterOptics:
-    """Optical properties of one water at one wavelength.
-
-    Attributes:
-        wavelength_nm: In vacuum [nm].
-        absorption, scattering: a and b [1/m], of water and of what is in it.
-        water_absorption, water_scattering: The part of the water itself [1/m].
-        phase_index, group_index: Refractive index, and the index for the time of flight.
-    """
+class Coefficients:
+    """Absorption a and scattering b [1/m] at a wavelength in vacuum [nm]."""
 
     wavelength_nm: float
     absorption: float
     scattering: float
-    water_absorption: float
-    water_scattering: float
-    phase_index: float
-    group_index: float
 
     @property
     def extinction(self) -> float:
@@ -72,6 +61,21 @@ class WaterOptics:
     def albedo(self) -> float:
         """b/c."""
         return self.scattering / self.extinction
+
+
+@dataclass(frozen=True)
+class WaterOptics(Coefficients):
+    """Optical properties of one water at one wavelength; `absorption` and `scattering` are of all that is in it.
+
+    Attributes:
+        water_absorption, water_scattering: The part of the water itself [1/m].
+        phase_index, group_index: Refractive index, and the index for the time of flight.
+    """
+
+    water_absorption: float
+    water_scattering: float
+    phase_index: float
+    group_index: float
 
 
 def water_optics(
