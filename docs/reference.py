@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 import typer
-from annotated_types import Ge, Gt, Le, Lt
 from pydantic import AfterValidator, BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -26,7 +25,9 @@ from pydantic_core import PydanticUndefined
 import spadwarp
 from spadwarp.cli import app
 from spadwarp.dataset import Distribution, Recipe
+from spadwarp.limits import Interval
 from spadwarp.scene import Scene
+from spadwarp.scene.sections import interval_of, parts_of
 from spadwarp.scene.tables import COEFFICIENTS
 
 FOLDER = Path(__file__).parent / "reference"
@@ -179,34 +180,13 @@ def _one_kind(annotation: Any) -> str:
 
 
 def _range(info: FieldInfo) -> str:
-    low, high = "(-∞", "∞)"
-    for one in _constraints(info):
-        match one:
-            case Ge(ge=value):
-                low = f"[{_short(value)}"
-            case Gt(gt=value):
-                low = f"({_short(value)}"
-            case Le(le=value):
-                high = f"{_short(value)}]"
-            case Lt(lt=value):
-                high = f"{_short(value)})"
-            case AfterValidator(func=check):  # of a distribution's values
-                limits = inspect.getclosurevars(check).nonlocals
-                if "interval" in limits:
-                    return limits["interval"]
-    return "" if (low, high) == ("(-∞", "∞)") else f"{low}, {high}"
-
-
-def _constraints(info: FieldInfo) -> Iterator[Any]:
-    yield from info.metadata
-    waiting = list(_union(info.annotation))
-    while waiting:
-        one = waiting.pop()
-        if get_origin(one) is Annotated:
-            inner, *more = get_args(one)
-            for constraint in more:
-                yield from constraint.metadata if isinstance(constraint, FieldInfo) else [constraint]
-            waiting.append(inner)
+    for part in parts_of(info):
+        if isinstance(part, AfterValidator):  # of a distribution's values
+            limits = inspect.getclosurevars(part.func).nonlocals
+            if "interval" in limits:
+                return str(limits["interval"])
+    interval = interval_of(info)._replace(unit="")
+    return "" if interval == Interval(-math.inf, math.inf, False, False) else str(interval)
 
 
 def _default(info: FieldInfo) -> str:
