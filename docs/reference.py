@@ -277,18 +277,18 @@ def _help(command: Any, path: str) -> Iterator[str]:
 
 
 def python() -> str:
-    """The names of `spadwarp.__all__` by module, and the other public names of each room."""
+    """The names of `spadwarp.__all__` by module, and the other public names of each package."""
     homes: dict[str, list[str]] = {}
     for name, home in spadwarp._HOMES.items():
         homes.setdefault(home, []).append(name)
-    for room in sorted(spadwarp._PACKAGES):
-        module = import_module(f"spadwarp.{room}")
+    for package in sorted(spadwarp._PACKAGES):
+        module = import_module(f"spadwarp.{package}")
         names = [name for name in getattr(module, "__all__", ()) if name not in spadwarp._HOMES]
-        homes.setdefault(room, []).extend(name for name in names if callable(getattr(module, name)))
+        homes.setdefault(package, []).extend(name for name in names if callable(getattr(module, name)))
     homes = {home: names for home, names in homes.items() if names}
     parts = [
         MADE + "# Python\n\n`import spadwarp` loads a name when it is used. Names of `spadwarp.__all__` are "
-        "`spadwarp.NAME`; the others are found in their room, as `spadwarp.ROOM.NAME`."
+        "`spadwarp.NAME`; the others are found in their package, as `spadwarp.PACKAGE.NAME`."
     ]
     for home, names in homes.items():
         about = inspect.cleandoc(import_module(f"spadwarp.{home}").__doc__ or "").splitlines()[0]
@@ -298,7 +298,7 @@ def python() -> str:
 
 
 def kernels() -> str:
-    """The public names of `spadwarp_kernels`, by room."""
+    """The public names of `spadwarp_kernels`, by package."""
     import spadwarp_kernels
 
     rooms = [one.name for one in pkgutil.iter_modules(spadwarp_kernels.__path__) if one.ispkg]

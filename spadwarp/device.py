@@ -1,4 +1,4 @@
-"""What photons can be traced on: devices, cores, memory."""
+"""Devices on which photons can be traced, cores, memory."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def pick_device(name: str | wp.Device | None = None) -> wp.Device:
 
 
 def devices() -> list[dict[str, Any]]:
-    """What `device=` may be, in plain values.
+    """Devices that `device=` may be, in plain values.
 
     Returns:
         For each device `name` ("cpu", "cuda:0"), `description`, `memory` [bytes], `compute_capability` (None for the

@@ -52,7 +52,7 @@ class DeviceError(SpadwarpError):
 
 
 class SpadwarpWarning(UserWarning):
-    """What succeeded and may still mislead; its text is meant for the user as it is."""
+    """A success that may still mislead; its text is meant for the user as it is."""
 
 
 @contextmanager

@@ -150,7 +150,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
 
 
 def suggestion(word: Any, known: Sequence[str]) -> str:
-    """What to add to an error, `; did you mean 'gaussian'?`, where a known word is close to the one that was given."""
+    """A hint for an error, `; did you mean 'gaussian'?`, where a known word is close to the one that was given."""
     # The time to compare words grows as the product of their lengths.
     if not (isinstance(word, str) and 0 < len(word) <= 100):
         return ""

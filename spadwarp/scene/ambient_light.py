@@ -178,9 +178,9 @@ def noise_rate(scene: Scene, truth: Any = None) -> Any:
 
 
 class _Seen(NamedTuple):
-    """What pixels see: lines of sight in the water `[P, 3]`, distance along them `[P]` (infinite in open water), of
-    surfaces the normal and the reflectance; by how much deeper than the lens the lines begin [m], and the radiance in
-    front of the lens over that in the water."""
+    """Pixels and what is before them: lines of sight in the water `[P, 3]`, distance along them `[P]` (infinite in open
+    water), of surfaces the normal and the reflectance; by how much deeper than the lens the lines begin [m], and the
+    radiance in front of the lens over that in the water."""
 
     view: Floats
     distance: Floats

@@ -120,7 +120,7 @@ class Camera(Section):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What a result holds of polarisation: ("co", "cross") of an analyser and of one across it, the Stokes vector
+        """Names of the polarisation in a result: ("co", "cross") of an analyser and of one across it, the Stokes vector
         ("I", "Q", "U", "V"), or nothing."""
         return {"none": (), "analyser": ("co", "cross"), "stokes": ("I", "Q", "U", "V")}[self.polarisation]
 
@@ -286,7 +286,7 @@ def pixel_views(camera: Camera) -> Points:
 
 
 def camera_attributes(camera: Camera, focus_distance: float | None) -> dict[str, NDArray[np.float64] | float]:
-    """What a file says of a camera, for readers without spadwarp: OpenCV's `camera_matrix` [pixels], 0 being the
+    """Attributes of a camera in a file, for readers without spadwarp: OpenCV's `camera_matrix` [pixels], 0 being the
     first pixel's centre, and `camera_distortion` (k1, k2, p1, p2, k3); `camera_position` [m] and `camera_rotation`, the
     camera's axes in the world as columns; `camera_focus_distance` [m], NaN if all depths are sharp.
 

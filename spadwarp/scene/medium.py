@@ -40,7 +40,7 @@ __all__ = ["Layer", "Medium"]
 
 
 class Water(Section):
-    """What water does to light: two of four coefficients, or chlorophyll, from which they follow."""
+    """Coefficients of water: two of four coefficients, or chlorophyll, from which they follow."""
 
     section: ClassVar[str] = "medium"
     alternatives: ClassVar[tuple[str, ...]] = COEFFICIENTS
@@ -267,7 +267,7 @@ class Medium(Water):
 
     @property
     def waters(self) -> tuple[Medium | Layer, ...]:
-        """Itself and its layers, in the order of `layer_axis`."""
+        """The medium and its layers, in the order of `layer_axis`."""
         return (self, *self.layers)
 
     @property

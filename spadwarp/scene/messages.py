@@ -113,7 +113,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
 
 
 def _factor(key: Key, value: Any) -> str:
-    """What to add where a mesh's scale is given as a length."""
+    """A hint where a mesh's scale is given as a length."""
     try:
         metres = quantity(value if any(map(str.isdigit, value)) else f"1 {value}", "m") if key[-1] == "scale" else None
     except (TypeError, ValueError):
@@ -122,7 +122,7 @@ def _factor(key: Key, value: Any) -> str:
 
 
 def _percentage(info: FieldInfo, value: Any) -> str:
-    """What to add where a ratio within [0, 1] is given in per cent."""
+    """A hint where a ratio within [0, 1] is given in per cent."""
     bounds, number = interval_of(info), isinstance(value, int | float) and not isinstance(value, bool)
     if not number or field_unit(info) != "1" or bounds.low < 0.0 or bounds.high != 1.0 or not 2 <= value <= 100:
         return ""
@@ -130,7 +130,7 @@ def _percentage(info: FieldInfo, value: Any) -> str:
 
 
 def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
-    """What to write in place of a value of another kind."""
+    """A hint where a value is of another kind: how it is written."""
     if kind == "tuple_type" and isinstance(value, Mapping):
         return f" of tables; write [[{key_text(key)}]]"
     if kind in ("model_type", "model_attributes_type") and isinstance(value, str) and info is not None:

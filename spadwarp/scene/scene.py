@@ -310,7 +310,7 @@ class WaterLine(NamedTuple):
 
 
 def water_lines(scene: Scene) -> list[WaterLine]:
-    """What passes the filter of a pulse, line by line; one line where nothing of the water follows the wavelength.
+    """Lines of a pulse that pass the filter; one line where nothing of the water follows the wavelength.
 
     Raises `FileError` or `ConfigError` for a table, and `ConfigError` for a spectrum beyond where the water is known.
     """
@@ -329,13 +329,13 @@ def water_lines(scene: Scene) -> list[WaterLine]:
 
 
 def camera_port(scene: Scene) -> PortGeometry | None:
-    """What a scene's camera looks through; None: it is in the water."""
+    """The port that a scene's camera looks through; None: it is in the water."""
     port = scene.camera.port
     return None if port is None else _placed(scene, port, np.zeros(3), np.array(port.axis))
 
 
 def laser_port(scene: Scene) -> PortGeometry | None:
-    """What a scene's laser shines through; None: it is in the water."""
+    """The port that a scene's laser shines through; None: it is in the water."""
     port = scene.laser.port
     if not isinstance(port, Port):
         return None if port is None else camera_port(scene)

@@ -1,4 +1,4 @@
-"""What all tables of a scene share: strictness, presets, types of fields, ranges, numbers with a unit.
+"""Tables of a scene, and what they share: strictness, presets, types of fields, ranges, numbers with a unit.
 
 A range stands once, on its field: messages, functions that take the same number, and the JSON schema read it there. So
 does the unit, in brackets in the field's docstring; a number of real value without one takes `%` alone:
@@ -160,7 +160,7 @@ class Section(BaseModel):
 
     @property
     def given(self) -> tuple[str, ...]:
-        """Those of the alternatives that were given."""
+        """Alternatives that were given."""
         return tuple(name for name in self.alternatives if name in self.model_fields_set)
 
     def to_dict(self) -> dict[str, Any]:

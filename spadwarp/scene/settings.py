@@ -102,7 +102,7 @@ class Analytic(Section):
 
 
 class Output(Section):
-    """What a run writes into its directory."""
+    """Files that a run writes into its directory."""
 
     section: ClassVar[str] = "output"
     result: bool = True

@@ -1,4 +1,4 @@
-"""What pixels see: lines of sight, times, ranges and depths along them, and the view and the beam as regions.
+"""Lines of sight of pixels: times, ranges and depths along them, and the view and the beam as regions.
 
 The one place for all conversions between time of flight, path, range and depth in the camera frame. The path of light
 goes from the laser by the target to the lens; the range runs along a pixel's line of sight, the depth along the optical
@@ -98,17 +98,17 @@ class LinesOfSight:
 
     @classmethod
     def in_water(cls, view: Floats, laser: Floats, port: PortGeometry | None = None) -> LinesOfSight:
-        """Those of a lens in the water, along unit vectors."""
+        """Lines of sight of a lens in the water, along unit vectors."""
         nothing = np.zeros(view.shape[:-1])
         return cls(np.zeros(view.shape), view, nothing, nothing, laser, port)
 
     def __getitem__(self, index: Any) -> LinesOfSight:
-        """Those of some pixels."""
+        """The lines of some pixels."""
         parts = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
         return LinesOfSight(*parts, self.laser, self.laser_port)
 
     def flat(self) -> LinesOfSight:
-        """Those of all pixels in one row, `[P, 3]`."""
+        """The lines of all pixels in one row, `[P, 3]`."""
         start, direction = self.start.reshape(-1, 3), self.direction.reshape(-1, 3)
         return replace(self, start=start, direction=direction, lead=self.lead.ravel(), delay=self.delay.ravel())
 
@@ -176,7 +176,7 @@ def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
 
 
 def lines_of_camera(camera: Camera) -> LinesOfSight:
-    """Those of a camera in the water, with a laser in its lens."""
+    """Lines of sight of a camera in the water, with a laser in its lens."""
     return LinesOfSight.in_water(pixel_directions(camera), np.zeros(3))
 
 

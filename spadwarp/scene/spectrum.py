@@ -70,7 +70,7 @@ def filter_band(laser: Laser, detector: Detector) -> Floats | None:
 
 
 def spectral_lines(laser: Laser, detector: Detector) -> tuple[SpectralLine, ...]:
-    """What passes the filter of a pulse's photons, in up to 32 lines; one for a laser of one line.
+    """Lines of a pulse's photons that pass the filter, up to 32; one for a laser of one line.
 
     Raises `FileError` or `ConfigError` if a table cannot be read.
     """
@@ -113,7 +113,7 @@ def _passed(laser: Laser, detector: Detector) -> tuple[Floats, Floats]:
 
 
 def widths_of(nodes: Floats) -> Floats:
-    """What each of ascending wavelengths stands for, half of what is between it and its neighbours."""
+    """Widths that ascending wavelengths stand for, half of what is between it and its neighbours."""
     widths = np.gradient(nodes)
     widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
     return widths

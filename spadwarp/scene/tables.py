@@ -215,7 +215,7 @@ def _preset(section: str, fields: Mapping[str, Any]) -> Preset | None:
 
 
 def preset_hint(section: str, word: Any) -> str:
-    """What to add to an error about a word in place of a table: how a preset is taken."""
+    """A hint where a word stands in place of a table: how a preset is taken."""
     known = PRESETS.get(section, {})
     if word in known:
         return f'; a preset is taken by {{preset = "{word}"}}'
