@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
 
 from spadwarp.errors import ArgumentError
 
-__all__ = ["BIN_WIDTH", "SEED", "TIME", "Interval", "check_choice", "check_integer", "check_part", "check_real"]
-__all__ += ["environment_integer", "parse_number", "read_real", "shown", "suggestion", "within"]
+__all__ = ["BIN_WIDTH", "SEED", "TIME", "Interval", "bounds", "check_choice", "check_integer", "check_part"]
+__all__ += ["check_real", "environment_integer", "parse_number", "read_real", "shown", "suggestion"]
 
 SEED = "[0, 18446744073709551615]"
 """Range of seeds: 64 bits."""
@@ -65,7 +65,7 @@ class Interval(NamedTuple):
         return f"{left}{_end(self.low)}, {_end(self.high)}{right} {self.unit}".rstrip()
 
 
-def within(text: str) -> dict[str, Any]:
+def bounds(text: str) -> dict[str, Any]:
     """A range as the arguments of pydantic's `Field`."""
     interval = Interval.read(text)
     low, high = "ge" if interval.includes_low else "gt", "le" if interval.includes_high else "lt"

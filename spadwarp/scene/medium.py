@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
-from spadwarp.limits import within
+from spadwarp.limits import bounds
 from spadwarp.scene.grid import Grid, GridCells, cells_of
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.sections import (
@@ -54,7 +54,7 @@ class Water(Section):
     """extinction (beam attenuation) coefficient c = a + b [1/m]"""
     albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = 0.0
     """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
-    chlorophyll: float | None = Field(None, **within(RANGES["chlorophyll"]))
+    chlorophyll: float | None = Field(None, **bounds(RANGES["chlorophyll"]))
     """chlorophyll of the open ocean, in place of coefficients [mg/m³]"""
 
     @model_validator(mode="after")
@@ -140,17 +140,17 @@ class Medium(Water):
     matrix_table: CsvFile = None
     """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp particles` writes one
     """
-    depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **within(RANGES["depolarisation_ratio"]))
+    depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
     """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
-    largest_polarisation: float = Field(0.66, **within(RANGES["largest"]))
+    largest_polarisation: float = Field(0.66, **bounds(RANGES["largest"]))
     """scaled_rayleigh: polarisation of unpolarised light that is scattered by 90°"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
     """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
-    temperature: float | None = Field(None, **within(RANGES["temperature"]))
+    temperature: float | None = Field(None, **bounds(RANGES["temperature"]))
     """gives the indices that are not given, with salinity 35 [°C]"""
-    salinity: float | None = Field(None, **within(RANGES["salinity"]))
+    salinity: float | None = Field(None, **bounds(RANGES["salinity"]))
     """the same, with temperature 20 [g/kg]"""
     layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = ()
     """other waters further along `layer_axis`, in its order"""

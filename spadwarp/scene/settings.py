@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from spadwarp.limits import SEED, within
+from spadwarp.limits import SEED, bounds
 from spadwarp.scene.sections import Section, Whole
 
 __all__ = ["Analytic", "Gate", "Output", "Scan", "Transport"]
@@ -58,7 +58,7 @@ class Transport(Section):
     section: ClassVar[str] = "transport"
     photons: Whole = Field(1_000_000, ge=1, le=10**12)
     """photons to emit"""
-    seed: Whole = Field(0, **within(SEED))
+    seed: Whole = Field(0, **bounds(SEED))
     """key of the random numbers; one seed gives the same bits"""
     estimator: Literal["analog", "next_event", "guided"] = "guided"
     """what scores: the photon itself, every event, or guided flights; `none` of the kernel library is not offered here;

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from spadwarp.limits import within
+from spadwarp.limits import bounds
 from spadwarp.scene.sections import AnyFile, Corner, Direction, Scale, Section, Size, Vector, Whole, unit_vector
 from spadwarp.water.daylight import refracted_cosine
 from spadwarp.water.seawater import RANGES
@@ -140,7 +140,7 @@ class Daylight(Section):
     `detector.ambient_rate`."""
 
     section: ClassVar[str] = "daylight"
-    sun_elevation_deg: float = Field(..., **within(RANGES["sun_elevation_deg"]))
+    sun_elevation_deg: float = Field(..., **bounds(RANGES["sun_elevation_deg"]))
     """height of the sun above the horizon, 90 less its zenith angle [°]"""
     depth: float = Field(..., ge=0, le=1e4)
     """of the lens below the surface [m]"""
@@ -148,7 +148,7 @@ class Daylight(Section):
     """horizontal angle from the world's z axis, or without one from its x axis, to below the sun, towards +x [°]"""
     up: Direction = (0.0, -1.0, 0.0)
     """direction of the surface in the world; any length but 0"""
-    aerosol_optical_depth: float = Field(0.084, **within(RANGES["aerosol_optical_depth"]))
+    aerosol_optical_depth: float = Field(0.084, **bounds(RANGES["aerosol_optical_depth"]))
     """vertical optical depth of the aerosol at 500 nm: 0.05 very clear air, 0.3 haze"""
     cloud_factor: float = Field(1.0, ge=0, le=2)
     """irradiance over that of a clear sky"""

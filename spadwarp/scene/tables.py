@@ -339,21 +339,15 @@ def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
         for name, inner in value.items():
             _insert(layer, (*key, int(name) if _is_index(name) else str(name)), inner)
         return
-    whole = f"override {shown(key_text(key))}"
-    names_a_field = tuple(map(type, key)) in (
-        [(str,), (str, int, str)] if is_target else [(str,), (str, str), (str, str, str)][: 3 if in_table else 2]
-    )
-    for depth, part in enumerate(key[:-1] if names_a_field else ()):
-        inner = layer.setdefault(part, {})
-        if not isinstance(inner, dict):
-            if depth == 0:
-                names_a_field = False
-                break
-            hint = preset_hint(_TABLES[str(key[0]), str(key[1])], inner) if in_table else ""
-            raise ConfigError(f"{whole}: {key_text(key[: depth + 1])} = {shown(inner)} is not a table{hint}")
-        layer = inner
-    if not names_a_field:
+    whole, shape = f"override {shown(key_text(key))}", tuple(map(type, key))
+    fits = shape in ((str,), (str, int, str) if is_target else (str, str)) or (in_table and len(key) == 3)
+    if not fits or (len(key) > 1 and not isinstance(layer.setdefault(key[0], {}), dict)):
         raise ConfigError(f"{whole} does not name a field; write section.field or targets[0].field")
+    for depth, part in enumerate(key[:-1], 1):
+        layer = layer.setdefault(part, {})
+        if not isinstance(layer, dict):
+            hint = preset_hint(_TABLES[str(key[0]), str(key[1])], layer)
+            raise ConfigError(f"{whole}: {key_text(key[:depth])} = {shown(layer)} is not a table{hint}")
     layer[key[-1]] = value
 
 

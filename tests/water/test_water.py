@@ -47,14 +47,6 @@ def test_absorption_of_pure_water_as_published(wavelength, absorption):
     assert pure_water_absorption(wavelength) == absorption
 
 
-def test_the_absorption_minimum_is_where_pope_and_fry_found_it():
-    """0.0044 ± 0.0006 1/m at 418 nm (their abstract)."""
-    wavelength = np.linspace(400.0, 700.0, 3001)
-    absorption = pure_water_absorption(wavelength)
-    assert wavelength[absorption.argmin()] == pytest.approx(418.0, abs=1.0)
-    assert absorption.min() == pytest.approx(0.0044, abs=5e-5)
-
-
 def test_scattering_of_pure_seawater_is_that_of_zhang_hu_and_he():
     """Their own program at 18 °C and a salinity of 37, as other ports of it reproduce it."""
     published = [0.00668, 0.00403, 0.00258, 0.00173, 0.00120, 0.00086, 0.00063]
