@@ -15,15 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ConfigError
 from spadwarp.scene.detector import Detector
 from spadwarp.scene.laser import Laser
-from spadwarp.scene.sections import read_table
+from spadwarp.scene.sections import field_range, read_table
 
 __all__ = ["SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]
 
 Floats = NDArray[np.float64]
 
-SPECTRUM_COLUMNS = {"wavelength_nm": "[1e-9, 1e6]", "power": "[0, 1e30]"}
+_WAVELENGTHS = str(field_range(Laser, "wavelength_nm"))
+SPECTRUM_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "power": "[0, 1e30]"}
 """Columns of a laser's spectrum: vacuum wavelength [nm] and power per nm of any scale."""
-FILTER_COLUMNS = {"wavelength_nm": "[1e-9, 1e6]", "transmission": "[0, 1]"}
+FILTER_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "transmission": "[0, 1]"}
 """Columns of a filter: vacuum wavelength [nm] and transmission."""
 
 _MOST_LINES = 32
