@@ -19,7 +19,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 import typer
-from annotated_types import Ge, Gt, Le, Lt
 from pydantic import AfterValidator, BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -27,8 +26,10 @@ from pydantic_core import PydanticUndefined
 import spadwarp
 from spadwarp.cli import app
 from spadwarp.dataset import Distribution, Recipe
+from spadwarp.limits import Interval
 from spadwarp.scene import Scene
-from spadwarp.scene.load import COEFFICIENTS
+from spadwarp.scene.sections import interval_of, parts_of
+from spadwarp.scene.tables import COEFFICIENTS
 
 FOLDER = Path(__file__).parent / "reference"
 MADE = "<!-- Made by docs/reference.py from the code. -->\n\n"
@@ -180,34 +181,13 @@ def _one_kind(annotation: Any) -> str:
 
 
 def _range(info: FieldInfo) -> str:
-    low, high = "(-∞", "∞)"
-    for one in _constraints(info):
-        match one:
-            case Ge(ge=value):
-                low = f"[{_short(value)}"
-            case Gt(gt=value):
-                low = f"({_short(value)}"
-            case Le(le=value):
-                high = f"{_short(value)}]"
-            case Lt(lt=value):
-                high = f"{_short(value)})"
-            case AfterValidator(func=check):  # of a distribution's values
-                limits = inspect.getclosurevars(check).nonlocals
-                if "interval" in limits:
-                    return limits["interval"]
-    return "" if (low, high) == ("(-∞", "∞)") else f"{low}, {high}"
-
-
-def _constraints(info: FieldInfo) -> Iterator[Any]:
-    yield from info.metadata
-    waiting = list(_union(info.annotation))
-    while waiting:
-        one = waiting.pop()
-        if get_origin(one) is Annotated:
-            inner, *more = get_args(one)
-            for constraint in more:
-                yield from constraint.metadata if isinstance(constraint, FieldInfo) else [constraint]
-            waiting.append(inner)
+    for part in parts_of(info):
+        if isinstance(part, AfterValidator):  # of a distribution's values
+            limits = inspect.getclosurevars(part.func).nonlocals
+            if "interval" in limits:
+                return str(limits["interval"])
+    interval = interval_of(info)._replace(unit="")
+    return "" if interval == Interval(-math.inf, math.inf, False, False) else str(interval)
 
 
 def _default(info: FieldInfo) -> str:
@@ -302,18 +282,18 @@ def _help(command: Any, path: str) -> Iterator[str]:
 
 
 def python() -> str:
-    """The names of `spadwarp.__all__` by module, and the other public names of each room."""
+    """The names of `spadwarp.__all__` by module, and the other public names of each package."""
     homes: dict[str, list[str]] = {}
     for name, home in spadwarp._HOMES.items():
         homes.setdefault(home, []).append(name)
-    for room in sorted(spadwarp._ROOMS):
-        module = import_module(f"spadwarp.{room}")
+    for package in sorted(spadwarp._PACKAGES):
+        module = import_module(f"spadwarp.{package}")
         names = [name for name in getattr(module, "__all__", ()) if name not in spadwarp._HOMES]
-        homes.setdefault(room, []).extend(name for name in names if callable(getattr(module, name)))
+        homes.setdefault(package, []).extend(name for name in names if callable(getattr(module, name)))
     homes = {home: names for home, names in homes.items() if names}
     parts = [
         MADE + "# Python\n\n`import spadwarp` loads a name when it is used. Names of `spadwarp.__all__` are "
-        "`spadwarp.NAME`; the others are found in their room, as `spadwarp.ROOM.NAME`."
+        "`spadwarp.NAME`; the others are found in their package, as `spadwarp.PACKAGE.NAME`."
     ]
     for home, names in homes.items():
         about = inspect.cleandoc(import_module(f"spadwarp.{home}").__doc__ or "").splitlines()[0]
@@ -323,7 +303,7 @@ def python() -> str:
 
 
 def kernels() -> str:
-    """The public names of `spadwarp_kernels`, by room."""
+    """The public names of `spadwarp_kernels`, by package."""
     import spadwarp_kernels
 
     rooms = [one.name for one in pkgutil.iter_modules(spadwarp_kernels.__path__) if one.ispkg]

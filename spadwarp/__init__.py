@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-# The rooms, and which of their public names stand here too. Loaded when first used, so that `import spadwarp` and
+# The packages, and which of their public names stand here too. Loaded when first used, so that `import spadwarp` and
 # `spadwarp --help` need neither Warp nor h5py.
-_ROOMS = {
+_PACKAGES = {
     "scene": ("Scene", "load_scene"),
     "water": (),
     "mesh": (),
@@ -35,38 +35,7 @@ _ROOMS = {
     "io": (),
     "errors": ("ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"),
 }
-_HOMES = {name: room for room, names in _ROOMS.items() for name in names}
-
-__all__ = [  # written out for type checkers
-    "ArgumentError",
-    "ConfigError",
-    "DeviceError",
-    "FileError",
-    "Frames",
-    "MeshError",
-    "Ray",
-    "Result",
-    "Scene",
-    "SpadwarpError",
-    "__version__",
-    "arrival_time",
-    "budget",
-    "check",
-    "crlb",
-    "detect",
-    "export",
-    "fit",
-    "load",
-    "load_result",
-    "load_scene",
-    "merge",
-    "plan",
-    "simulate",
-    "simulate_analytic",
-    "sweep",
-    "to_pandas",
-    "truth_maps",
-]
+_HOMES = {name: package for package, names in _PACKAGES.items() for name in names}
 
 # Type checkers take "as" for public, and without `__getattr__` they find misspelled names.
 if TYPE_CHECKING:
@@ -93,26 +62,33 @@ if TYPE_CHECKING:
         viz as viz,
         water as water,
     )
-    from spadwarp.analytic import budget, plan, simulate_analytic, sweep
-    from spadwarp.checks import check
-    from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, MeshError, SpadwarpError
-    from spadwarp.files import export, load
-    from spadwarp.frames import Frames, arrival_time, crlb, detect
-    from spadwarp.interop import to_pandas
-    from spadwarp.inverse import fit
-    from spadwarp.parallel import Ray
-    from spadwarp.result import Result, load_result, merge
-    from spadwarp.scene import Scene, load_scene
-    from spadwarp.transport import simulate, truth_maps
+    from spadwarp.analytic import budget as budget, plan as plan, simulate_analytic as simulate_analytic, sweep as sweep
+    from spadwarp.checks import check as check
+    from spadwarp.errors import (
+        ArgumentError as ArgumentError,
+        ConfigError as ConfigError,
+        DeviceError as DeviceError,
+        FileError as FileError,
+        MeshError as MeshError,
+        SpadwarpError as SpadwarpError,
+    )
+    from spadwarp.files import export as export, load as load
+    from spadwarp.frames import Frames as Frames, arrival_time as arrival_time, crlb as crlb, detect as detect
+    from spadwarp.interop import to_pandas as to_pandas
+    from spadwarp.inverse import fit as fit
+    from spadwarp.parallel import Ray as Ray
+    from spadwarp.result import Result as Result, load_result as load_result, merge as merge
+    from spadwarp.scene import Scene as Scene, load_scene as load_scene
+    from spadwarp.transport import simulate as simulate, truth_maps as truth_maps
 else:
+    __all__ = ["__version__", *_HOMES]
 
     def __getattr__(name: str) -> Any:
         if name in _HOMES:
             return getattr(import_module(f"spadwarp.{_HOMES[name]}"), name)
-        if name in _ROOMS:
+        if name in _PACKAGES:
             return import_module(f"spadwarp.{name}")
         raise AttributeError(f"module 'spadwarp' has no attribute {name!r}")
 
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+    def __dir__() -> list[str]:
+        return sorted(__all__)

@@ -19,17 +19,8 @@ if TYPE_CHECKING:
     import torch
     import warp as wp
 
-__all__ = [
-    "as_warp",
-    "caller_tallies",
-    "histogram_rows",
-    "in_torch_order",
-    "is_torch",
-    "on_host",
-    "output_tensor",
-    "real_array",
-    "tensor_of",
-]
+__all__ = ["as_warp", "caller_tallies", "histogram_rows", "in_torch_order", "is_torch", "on_host", "output_tensor"]
+__all__ += ["real_array", "tensor_of"]
 
 
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:

@@ -1,4 +1,4 @@
-"""What photons can be traced on: devices, cores, memory."""
+"""Devices on which photons can be traced, cores, memory."""
 
 from __future__ import annotations
 
@@ -18,16 +18,8 @@ from spadwarp.limits import shown
 if TYPE_CHECKING:
     import warp as wp
 
-__all__ = [
-    "core_count",
-    "devices",
-    "nvidia_driver",
-    "physical_memory",
-    "pick_device",
-    "pick_devices",
-    "processor_name",
-    "start_warp",
-]
+__all__ = ["core_count", "devices", "nvidia_driver", "physical_memory", "pick_device", "pick_devices"]
+__all__ += ["processor_name", "start_warp"]
 
 
 def pick_devices(names: str | None = None) -> list[wp.Device]:
@@ -69,7 +61,7 @@ def pick_device(name: str | wp.Device | None = None) -> wp.Device:
 
 
 def devices() -> list[dict[str, Any]]:
-    """What `device=` may be, in plain values.
+    """Devices that `device=` may be, in plain values.
 
     Returns:
         For each device `name` ("cpu", "cuda:0"), `description`, `memory` [bytes], `compute_capability` (None for the
@@ -77,39 +69,33 @@ def devices() -> list[dict[str, Any]]:
     """
     import warp as wp
 
-    default = pick_device().alias
-    found = []
-    for device in wp.get_devices():
-        cuda = device.is_cuda
-        threads = None if cuda else core_count()
-        found.append(
-            {
-                "name": device.alias,
-                "description": processor_name(device) if cuda else f"{threads} threads, {processor_name(device)}",
-                "memory": device.total_memory if cuda else physical_memory(),
-                "compute_capability": f"{device.arch // 10}.{device.arch % 10}" if cuda else None,
-                "threads": threads,
-                "default": device.alias == default,
-            }
-        )
-    return found
+    default, threads = pick_device().alias, core_count()
+    return [
+        {
+            "name": device.alias,
+            "description": ("" if device.is_cuda else f"{threads} threads, ") + processor_name(device),
+            "memory": device.total_memory if device.is_cuda else physical_memory(),
+            "compute_capability": f"{device.arch // 10}.{device.arch % 10}" if device.is_cuda else None,
+            "threads": None if device.is_cuda else threads,
+            "default": device.alias == default,
+        }
+        for device in wp.get_devices()
+    ]
 
 
 def processor_name(device: wp.Device | None = None) -> str:
     """The name of a device's processor; by default the CPU's, or its architecture where the system has no more."""
-    if device is not None and device.is_cuda:
-        return device.name
-    return _cpu_model() or platform.processor() or platform.machine()
+    return device.name if device is not None and device.is_cuda else _cpu_name()
 
 
 @functools.cache
-def _cpu_model() -> str:
-    """As Linux has it, which gives Python the architecture alone; empty elsewhere."""
-    try:
+def _cpu_name() -> str:
+    try:  # Linux gives Python the architecture alone
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return ""
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, "") or platform.processor() or platform.machine()
 
 
 @functools.cache

@@ -11,16 +11,8 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-__all__ = [
-    "ArgumentError",
-    "ConfigError",
-    "DeviceError",
-    "FileError",
-    "MeshError",
-    "SpadwarpError",
-    "SpadwarpWarning",
-    "in_words",
-]
+__all__ = ["ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError", "SpadwarpWarning"]
+__all__ += ["in_words"]
 
 
 class SpadwarpError(Exception):
@@ -60,7 +52,7 @@ class DeviceError(SpadwarpError):
 
 
 class SpadwarpWarning(UserWarning):
-    """What succeeded and may still mislead; its text is meant for the user as it is."""
+    """A success that may still mislead; its text is meant for the user as it is."""
 
 
 @contextmanager
@@ -87,30 +79,23 @@ def in_words(error: BaseException) -> str | None:
     """
     short = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
     # Python's parser loses the MemoryError and says "error return without exception set".
-    short = short or (isinstance(error, SystemError) and address_space() is not None)
-    if short or (isinstance(error, OSError | ImportError | RuntimeError) and _names_memory(error)):
-        return f"not enough memory{_limit_of_memory()}" + (f": {_one_line(error)}" if str(error) else "")
+    limit, text = address_space(), " ".join(str(error).split())[:300] or type(error).__name__
+    short = short or (isinstance(error, SystemError) and limit is not None)
+    if isinstance(error, OSError | ImportError | RuntimeError):
+        short = short or any(words in str(error).lower() for words in _SHORT_OF_MEMORY)
+    if short:
+        most = "" if limit is None else f" (this process may use {limit / 2**30:.3g} GiB, see ulimit -v)"
+        return f"not enough memory{most}" + (f": {text}" if str(error) else "")
     if isinstance(error, OSError) and error.strerror:
         names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
         return f"{names}: {error.strerror}" if names else error.strerror
     if isinstance(error, UnicodeError):
-        return f"text that cannot be read or written: {_one_line(error)}"
+        return f"text that cannot be read or written: {text}"
     if isinstance(error, RecursionError):
         return "the input is nested too deeply"
     if isinstance(error, ImportError):
-        return f"a package cannot be loaded, see `spadwarp doctor`: {_one_line(error)}"
+        return f"a package cannot be loaded, see `spadwarp doctor`: {text}"
     return None if error.__cause__ is None else in_words(error.__cause__)
-
-
-def _names_memory(error: BaseException) -> bool:
-    text = str(error).lower()
-    return any(words in text for words in _SHORT_OF_MEMORY)
-
-
-def _limit_of_memory() -> str:
-    """The limit of this process where it has one, such as of `ulimit -v`."""
-    limit = address_space()
-    return "" if limit is None else f" (this process may use {limit / 2**30:.3g} GiB, see ulimit -v)"
 
 
 def address_space() -> int | None:
@@ -129,7 +114,3 @@ def need_memory(gibibytes: float, name: str) -> None:
     limit = address_space()
     if limit is not None and limit < gibibytes * 2**30:
         raise MemoryError(f"{name} needs {gibibytes:g} GiB")
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__

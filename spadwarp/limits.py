@@ -1,4 +1,8 @@
-"""Numbers that enter, as text or from Python: finite and within their range, or refused by name."""
+"""Numbers and words that enter, as text or from Python: of their kind and within their range, or refused by name.
+
+A range is written "(0, 1e6] 1/m": a bracket includes its end, a parenthesis does not. Those of a scene's fields stand
+on the fields, from where `spadwarp.scene.sections.field_range` reads them.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +19,8 @@ from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
 
 from spadwarp.errors import ArgumentError
 
-__all__ = ["BIN_WIDTH", "SEED", "TIME", "Interval", "check_choice", "check_integer"]
-__all__ += ["check_part", "check_real", "environment_integer", "parse_number", "shown", "suggestion"]
+__all__ = ["BIN_WIDTH", "SEED", "TIME", "Interval", "bounds", "check_choice", "check_integer", "check_part"]
+__all__ += ["check_real", "environment_integer", "parse_number", "read_real", "shown", "suggestion"]
 
 SEED = "[0, 18446744073709551615]"
 """Range of seeds: 64 bits."""
@@ -26,17 +30,18 @@ BIN_WIDTH, TIME = "[1e-24, 1e6] s", "[-1e6, 1e6] s"
 _NUMBER = re.compile(
     r"[+-]?(?:\d+(?:_\d+)*(?:\.(?:\d+(?:_\d+)*)?)?|\.\d+(?:_\d+)*)(?:e[+-]?\d+)?", re.ASCII | re.IGNORECASE
 )
-_INTERVAL = re.compile(r"([\[(])(.+), (.+)([])])(?: \S+)?")
+_INTERVAL = re.compile(r"([\[(])(.+), (.+)([])])(?: (\S+))?")
 _LONGEST = 60  # characters of a value in a message
 
 
 class Interval(NamedTuple):
-    """A range of numbers, written "(0, 1]": a bracket includes its end, a parenthesis does not."""
+    """A range of numbers."""
 
     low: float
     high: float
     includes_low: bool
     includes_high: bool
+    unit: str = ""
 
     @classmethod
     @functools.cache
@@ -45,18 +50,26 @@ class Interval(NamedTuple):
         match = _INTERVAL.fullmatch(text)
         assert match is not None, text
         low, high = (int(end) if end.lstrip("-").isdecimal() else float(end) for end in match.group(2, 3))
-        return cls(low, high, match[1] == "[", match[4] == "]")
+        return cls(low, high, match[1] == "[", match[4] == "]", match[5] or "")
+
+    def holds(self, values: Any) -> Any:
+        """Whether a number, or each of an array, lies in it; NaN does not."""
+        above = values >= self.low if self.includes_low else values > self.low
+        return above & (values <= self.high if self.includes_high else values < self.high)
 
     def __contains__(self, value: object) -> bool:
-        """Whether a number lies in it; NaN does not."""
-        if not isinstance(value, int | float):
-            return False
-        above = value >= self.low if self.includes_low else value > self.low
-        return above and (value <= self.high if self.includes_high else value < self.high)
+        return isinstance(value, int | float) and self.holds(value)
 
     def __str__(self) -> str:
         left, right = "[" if self.includes_low else "(", "]" if self.includes_high else ")"
-        return f"{left}{_end(self.low)}, {_end(self.high)}{right}"
+        return f"{left}{_end(self.low)}, {_end(self.high)}{right} {self.unit}".rstrip()
+
+
+def bounds(text: str) -> dict[str, Any]:
+    """A range as the arguments of pydantic's `Field`."""
+    interval = Interval.read(text)
+    low, high = "ge" if interval.includes_low else "gt", "le" if interval.includes_high else "lt"
+    return {low: interval.low, high: interval.high}
 
 
 def _end(value: float) -> str:
@@ -64,7 +77,7 @@ def _end(value: float) -> str:
     return str(value) if isinstance(value, int) else re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")
 
 
-def check_real(name: str, value: Any, within: str = "(-inf, inf)") -> float:
+def check_real(name: str, value: Any, within: str | Interval = "(-inf, inf)") -> float:
     """An argument as a float; infinite only where the range includes it, as "(0, inf]" does.
 
     Raises `ArgumentError`, which names the argument, its value and the range, where it is no number or outside.
@@ -75,12 +88,10 @@ def check_real(name: str, value: Any, within: str = "(-inf, inf)") -> float:
         number = float(value)
     except OverflowError:  # an integer beyond 1.8e308
         number = math.nan
-    if number not in Interval.read(within):
-        raise ArgumentError(f"{name} = {shown(value)} is outside {within}")
-    return number
+    return _inside(name, value, number, within)
 
 
-def check_integer(name: str, value: Any, within: str) -> int:
+def check_integer(name: str, value: Any, within: str | Interval) -> int:
     """An argument as an int; a float without a fraction, such as 1e5, counts as one.
 
     Raises `ArgumentError`, which names the argument, its value and the range, where it is no integer or outside.
@@ -91,9 +102,23 @@ def check_integer(name: str, value: Any, within: str) -> int:
         number = int(float(value))
     else:
         raise ArgumentError(f"{name} = {shown(value)} is not an integer in {within}")
-    if number not in Interval.read(within):
+    return _inside(name, value, number, within)
+
+
+def _inside(name: str, value: Any, number: Any, within: str | Interval) -> Any:
+    if number not in (Interval.read(within) if isinstance(within, str) else within):
         raise ArgumentError(f"{name} = {shown(value)} is outside {within}")
     return number
+
+
+def read_real(name: str, cell: Any, within: str | Interval) -> float:
+    """A number of a file, or a text that stands for one; as `check_real`, whose errors it raises."""
+    try:
+        return check_real(name, parse_number(cell) if isinstance(cell, str) else cell, within)
+    except ArgumentError:
+        raise
+    except ValueError as error:
+        raise ArgumentError(f"{name} = {shown(cell)} {error}") from None
 
 
 def check_part(name: str, value: Any) -> tuple[int, int]:
@@ -125,7 +150,7 @@ def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
 
 
 def suggestion(word: Any, known: Sequence[str]) -> str:
-    """What to add to an error, `; did you mean 'gaussian'?`, where a known word is close to the one that was given."""
+    """A hint for an error, `; did you mean 'gaussian'?`, where a known word is close to the one that was given."""
     # The time to compare words grows as the product of their lengths.
     if not (isinstance(word, str) and 0 < len(word) <= 100):
         return ""

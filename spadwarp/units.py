@@ -9,23 +9,10 @@ from __future__ import annotations
 import math
 import re
 from fractions import Fraction
-from math import pi
 from typing import Any
 
-__all__ = [
-    "PLANCK",
-    "SPEED_OF_LIGHT",
-    "UNITS",
-    "path_from_time",
-    "percent",
-    "pulse_speed",
-    "quantity",
-    "range_from_time",
-    "rounded",
-    "time_from_path",
-    "time_from_range",
-    "with_prefix",
-]
+__all__ = ["PLANCK", "SPEED_OF_LIGHT", "UNITS", "path_from_time", "percent", "pulse_speed", "quantity"]
+__all__ += ["range_from_time", "rounded", "time_from_path", "time_from_range", "with_prefix"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 """c0, in vacuum [m/s]."""
@@ -50,7 +37,7 @@ def time_from_path(path: Any, group_index: float) -> Any:
 
 
 def range_from_time(time: Any, group_index: float) -> Any:
-    """Range [m] of a round trip of a time [s], laser at the lens; `spadwarp.scene.geometry` has it for any laser."""
+    """Range [m] of a round trip of a time [s], laser at the lens; `spadwarp.scene.sight` has it for any laser."""
     return 0.5 * pulse_speed(group_index) * time
 
 
@@ -62,6 +49,8 @@ def time_from_range(distance: Any, group_index: float) -> Any:
 # Numbers with a unit
 
 _PREFIXES = {"f": -15, "p": -12, "n": -9, "u": -6, "µ": -6, "μ": -6, "m": -3, "": 0, "k": 3, "M": 6, "G": 9}
+
+_RADIAN = Fraction(180 / math.pi)  # [°]
 
 # A kind of quantity with its article, an example, the unit that takes prefixes, and units without them.
 _KINDS: tuple[tuple[str, str, str, dict[str, Fraction]], ...] = (
@@ -75,8 +64,14 @@ _KINDS: tuple[tuple[str, str, str, dict[str, Fraction]], ...] = (
     ),
     ("an energy", "150 nJ", "J", {}),
     ("a power", "20 mW", "W", {}),
-    ("an angle", "12 deg", "", {"deg": Fraction(1), "°": Fraction(1)}),
-    ("a coefficient", "0.3 1/m", "", dict.fromkeys(("1/m", "/m", "m^-1", "m-1", "m⁻¹"), Fraction(1))),
+    ("an angle", "12 deg", "", {"deg": Fraction(1), "°": Fraction(1), "rad": _RADIAN, "mrad": _RADIAN / 1000}),
+    (
+        "a coefficient",
+        "0.3 1/m",
+        "",
+        dict.fromkeys(("1/m", "/m", "m^-1", "m-1", "m⁻¹"), Fraction(1))
+        | {"1/cm": Fraction(100), "1/km": Fraction(1, 1000)},
+    ),
     ("a concentration", "0.5 mg/m³", "", dict.fromkeys(("mg/m³", "mg/m3", "mg/m^3", "µg/L", "ug/L"), Fraction(1))),
     ("a salinity", "35 g/kg", "", {"g/kg": Fraction(1)}),
     ("a temperature", "20 °C", "", {"°C": Fraction(1), "degC": Fraction(1)}),
@@ -90,11 +85,6 @@ def _unit_table() -> dict[str, tuple[str, str, Fraction]]:
     for kind, example, base, others in _KINDS:
         scaled = {prefix + base: Fraction(10) ** power for prefix, power in _PREFIXES.items()} if base else {}
         table |= {unit: (kind, example, factor) for unit, factor in {**scaled, **others}.items()}
-    degrees = Fraction(180 / pi)
-    table |= {unit: ("an angle", "12 deg", factor) for unit, factor in (("rad", degrees), ("mrad", degrees / 1000))}
-    table |= {
-        unit: ("a coefficient", "0.3 1/m", f) for unit, f in (("1/cm", Fraction(100)), ("1/km", Fraction(1, 1000)))
-    }
     del table["mHz"]  # for MHz, more often than not
     return table
 
@@ -157,7 +147,7 @@ def rounded(value: float, error: float) -> str:
 
 def with_prefix(value: float, unit: str, *, digits: int = 3) -> str:
     """A number of m, s, Hz, J or W for people: `with_prefix(1.5e-7, "J")` is "150 nJ"."""
-    if not (abs(value) > 0) or value in (float("inf"), float("-inf")):
+    if not abs(value) > 0 or math.isinf(value):
         return f"{value:.{digits}g} {unit}"
     symbols = {power: prefix for prefix, power in _PREFIXES.items() if prefix not in ("u", "μ")}
     rounded = float(f"{value:.{digits}g}")

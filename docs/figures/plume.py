@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 
 import spadwarp
 from spadwarp.scene import Scene
-from spadwarp.scene.grid_cells import grid_cells
+from spadwarp.scene.medium import grid_cells
 from spadwarp.viz import style
 
 Floats = NDArray[np.float64]

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import pixel_directions, range_from_path
-from spadwarp.scene.sight import LinesOfSight, lines_of_sight
+from spadwarp.scene.sight import LinesOfSight, lines_of_sight, pixel_directions, range_from_path
 from spadwarp.viz import style
 
 PORTS: dict[str, dict[str, Any]] = {

@@ -17,7 +17,8 @@ from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import METHODS, Method
 from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
 from spadwarp.result import CHANNELS, Channel
-from spadwarp.scene import SceneLike, as_scene
+from spadwarp.scene import SceneLike, Transport, as_scene
+from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import port_advance
 from spadwarp.units import quantity, range_from_time
 
@@ -154,7 +155,10 @@ def plan(
     check_real("depth_error", depth_error, "[1e-9, 1e9] m")
     for name, value in {"time": time, "eye_exposure": eye_exposure}.items():
         check_real(name, value, "[1e-9, 1e9] s")
-    photons, seed = check_integer("photons", photons, "[1, 1000000000000]"), check_integer("seed", seed, SEED)
+    photons, seed = (
+        check_integer("photons", photons, field_range(Transport, "photons")),
+        check_integer("seed", seed, SEED),
+    )
     margin = check_real("margin", margin, "[0, 1e6] m")
     check_choice("method", method, METHODS)
     if ranges is not None:

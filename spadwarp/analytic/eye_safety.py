@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_real
-from spadwarp.scene.beam_profile import load_profile
+from spadwarp.scene.laser import load_profile
 
 if TYPE_CHECKING:
     from spadwarp.scene import Laser

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.scene.grid_cells import GridCells, grid_cells
-from spadwarp.scene.port_rays import laser_port
-from spadwarp.scene.pose import to_world
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.grid import GridCells
+from spadwarp.scene.medium import grid_cells
+from spadwarp.scene.scene import laser_port
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from spadwarp.analytic.exposure_proposal import Progress, Question, propose_expo
 from spadwarp.analytic.gate_proposal import propose_gate
 from spadwarp.analytic.photon_budget import axis_line
 from spadwarp.errors import ConfigError
-from spadwarp.scene.pose import to_world
+from spadwarp.scene.camera import to_world
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

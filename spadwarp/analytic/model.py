@@ -24,7 +24,7 @@ from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import WaterLine, daylight_rate, phase_function, water_lines
-from spadwarp.scene.port_rays import laser_port
+from spadwarp.scene.scene import laser_port
 from spadwarp.scene.sight import depth_per_time, lines_of_sight
 
 if TYPE_CHECKING:

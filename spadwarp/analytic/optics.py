@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
-from spadwarp.scene.port_rays import camera_port, laser_port
+from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.transport.model import port_kind, port_parameters
 
 if TYPE_CHECKING:

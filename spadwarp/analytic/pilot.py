@@ -23,8 +23,7 @@ from spadwarp.frames.depth import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import Channel, merge, received
 from spadwarp.scene import noise_rate
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.sight import depth_from_time, depth_per_time
+from spadwarp.scene.sight import depth_from_time, depth_per_time, pixel_directions
 from spadwarp.transport import simulate, truth_maps
 
 if TYPE_CHECKING:

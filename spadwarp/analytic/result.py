@@ -15,8 +15,7 @@ from spadwarp.device import pick_device
 from spadwarp.errors import kernel_errors
 from spadwarp.result.result import Truth
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import gate_deviation, pixel_directions
-from spadwarp.scene.sight import lines_of_sight
+from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
 
 __all__ = ["AnalyticResult", "background_photons"]
 

@@ -19,7 +19,7 @@ from spadwarp.limits import SEED, check_integer
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
-from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import pixel_directions
 from spadwarp.transport import truth_maps
 
 __all__ = ["simulate_analytic"]

@@ -18,10 +18,10 @@ from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 from spadwarp.io.text import parse_toml
 from spadwarp.limits import check_choice, check_integer, parse_number, shown
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.load import parse_key
 from spadwarp.scene.messages import locate
-from spadwarp.scene.quantities import field_unit, takes_integers
+from spadwarp.scene.sections import field_unit, takes_integers
+from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.tables import parse_key
 from spadwarp.transport import truth_maps
 from spadwarp.units import quantity
 
@@ -107,7 +107,7 @@ def sweep(
     found = Sweep(field=field, values=tuple(values), rows=tuple(rows))
     if found.is_flat:
         hint = ""
-        if field in ("detector.pulses_per_frame", "detector.pulses"):
+        if field == "detector.pulses_per_frame":
             hint = "; analytic.pulses_per_depth_frame or a count law per frame takes its place in this scene"
         warnings.warn(
             f"no number depends on {field}: the analytic model does not use it{hint}", SpadwarpWarning, stacklevel=2

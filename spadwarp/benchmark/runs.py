@@ -21,7 +21,8 @@ from spadwarp.device import core_count, pick_device
 from spadwarp.frames import detect
 from spadwarp.limits import check_choice, check_integer
 from spadwarp.mesh import build_mesh
-from spadwarp.scene import Detector, Laser, Scene
+from spadwarp.scene import Detector, Laser, Scene, Transport
+from spadwarp.scene.sections import field_range
 from spadwarp.transport import simulate, trace, truth_maps
 from spadwarp.transport.model import build_model, transport_spec
 
@@ -69,7 +70,7 @@ def run(
     names = list(CASES) if cases is None else list(cases)
     for name in names:
         check_choice("cases: an item", name, [*CASES, *GROUPS])
-    photons = None if photons is None else check_integer("photons", photons, "[1, 1000000000000]")
+    photons = None if photons is None else check_integer("photons", photons, field_range(Transport, "photons"))
     repeats = check_integer("repeats", repeats, "[1, 1000]")
     wp_device = pick_device(device)
     chosen = [case for name in names for case in (GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]])]

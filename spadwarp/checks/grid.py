@@ -11,9 +11,10 @@ import numpy as np
 from spadwarp.checks.message import CheckMessage, note, warning
 from spadwarp.checks.survey import Survey
 from spadwarp.scene import Scene
-from spadwarp.scene.frustum import beam_planes, view_planes
-from spadwarp.scene.grid_cells import GridCells, grid_cells
-from spadwarp.scene.pose import to_camera
+from spadwarp.scene.camera import to_camera
+from spadwarp.scene.grid import GridCells
+from spadwarp.scene.medium import grid_cells
+from spadwarp.scene.sight import beam_planes, view_planes
 
 __all__ = ["check_grid", "grid_summary"]
 

@@ -10,8 +10,8 @@ import numpy as np
 from spadwarp.checks.message import CheckMessage, note, warning
 from spadwarp.checks.survey import Survey
 from spadwarp.scene import Laser
+from spadwarp.scene.camera import to_world
 from spadwarp.scene.port import Port
-from spadwarp.scene.pose import to_world
 
 
 def check_focus(survey: Survey) -> Iterator[CheckMessage]:

@@ -11,7 +11,7 @@ from spadwarp.checks.message import CheckMessage, warning
 from spadwarp.checks.survey import Survey
 from spadwarp.mesh import guess_unit
 from spadwarp.scene.port import Port
-from spadwarp.scene.quantities import field_unit
+from spadwarp.scene.sections import field_unit
 from spadwarp.units import quantity, with_prefix
 
 # Section → field → lowest and highest plausible value in the field's own unit, and units that people take it for.

@@ -27,7 +27,7 @@ def check_polarisation(survey: Survey) -> Iterator[CheckMessage]:
         ("medium", Medium, "depolarisation_ratio", rayleigh, "scattering_matrix or phase_function = 'rayleigh'"),
         ("medium", Medium, "largest_polarisation", scaled, "scattering_matrix = 'scaled_rayleigh'"),
         ("camera", Camera, "analyser_angle_deg", measured, cameras),
-        ("camera", Camera, "extinction_ratio", measured, cameras),
+        ("camera", Camera, "analyser_extinction_ratio", measured, cameras),
     ):
         value = getattr(getattr(scene, section), field)
         if not used and value != model.model_fields[field].default:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from spadwarp.analytic import beam_axis_fluence
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.scene import Scene
-from spadwarp.scene.beam_profile import profile_extent
-from spadwarp.scene.frustum import beam_planes, points_inside, view_planes
-from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
-from spadwarp.scene.sight import port_advance
+from spadwarp.scene.laser import profile_extent
+from spadwarp.scene.port import PortGeometry
+from spadwarp.scene.scene import camera_port, laser_port
+from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
 from spadwarp.units import range_from_time, time_from_path
 
 __all__ = ["Survey"]
@@ -27,7 +27,7 @@ class Survey:
 
     Attributes:
         triangles, target, reflectance: The faces `[F, 3, 3]` [m] in the camera frame, their targets and reflectances.
-        view, beam: Planes around the view and the beam, as in `spadwarp.scene.frustum`.
+        view, beam: Planes around the view and the beam, as in `spadwarp.scene.sight`.
         focus_distance: Depth that the lens images sharply [m]; None for a pinhole.
         illuminated: Points of the targets in both, `[N, 3]` [m].
         target_range: Nearest and farthest of them from the lens [m]; None if there are none.

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from spadwarp.checks.message import CheckMessage, note, span, vector, warning
 from spadwarp.checks.survey import Survey
 from spadwarp.scene import Laser
-from spadwarp.scene.beam_profile import profile_extent
-from spadwarp.scene.frustum import points_inside
-from spadwarp.scene.intrinsics import image_points
-from spadwarp.scene.pose import to_world
+from spadwarp.scene.camera import image_points, to_world
+from spadwarp.scene.laser import profile_extent
+from spadwarp.scene.sight import points_inside
 from spadwarp.units import path_from_time
 
 Points = NDArray[np.float64]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from spadwarp.checks.message import CheckMessage, note, warning
 from spadwarp.checks.survey import Survey
-from spadwarp.scene.preset import WATER_INDICES
+from spadwarp.scene.tables import WATER_INDICES
 from spadwarp.water import group_index
 
 _FRESH, _SEA = WATER_INDICES["fresh"][1], WATER_INDICES["seawater"][1]

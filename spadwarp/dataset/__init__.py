@@ -6,11 +6,11 @@
 
 from typing import TYPE_CHECKING
 
-from spadwarp.dataset.export import *  # noqa: F403
-from spadwarp.dataset.make import *  # noqa: F403
-from spadwarp.dataset.plan import *  # noqa: F403
-from spadwarp.dataset.read import *  # noqa: F403
-from spadwarp.dataset.recipe import *  # noqa: F403
+from spadwarp.dataset.export import *
+from spadwarp.dataset.make import *
+from spadwarp.dataset.plan import *
+from spadwarp.dataset.read import *
+from spadwarp.dataset.recipe import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = [*recipe.__all__, *plan.__all__, *make.__all__, *read.__all__, *export.__all__]  # noqa: F405
+    __all__ = [*recipe.__all__, *plan.__all__, *make.__all__, *read.__all__, *export.__all__]

@@ -18,8 +18,7 @@ from spadwarp.errors import ConfigError, kernel_errors
 from spadwarp.frames import Frames, crlb, detect
 from spadwarp.result import Truth, degree_of_polarisation, received
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import gate_deviation, pixel_directions
-from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight
+from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import simulate, truth_maps
 from spadwarp.units import path_from_time
 

@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING
 
 from spadwarp.files import formats, loader, run, schema
-from spadwarp.files.formats import *  # noqa: F403
-from spadwarp.files.loader import *  # noqa: F403
-from spadwarp.files.run import *  # noqa: F403
-from spadwarp.files.schema import *  # noqa: F403
+from spadwarp.files.formats import *
+from spadwarp.files.loader import *
+from spadwarp.files.run import *
+from spadwarp.files.schema import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     __all__ = formats.__all__ + loader.__all__ + run.__all__ + schema.__all__

@@ -23,7 +23,7 @@ from spadwarp.limits import check_choice
 from spadwarp.result.received import Channel, received
 from spadwarp.result.result import COMPONENTS, Result
 from spadwarp.scene import noise_rate
-from spadwarp.scene.calibration import CALIBRATION_ENDINGS, save_calibration
+from spadwarp.scene.camera import CALIBRATION_ENDINGS, save_calibration
 
 __all__ = ["FORMATS", "export", "export_sensor_fusion", "open_source", "sequence"]
 

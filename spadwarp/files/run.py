@@ -25,7 +25,8 @@ from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
 from spadwarp.result.file import read_head
 from spadwarp.scene import Scene
-from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.pose import rotation_matrix
 
 if TYPE_CHECKING:
     from spadwarp.inverse import Fit, Unknown

@@ -11,8 +11,7 @@ from pydantic import BaseModel
 from spadwarp.dataset import Recipe
 from spadwarp.mesh import builtin_names
 from spadwarp.scene import Scene, presets
-from spadwarp.scene.coefficients import COEFFICIENTS
-from spadwarp.scene.load import ENERGIES
+from spadwarp.scene.tables import COEFFICIENTS, ENERGIES
 
 __all__ = ["json_schema"]
 

@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
 from spadwarp.errors import ArgumentError, kernel_errors
+from spadwarp.frames.measured import Histograms
 from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
-from spadwarp.scene import Camera
+from spadwarp.scene import Camera, Medium
+from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
 from spadwarp.units import path_from_time
 
@@ -318,12 +320,16 @@ def _geometry(
         )
     if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
         raise ArgumentError("group index and field of view are those of the file's scene")
-    index = check_real("group index", scene.medium.group_index if scene is not None else group_index, "[1, 3]")
+    index = check_real(
+        "group index",
+        scene.medium.group_index if scene is not None else group_index,
+        field_range(Medium, "group_index"),
+    )
     if scene is not None:
         return index, lines_of_sight(scene)
     if horizontal_fov_deg is None:
         return index, None
-    check_real("horizontal field of view", horizontal_fov_deg, "[1e-6, 180)")
+    check_real("horizontal field of view", horizontal_fov_deg, field_range(Camera, "horizontal_fov_deg"))
     height, width = histograms.values.shape[-3:-1]
     camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
     return index, lines_of_camera(camera)

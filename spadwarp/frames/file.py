@@ -14,10 +14,18 @@ from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse
-from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, hdf5_format, image_coordinates, name_dimensions, read_hdf5
+from spadwarp.io.hdf5 import (
+    PIXELS,
+    Coordinate,
+    Hdf5File,
+    hdf5_format,
+    image_coordinates,
+    name_dimensions,
+    read_hdf5,
+)
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, Trajectory
-from spadwarp.scene.intrinsics import camera_attributes
+from spadwarp.scene.camera import camera_attributes
 
 __all__ = ["FramesFile", "SequenceFile", "is_frames_file"]
 

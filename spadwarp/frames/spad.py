@@ -269,7 +269,7 @@ def _draw(
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
     in_place = out is not None and not add_frames
-    common: dict[str, Any] = {**numbers, "counter_depth": detector.counter_depth}
+    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count}
     common["counts"] = wp.from_torch(out).flatten() if in_place else None
     events = None
     if by_event:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.scene.grid import Grid
-from spadwarp.scene.grid_cells import grid_cells
+from spadwarp.scene.medium import grid_cells
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

@@ -100,8 +100,8 @@ def detector_law(detector: Detector, window: Any) -> Law:
         raise ConfigError(
             f"detector.afterpulsing_probability = {detector.afterpulsing_probability}: a fit does not model it"
         )
-    if detector.counter_depth > 0:
-        raise ConfigError(f"detector.counter_depth = {detector.counter_depth}: a fit does not model full counters")
+    if detector.max_count > 0:
+        raise ConfigError(f"detector.max_count = {detector.max_count}: a fit does not model full counters")
     free = detector.mode == "free_running"
     return Law(not free, detector.dead_time_ns * 1e-9 / window.period if free else 0.0, window.recorded)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import shown, suggestion
-from spadwarp.scene.pose import to_world
+from spadwarp.scene.camera import to_world
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

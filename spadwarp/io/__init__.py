@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING
 
 from spadwarp.io import arrays, paths, text
-from spadwarp.io.arrays import *  # noqa: F403
-from spadwarp.io.paths import *  # noqa: F403
-from spadwarp.io.text import *  # noqa: F403
+from spadwarp.io.arrays import *
+from spadwarp.io.paths import *
+from spadwarp.io.text import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     __all__ = arrays.__all__ + paths.__all__ + text.__all__

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from spadwarp.mesh.targets import *  # noqa: F403
+from spadwarp.mesh.targets import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = targets.__all__  # noqa: F405
+    __all__ = targets.__all__

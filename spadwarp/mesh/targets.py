@@ -19,9 +19,11 @@ from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
 from spadwarp.limits import suggestion
 from spadwarp.mesh.files import USD_ENDINGS, Images, Pattern, check_sizes, check_triangles, read_coloured_mesh, read_usd
 from spadwarp.scene import Scene, Target
-from spadwarp.scene.frustum import points_inside, view_planes
-from spadwarp.scene.port_rays import PortGeometry, camera_port
-from spadwarp.scene.pose import rotation_matrix, to_camera
+from spadwarp.scene.camera import to_camera
+from spadwarp.scene.port import PortGeometry
+from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scene import camera_port
+from spadwarp.scene.sight import points_inside, view_planes
 
 __all__ = [
     "BUILTINS",

@@ -31,7 +31,7 @@ from spadwarp.result.result import COMPONENTS, Result, Truth, physics_of
 from spadwarp.result.signed_file import SIGNED_DIMENSIONS, read_signed, write_signed
 from spadwarp.result.signed_tallies import SignedTallies
 from spadwarp.scene import Scene
-from spadwarp.scene.intrinsics import camera_attributes
+from spadwarp.scene.camera import camera_attributes
 
 __all__ = [
     "FORMAT",

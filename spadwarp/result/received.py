@@ -30,8 +30,8 @@ def received(result: Result, channel: Channel) -> Result:
     """The result with the light of one channel alone, for all that takes a result: counts, depth, bounds, pictures.
 
     "I" is the result itself, without an analyser; "co" passes an analyser at `camera.analyser_angle_deg` of the
-    camera's `extinction_ratio`, "cross" one across it. A camera of four Stokes cubes has both. Ambient light counts as
-    unpolarised: ½(1 + 1/E) of it passes, of `detector.ambient_rate` and of daylight.
+    camera's `analyser_extinction_ratio`, "cross" one across it. A camera of four Stokes cubes has both. Ambient light
+    counts as unpolarised: ½(1 + 1/E) of it passes, of `detector.ambient_rate` and of daylight.
 
     The ledger and the counters stay those of all light; from Stokes cubes the channel has no standard errors.
 
@@ -80,7 +80,7 @@ def _tallies(result: Result, channel: Channel, at: tuple[Any, ...] = ()) -> tupl
     if channel in stored.names:
         k = stored.names.index(channel)
         return np.maximum(stored.tallies[(k, *at)], 0), stored.units[k]
-    leak, angle = 1.0 / camera.extinction_ratio, 2.0 * math.radians(camera.analyser_angle_deg)
+    leak, angle = 1.0 / camera.analyser_extinction_ratio, 2.0 * math.radians(camera.analyser_angle_deg)
     sign = 1.0 if channel == "co" else -1.0
     light = (1.0 + leak) * result.tallies[at]
     for name, share in {"Q": math.cos(angle), "U": math.sin(angle)}.items():
@@ -103,7 +103,7 @@ def degree_of_polarisation(result: Result, *, gated: bool = False) -> Floats:
         raise ConfigError(
             "the degree of polarisation needs channels; simulate with camera.polarisation = 'analyser' or 'stokes'"
         )
-    return _degree(_sums(result, (0, 3) if gated else (0,)), 1.0 / result.scene.camera.extinction_ratio)
+    return _degree(_sums(result, (0, 3) if gated else (0,)), 1.0 / result.scene.camera.analyser_extinction_ratio)
 
 
 def polarisation_summary(result: Result) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def polarisation_summary(result: Result) -> dict[str, Any]:
     if not result.channels:
         return {}
     sums = _sums(result, (0, 1, 2, 3))
-    degree = float(_degree(sums, 1.0 / result.scene.camera.extinction_ratio))
+    degree = float(_degree(sums, 1.0 / result.scene.camera.analyser_extinction_ratio))
     light = {name: float(sums[name]) / result.photons for name in result.channels}
     return {"channels": light, "degree_of_polarisation": degree if math.isfinite(degree) else None}
 
@@ -140,7 +140,7 @@ def _degree(sums: dict[str, Floats], leak: float) -> Floats:
 
 def _behind_analyser(scene: Scene) -> Scene:
     """The scene whose camera has no analyser, and as much ambient light as it would pass."""
-    passed = 0.5 * (1.0 + 1.0 / scene.camera.extinction_ratio)
+    passed = 0.5 * (1.0 + 1.0 / scene.camera.analyser_extinction_ratio)
     changed = {"camera.polarisation": "none", "detector.ambient_rate": passed * scene.detector.ambient_rate}
     if scene.daylight is not None:
         changed["daylight.cloud_factor"] = passed * scene.daylight.cloud_factor

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.limits import check_choice, check_real
 from spadwarp.result.result import Truth
-from spadwarp.scene.geometry import depth_from_range, pixel_directions, range_from_depth
+from spadwarp.scene.sight import pixel_directions
 
 __all__ = ["EXR_PRESETS", "ExrPreset", "load_truth_exr"]
 
@@ -117,7 +117,7 @@ def load_truth_exr(
         raise FileError(f"{depth}: no pixel has a depth: everything is sky, 0 or NaN")
     if (raw[hit] < 0).any():
         raise FileError(f"{depth}: depth {raw[hit].min():g} is outside (0, inf)")
-    distance = raw * scale if radial else range_from_depth(raw * scale, view)
+    distance = raw * scale if radial else raw * scale / view[..., 2]
 
     if isinstance(albedo, (str, Path)):
         wanted = (albedo_channel,) if albedo_channel else how.albedo_channels
@@ -130,7 +130,7 @@ def load_truth_exr(
 
     normals = -view if normal is None else _normals(normal, how, axes, view, hit)
     return Truth(
-        depth=depth_from_range(distance, view).astype(np.float32),
+        depth=(distance * view[..., 2]).astype(np.float32),
         range=distance.astype(np.float32),
         normal=np.where(hit[..., None], normals, np.nan).astype(np.float32),
         reflectance=np.where(hit, reflectance, np.nan).astype(np.float32),

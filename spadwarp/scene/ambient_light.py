@@ -9,18 +9,19 @@ the water. Surfaces reflect sun, sky and the light of the water.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ConfigError
-from spadwarp.scene.geometry import pixel_directions
+from spadwarp.limits import Interval
 from spadwarp.scene.medium import Medium
-from spadwarp.scene.phase import PhaseFunction, phase_function
-from spadwarp.scene.port_rays import camera_port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.spectrum import filter_band, filter_transmission
+from spadwarp.scene.scattering import PhaseFunction, phase_function
+from spadwarp.scene.scene import Scene, camera_port
+from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.spectrum import filter_band, filter_transmission, widths_of
 from spadwarp.units import PLANCK, SPEED_OF_LIGHT
 from spadwarp.water.daylight import (
     SKY_REFLECTANCE,
@@ -29,9 +30,7 @@ from spadwarp.water.daylight import (
     refracted_cosine,
     surface_reflectance,
 )
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
+from spadwarp.water.seawater import RANGES
 
 __all__ = ["daylight_radiance", "daylight_rate", "downwelling_irradiance", "noise_rate"]
 
@@ -98,7 +97,7 @@ def downwelling_irradiance(scene: Scene, wavelength_nm: ArrayLike, depth: float 
     daylight = _daylight(scene)
     nm = np.asarray(wavelength_nm, np.float64)
     values = [_irradiance(scene, float(one), daylight.depth if depth is None else depth) for one in nm.ravel()]
-    total = np.array([direct + diffuse for direct, diffuse, _ in values]).reshape(nm.shape)
+    total = np.array([direct + diffuse for direct, diffuse, *_ in values]).reshape(nm.shape)
     return total if nm.ndim else float(total)
 
 
@@ -149,10 +148,9 @@ def daylight_rate(
     view = pixel_directions(camera) if view is None else np.asarray(view, np.float64)
     if scene.daylight is None:
         return np.zeros(view.shape[:-1])
-    nodes, widths = _band(scene)
-    photons = (
-        widths * filter_transmission(scene.laser, scene.detector, nodes) * nodes * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
-    )
+    nodes = _band(scene)
+    passed = widths_of(nodes) * filter_transmission(scene.laser, scene.detector, nodes)
+    photons = passed * nodes * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
     fields = [(_field(scene, float(nm)), weight) for nm, weight in zip(nodes, photons, strict=True) if weight > 0.0]
     seen = _Seen.of(scene, view, distance, normal, reflectance)
     total = np.zeros(len(seen.view))
@@ -180,9 +178,9 @@ def noise_rate(scene: Scene, truth: Any = None) -> Any:
 
 
 class _Seen(NamedTuple):
-    """What pixels see: lines of sight in the water `[P, 3]`, distance along them `[P]` (infinite in open water), of
-    surfaces the normal and the reflectance; by how much deeper than the lens the lines begin [m], and the radiance in
-    front of the lens over that in the water."""
+    """Pixels and what is before them: lines of sight in the water `[P, 3]`, distance along them `[P]` (infinite in open
+    water), of surfaces the normal and the reflectance; by how much deeper than the lens the lines begin [m], and the
+    radiance in front of the lens over that in the water."""
 
     view: Floats
     distance: Floats
@@ -241,54 +239,44 @@ def _daylight(scene: Scene) -> Any:
     return scene.daylight
 
 
-def _band(scene: Scene) -> tuple[Floats, Floats]:
-    """Wavelengths [nm] and what each stands for [nm], from 400 to 700 nm."""
+def _band(scene: Scene) -> Floats:
+    """Wavelengths of the light that passes the filter, from 400 to 700 nm [nm]."""
+    least, most, *_ = Interval.read(RANGES["wavelength_nm"])
     band = filter_band(scene.laser, scene.detector)
     if band is None:
-        nodes = np.linspace(400.0, 700.0, 31)
-    else:
-        open_at = band[filter_transmission(scene.laser, scene.detector, band) > 0.0]
-        low, high = (max(400.0, float(open_at[0])), min(700.0, float(open_at[-1]))) if open_at.size else (1.0, 0.0)
-        if not low < high:
-            raise ConfigError(
-                f"detector: the filter passes nothing from 400 to 700 nm, where daylight is known; it is open from "
-                f"{open_at[0] if open_at.size else 0:g} to {open_at[-1] if open_at.size else 0:g} nm"
-            )
-        coarse = np.linspace(low, high, _BAND_NODES)
-        # A table with steep sides keeps its own points.
-        inside = band[(band >= low) & (band <= high)]
-        nodes = np.unique(np.concatenate([coarse, inside])) if inside.size <= 4 * _BAND_NODES else coarse
-    widths = np.gradient(nodes)
-    widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
-    return nodes, widths
+        return np.linspace(least, most, 31)
+    open_at = band[filter_transmission(scene.laser, scene.detector, band) > 0.0]
+    first, last = (float(open_at[0]), float(open_at[-1])) if open_at.size else (0.0, 0.0)
+    low, high = max(float(least), first), min(float(most), last)
+    if not low < high:
+        raise ConfigError(
+            f"detector: the filter passes nothing from {least} to {most} nm, where daylight is known; it is open from "
+            f"{first:g} to {last:g} nm"
+        )
+    coarse = np.linspace(low, high, _BAND_NODES)
+    # A table with steep sides keeps its own points.
+    inside = band[(band >= low) & (band <= high)]
+    return np.unique(np.concatenate([coarse, inside])) if inside.size <= 4 * _BAND_NODES else coarse
 
 
-def _optics(scene: Scene, wavelength_nm: float) -> tuple[Medium, PhaseFunction]:
-    medium = scene.medium
-    if medium.follows_wavelength:
-        medium = medium.at_wavelength(wavelength_nm)
-    return medium, phase_function(medium)
-
-
-def _irradiance(scene: Scene, wavelength_nm: float, depth: float) -> tuple[float, float, float]:
-    """Of the sun and of the sky on a horizontal surface at a depth [W/m²/nm], and K_d [1/m]."""
-    daylight = _daylight(scene)
-    medium, phase = _optics(scene, wavelength_nm)
-    elevation = daylight.sun_elevation_deg
+def _irradiance(scene: Scene, wavelength_nm: float, depth: float) -> tuple[float, float, float, Medium, PhaseFunction]:
+    """Of the sun and of the sky on a horizontal surface at a depth [W/m²/nm], K_d [1/m], the water and its law."""
+    daylight, medium = _daylight(scene), scene.medium
+    medium = medium.at_wavelength(wavelength_nm) if medium.follows_wavelength else medium
+    phase, elevation = phase_function(medium), daylight.sun_elevation_deg
     above = clear_sky_irradiance(
         wavelength_nm, sun_elevation_deg=elevation, aerosol_optical_depth=daylight.aerosol_optical_depth
     )
     backward = phase.backscatter_fraction * medium.scattering
     decay = daylight_attenuation(medium.absorption, backward, sun_elevation_deg=elevation)
     factor = daylight.cloud_factor * math.exp(-decay * depth)
-    direct = above.direct * (1.0 - surface_reflectance(elevation, medium.phase_index))
-    return factor * direct, factor * above.diffuse * (1.0 - SKY_REFLECTANCE), decay
+    direct = factor * (above.direct * (1.0 - surface_reflectance(elevation, medium.phase_index)))
+    return direct, factor * above.diffuse * (1.0 - SKY_REFLECTANCE), decay, medium, phase
 
 
 def _field(scene: Scene, wavelength_nm: float) -> _Field:
     daylight = _daylight(scene)
-    medium, phase = _optics(scene, wavelength_nm)
-    direct, diffuse, decay = _irradiance(scene, wavelength_nm, daylight.depth)
+    direct, diffuse, decay, medium, phase = _irradiance(scene, wavelength_nm, daylight.depth)
     to_camera = rotation_matrix(scene.camera.rotation_deg)  # its columns are the camera's axes
     index = medium.phase_index
     scattered = medium.scattering * phase.density(np.maximum(_ANGLES, 2e-5))

@@ -1,22 +1,34 @@
-"""The section `camera`."""
+"""Cameras: the section `camera`, where it sees a direction, and calibrations of OpenCV and ROS.
+
+Intrinsics and lens distortion are OpenCV's. Image coordinates are in pixels, `[..., 2]` (column, row), and (0.5, 0.5)
+is the first pixel's centre; OpenCV's own are half a pixel less. Tangents are x/z and y/z of a direction in the camera
+frame.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
+from xml.etree import ElementTree
 
-from pydantic import BeforeValidator, Field, model_validator
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
 
-from spadwarp.scene import intrinsics
-from spadwarp.scene.calibration import load_calibration
+from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.io.text import parse_json, read_text, write_text
+from spadwarp.limits import check_integer, read_real, shown
 from spadwarp.scene.port import Port
-from spadwarp.scene.sections import Brown, Coordinate, Section, Vector, Whole
+from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.sections import AnyFile, Brown, Coordinate, Infinite, Section, Vector, Whole, field_range
 
+__all__ = ["Camera", "load_calibration", "save_calibration"]
 
-def _infinite(value: Any) -> Any:
-    """The word for what TOML writes as inf."""
-    return math.inf if value == "infinity" else value
+Points = NDArray[np.float64]
 
 
 class Camera(Section):
@@ -50,15 +62,14 @@ class Camera(Section):
     """row of the optical axis, likewise"""
     distortion: Brown = (0.0,) * 5
     """Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order"""
-    calibration: str | None = None
+    calibration: AnyFile = None
     """OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place"""
     aperture_diameter: float | None = Field(None, ge=1e-9, le=1e6)
     """diameter of the entrance aperture [m]"""
     f_number: float | None = Field(None, ge=1e-3, le=1e6)
     """focal length over aperture diameter"""
     focus_distance: Annotated[
-        Annotated[float, Field(ge=1e-6, le=math.inf, allow_inf_nan=True)] | Literal["target"],
-        BeforeValidator(_infinite),
+        Annotated[float, Field(ge=1e-6, le=math.inf, allow_inf_nan=True)] | Literal["target"], Infinite
     ] = "target"
     """depth that is imaged sharply [m], inf or "infinity"; "target": that of the first target on the optical axis"""
     pinhole: bool = False
@@ -71,9 +82,7 @@ class Camera(Section):
     """what it records of polarisation: nothing; light through an analyser and one across; the Stokes vector"""
     analyser_angle_deg: float = Field(0.0, ge=-180, le=180)
     """analyser: direction of the field that it lets through, in the image from +x towards +y [°]"""
-    extinction_ratio: Annotated[
-        Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True)], BeforeValidator(_infinite)
-    ] = math.inf
+    analyser_extinction_ratio: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True), Infinite] = math.inf
     """analyser: light that it lets through along its direction over light across; inf or "infinity" is ideal"""
     port: Port | None = None
     """what it looks through; view and focus are those in the air behind it. Without one it is in the water"""
@@ -93,33 +102,24 @@ class Camera(Section):
     def _determined(self) -> Self:
         given = [name for name in ("horizontal_fov_deg", "pixel_pitch_um", "fx") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(
-                "needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length"
-                + (f"; given: {', '.join(given)}" if given else "")
-            )
+            hint = f"; given: {', '.join(given)}" if given else ""
+            raise ValueError(f"needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length{hint}")
         if (self.aperture_diameter is None) == (self.f_number is None):
             raise ValueError("needs either aperture_diameter or f_number with focal_length")
-        if self.focal_length is None and (self.pixel_pitch_um is not None or self.f_number is not None):
-            raise ValueError(
-                f"focal_length is missing; {'pixel_pitch_um' if self.f_number is None else 'f_number'} needs it"
-            )
-        for name in ("fy", "cx", "cy"):
-            if self.fx is None and getattr(self, name) is not None:
-                raise ValueError(f"{name} = {getattr(self, name)} goes with fx only")
+        needs_it = [name for name in ("f_number", "pixel_pitch_um") if getattr(self, name) is not None]
+        if self.focal_length is None and needs_it:
+            raise ValueError(f"focal_length is missing; {needs_it[0]} needs it")
+        self._only_with("fx", self.fx is not None, "fy", "cx", "cy")
         if self.focus_distance != "target" and self.focus_distance <= (self.focal_length or 0.0):
-            raise ValueError(
-                f"focus_distance = {self.focus_distance} is outside ({self.focal_length}, inf], beyond the focal length"
-            )
-        if not intrinsics.is_invertible(self):
-            raise ValueError(
-                f"distortion = {list(self.distortion)} is not one-to-one: some of its {self.width} x {self.height} "
-                "pixels show no direction, or two"
-            )
+            self._refuse("focus_distance", f"is outside ({self.focal_length}, inf], beyond the focal length")
+        if not is_invertible(self):
+            size = f"{self.width} x {self.height}"
+            self._refuse("distortion", f"is not one-to-one: some of its {size} pixels show no direction, or two")
         return self
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What a result holds of polarisation: ("co", "cross") of an analyser and of one across it, the Stokes vector
+        """Names of the polarisation in a result: ("co", "cross") of an analyser and of one across it, the Stokes vector
         ("I", "Q", "U", "V"), or nothing."""
         return {"none": (), "analyser": ("co", "cross"), "stokes": ("I", "Q", "U", "V")}[self.polarisation]
 
@@ -175,7 +175,7 @@ class Camera(Section):
     def view_box(self) -> tuple[float, float, float, float]:
         """Least and largest tangents (left, top, right, bottom) of what the image shows."""
         if any(self.distortion):
-            return intrinsics.view_box(self)
+            return view_box(self)
         (fx, fy), (cx, cy) = self.focal_pixels, self.principal_point
         return -cx / fx, -cy / fy, (self.width - cx) / fx, (self.height - cy) / fy
 
@@ -203,3 +203,302 @@ class Camera(Section):
     def aperture_area(self) -> float:
         """Area of the entrance aperture [m²]."""
         return math.pi * self.aperture_radius**2
+
+
+def to_camera(camera: Camera, points: ArrayLike) -> Points:
+    """Points of the world `[..., 3]` [m] in the camera's frame."""
+    return (np.asarray(points, np.float64) - camera.position) @ rotation_matrix(camera.rotation_deg)
+
+
+def to_world(camera: Camera, points: ArrayLike) -> Points:
+    """Points of the camera's frame `[..., 3]` [m] in the world."""
+    return np.asarray(points, np.float64) @ rotation_matrix(camera.rotation_deg).T + camera.position
+
+
+# Intrinsics
+
+# Boxes are wider by this part of a pixel than what they hold: edges bend between the points that are looked at, and
+# float32 rounds.
+_MARGIN = 0.01
+
+
+def image_points(camera: Camera, tangents: ArrayLike) -> Points:
+    """Image coordinates at which directions with the given tangents are seen, `[..., 2]`."""
+    return _distort(np.asarray(tangents, np.float64), camera.distortion) * camera.focal_pixels + camera.principal_point
+
+
+def image_tangents(camera: Camera, points: ArrayLike) -> Points:
+    """Tangents of the directions that are seen at image coordinates, `[..., 2]`: `image_points` undone, by Newton's
+    method; NaN where no direction is seen."""
+    seen = (np.asarray(points, np.float64) - camera.principal_point) / camera.focal_pixels
+    if not any(camera.distortion):
+        return seen
+    tangents = seen.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(50):
+            a, b, d = _jacobian(tangents, camera.distortion)
+            error = _distort(tangents, camera.distortion) - seen
+            step = np.stack([d * error[..., 0] - b * error[..., 1], a * error[..., 1] - b * error[..., 0]], axis=-1)
+            tangents -= step / (a * d - b * b)[..., None]
+            if np.nanmax(np.abs(error), initial=0.0) < 1e-14:
+                break
+        error = np.abs(_distort(tangents, camera.distortion) - seen).max(axis=-1)
+        tangents[~(error < 1e-10)] = np.nan
+    return tangents
+
+
+def is_invertible(camera: Camera) -> bool:
+    """Whether each point of the image belongs to one direction of the view.
+
+    The distortion is the gradient of a function of the tangents, so that a positive definite Jacobian throughout a
+    convex region makes it one-to-one in it; tested on a grid over the box that holds the view.
+    """
+    if not any(camera.distortion):
+        return True
+    left, top, right, bottom = view_box(camera)
+    if not np.isfinite([left, top, right, bottom]).all():
+        return False
+    a, b, d = _jacobian(_grid(np.linspace(left, right, 65), np.linspace(top, bottom, 65)), camera.distortion)
+    return bool((a + d > 0.0).all() and (a * d - b * b > 0.0).all())
+
+
+def view_box(camera: Camera) -> tuple[float, float, float, float]:
+    """Least and largest tangents (left, top, right, bottom) of what the image shows, a hundredth of a pixel wider."""
+    columns, rows = np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)
+    if not any(camera.distortion):
+        columns, rows = columns[[0, -1]], rows[[0, -1]]
+    border = np.concatenate(
+        [_grid(columns, rows[[0, -1]]).reshape(-1, 2), _grid(columns[[0, -1]], rows).reshape(-1, 2)]
+    )
+    tangents = image_tangents(camera, border)
+    margin = _MARGIN / np.array(camera.focal_pixels)
+    (left, top), (right, bottom) = tangents.min(axis=0) - margin, tangents.max(axis=0) + margin
+    return float(left), float(top), float(right), float(bottom)
+
+
+def pixel_views(camera: Camera) -> Points:
+    """As `view_box` for each pixel alone: `[H, W, 4]`."""
+    corners = image_tangents(camera, _grid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)))
+    four = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]])
+    margin = _MARGIN / np.array(camera.focal_pixels)
+    return np.concatenate([four.min(axis=0) - margin, four.max(axis=0) + margin], axis=-1)
+
+
+def camera_attributes(camera: Camera, focus_distance: float | None) -> dict[str, NDArray[np.float64] | float]:
+    """Attributes of a camera in a file, for readers without spadwarp: OpenCV's `camera_matrix` [pixels], 0 being the
+    first pixel's centre, and `camera_distortion` (k1, k2, p1, p2, k3); `camera_position` [m] and `camera_rotation`, the
+    camera's axes in the world as columns; `camera_focus_distance` [m], NaN if all depths are sharp.
+
+    The matrices `[3, 3]` are 9 numbers, row after row: netCDF knows no attributes of two dimensions."""
+    (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
+    return {
+        "camera_matrix": np.array([fx, 0.0, column - 0.5, 0.0, fy, row - 0.5, 0.0, 0.0, 1.0]),
+        "camera_distortion": np.array(camera.distortion),
+        "camera_position": np.array(camera.position),
+        "camera_rotation": rotation_matrix(camera.rotation_deg).ravel(),
+        "camera_focus_distance": np.nan if focus_distance is None else focus_distance,
+    }
+
+
+def _grid(columns: Points, rows: Points) -> Points:
+    """`[R, C, 2]`."""
+    return np.stack(np.meshgrid(columns, rows), axis=-1)
+
+
+def _distort(tangents: Points, coefficients: tuple[float, ...]) -> Points:
+    """Brown's model (1966) in OpenCV's order k1, k2, p1, p2, k3."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = tangents[..., 0], tangents[..., 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _jacobian(tangents: Points, coefficients: tuple[float, ...]) -> tuple[Points, Points, Points]:
+    """Derivatives of `_distort`: of x by x, of x by y and of y by x, which are the same, of y by y."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = tangents[..., 0], tangents[..., 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))  # of the radial factor by r², twice
+    return (
+        radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+        slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
+        radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
+    )
+
+
+# Calibrations
+
+CALIBRATION_ENDINGS = (".xml", ".yml", ".yaml", ".json")
+"""Of files that `save_calibration` writes."""
+
+_COORDINATE = field_range(Camera, "cx")
+_LARGEST = 1 << 19  # bytes; one with all corners of 100 views has 300 kB
+
+# What programs call the same thing.
+_NAMES = {
+    "camera_matrix": ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "mtx", "K", "M"),
+    "distortion": (
+        "distortion_coefficients",
+        "dist_coeffs",
+        "dist_coeff",
+        "distCoeffs",
+        "distortion",
+        "dist",
+        "D",
+    ),
+    "width": ("image_width", "width"),
+    "height": ("image_height", "height"),
+}
+
+
+def load_calibration(path: str | Path) -> dict[str, Any]:
+    """Fields of the scene's `camera` section from a calibration file.
+
+    Reads `camera_matrix` (3 × 3), `distortion_coefficients` (k1, k2, p1, p2[, k3]) and, if there, `image_width` and
+    `image_height`, under these or the other usual names.
+
+    Returns:
+        `fx`, `fy`, `cx`, `cy`, `distortion` [pixels, 1], and `width` and `height` if the file has them.
+
+    Raises:
+        FileError: The file cannot be read.
+        ConfigError: It holds no calibration, one of a lens model other than Brown's, or numbers that are not finite.
+    """
+    try:
+        text = read_text(path, largest=_LARGEST)
+    except FileError as error:
+        raise FileError(f"camera.calibration = {error}") from None
+    try:
+        return _fields(_entries(text))
+    except ValueError as error:
+        raise ConfigError(f"camera.calibration = {str(path)!r}: {error}") from None
+
+
+def save_calibration(camera: Camera, path: str | Path) -> Path:
+    """Writes a camera's calibration as OpenCV's `cv::FileStorage` reads it: XML, YAML or JSON by the ending.
+
+    Holds `image_width`, `image_height`, `camera_matrix` and `distortion_coefficients` (k1, k2, p1, p2, k3), as
+    `cv2.calibrateCamera` gives them: 0 is the centre of the first pixel.
+
+    Raises:
+        ArgumentError: Another ending.
+        FileError: The file cannot be written.
+    """
+    path = Path(path)
+    if (ending := path.suffix.lower()) not in CALIBRATION_ENDINGS:
+        raise ArgumentError(f"{path}: ending {path.suffix!r} is not one of {', '.join(CALIBRATION_ENDINGS)}")
+    numbers: Any = camera_attributes(camera, None)
+    size = {"image_width": camera.width, "image_height": camera.height}
+    matrices: dict[str, dict[str, Any]] = {
+        "camera_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": numbers["camera_matrix"].tolist()},
+        "distortion_coefficients": {"rows": 1, "cols": 5, "dt": "d", "data": numbers["camera_distortion"].tolist()},
+    }
+    if ending == ".json":
+        tables = {name: {"type_id": "opencv-matrix", **matrix} for name, matrix in matrices.items()}
+        return write_text(json.dumps({**size, **tables}, indent=1) + "\n", path)
+    is_xml = ending == ".xml"
+    lines = ['<?xml version="1.0"?>', "<opencv_storage>"] if is_xml else ["%YAML:1.0", "---"]
+    lines += [f"<{name}>{value}</{name}>" if is_xml else f"{name}: {value}" for name, value in size.items()]
+    for name, matrix in matrices.items():
+        data = map(repr, matrix["data"])
+        matrix["data"] = " ".join(data) if is_xml else f"[ {', '.join(data)} ]"
+        lines += [f'<{name} type_id="opencv-matrix">' if is_xml else f"{name}: !!opencv-matrix"]
+        lines += [f"  <{key}>{value}</{key}>" if is_xml else f"   {key}: {value}" for key, value in matrix.items()]
+        lines += [f"</{name}>"] if is_xml else []
+    return write_text("\n".join([*lines, "</opencv_storage>", ""] if is_xml else [*lines, ""]), path)
+
+
+def _entries(text: str) -> dict[str, Any]:
+    if text.lstrip().startswith("<"):
+        return _xml_entries(text)
+    is_json = text.lstrip().startswith("{")
+    try:  # OpenCV's first line is no YAML
+        entries = parse_json(text) if is_json else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
+    except (ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"not valid {'JSON' if is_json else 'YAML'}: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise ValueError("not valid YAML: lists or tables are nested too deeply") from None
+    return entries if isinstance(entries, dict) else {}
+
+
+def _xml_entries(text: str) -> dict[str, Any]:
+    """The entries of OpenCV's XML, its matrices as `_numbers` takes them."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # with entities a small file can be huge
+        raise ValueError("not OpenCV's XML: it declares a document type")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"not valid XML: {error}") from None
+    entries: dict[str, Any] = {}
+    for element in root:
+        if element.find("data") is not None:  # a matrix
+            parts = {part.tag: (part.text or "").split() for part in element}
+            entries[element.tag] = {**parts, "rows": _one(parts.get("rows")), "cols": _one(parts.get("cols"))}
+        else:
+            entries[element.tag] = _one((element.text or "").split())
+    return entries
+
+
+def _one(words: list[str] | None) -> list[str] | str | None:
+    """The word of a list of one, else the list."""
+    return words[0] if words is not None and len(words) == 1 else words
+
+
+class _Loader(yaml.BaseLoader):
+    """Every scalar as text, every tag ignored (`!!opencv-matrix`), no aliases: with them a small file can be huge."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError(f"an alias stands in line {self.peek_event().start_mark.line + 1}")
+        return super().compose_node(parent, index)
+
+
+def _fields(entries: Mapping[str, Any]) -> dict[str, Any]:
+    def find(key: str) -> list[float] | None:
+        name = next((name for name in _NAMES[key] if name in entries), None)
+        return None if name is None else _numbers(name, entries[name])
+
+    model = entries.get("distortion_model", entries.get("camera_model", "plumb_bob"))
+    if str(model).lower() not in ("plumb_bob", "brown", "pinhole", "opencv", "radtan"):
+        raise ValueError(f"the lens model {shown(model)} is not Brown's (k1, k2, p1, p2, k3)")
+    matrix = find("camera_matrix")
+    if matrix is None or len(matrix) != 9:
+        raise ValueError("holds no camera_matrix of 3 x 3 numbers")
+    fx, skew, cx, zero, fy, cy, *last = matrix
+    if skew or zero or last != [0, 0, 1] or fx <= 0 or fy <= 0:
+        raise ValueError(f"camera_matrix = {shown(matrix)} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
+    distortion = find("distortion") or []
+    if any(distortion[5:]) or len(distortion) not in (0, 4, 5, 8, 12, 14):
+        raise ValueError(
+            f"distortion_coefficients = {shown(distortion)}: k1, k2, p1, p2, k3 are known, no rational, prism or tilt"
+            " terms"
+        )
+    coefficients = tuple([*distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5])
+    fields: dict[str, Any] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": coefficients}
+    for name in ("width", "height"):
+        if (pixels := find(name)) is not None:
+            fields[name] = check_integer(
+                f"image_{name}", pixels[0] if len(pixels) == 1 else pixels, field_range(Camera, name)
+            )
+    return fields
+
+
+def _numbers(name: str, value: Any) -> list[float]:
+    """The numbers of a matrix as OpenCV and ROS write it, of a list of rows, or of a list; or the one number."""
+    data = value.get("data") if isinstance(value, Mapping) else value
+    items = data if isinstance(data, list) else [data]
+    cells = [cell for item in items for cell in (item if isinstance(item, list) else [item])]
+    numbers = [read_real(name, cell, _COORDINATE) for cell in cells]
+    if isinstance(value, Mapping) and value.get("rows") is not None and value.get("cols") is not None:
+        rows, columns = (read_real(f"{name}.{side}", value[side], _COORDINATE) for side in ("rows", "cols"))
+        if rows * columns != len(numbers):
+            raise ValueError(f"{name} has {len(numbers)} numbers in {rows:g} rows and {columns:g} columns")
+    return numbers

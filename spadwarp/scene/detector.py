@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from spadwarp.scene.sections import Section, Whole
+from spadwarp.scene.sections import CsvFile, FilePath, Section, Whole
+
+__all__ = ["Detector"]
 
 
 class Detector(Section):
@@ -21,7 +23,7 @@ class Detector(Section):
     """active part of a pixel's area, microlenses included"""
     jitter_fwhm_ps: float = Field(200.0, ge=0, le=1e12)
     """timing jitter, full width at half maximum [ps]"""
-    irf: str = "gaussian"
+    irf: Annotated[str, FilePath(".csv", ("gaussian", "exponentially_modified_gaussian"))] = "gaussian"
     """instrument response: "gaussian", "exponentially_modified_gaussian", or the path of a .csv file"""
     irf_tail_ps: float = Field(100.0, ge=1e-12, le=1e12)
     """time constant of the exponential tail [ps]"""
@@ -41,7 +43,7 @@ class Detector(Section):
     """full width at half maximum of its Gaussian transmission [nm]; without it there is no filter"""
     filter_peak: float = Field(1.0, gt=0, le=1)
     """its largest transmission"""
-    filter_table: str | None = None
+    filter_table: CsvFile = None
     """a measured filter in place of these: .csv file of wavelength [nm] and transmission"""
     mode: Literal["first_photon", "free_running"] = "first_photon"
     """one count a pulse, or as many as come"""
@@ -57,34 +59,18 @@ class Detector(Section):
     """time of flight modulo the pulse period (range aliasing), as a detector sees it"""
     pulses_per_frame: Whole = Field(20_000, ge=1, le=2**63 - 1)
     """laser pulses in one frame of counts"""
-    counter_depth: Whole = Field(0, ge=0, le=2**31 - 1)
+    max_count: Whole = Field(0, ge=0, le=2**31 - 1)
     """largest count a histogram bin holds; 0 is unlimited"""
-
-    @field_validator("irf")
-    @classmethod
-    def _known_irf(cls, value: str) -> str:
-        if value not in (names := ("gaussian", "exponentially_modified_gaussian")) and not value.lower().endswith(
-            ".csv"
-        ):
-            raise ValueError("choice", names, "the path of a .csv file")
-        return value
-
-    @field_validator("filter_table")
-    @classmethod
-    def _table_of_a_filter(cls, value: str | None) -> str | None:
-        if value is not None and not value.lower().endswith(".csv"):
-            raise ValueError("is not the path of a .csv file")
-        return value
 
     @model_validator(mode="after")
     def _one_filter(self) -> Self:
-        others = {"filter_centre_nm": self.filter_centre_nm, "filter_fwhm_nm": self.filter_fwhm_nm}
-        others |= {"filter_peak": None if self.filter_peak == 1.0 else self.filter_peak}
-        given = [f"{name} = {value}" for name, value in others.items() if value is not None]
-        if self.filter_table is not None and given:
-            raise ValueError(f"{given[0]} goes without filter_table")
-        if self.filter_table is None and self.filter_fwhm_nm is None and given:
-            raise ValueError(f"{given[0]} needs filter_fwhm_nm")
+        for name in ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"):
+            if getattr(self, name) == Detector.model_fields[name].default:
+                continue
+            if self.filter_table is not None:
+                self._refuse(name, "cannot be combined with filter_table")
+            if self.filter_fwhm_nm is None:
+                self._refuse(name, "needs filter_fwhm_nm")
         return self
 
     @property

@@ -1,15 +1,39 @@
-"""The table `medium.grid`: water that varies from place to place, in a box."""
+"""Water that varies from place to place, in a box: the table `medium.grid`, its files and shapes, and its cells."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from spadwarp.scene.sections import Counts, Scale, Section, Size, Vector, Whole
+from spadwarp.errors import ConfigError, FileError, SpadwarpError
+from spadwarp.io.arrays import read_npz
+from spadwarp.io.hdf5 import read_hdf5
+from spadwarp.io.paths import existing_file
+from spadwarp.limits import Interval
+from spadwarp.scene.pose import rotation_matrix, vector_of
+from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field_range
+from spadwarp.scene.tables import COEFFICIENTS
+
+__all__: list[str] = []
+
+Floats = NDArray[np.float64]
+Cells = NDArray[np.floating]
 
 GRID_ENDINGS = (".npz", ".h5", ".hdf5", ".nvdb")
+LARGEST_CELL_COUNT = 1 << 27
+
+# Values of a table of crossings that `optical_depths` holds at a time.
+_CROSSINGS = 1 << 21
+
+
+_OF_SHAPES = ("cells", "turbulence", "eddy_size", "seed")
 
 
 class Grid(Section):
@@ -20,7 +44,7 @@ class Grid(Section):
     """
 
     section: ClassVar[str] = "grid"
-    file: str | None = None
+    file: AnyFile = None
     """path of a .npz, .h5 or .nvdb file with cells, relative to the scene file"""
     shape: Literal["cloud", "plume", "sediment", "gradient"] | None = None
     """in place of a file: a round cloud, a plume that rises, matter stirred up from the bottom, a rise from top to
@@ -59,22 +83,17 @@ class Grid(Section):
         if (self.file is None) == (self.shape is None):
             raise ValueError("needs either file or shape")
         if self.file is not None and Path(self.file).suffix.lower() not in GRID_ENDINGS:
-            hint = (
-                "; `nanovdb_convert` of OpenVDB makes a .nvdb file of it" if self.file.lower().endswith(".vdb") else ""
-            )
-            raise ValueError(f"file = {self.file!r} does not end in {', '.join(GRID_ENDINGS)}{hint}")
+            is_vdb = self.file.lower().endswith(".vdb")
+            hint = "; `nanovdb_convert` of OpenVDB makes a .nvdb file of it" if is_vdb else ""
+            self._refuse("file", f"does not end in {', '.join(GRID_ENDINGS)}{hint}")
         if self.shape is not None and self.size is None:
             raise ValueError(f"needs size with shape = {self.shape!r}")
-        if self.size is not None and len(self.size) == 2:
-            raise ValueError(f"size = {list(self.size)} has two numbers; one or three are needed")
-        if len(self.cells) == 2:
-            raise ValueError(f"cells = {list(self.cells)} has two numbers; one or three are needed")
+        for name in ("size", "cells"):
+            if len(getattr(self, name) or ()) == 2:
+                self._refuse(name, "has two numbers; one or three are needed")
         if min(self.scale) <= 0.0:
-            raise ValueError(f"scale = {list(self.scale)} is not positive")
-        given = self.model_fields_set
-        for name in ("cells", "turbulence", "eddy_size", "seed"):
-            if self.file is not None and name in given and getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{name} = {getattr(self, name)!r} goes with shape only; a file has its cells")
+            self._refuse("scale", "is not positive")
+        self._only_with("shape", self.shape is not None, *_OF_SHAPES)
         return self
 
     @property
@@ -98,7 +117,378 @@ class Grid(Section):
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal table again."""
         fields = super().to_dict()
-        if self.file is not None:
-            for name in ("cells", "turbulence", "seed"):
-                fields.pop(name, None)
-        return fields
+        hidden = () if self.file is None else _OF_SHAPES
+        return {name: value for name, value in fields.items() if name not in hidden}
+
+
+# Shapes: in the box's own coordinates x, y and z run from -1 to 1; y points down, as in the world.
+
+
+def cloud(x: Floats, y: Floats, z: Floats) -> Floats:
+    """A Gaussian in all directions, of a standard deviation of a third of half the edge; 1 in the middle."""
+    return np.exp(-4.5 * (x**2 + y**2 + z**2))
+
+
+def plume(x: Floats, y: Floats, z: Floats) -> Floats:
+    """A Gaussian across, from the middle of the bottom upwards, four times as wide at the top; 1 where it begins."""
+    width = 0.1 + 0.15 * (1.0 - y)
+    return (0.1 / width) ** 2 * np.exp(-0.5 * (x**2 + z**2) / width**2)
+
+
+def sediment(x: Floats, y: Floats, z: Floats) -> Floats:
+    """Matter stirred up from the bottom: it falls to 1/e in a fifth of the height, and towards the sides."""
+    return np.exp(-5.0 * 0.5 * (1.0 - y)) * np.cos(0.5 * np.pi * x) ** 2 * np.cos(0.5 * np.pi * z) ** 2
+
+
+def gradient(x: Floats, y: Floats, z: Floats) -> Floats:
+    """From 0 at the top to 1 at the bottom."""
+    return 0.5 * (1.0 + y) + 0.0 * (x + z)
+
+
+SHAPES = {"cloud": cloud, "plume": plume, "sediment": sediment, "gradient": gradient}
+"""Densities by the name of `medium.grid.shape`."""
+
+
+def shape_density(grid: Grid) -> Floats:
+    """Density of each cell at its middle, `[x, y, z]`, of a grid with a shape."""
+    counts, edges = grid.cell_counts, grid.edges
+    assert grid.shape is not None and edges is not None  # see Grid
+    axes = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
+    density = SHAPES[grid.shape](axes[0][:, None, None], axes[1][:, None], axes[2])
+    if grid.turbulence > 0.0:
+        eddy = grid.eddy_size or min(edges) / 3.0
+        field = turbulent_field(counts, edges, eddy, grid.seed, grid.frame)
+        density = density * np.exp(grid.turbulence * field - 0.5 * grid.turbulence**2)
+    return density
+
+
+def turbulent_field(
+    counts: tuple[int, int, int], edges: tuple[float, float, float], eddy_size: float, seed: int, time: float = 0.0
+) -> Floats:
+    """A Gaussian random field of mean 0 and variance 1 with von Kármán's spectrum, (k² + k0²)^(-11/6), k0 = 2π over
+    eddy_size.
+
+    Args:
+        counts: Cells along the edges.
+        edges: Of the box [m].
+        eddy_size: Of the largest eddies [m].
+        seed: Same seed, same field.
+        time: In turnovers of the largest eddies; a mode changes at the rate of its own, as k^(2/3).
+    """
+    rng = np.random.default_rng(seed)
+    waves = [2.0 * np.pi * np.fft.fftfreq(n, edge / n) for n, edge in zip(counts, edges, strict=True)]
+    waves[2] = np.abs(waves[2][: counts[2] // 2 + 1])
+    k2 = waves[0][:, None, None] ** 2 + waves[1][:, None] ** 2 + waves[2] ** 2
+    k0 = 2.0 * np.pi / eddy_size
+    amplitude = (k2 + k0**2) ** (-11.0 / 12.0)
+    amplitude[0, 0, 0] = 0.0
+    # The second field before the first: at time 0 the field is that of the first, whatever comes with time.
+    first, second = (np.fft.rfftn(rng.standard_normal(counts)) for _ in range(2))
+    turn = time * ((k2 + k0**2) / k0**2) ** (1.0 / 3.0)
+    field = np.fft.irfftn(amplitude * (np.cos(turn) * first + np.sin(turn) * second), s=counts, axes=(0, 1, 2))
+    spread = field.std()
+    return field / spread if spread > 0.0 else field
+
+
+# Files: NumPy archives, HDF5, NanoVDB
+
+_MATTER = field_range(Grid, "extinction")
+GRID_ARRAYS = {
+    "density": Interval.read("[0, 1e9]"),
+    "extinction": _MATTER,
+    "absorption": _MATTER,
+    "scattering": _MATTER,
+    "albedo": field_range(Grid, "albedo"),
+    "anisotropy": field_range(Grid, "anisotropy"),
+}
+"""Arrays of a file `[x, y, z]`, or of several frames `[frame, x, y, z]`, and their ranges."""
+_PLACES = {"size": "(0, inf)", "cell_size": "(0, inf)", "origin": "(-inf, inf)"}
+
+Place = tuple[float, float, float]
+
+
+class GridFile(NamedTuple):
+    """Cells of a file.
+
+    Attributes:
+        arrays: By the names of `GRID_ARRAYS`, `[frame, x, y, z]` float32.
+        size: Edges of the box [m]; None: the scene has to say.
+        origin: Its lower corner in the file's own frame [m]; None: the box stands about its middle.
+    """
+
+    arrays: Mapping[str, NDArray[np.float32]]
+    size: Place | None = None
+    origin: Place | None = None
+
+
+def read_grid(path: str | Path) -> GridFile:
+    """The cells of a file: `density`, or two of extinction, absorption, scattering and albedo; and `anisotropy`.
+
+    `.npz` and `.h5`: arrays by these names, `[x, y, z]` or `[frame, x, y, z]`, and `size` (3 edges) or `cell_size` (one
+    or 3) and `origin` [m]. `.nvdb`: grids of these names, or one grid of any name, which is the density; the box holds
+    the voxels that are set.
+
+    Raises `FileError`.
+    """
+    place, names = existing_file(path), (*GRID_ARRAYS, *_PLACES)
+    try:
+        if place.suffix.lower() == ".nvdb":
+            arrays = _read_nvdb(place)
+        elif place.suffix.lower() == ".npz":
+            arrays = read_npz(place, names=names, largest=LARGEST_CELL_COUNT)
+        else:
+            with read_hdf5(place) as file:
+                found = {name: entry for name, entry in file.arrays().items() if name in names}
+                arrays = {name: file.array(name, kind, (None,) * len(shape)) for name, (shape, kind) in found.items()}
+        return _checked(place, arrays)
+    except FileError:
+        raise
+    except (SpadwarpError, ValueError, TypeError, RuntimeError, OSError, MemoryError) as error:
+        raise FileError(f"{path}: damaged or not readable: {error}") from error
+
+
+def _read_nvdb(path: Path) -> dict[str, NDArray[Any]]:
+    """By way of `wp.Volume`, on the CPU."""
+    import warp as wp
+
+    volume: Any = wp.Volume.load_from_nvdb(path.read_bytes(), device="cpu")
+    volumes: list[Any] = []
+    while volume is not None:
+        volumes.append(volume)
+        info = volume.get_grid_info()
+        volume = volume.load_next_grid() if info.grid_index + 1 < info.grid_count else None
+    names = [one.get_grid_info().name for one in volumes]
+    named = {name: one for name, one in zip(names, volumes, strict=True) if name in GRID_ARRAYS}
+    if not named:
+        if len(volumes) > 1:
+            raise FileError(f"{path}: grids {names}, none of which is one of {', '.join(GRID_ARRAYS)}")
+        named = {"density": volumes[0]}
+    voxels = {name: one.get_voxels().numpy() for name, one in named.items()}
+    if not all(map(len, voxels.values())):
+        raise FileError(f"{path}: a grid without voxels")
+    low = np.min([one.min(axis=0) for one in voxels.values()], axis=0)
+    shape = tuple(int(n) for n in np.max([one.max(axis=0) for one in voxels.values()], axis=0) + 1 - low)
+    if np.prod(shape, dtype=np.float64) > LARGEST_CELL_COUNT:
+        raise FileError(f"{path}: voxels within {shape} cells; at most {LARGEST_CELL_COUNT} are allowed")
+    info = next(iter(named.values())).get_grid_info()
+    transform = np.array(info.transform_matrix, np.float64).reshape(3, 3)
+    cell = np.diag(transform)
+    if not np.allclose(transform, np.diag(cell)) or (cell <= 0.0).any():
+        raise FileError(f"{path}: a rotated or mirrored grid; rotate it by medium.grid.rotation_deg")
+    # A voxel's value is that at its middle, which is the place of its index.
+    origin = np.array(info.translation, np.float64) + (low - 0.5) * cell
+    arrays = {name: _dense(path, one, voxels[name], low, shape) for name, one in named.items()}
+    return {**arrays, "size": cell * shape, "origin": origin}
+
+
+def _dense(path: Path, volume: Any, voxels: Any, low: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The values of a sparse grid, and its background where there are none."""
+    import warp as wp
+
+    import spadwarp_kernels as sk
+
+    if volume.dtype is not wp.float32:
+        raise FileError(f"{path}: grid {volume.get_grid_info().name!r} holds {volume.dtype}; float is needed")
+    values = wp.empty(len(voxels), dtype=float, device="cpu")
+    indices: wp.array = wp.array(voxels, dtype=wp.vec3i, device="cpu")
+    wp.launch(sk.voxel_values_kernel, len(voxels), [volume.id, indices, values], device="cpu")
+    dense = np.zeros(shape, np.float32)
+    dense[tuple((voxels - low).T)] = values.numpy()
+    return dense
+
+
+def _checked(path: Path, found: Mapping[str, NDArray[Any]]) -> GridFile:
+    arrays: dict[str, NDArray[np.float32]] = {}
+    for name, interval in GRID_ARRAYS.items():
+        if name not in found:
+            continue
+        values = found[name]
+        if values.ndim not in (3, 4) or values.dtype.kind not in "fiu" or not 0 < values.size <= LARGEST_CELL_COUNT:
+            raise FileError(
+                f"{path}: {name} is {values.dtype} {values.shape}; numbers [x, y, z] or [frame, x, y, z] of at most "
+                f"{LARGEST_CELL_COUNT} cells are needed"
+            )
+        values = values.astype(np.float32).reshape(-1, *values.shape[-3:])
+        if not (inside := interval.holds(values)).all():
+            place = tuple(int(i) for i in np.argwhere(~inside)[0])
+            raise FileError(f"{path}: {name}{list(place[1:])} = {values[place]:g} is outside {interval}")
+        arrays[name] = values
+    coefficients = set(COEFFICIENTS) & set(arrays)
+    if ("density" in arrays) == bool(coefficients) or len(coefficients) not in (0, 2):
+        held = ", ".join(arrays) or "none of them"
+        raise FileError(
+            f"{path}: holds {held}; density, or two of extinction, absorption, scattering and albedo are needed"
+        )
+    shapes = {values.shape for values in arrays.values()}
+    if len(shapes) > 1:
+        raise FileError(f"{path}: arrays of different shapes, {sorted(shapes)}")
+    places = {name: _place(path, name, found[name]) for name in _PLACES if name in found}
+    size = places.get("size")
+    if size is None and (cell := places.get("cell_size")) is not None:
+        (_, x, y, z) = shapes.pop()
+        size = (cell[0] * x, cell[1] * y, cell[2] * z)
+    return GridFile(arrays, size, places.get("origin"))
+
+
+def _place(path: Path, name: str, found: NDArray[Any]) -> Place:
+    values = np.asarray(found, np.float64).ravel()
+    values = np.repeat(values, 3) if values.size == 1 else values
+    if values.size != 3 or not Interval.read(_PLACES[name]).holds(values).all():
+        raise FileError(f"{path}: {name} = {values.tolist()[:4]} is not three numbers in {_PLACES[name]}")
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+# Cells
+
+
+@dataclass(frozen=True, eq=False)
+class GridCells:
+    """Cells of water in a box, and what light loses on straight lines through it.
+
+    Attributes:
+        extinction: c [1/m], `[x, y, z]` along the box's own axes.
+        albedo: b/c.
+        anisotropy: g; None: the medium's everywhere.
+        size: Edges of the box [m].
+        centre: Its middle in the world [m].
+        rotation: Its own axes in the world, as columns.
+    """
+
+    extinction: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    anisotropy: NDArray[np.float32] | None
+    size: Place
+    centre: Place
+    rotation: Floats
+
+    @property
+    def scattering(self) -> NDArray[np.float32]:
+        """b [1/m] of each cell."""
+        return self.extinction * self.albedo
+
+    def in_cells(self, points: ArrayLike) -> Floats:
+        """Points of the world `[..., 3]` [m] in cells: the box has 0 ... shape there."""
+        shape = np.array(self.extinction.shape)
+        own = (np.asarray(points, np.float64) - self.centre) @ self.rotation
+        return (own / self.size + 0.5) * shape
+
+    def at(self, points: ArrayLike, outside: float) -> Floats:
+        """Extinction [1/m] at points of the world `[..., 3]`, with that outside the box."""
+        return self._at(self.in_cells(points), outside)
+
+    def _at(self, places: Floats, outside: float) -> Floats:
+        shape = self.extinction.shape
+        index = np.clip(np.floor(places), -1, shape).astype(np.int32)
+        inside = ((index >= 0) & (index < shape)).all(axis=-1)
+        clipped = np.clip(index, 0, np.array(shape) - 1)
+        return np.where(inside, self.extinction[tuple(np.moveaxis(clipped, -1, 0))], outside)
+
+    def optical_depths(self, begin: ArrayLike, end: ArrayLike, outside: float) -> Floats:
+        """∫c ds along straight lines between points of the world `[..., 3]`, exact for the cells.
+
+        A line is cut where it crosses the planes between cells, and the cell of each piece is that of its middle.
+        """
+        first, last = np.broadcast_arrays(np.asarray(begin, np.float64), np.asarray(end, np.float64))
+        shape = first.shape[:-1]
+        first, last = first.reshape(-1, 3), last.reshape(-1, 3)
+        size = max(1, _CROSSINGS // (sum(self.extinction.shape) + 5))
+        parts = [self._depths(first[k : k + size], last[k : k + size], outside) for k in range(0, len(first), size)]
+        return np.concatenate([np.zeros(0), *parts]).reshape(shape)
+
+    def _depths(self, begin: Floats, end: Floats, outside: float) -> Floats:
+        first, along = self.in_cells(begin), self.in_cells(end) - self.in_cells(begin)
+        cuts = [np.zeros((len(begin), 1)), np.ones((len(begin), 1))]
+        for axis, count in enumerate(self.extinction.shape):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                crossing = (np.arange(count + 1) - first[:, axis, None]) / along[:, axis, None]
+            cuts.append(np.clip(np.nan_to_num(crossing, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0))
+        t = np.sort(np.concatenate(cuts, axis=1), axis=1)
+        middle = first[:, None, :] + 0.5 * (t[:, 1:] + t[:, :-1])[..., None] * along[:, None, :]
+        return (self._at(middle, outside) * np.diff(t, axis=1)).sum(axis=1) * np.linalg.norm(end - begin, axis=1)
+
+
+@functools.lru_cache(maxsize=4)
+def cells_of(grid: Grid, water: tuple[float, float, float], has_table: bool, stamp: Any) -> GridCells:
+    """The cells of a grid in water of an extinction [1/m], an albedo and an anisotropy.
+
+    `has_table`: whether scattering is drawn from a table, which all cells share. `stamp` changes when the file does.
+    """
+    edges, origin, own_g = grid.edges, None, None
+    if grid.file is None:
+        c, omega, g = _added(grid, shape_density(grid), water)
+    else:
+        file = _read(grid.file, stamp)
+        edges, origin = edges or file.size, file.origin
+        if edges is None:
+            raise ConfigError(f"medium.grid: needs size; {grid.file} has no size and no cell_size")
+        found = {name: _frame(grid, values) for name, values in file.arrays.items()}
+        own_g = found.get("anisotropy")
+        if own_g is not None and has_table:
+            raise ConfigError(
+                f"medium.grid.file = {grid.file!r} has an anisotropy, which goes with phase_function = "
+                "'henyey_greenstein' only; cells share any other"
+            )
+        if "density" in found:
+            c, omega, g = _added(grid, found["density"], water, own_g)
+        else:
+            c, omega, g = *_coefficients(found), own_g
+    size = np.array(edges) * grid.scale
+    rotation = rotation_matrix(grid.rotation_deg)
+    own = np.zeros(3) if origin is None else (np.array(origin) + 0.5 * np.array(edges)) * grid.scale
+    centre = rotation @ own + grid.translation
+    c, omega = np.ascontiguousarray(c, np.float32), np.ascontiguousarray(omega, np.float32)
+    g = None if g is None else np.ascontiguousarray(g, np.float32)
+    return GridCells(c, omega, g, vector_of(size), vector_of(centre), rotation)
+
+
+@functools.lru_cache(maxsize=2)
+def _read(path: str, stamp: Any) -> GridFile:
+    try:
+        return read_grid(path)
+    except FileError as error:
+        raise FileError(f"medium.grid.file: {error}") from None
+
+
+def _frame(grid: Grid, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The cells at `grid.frame`, between two frames the mean of both by their distance."""
+    last = len(values) - 1
+    if grid.frame > last:
+        raise ConfigError(f"medium.grid.frame = {grid.frame:g} is outside [0, {last}], the frames of {grid.file}")
+    low = min(int(grid.frame), max(last - 1, 0))
+    part = np.float32(grid.frame - low)
+    return values[low] if part == 0.0 else (1 - part) * values[low] + part * values[low + 1]
+
+
+def _added(
+    grid: Grid, density: Cells, water: tuple[float, float, float], own_anisotropy: Cells | None = None
+) -> tuple[Cells, Cells, Cells | None]:
+    """The medium with suspended matter: coefficients add up, the mean cosine is that of both scatterings together."""
+    extinction, albedo, anisotropy = water
+    added = grid.extinction * density
+    c = extinction + added
+    b = extinction * albedo + grid.albedo * added
+    g = grid.anisotropy if own_anisotropy is None else own_anisotropy
+    mean: Cells | None = None
+    if g is not None:
+        both = (extinction * albedo * anisotropy + grid.albedo * added * g) / np.maximum(b, 1e-30)
+        mean = np.where(b > 0.0, both, anisotropy)
+    return c, np.clip(b / np.maximum(c, 1e-30), 0.0, 1.0), mean
+
+
+def _coefficients(found: Mapping[str, NDArray[np.float32]]) -> tuple[Cells, Cells]:
+    """Extinction and albedo from two of the four coefficients."""
+    a, b, c, omega = (found.get(name) for name in COEFFICIENTS)
+    tiny = np.float32(1e-30)
+    if omega is not None:
+        if b is not None:
+            return b / np.maximum(omega, tiny) * (omega > 0.0), omega
+        if a is not None:
+            return a / np.maximum(1.0 - omega, tiny) * (omega < 1.0), omega
+        assert c is not None  # two of the four are there
+        return c, omega
+    if c is None:
+        assert a is not None and b is not None
+        c = a + b
+    scattered = b if b is not None else np.maximum(c - (0.0 if a is None else a), 0.0)
+    return c, np.clip(scattered / np.maximum(c, tiny), 0.0, 1.0)

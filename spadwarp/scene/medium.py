@@ -1,25 +1,95 @@
-"""The section `medium`."""
+"""Water: the section `medium`, its layers, and what it is along a line."""
 
 from __future__ import annotations
 
 import bisect
 import itertools
 import math
-from collections.abc import Sequence
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
-from spadwarp.scene.coefficients import COEFFICIENTS
-from spadwarp.scene.grid import Grid
-from spadwarp.scene.grid_cells import grid_cells
+from spadwarp.limits import bounds
+from spadwarp.scene.grid import Grid, GridCells, cells_of
 from spadwarp.scene.laser import Laser
-from spadwarp.scene.layers import Layer, Water
-from spadwarp.scene.phase_fields import PHASE_FIELDS
-from spadwarp.scene.preset import PHASE_TABLES, PRESETS, WATER_INDICES
-from spadwarp.scene.sections import Vector, listed
+from spadwarp.scene.sections import (
+    Coordinate,
+    CsvFile,
+    Direction,
+    FilePath,
+    Section,
+    field_range,
+    listed,
+    with_units,
+)
+from spadwarp.scene.tables import (
+    COEFFICIENTS,
+    PHASE_FIELDS,
+    PHASE_TABLES,
+    PRESETS,
+    WATER_INDICES,
+    complete_coefficients,
+    merge_section,
+)
 from spadwarp.units import pulse_speed
-from spadwarp.water import water_optics
+from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, water_optics
+
+__all__ = ["Layer", "Medium"]
+
+
+class Water(Section):
+    """Coefficients of water: two of four coefficients, or chlorophyll, from which they follow."""
+
+    section: ClassVar[str] = "medium"
+    alternatives: ClassVar[tuple[str, ...]] = COEFFICIENTS
+    preset: str | None = None
+    """a named water, see `spadwarp presets medium`"""
+    absorption: float = Field(0.0, ge=0, le=1e6)
+    """absorption coefficient a [1/m]"""
+    scattering: float = Field(0.0, ge=0, le=1e6)
+    """scattering coefficient b [1/m]"""
+    extinction: float = Field(0.0, ge=1e-12, le=1e6)
+    """extinction (beam attenuation) coefficient c = a + b [1/m]"""
+    albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = 0.0
+    """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
+    chlorophyll: float | None = Field(None, **bounds(RANGES["chlorophyll"]))
+    """chlorophyll of the open ocean, in place of coefficients [mg/m³]"""
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        # What was given stays in model_fields_set, from where to_dict() knows it.
+        if self.chlorophyll is None:
+            self.__dict__.update(complete_coefficients({name: getattr(self, name) for name in self.given}))
+            if self.extinction not in (allowed := field_range(type(self), "extinction")):
+                raise ValueError(f"extinction = {self.extinction} is outside {allowed}")
+        elif self.given or self.preset is not None:
+            self._refuse("chlorophyll", f"cannot be combined with {', '.join(self.given or ['preset'])}")
+        return self
+
+    @property
+    def attenuation_length(self) -> float:
+        """1/c [m]."""
+        return 1.0 / self.extinction
+
+
+class Layer(Water):
+    """Water from a plane on, up to the next layer; given as a medium is."""
+
+    start: Coordinate
+    """where it begins along `layer_axis`, the world's z if not given [m]"""
+    anisotropy: float | None = Field(None, gt=-1, lt=1)
+    """henyey_greenstein: mean cosine of the scattering angle; default: the medium's"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expand_preset(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping):
+            return fields
+        whole = merge_section(cls.section, {}, with_units(cls, fields))
+        # A preset has indices, but one pair of them holds for all layers: the medium's.
+        return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}
 
 
 class WaterRange(NamedTuple):
@@ -63,28 +133,28 @@ class Medium(Water):
     """fournier_forand: index n of the particles over that of the water"""
     junge_slope: float = Field(3.5835, ge=3.05, lt=5)
     """fournier_forand: slope µ of the size distribution"""
-    phase_table: str | None = None
+    phase_table: Annotated[str | None, FilePath(".csv", tuple(PHASE_TABLES))] = None
     """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
     scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
     """what scattering does to the polarisation of light, over any phase function; "none": light is not polarised"""
-    matrix_table: str | None = None
+    matrix_table: CsvFile = None
     """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp particles` writes one
     """
-    depolarisation_ratio: float = Field(0.039, ge=0, le=0.5)
+    depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
     """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
-    largest_polarisation: float = Field(0.66, ge=0, le=1)
+    largest_polarisation: float = Field(0.66, **bounds(RANGES["largest"]))
     """scaled_rayleigh: polarisation of unpolarised light that is scattered by 90°"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
     """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
-    temperature: float | None = Field(None, ge=0, le=30)
+    temperature: float | None = Field(None, **bounds(RANGES["temperature"]))
     """gives the indices that are not given, with salinity 35 [°C]"""
-    salinity: float | None = Field(None, ge=0, le=40)
+    salinity: float | None = Field(None, **bounds(RANGES["salinity"]))
     """the same, with temperature 20 [g/kg]"""
     layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = ()
     """other waters further along `layer_axis`, in its order"""
-    layer_axis: Vector = (0.0, 0.0, 1.0)
+    layer_axis: Direction = (0.0, 0.0, 1.0)
     """direction across the layers, in the world; not 0"""
     grid: Grid | None = None
     """water that varies within a box, cell by cell; not with layers"""
@@ -93,48 +163,28 @@ class Medium(Water):
     @field_validator("phase_index", "group_index", mode="before")
     @classmethod
     def _named_index(cls, value: Any, info: Any) -> Any:
-        if isinstance(value, str):
-            if value not in WATER_INDICES:
-                raise ValueError(f"is neither a number nor one of {', '.join(map(repr, WATER_INDICES))}")
-            return WATER_INDICES[value][info.field_name == "group_index"]
-        return value
-
-    @field_validator("phase_table")
-    @classmethod
-    def _known_table(cls, value: str | None) -> str | None:
-        if value is not None and value not in PHASE_TABLES and not value.lower().endswith(".csv"):
-            raise ValueError("choice", tuple(PHASE_TABLES), "the path of a .csv file")
-        return value
+        if isinstance(value, str) and value not in WATER_INDICES:
+            raise ValueError(f"is neither a number nor one of {', '.join(map(repr, WATER_INDICES))}")
+        return WATER_INDICES[value][info.field_name == "group_index"] if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _fields_of_the_phase_function(self) -> Self:
+    def _tables_of_scattering(self) -> Self:
         for law, (needed, _) in PHASE_FIELDS.items():
             missing = [name for name in needed if getattr(self, name) is None]
             if law == self.phase_function and missing:
                 raise ValueError(f"needs {', '.join(missing)} with phase_function = {law!r}")
-            if law != self.phase_function and (given := [name for name in needed if name not in missing]):
-                value = getattr(self, given[0])
-                raise ValueError(f"{given[0]} = {value!r} goes with phase_function = {law!r} only")
-        return self
-
-    @model_validator(mode="after")
-    def _table_of_the_matrix(self) -> Self:
-        table = self.matrix_table
-        if (self.scattering_matrix == "tabulated") != (table is not None):
-            if table is None:
-                raise ValueError("needs matrix_table with scattering_matrix = 'tabulated'")
-            raise ValueError(f"matrix_table = {table!r} goes with scattering_matrix = 'tabulated' only")
-        if table is not None and not table.lower().endswith(".csv"):
-            raise ValueError(f"matrix_table = {table!r} is not the path of a .csv file")
+            self._only_with(f"phase_function = {law!r}", law == self.phase_function, *needed)
+        has_table = self.scattering_matrix == "tabulated"
+        if has_table and self.matrix_table is None:
+            raise ValueError("needs matrix_table with scattering_matrix = 'tabulated'")
+        self._only_with("scattering_matrix = 'tabulated'", has_table, "matrix_table")
         return self
 
     @model_validator(mode="after")
     def _resolved(self) -> Self:
-        if math.hypot(*self.layer_axis) < 1e-9:
-            raise ValueError(f"layer_axis = {list(self.layer_axis)} has no length")
+        own_law = "goes with phase_function = 'henyey_greenstein' only"
         for i, layer in enumerate(self.layers):
-            if i and layer.start <= self.layers[i - 1].start:
-                before = self.layers[i - 1].start
+            if i and layer.start <= (before := self.layers[i - 1].start):
                 raise ValueError(f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it")
             if (layer.albedo == "lu2024") != (self.albedo == "lu2024"):
                 raise ValueError(
@@ -143,27 +193,17 @@ class Medium(Water):
             # A preset may bring one with it, which is no more than what the medium's own preset may.
             own = PRESETS["medium"][layer.preset].values.get("anisotropy") if layer.preset else None
             if self.phase_function != "henyey_greenstein" and layer.anisotropy not in (None, own):
-                raise ValueError(
-                    f"layers[{i}].anisotropy = {layer.anisotropy} goes with phase_function = 'henyey_greenstein' only;"
-                    " layers share any other"
-                )
+                raise ValueError(f"layers[{i}].anisotropy = {layer.anisotropy} {own_law}; layers share any other")
         if self.grid is not None:
-            self._check_grid(self.grid)
+            if self.layers:
+                count = len(self.layers)
+                raise ValueError(f"grid does not go with layers, {count} given; cells can repeat them, from a file")
+            if self.albedo == "lu2024":
+                raise ValueError("grid does not go with albedo = 'lu2024', which has no cells; give it a number")
+            if self.grid.anisotropy is not None and self.phase_function != "henyey_greenstein":
+                raise ValueError(f"grid.anisotropy = {self.grid.anisotropy} {own_law}; cells share any other")
         self._follow(Laser.model_fields["wavelength_nm"].default)
         return self
-
-    def _check_grid(self, grid: Grid) -> None:
-        if self.layers:
-            raise ValueError(
-                f"grid does not go with layers, {len(self.layers)} given; cells can repeat them: write them to a file"
-            )
-        if self.albedo == "lu2024":
-            raise ValueError("grid does not go with albedo = 'lu2024', which has no cells; give the albedo a number")
-        if grid.anisotropy is not None and self.phase_function != "henyey_greenstein":
-            raise ValueError(
-                f"grid.anisotropy = {grid.anisotropy} goes with phase_function = 'henyey_greenstein' only;"
-                " cells share any other"
-            )
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
@@ -227,7 +267,7 @@ class Medium(Water):
 
     @property
     def waters(self) -> tuple[Medium | Layer, ...]:
-        """Itself and its layers, in the order of `layer_axis`."""
+        """The medium and its layers, in the order of `layer_axis`."""
         return (self, *self.layers)
 
     @property
@@ -238,26 +278,19 @@ class Medium(Water):
     @property
     def range(self) -> WaterRange:
         """Extremes over the medium, its layers and its grid. Raises what `grid_cells` raises."""
-        waters = self.waters
-        found = WaterRange(
-            max(water.extinction for water in waters),
-            max(water.scattering for water in waters),
-            max(0.0, min(water.extinction - water.scattering for water in waters)),
-            max(water.scattering / max(water.extinction, 1e-30) for water in waters),
-            tuple(layer.anisotropy for layer in self.layers if layer.anisotropy is not None),
-        )
-        if self.grid is None:
-            return found
-        cells = grid_cells(self)
-        scattering = cells.scattering
-        g = cells.anisotropy
-        return WaterRange(
-            max(found.extinction, float(cells.extinction.max())),
-            max(found.scattering, float(scattering.max())),
-            max(0.0, min(found.absorption, float((cells.extinction - scattering).min()))),
-            max(found.albedo, float(cells.albedo.max())),
-            () if g is None else (float(g.min()), float(g.max())),
-        )
+        extinction = [water.extinction for water in self.waters]
+        scattering = [water.scattering for water in self.waters]
+        absorption = [water.extinction - water.scattering for water in self.waters]
+        albedo = [water.scattering / max(water.extinction, 1e-30) for water in self.waters]
+        g = [layer.anisotropy for layer in self.layers if layer.anisotropy is not None]
+        if self.grid is not None:
+            cells = grid_cells(self)
+            extinction.append(float(cells.extinction.max()))
+            scattering.append(float(cells.scattering.max()))
+            absorption.append(float((cells.extinction - cells.scattering).min()))
+            albedo.append(float(cells.albedo.max()))
+            g += [] if cells.anisotropy is None else [float(cells.anisotropy.min()), float(cells.anisotropy.max())]
+        return WaterRange(max(extinction), max(scattering), max(0.0, min(absorption)), max(albedo), tuple(g))
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
         """∫c ds along the straight line between two points of the world [m]."""
@@ -281,10 +314,26 @@ class Medium(Water):
 
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal section again: of the coefficients the given ones, of the indices too."""
-        hidden = {"layers", "layer_axis"}
-        if self.follows_wavelength:
-            hidden |= {"phase_index", "group_index"} - self.model_fields_set
-        fields = {name: value for name, value in super().to_dict().items() if name not in hidden}
-        if self.layers:
-            fields |= {"layer_axis": self.layer_axis, "layers": [layer.to_dict() for layer in self.layers]}
-        return fields
+        hidden = {"phase_index", "group_index"} - self.model_fields_set if self.follows_wavelength else set()
+        if not self.layers:
+            hidden |= {"layers", "layer_axis"}
+        return {name: value for name, value in super().to_dict().items() if name not in hidden}
+
+
+def grid_cells(medium: Medium) -> GridCells:
+    """The cells of a medium with a grid.
+
+    Raises:
+        FileError: The file cannot be read, or has no cells.
+        ConfigError: `medium.grid` does not say how large the box is, or its frame is not in the file.
+    """
+    grid, albedo = medium.grid, medium.albedo
+    assert grid is not None and not isinstance(albedo, str)  # see Medium
+    stamp: tuple[int, int] | None = None
+    if grid.file is not None:
+        try:
+            status = Path(grid.file).stat()
+            stamp = status.st_mtime_ns, status.st_size
+        except OSError:
+            stamp = None  # the reader says why
+    return cells_of(grid, (medium.extinction, albedo, medium.anisotropy), medium.has_phase_table, stamp)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from spadwarp.limits import Interval, shown, suggestion
-from spadwarp.scene.load import Key, key_text, preset_hint
-from spadwarp.scene.quantities import field_unit
+from spadwarp.limits import shown, suggestion
+from spadwarp.scene.sections import field_unit, interval_of, models_of, parts_of
+from spadwarp.scene.tables import Key, key_text, preset_hint
 from spadwarp.units import quantity
 
 # What people write for a field's name, beyond misspellings.
@@ -66,15 +65,8 @@ def locate(model: type[BaseModel], loc: Sequence[str | int]) -> tuple[Key, Field
         elif inner is not None and not part.startswith(("literal[", "function-")):
             key.append(part)
             info = inner.model_fields.get(part)
-            inner = next(_models(info.annotation), None) if info is not None else None
+            inner = next(iter(models_of(info)), None) if info is not None else None
     return tuple(key), info
-
-
-def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for argument in typing.get_args(annotation):
-        yield from _models(argument)
 
 
 def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel], overridden: bool) -> str:
@@ -90,7 +82,8 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     cause = problem.get("ctx", {}).get("error")
     if kind in ("missing", "too_short", "too_long"):  # of a list
         name = key_text(key[: max(i for i, part in enumerate(key) if isinstance(part, str)) + 1])
-        return f"{name} = {shown(value)} has the wrong number of values{_count(info)}"
+        hint = "" if (size := _size(info)) is None else f"; {size} are needed"
+        return f"{name} = {shown(value)} has the wrong number of values{hint}"
     entry = f"{name} = {shown(value)}" + (" (an override)" if overridden else "")
     if isinstance(cause, ValueError) and isinstance(cause.args[0], str) and len(cause.args) == 1:
         whole_table = isinstance(value, (Mapping, BaseModel))
@@ -103,7 +96,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     choices = _choices(info, cause)
     if kind in _LIMITS and info is not None:
         words = "".join(f" and not {word!r}" for word in choices)
-        return f"{entry} is outside {_interval(info)}{words}{_percentage(info, value)}"
+        return f"{entry} is outside {interval_of(info)}{words}{_percentage(info, value)}"
     if choices and kind in _KINDS and isinstance(value, str):
         words = " nor ".join(map(repr, choices))
         return f"{entry} is neither {_KINDS[kind]} nor {words}{_instead(key, info, kind, value)}"
@@ -112,14 +105,15 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         listed = ", ".join([*map(repr, choices), *others]) if len(choices) < 9 else "the known presets"
         return f"{entry} is not one of {listed}{_suggest(value, choices)}"
     if kind in _KINDS:
-        what = _numbers(info) if kind == "tuple_type" else ""
+        size = _size(info) if kind == "tuple_type" else None
+        what = "" if size is None else f" of {size} values"
         return f"{entry} is not {_KINDS[kind]}{what}{_instead(key, info, kind, value)}"
     message = problem["msg"]
     return f"{entry}: {message[0].lower()}{message[1:]}"
 
 
 def _factor(key: Key, value: Any) -> str:
-    """What to add where a mesh's scale is given as a length."""
+    """A hint where a mesh's scale is given as a length."""
     try:
         metres = quantity(value if any(map(str.isdigit, value)) else f"1 {value}", "m") if key[-1] == "scale" else None
     except (TypeError, ValueError):
@@ -128,49 +122,36 @@ def _factor(key: Key, value: Any) -> str:
 
 
 def _percentage(info: FieldInfo, value: Any) -> str:
-    """What to add where a ratio within [0, 1] is given in per cent."""
-    bounds, number = _limits(info), isinstance(value, int | float) and not isinstance(value, bool)
+    """A hint where a ratio within [0, 1] is given in per cent."""
+    bounds, number = interval_of(info), isinstance(value, int | float) and not isinstance(value, bool)
     if not number or field_unit(info) != "1" or bounds.low < 0.0 or bounds.high != 1.0 or not 2 <= value <= 100:
         return ""
     return f'; did you mean "{value:g} %"?' if 0.01 * value in bounds else ""
 
 
 def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
-    """What to write in place of a value of another kind."""
+    """A hint where a value is of another kind: how it is written."""
     if kind == "tuple_type" and isinstance(value, Mapping):
         return f" of tables; write [[{key_text(key)}]]"
     if kind in ("model_type", "model_attributes_type") and isinstance(value, str) and info is not None:
-        return "".join(preset_hint(getattr(one, "section", ""), value) for one in list(_models(info.annotation))[:1])
+        return "".join(preset_hint(getattr(one, "section", ""), value) for one in models_of(info)[:1])
     if kind in ("model_type", "model_attributes_type") and info is not None:
-        fields = [name for one in list(_models(info.annotation))[:1] for name in one.model_fields]
+        fields = [name for one in models_of(info)[:1] for name in one.model_fields]
         return f" of {', '.join(fields[:8])}{', ...' if len(fields) > 8 else ''}"
     return _factor(key, value)
 
 
-def _sizes(annotation: Any) -> Iterator[int]:
-    """How many values the lists of an annotation have."""
-    parts = typing.get_args(annotation)
-    if typing.get_origin(annotation) is tuple and ... not in parts:
-        yield len(parts)
-    for part in parts:
-        yield from _sizes(part)
-
-
-def _count(info: FieldInfo | None) -> str:
-    size = None if info is None else next(_sizes(info.annotation), None)
-    return "" if size is None else f"; {size} are needed"
-
-
-def _numbers(info: FieldInfo | None) -> str:
-    size = None if info is None else next(_sizes(info.annotation), None)
-    return "" if size is None else f" of {size} values"
+def _size(info: FieldInfo | None) -> int | None:
+    """How many values the list of a field has."""
+    sizes = (typing.get_args(part) for part in parts_of(info) if typing.get_origin(part) is tuple)
+    return next((len(items) for items in sizes if ... not in items), None)
 
 
 def _fields(model: type[BaseModel], key: Key) -> list[str]:
     """Names of the fields of the table at `key`."""
     for part in key:
         if isinstance(part, str):
-            model = next(_models(model.model_fields[part].annotation))
+            model = models_of(model.model_fields[part])[0]
     return list(model.model_fields)
 
 
@@ -183,42 +164,8 @@ def _choices(info: FieldInfo | None, cause: Any) -> tuple[str, ...]:
     """The words that a field takes: those of its literal type, or those that a validator names."""
     if isinstance(cause, ValueError) and len(cause.args) > 1:
         return tuple(cause.args[1])
-    return tuple(_literals(info.annotation)) if info is not None else ()
-
-
-def _literals(annotation: Any) -> Iterator[str]:
-    if typing.get_origin(annotation) is typing.Literal:
-        yield from typing.get_args(annotation)
-    else:
-        for argument in typing.get_args(annotation):
-            yield from _literals(argument)
-
-
-def _interval(info: FieldInfo) -> str:
-    """The range of a numeric field with its unit, such as `(0, 1e6] 1/m`."""
-    interval, unit = _limits(info), field_unit(info)
-    return str(interval) if unit in (None, "1") else f"{interval} {unit}"
-
-
-def _limits(info: FieldInfo) -> Interval:
-    """The range of a numeric field."""
-    interval = Interval(-math.inf, math.inf, False, False)
-    for bound in _bounds(info):
-        for name, includes in (("gt", False), ("ge", True)):
-            if getattr(bound, name, None) is not None:
-                interval = interval._replace(low=getattr(bound, name), includes_low=includes)
-        for name, includes in (("lt", False), ("le", True)):
-            if getattr(bound, name, None) is not None:
-                interval = interval._replace(high=getattr(bound, name), includes_high=includes)
-    return interval
-
-
-def _bounds(holder: Any) -> Iterator[Any]:
-    if isinstance(holder, FieldInfo):
-        yield from holder.metadata
-        yield from _bounds(holder.annotation)
-    for inner in (*getattr(holder, "__metadata__", ()), *typing.get_args(holder)):
-        yield from _bounds(inner)
+    literals = (part for part in parts_of(info) if typing.get_origin(part) is typing.Literal)
+    return tuple(word for part in literals for word in typing.get_args(part))
 
 
 def _is_overridden(key: Key, layer: Mapping[str, Any]) -> bool:

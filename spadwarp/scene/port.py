@@ -1,14 +1,93 @@
-"""The table `camera.port` or `laser.port`."""
+"""Ports between the air of a housing and the water: the table `camera.port` or `laser.port`, and rays through them.
+
+Rays are in the frame of the camera, in float64: truth maps, depths and focus are computed from them. The kernels have
+their own, in float32.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal, Self
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from spadwarp.scene.materials import air_indices, window_indices
-from spadwarp.scene.sections import Section, Vector
+from spadwarp.scene.pose import vector_of
+from spadwarp.scene.sections import Direction, Section, Vector, unit_vector
+
+__all__: list[str] = []
+
+Floats = NDArray[np.float64]
+
+# Steps of Newton's method: it has converged after 4 to 12.
+_STEPS = 30
+
+
+class Material(NamedTuple):
+    """Sellmeier's n² = 1 + Σ B λ²/(λ² − C), λ in µm, within a range [µm]."""
+
+    terms: tuple[tuple[float, float], ...]
+    low: float
+    high: float
+    source: str
+
+
+_PMMA = Material(((1.1819, 0.011313),), 0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C")
+
+MATERIALS: dict[str, Material] = {
+    "BK7": Material(
+        ((1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)),
+        0.3,
+        2.5,
+        "SCHOTT, data sheet of N-BK7",
+    ),
+    "fused silica": Material(
+        ((0.6961663, 0.0684043**2), (0.4079426, 0.1162414**2), (0.8974794, 9.896161**2)),
+        0.21,
+        6.7,
+        "Malitson, J. Opt. Soc. Am. 55, 1205 (1965)",
+    ),
+    "sapphire": Material(
+        ((1.4313493, 0.0726631**2), (0.65054713, 0.1193242**2), (5.3414021, 18.028251**2)),
+        0.2,
+        5.0,
+        "ordinary ray; Malitson (1962), as in Weber, Handbook of optical materials (2003)",
+    ),
+    "acrylic": _PMMA,
+    "PMMA": _PMMA,
+    "polycarbonate": Material(
+        ((1.4182, 0.021304),), 0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C"
+    ),
+}
+"""Materials of windows; the coefficients as refractiveindex.info lists them."""
+
+
+def window_indices(material: str, wavelength_nm: float) -> tuple[float, float]:
+    """Phase and group index of a material of `MATERIALS` at a vacuum wavelength; n_g = n − λ dn/dλ.
+
+    Raises `ValueError` outside the range of its source.
+    """
+    glass, micrometres = MATERIALS[material], wavelength_nm * 1e-3
+    if not glass.low <= micrometres <= glass.high:
+        low, high = 1e3 * glass.low, 1e3 * glass.high
+        raise ValueError(f"material = {material!r} is known for [{low:g}, {high:g}] nm, not for {wavelength_nm:g} nm")
+    square = micrometres**2
+    index = math.sqrt(1.0 + sum(b * square / (square - c) for b, c in glass.terms))
+    slope = -sum(b * c * micrometres / (square - c) ** 2 for b, c in glass.terms) / index
+    return index, index - micrometres * slope
+
+
+def air_indices(wavelength_nm: float) -> tuple[float, float]:
+    """Phase and group index of dry air at 15 °C and 101 325 Pa (Ciddor, Appl. Opt. 35, 1566 (1996))."""
+    s2 = 1.0 / max(wavelength_nm * 1e-3, 0.23) ** 2
+    excess, slope = 0.0, 0.0
+    for strength, pole in ((0.05792105, 238.0185), (0.00167917, 57.362)):
+        excess += strength / (pole - s2)
+        slope += strength * 2.0 * s2 / (pole - s2) ** 2  # −λ d/dλ
+    return 1.0 + excess, 1.0 + excess + slope
 
 
 class Port(Section):
@@ -21,7 +100,7 @@ class Port(Section):
     """a plane window, or a spherical one"""
     distance: float | None = Field(None, ge=1e-6, le=1e6)
     """flat: from the lens centre along `normal` to the window; above a calm surface the altitude [m]"""
-    normal: Vector = (0.0, 0.0, 1.0)
+    normal: Direction = (0.0, 0.0, 1.0)
     """flat: direction into the water, any length but 0; in the frame of the camera, or of the laser's direction"""
     radius: float | None = Field(None, ge=1e-6, le=1e6)
     """dome: of its inner face [m]"""
@@ -42,27 +121,17 @@ class Port(Section):
 
     @model_validator(mode="after")
     def _determined(self) -> Self:
-        needed, other = ("distance", "radius") if self.shape == "flat" else ("radius", "distance")
+        needed = "distance" if self.shape == "flat" else "radius"
         if getattr(self, needed) is None:
             raise ValueError(f"needs {needed} with shape = {self.shape!r}")
-        if getattr(self, other) is not None:
-            raise ValueError(
-                f"{other} = {getattr(self, other)} does not go with shape = {self.shape!r}; a flat port has distance, "
-                "a dome has radius"
-            )
-        if self.shape == "flat" and any(self.offset):
-            raise ValueError(f"offset = {list(self.offset)} goes with shape = 'dome' only")
-        if self.shape == "dome" and self.normal != (0.0, 0.0, 1.0):
-            raise ValueError(f"normal = {list(self.normal)} goes with shape = 'flat' only")
-        if math.hypot(*self.normal) < 1e-9:
-            raise ValueError(f"normal = {list(self.normal)} has no length")
+        self._only_with("shape = 'flat'", self.shape == "flat", "distance", "normal")
+        self._only_with("shape = 'dome'", self.shape == "dome", "radius", "offset")
         if self.material is not None and self.index is not None:
             raise ValueError(f"needs either material or index; given: {self.material!r} and {self.index}")
         if (self.thickness > 0.0) != (self.material is not None or self.index is not None):
             raise ValueError(f"needs material or index and a thickness > 0, or neither; thickness = {self.thickness}")
-        for name, of in (("group_index", "index"), ("inside_group_index", "inside_index")):
-            if getattr(self, name) is not None and getattr(self, of) is None:
-                raise ValueError(f"{name} = {getattr(self, name)} goes with {of} only")
+        self._only_with("index", self.index is not None, "group_index")
+        self._only_with("inside_index", self.inside_index is not None, "inside_group_index")
         return self
 
     def indices(self, wavelength_nm: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -80,6 +149,212 @@ class Port(Section):
     @property
     def axis(self) -> tuple[float, float, float]:
         """`normal` as a unit vector."""
-        x, y, z = self.normal
-        length = math.hypot(x, y, z)
-        return (x / length, y / length, z / length)
+        return unit_vector(self.normal)
+
+    def placed(
+        self, origin: Floats, normal: ArrayLike, *, wavelength_nm: float, water: tuple[float, float]
+    ) -> PortGeometry:
+        """The port with its lengths from `origin` and its normal in the frame of the camera; `water`: (phase, group)
+        index of the water. Raises as `indices` does."""
+        (n_inside, g_inside), (n_window, g_window) = self.indices(wavelength_nm)
+        normal = np.asarray(normal, np.float64)
+        centre = origin + np.array(self.offset)
+        return PortGeometry(
+            shape=self.shape,
+            distance=(self.distance or 0.0) + float(origin @ normal),
+            normal=vector_of(normal),
+            radius=self.radius or 0.0,
+            centre=vector_of(centre),
+            thickness=self.thickness,
+            index=(n_inside, n_window, water[0]),
+            group_index=(g_inside, g_window, water[1]),
+        )
+
+
+@dataclass(frozen=True)
+class PortGeometry:
+    """A port: a window between two planes across `normal`, or between two spheres about `centre`.
+
+    Attributes:
+        shape: "flat" or "dome".
+        distance: flat: from the camera's lens centre along the normal to the inner face [m].
+        normal: flat: unit vector into the water.
+        radius, centre: dome: of the inner face [m].
+        thickness: Of the window [m].
+        index, group_index: Of what is inside, of the window, of the water.
+    """
+
+    shape: str
+    distance: float
+    normal: tuple[float, float, float]
+    radius: float
+    centre: tuple[float, float, float]
+    thickness: float
+    index: tuple[float, float, float]
+    group_index: tuple[float, float, float]
+
+    @property
+    def delays(self) -> tuple[float, float]:
+        """Group indices inside and in the window over that of the water."""
+        inside, window, water = self.group_index
+        return inside / water, window / water
+
+    @property
+    def nearest(self) -> float:
+        """Distance from the lens centre to the water [m]."""
+        if self.shape == "flat":
+            return self.distance + self.thickness
+        return self.radius + self.thickness - math.hypot(*self.centre)
+
+    def outside(self, x: ArrayLike) -> str:
+        """Why a point is not inside; empty where it is."""
+        if self.shape == "flat":
+            ahead = self.distance - float(np.asarray(x) @ np.array(self.normal))
+            return "" if ahead > 0.0 else f"it is {-ahead:.4g} m beyond the window's inner face"
+        away = math.dist(np.ravel(x), self.centre)
+        return (
+            "" if away < self.radius else f"it is {away:.4g} m from the dome's centre, the radius is {self.radius:g} m"
+        )
+
+    def enter(self, x: ArrayLike, u: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
+        """Rays from x inside along unit vectors u, `[..., 3]`, up to where they enter the water.
+
+        Returns where and in which direction they do, `[..., 3]`; the length of the way up to there, and the length in
+        water that takes as long [m]. NaN for rays that do not get through.
+        """
+        with np.errstate(invalid="ignore"):
+            (inside, _, _, _, _), (window, _, _, y, v) = self._faces(x, u)
+            inside = np.where(inside > 0.0, inside, np.nan)
+        return y, v, inside + window, self.delays[0] * inside + self.delays[1] * window
+
+    def transmission(self, x: ArrayLike, u: ArrayLike) -> Floats:
+        """Fraction of unpolarised light that gets through, of rays from x inside along unit vectors u; 0: none."""
+        s = p = np.ones(())
+        with np.errstate(invalid="ignore"):
+            for k, (_, q0, q1, _, _) in enumerate(self._faces(x, u)):
+                before, behind = self.index[k], self.index[k + 1]
+                s = s * (4.0 * before * q0 * behind * q1 / (before * q0 + behind * q1) ** 2)
+                p = p * (4.0 * before * q0 * behind * q1 / (behind * q0 + before * q1) ** 2)
+        return np.nan_to_num(0.5 * (s + p))
+
+    def _faces(self, x: ArrayLike, u: ArrayLike) -> Iterator[tuple[Floats, Floats, Floats, Floats, Floats]]:
+        """At the inner and the outer face: length up to it, cosines before and behind it, place and direction."""
+        y, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(u, np.float64))
+        for k, outward in enumerate((0.0, self.thickness)):
+            length = self._to_face(y, v, outward)
+            y = y + length[..., None] * v
+            normals, before = self._normals(y), v
+            v = _refracted(v, normals, self.index[k] / self.index[k + 1])
+            yield length, (before * normals).sum(axis=-1), (v * normals).sum(axis=-1), y, v
+
+    def spread(self, x: ArrayLike, u: ArrayLike, distance: float) -> float:
+        """Irradiance across a ray from x inside along the unit vector u, for an intensity of 1 in clear water, where it
+        has gone a distance beyond the port [1/m²]; by differences. 1/distance² without a port."""
+        x, u = np.asarray(x, np.float64), np.asarray(u, np.float64)
+        start, direction, lead, _ = self.enter(x, u)
+        middle = start + (distance - lead) * direction
+        aside = np.linalg.svd(u[None])[2][1:]
+        step = 1e-4
+        sides = []
+        for axis in aside:
+            ends = []
+            for sign in (1.0, -1.0):
+                y, v, _, _ = self.enter(x, math.cos(step) * u + sign * math.sin(step) * axis)
+                ends.append(y + ((middle - y) @ direction / (v @ direction)) * v)
+            sides.append((ends[0] - ends[1]) / (2.0 * step))
+        area = float(np.linalg.norm(np.cross(sides[0], sides[1])))
+        return float(self.transmission(x, u)) / area
+
+    def _to_face(self, x: Floats, u: Floats, outward: float) -> Floats:
+        if self.shape == "flat":
+            climb = u @ np.array(self.normal)
+            return (self.distance + outward - x @ np.array(self.normal)) / np.where(climb > 0.0, climb, np.nan)
+        y = x - np.array(self.centre)
+        b = (y * u).sum(axis=-1)
+        return np.sqrt(b * b - (y * y).sum(axis=-1) + (self.radius + outward) ** 2) - b
+
+    def _normals(self, x: Floats) -> Floats:
+        if self.shape == "flat":
+            return np.broadcast_to(np.array(self.normal), x.shape)
+        y = x - np.array(self.centre)
+        return y / np.linalg.norm(y, axis=-1, keepdims=True)
+
+    def connect(self, points: ArrayLike, origin: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
+        """The ways from a point inside to points in the water, `[..., 3]`.
+
+        Returns the directions inside and in the water, `[..., 3]`; the length of the way, and the length in water that
+        takes as long [m]. NaN for points behind the port.
+        """
+        points, origin = np.asarray(points, np.float64), np.asarray(origin, np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = self._start_flat(points, origin) if self.shape == "flat" else self._start_dome(points, origin)
+        start, v, length, path = self.enter(origin, u)
+        water = np.linalg.norm(points - start, axis=-1)
+        return u, v, length + water, path + water
+
+    def _start_flat(self, points: Floats, origin: Floats) -> Floats:
+        """Directions inside, by Newton's method in t = k/√(m² − k²), k Snell's invariant, m the least index."""
+        normal = np.array(self.normal)
+        y = points - origin
+        along = y @ normal
+        across = y - along[..., None] * normal
+        aside = np.linalg.norm(across, axis=-1)
+        inside = self.distance - float(origin @ normal)
+        water = along - inside - self.thickness
+        h: list[Any] = [inside, self.thickness, np.where(water > 0.0, water, np.nan)]
+        n = (self.index[0], self.index[1] if self.thickness > 0.0 else self.index[0], self.index[2])
+        m = min(n)
+        t = np.zeros_like(aside)
+        for _ in range(_STEPS):
+            roots = [np.sqrt(k * k + (k - m) * (k + m) * t * t) for k in n]
+            value = np.sum([m * t * d / root for d, root in zip(h, roots, strict=True)], axis=0)
+            slope = np.sum([m * d * k * k / root**3 for d, k, root in zip(h, n, roots, strict=True)], axis=0)
+            t = t + (aside - value) / slope
+        sine = m / n[0] * t / np.sqrt(1.0 + t * t)
+        sideways = across / np.maximum(aside, 1e-300)[..., None]
+        return sine[..., None] * sideways + np.sqrt(1.0 - sine * sine)[..., None] * normal
+
+    def _start_dome(self, points: Floats, origin: Floats) -> Floats:
+        """Directions inside, by Newton's method in the angle i to the radius."""
+        z = origin - np.array(self.centre)
+        d = float(np.linalg.norm(z))
+        y = points - np.array(self.centre)
+        r = np.linalg.norm(y, axis=-1)
+        to_point = y / r[..., None]
+        e = z / d if d > 0.0 else np.array([0.0, 0.0, 1.0])
+        cosine = to_point @ e
+        across = to_point - cosine[..., None] * e
+        sine = np.linalg.norm(across, axis=-1)
+        beta = np.arctan2(sine, cosine)
+        n, outer = self.index, self.radius + self.thickness
+        r = np.where(r > outer, r, np.nan)
+        faces = ((n[0] * self.radius, -1.0), (n[1] * self.radius, 1.0), (n[1] * outer, -1.0), (n[2] * outer, 1.0))
+        i = np.arctan2(r * sine, r * cosine - d)
+        for _ in range(_STEPS):
+            p = n[0] * d * np.sin(i)
+            angle, slope = i - np.arcsin(p / (n[2] * r)), -1.0 / np.sqrt((n[2] * r) ** 2 - p * p)
+            for size, sign in faces:
+                angle = angle + sign * np.arcsin(p / size)
+                slope = slope + sign / np.sqrt(size * size - p * p)
+            i = i + (beta - angle) / (1.0 + n[0] * d * np.cos(i) * slope)
+        sideways = across / np.maximum(sine, 1e-300)[..., None]
+        return np.cos(i)[..., None] * e + np.sin(i)[..., None] * sideways
+
+    def apparent_distance(self, point: ArrayLike) -> float:
+        """Distance from the lens centre at which it sees a point in the water, by the spread of its rays there [m].
+
+        The mean curvature of two sections: behind a tilted port, and off the axis, they differ (astigmatism).
+        """
+        step, at = 1e-4, np.asarray(point, np.float64)
+        curvature = 0.0
+        for axis in np.eye(3)[:2]:
+            ends = [self.connect(at, sign * step * axis)[0] for sign in (-1.0, 1.0)]
+            slopes = [u @ axis / u[2] for u in ends]
+            curvature += 0.5 * (slopes[0] - slopes[1]) / (2.0 * step)
+        return math.inf if curvature <= 1e-9 else 1.0 / curvature
+
+
+def _refracted(u: Floats, normals: Floats, ratio: float) -> Floats:
+    cosine = (u * normals).sum(axis=-1, keepdims=True)
+    across = ratio * (u - cosine * normals)
+    return across + np.sqrt(1.0 - (across * across).sum(axis=-1, keepdims=True)) * normals

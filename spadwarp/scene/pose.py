@@ -7,17 +7,13 @@ are the columns of R sees the world's point X at Rᵀ(X − position); R = Rx·R
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
 
-if TYPE_CHECKING:
-    from spadwarp.scene import Camera
-
-__all__ = ["look_at", "opencv_pose", "rotation_matrix", "to_camera", "to_world"]
+__all__ = ["look_at", "opencv_pose"]
 
 Vector = tuple[float, float, float]
 
@@ -35,17 +31,7 @@ def rotation_angles(matrix: ArrayLike) -> Vector:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of ry = ±90°, where only the sum of the other two angles is defined
-        return _vector(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True))
-
-
-def to_camera(camera: Camera, points: ArrayLike) -> NDArray[np.float64]:
-    """Points of the world `[..., 3]` [m] in the camera's frame."""
-    return (np.asarray(points, np.float64) - camera.position) @ rotation_matrix(camera.rotation_deg)
-
-
-def to_world(camera: Camera, points: ArrayLike) -> NDArray[np.float64]:
-    """Points of the camera's frame `[..., 3]` [m] in the world."""
-    return np.asarray(points, np.float64) @ rotation_matrix(camera.rotation_deg).T + camera.position
+        return vector_of(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True))
 
 
 def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
@@ -77,7 +63,7 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
         matrix = rotation
         if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
             raise ArgumentError(f"rvec = {matrix.tolist()} is not a rotation matrix")
-    return {"position": _vector(-matrix.T @ shift), "rotation_deg": rotation_angles(matrix.T)}
+    return {"position": vector_of(-matrix.T @ shift), "rotation_deg": rotation_angles(matrix.T)}
 
 
 def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.0, 0.0)) -> dict[str, Vector]:
@@ -103,8 +89,9 @@ def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.
         raise ArgumentError(f"a camera at {place.tolist()} that looks at {end.tolist()} has no horizon: down = {level}")
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     axes = np.column_stack([right, np.cross(forward, right), forward])
-    return {"position": _vector(place), "rotation_deg": rotation_angles(axes)}
+    return {"position": vector_of(place), "rotation_deg": rotation_angles(axes)}
 
 
-def _vector(values: NDArray[np.float64]) -> Vector:
+def vector_of(values: NDArray[np.float64]) -> Vector:
+    """An array of three numbers as a tuple."""
     return float(values[0]), float(values[1]), float(values[2])

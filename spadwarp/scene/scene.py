@@ -1,4 +1,4 @@
-"""A scene of all its sections, and the file that it comes from."""
+"""A scene of all its sections, the file that it comes from, and what follows from several sections."""
 
 from __future__ import annotations
 
@@ -7,37 +7,31 @@ import os
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
+import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import parse_toml, read_toml
 from spadwarp.limits import shown
-from spadwarp.scene import load
-from spadwarp.scene.analytic import Analytic
-from spadwarp.scene.camera import Camera
-from spadwarp.scene.daylight import Daylight
+from spadwarp.scene.camera import Camera, to_camera, to_world
 from spadwarp.scene.detector import Detector
-from spadwarp.scene.domain import Domain
-from spadwarp.scene.file_paths import FILE_FIELDS, with_absolute_paths, with_paths_from
-from spadwarp.scene.gate import Gate
 from spadwarp.scene.laser import Laser
-from spadwarp.scene.matrix import check_polarisation
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.messages import describe
-from spadwarp.scene.output import Output
-from spadwarp.scene.port import Port
-from spadwarp.scene.port_rays import camera_port, laser_port
-from spadwarp.scene.pose import rotation_matrix, to_camera, to_world
-from spadwarp.scene.quantities import with_units
-from spadwarp.scene.scan import Scan
-from spadwarp.scene.sections import listed
-from spadwarp.scene.spectrum import detection_efficiency
-from spadwarp.scene.targets import Target
-from spadwarp.scene.transport import Transport
+from spadwarp.scene.port import Port, PortGeometry
+from spadwarp.scene.pose import rotation_matrix, vector_of
+from spadwarp.scene.scattering import check_polarisation
+from spadwarp.scene.sections import listed, plain, with_paths, with_units
+from spadwarp.scene.settings import Analytic, Gate, Output, Scan, Transport
+from spadwarp.scene.spectrum import detection_efficiency, spectral_lines
+from spadwarp.scene.surroundings import Daylight, Domain, Target
+from spadwarp.scene.tables import Key, merge_scene, override_layer, set_item, toml_text
 from spadwarp.units import path_from_time
+
+__all__ = ["Scene", "SceneLike", "WaterLine", "as_scene", "load_scene", "template", "water_lines"]
 
 Overrides = Mapping[str, Any] | Sequence[str]
 
@@ -72,29 +66,24 @@ class Scene(BaseModel):
         return self
 
     @model_validator(mode="after")
-    def _lens_that_photons_can_hit(self) -> Self:
-        if self.camera.pinhole and self.transport.estimator == "analog":
+    def _sections_that_agree(self) -> Self:
+        camera, daylight, layers = self.camera, self.daylight, self.medium.layers
+        if camera.pinhole and self.transport.estimator == "analog":
             raise ValueError(
                 "camera.pinhole = true does not go with transport.estimator = 'analog', whose photons cannot hit a "
                 "point: take a small aperture_diameter, or next_event or guided"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _faces_within_reach(self) -> Self:
-        if self.domain.reflecting and math.isfinite(self.transport.lateral_limit):
+        if self.domain.reflecting and math.isfinite(limit := self.transport.lateral_limit):
             raise ValueError(
-                f"transport.lateral_limit = {self.transport.lateral_limit} does not go with domain.outside_index: the "
-                "faces reflect light from beyond it"
+                f"transport.lateral_limit = {limit} does not go with domain.outside_index: the faces reflect light "
+                "from beyond it"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _daylight_in_one_water(self) -> Self:
-        if self.daylight is not None and self.medium.layers:
-            raise ValueError(f"medium.layers: {len(self.medium.layers)} given; daylight takes one water")
-        if self.daylight is not None and self.medium.grid is not None:
+        if daylight is not None and layers:
+            raise ValueError(f"medium.layers: {len(layers)} given; daylight takes one water")
+        if daylight is not None and self.medium.grid is not None:
             raise ValueError("medium.grid does not go with daylight, which takes one water: leave one of them out")
+        if self.polarised:
+            check_polarisation(self.medium, self.transport, self.targets)
         return self
 
     @model_validator(mode="after")
@@ -123,27 +112,13 @@ class Scene(BaseModel):
                     f"scan.distance = {self.scan.distance} does not go with a port, behind which beam and line of "
                     "sight can be parallel alone: inf"
                 )
-        return self
-
-    @model_validator(mode="after")
-    def _light_that_can_be_polarised(self) -> Self:
-        if self.polarised:
-            check_polarisation(self.medium, self.transport, self.targets)
-        return self
-
-    @model_validator(mode="after")
-    def _inside_their_ports(self) -> Self:
-        through = camera_port(self)
+        through, position = camera_port(self), list(self.beam.position)
         if through is not None and (why := through.outside((0.0, 0.0, 0.0))):
             raise ValueError(f"camera.port: the lens is outside: {why}; change offset or radius")
-        through, position = laser_port(self), list(self.beam.position)
-        if through is not None and (why := through.outside(position)):
-            way_out = (
-                "move the laser, or give it a port of its own: [laser.port]"
-                if self.laser.port == "camera"
-                else "change it"
-            )
-            raise ValueError(f"laser.position = {position} is outside laser.port: {why}; {way_out}")
+        if (through := laser_port(self)) is not None and (why := through.outside(position)):
+            is_shared = self.laser.port == "camera"
+            hint = "move the laser, or give it a port of its own: [laser.port]" if is_shared else "change it"
+            raise ValueError(f"laser.position = {position} is outside laser.port: {why}; {hint}")
         return self
 
     @classmethod
@@ -167,11 +142,14 @@ class Scene(BaseModel):
     @property
     def files(self) -> list[Path]:
         """Files that the scene refers to: meshes, tables and images, all that `to_dict` names."""
-        tables = self.to_dict()
-        named = [tables[section].get(name, "") for section, name, _ in FILE_FIELDS]
-        named += [target.get("mesh", "") for target in tables.get("targets", ())]
-        named.append(tables["medium"].get("grid", {}).get("file", ""))
-        return [Path(path) for path in named if Path(path).suffix]
+        found: list[Path] = []
+
+        def noted(path: str) -> str:
+            found.append(Path(path))
+            return path
+
+        with_paths(Scene, self.to_dict(), noted)
+        return [path for path in found if path.suffix]
 
     @property
     def scan_positions(self) -> int:
@@ -185,7 +163,7 @@ class Scene(BaseModel):
         if laser.frame == "camera" or not camera.is_posed:
             return laser
         position, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
-        moved = {"position": tuple(map(float, position)), "direction": tuple(map(float, axis)), "frame": "camera"}
+        moved = {"position": vector_of(position), "direction": vector_of(axis), "frame": "camera"}
         return laser.model_copy(update=moved)
 
     @property
@@ -222,13 +200,7 @@ class Scene(BaseModel):
 
     def to_dict(self) -> dict[str, Any]:
         """Tables from which `from_dict` makes an equal scene."""
-        tables: dict[str, Any] = {}
-        for name, section in self:
-            if section is not None:
-                tables[name] = [target.to_dict() for target in section] if name == "targets" else section.to_dict()
-        if not tables["targets"]:
-            del tables["targets"]
-        return tables
+        return {name: plain(value) for name, value in self if value not in (None, ())}
 
     def to_toml(self, *, folder: str | os.PathLike[str] | None = None) -> str:
         """The full text that `load_scene` reads back to an equal scene.
@@ -237,7 +209,7 @@ class Scene(BaseModel):
         these, are then relative to it: they still hold where all were moved together. Others stay absolute.
         """
         tables = self.to_dict()
-        return load.toml_text(tables if folder is None else with_paths_from(tables, folder))
+        return toml_text(tables if folder is None else _paths_from(tables, folder))
 
     def with_overrides(self, overrides: Overrides | None = None, /, **sections: Mapping[str, Any]) -> Scene:
         """A changed scene: `with_overrides({"medium.extinction": 0.9})`, `with_overrides(medium={"extinction": 0.9})`.
@@ -321,6 +293,62 @@ def template() -> str:
     return (files("spadwarp.scene") / "template.toml").read_text(encoding="utf-8")
 
 
+class WaterLine(NamedTuple):
+    """A line of the light that passes the filter, in the water.
+
+    Attributes:
+        share: Photons, over those of a pulse of one line at `laser.wavelength_nm`.
+        extinction, scattering: [1/m].
+        speed: Of a pulse [m/s].
+    """
+
+    share: float
+    extinction: float
+    scattering: float
+    speed: float
+
+
+def water_lines(scene: Scene) -> list[WaterLine]:
+    """Lines of a pulse that pass the filter; one line where nothing of the water follows the wavelength.
+
+    Raises `FileError` or `ConfigError` for a table, and `ConfigError` for a spectrum beyond where the water is known.
+    """
+    medium, lines = scene.medium, spectral_lines(scene.laser, scene.detector)
+    if len(lines) == 1 or not medium.follows_wavelength:
+        whole = math.fsum(line.share for line in lines)
+        return [WaterLine(whole, medium.extinction, medium.scattering, medium.pulse_speed)]
+    try:
+        waters = [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
+    except ArgumentError as error:
+        raise ConfigError(
+            f"laser: the spectrum reaches beyond where medium.chlorophyll, temperature and salinity hold: {error}",
+            source=None if scene.source is None else str(scene.source),
+        ) from None
+    return [WaterLine(share, water.extinction, water.scattering, water.pulse_speed) for share, water in waters]
+
+
+def camera_port(scene: Scene) -> PortGeometry | None:
+    """The port that a scene's camera looks through; None: it is in the water."""
+    port = scene.camera.port
+    return None if port is None else _placed(scene, port, np.zeros(3), np.array(port.axis))
+
+
+def laser_port(scene: Scene) -> PortGeometry | None:
+    """The port that a scene's laser shines through; None: it is in the water."""
+    port = scene.laser.port
+    if not isinstance(port, Port):
+        return None if port is None else camera_port(scene)
+    normal = np.array(port.axis)
+    if scene.laser.frame == "world" and scene.camera.is_posed:
+        normal = normal @ rotation_matrix(scene.camera.rotation_deg)
+    return _placed(scene, port, np.array(scene.beam.position), normal)
+
+
+def _placed(scene: Scene, port: Port, origin: Any, normal: Any) -> PortGeometry:
+    water = scene.medium.phase_index, scene.medium.group_index
+    return port.placed(origin, normal, wavelength_nm=scene.laser.wavelength_nm, water=water)
+
+
 def _build(
     tables: dict[str, Any],
     *,
@@ -330,16 +358,16 @@ def _build(
 ) -> Scene:
     name = None if source is None else str(source)
     layer: dict[str, Any] = {}
-    items: dict[load.Key, Any] = {}
+    items: dict[Key, Any] = {}
     try:
         if source is not None and resolve:
-            tables = with_absolute_paths(tables, Path(source).absolute().parent)
+            tables = _absolute_paths(tables, Path(source).absolute().parent)
         if overrides:
-            layer, items = load.override_layer(overrides)
-            tables = load.merge_scene(_with_units(tables), with_absolute_paths(_with_units(layer), Path.cwd()))
+            layer, items = override_layer(overrides)
+            tables = merge_scene(_with_units(tables), _absolute_paths(_with_units(layer), Path.cwd()))
         scene = Scene.model_validate(tables)
         for key, value in items.items():  # of lists that may be defaults
-            scene = Scene.model_validate(load.set_item(scene.to_dict(), key, value))
+            scene = Scene.model_validate(set_item(scene.to_dict(), key, value))
     except ConfigError as error:
         raise ConfigError(error.problems, source=name) from None
     except ValidationError as error:
@@ -355,3 +383,41 @@ def _with_units(tables: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(fields := tables.get(name), Mapping):
             changed[name] = with_units(model, fields)
     return changed
+
+
+def _absolute_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The tables with paths that are relative to a folder made absolute."""
+    return with_paths(Scene, tables, lambda path: _without_dots(folder / os.path.expanduser(path)))
+
+
+def _paths_from(tables: Mapping[str, Any], folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """The tables of a scene in memory with the paths that a scene file in a folder has.
+
+    Relative for files in the folder or in the one above it, with the folders in these: what is moved together stays
+    together. Absolute for others.
+    """
+    here = os.path.abspath(folder)
+    above = os.path.dirname(here)
+    root = above if os.path.dirname(above) != above else here  # that of a disk holds all files
+
+    def shortened(value: str) -> str:
+        place = os.path.abspath(value)
+        if not Path(place).is_relative_to(root):
+            return place
+        relative = os.path.relpath(place, here)
+        return Path(relative).as_posix() if _is_same(os.path.join(here, relative), place) else place
+
+    return with_paths(Scene, tables, shortened)
+
+
+def _without_dots(path: Path) -> str:
+    short = os.path.normpath(path)
+    return short if ".." in path.parts and _is_same(short, path) else str(path)
+
+
+def _is_same(one: str | Path, other: str | Path) -> bool:
+    """Whether two paths lead to one place; links may make a difference of `..`."""
+    try:
+        return os.path.realpath(one) == os.path.realpath(other)
+    except (OSError, ValueError):  # no path at all
+        return False

@@ -1,27 +1,76 @@
-"""Lines of sight of the pixels, through a port if there is one: ranges and depths along them, and times."""
+"""Lines of sight of pixels: times, ranges and depths along them, and the view and the beam as regions.
+
+The one place for all conversions between time of flight, path, range and depth in the camera frame. The path of light
+goes from the laser by the target to the lens; the range runs along a pixel's line of sight, the depth along the optical
+axis (z).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.scene.geometry import path_from_range, pixel_directions, range_from_path
-from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
+from spadwarp.scene.camera import Camera, image_tangents
+from spadwarp.scene.laser import Laser, profile_axes, profile_extent
+from spadwarp.scene.port import PortGeometry
+from spadwarp.scene.scene import Scene, camera_port, laser_port
 from spadwarp.units import path_from_time
 
-if TYPE_CHECKING:
-    from spadwarp.scene import Camera, Scene
-
-__all__ = ["LinesOfSight", "depth_from_time", "depth_per_time", "lines_of_camera", "lines_of_sight", "port_advance"]
+__all__: list[str] = []
 
 Floats = NDArray[np.float64]
 
 # Nearest to a port that is asked for [m], and steps of Newton's method, which has converged after a few.
 _LEAST = 1e-9
 _STEPS = 30
+
+_GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
+
+
+def pixel_directions(camera: Camera) -> Floats:
+    """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
+    centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
+    rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def scan_axes(scene: Scene) -> Floats:
+    """Axis of the beam of a confocal scan at each pixel, unit vectors in the camera frame, float64 `[H, W, 3]`.
+
+    From the laser to the point of the line of sight at `scan.distance`; parallel to it where that is infinite.
+    """
+    view = pixel_directions(scene.camera)
+    if math.isinf(scene.scan.distance):
+        return view
+    axes = scene.scan.distance * view - np.asarray(scene.beam.position)
+    return axes / np.linalg.norm(axes, axis=-1, keepdims=True)
+
+
+def range_from_path(path: ArrayLike, directions: ArrayLike, laser_position: ArrayLike) -> Floats:
+    """Range along a line of sight at which light has gone `path` from the laser by the target to the lens.
+
+    The points of one path lie on an ellipsoid with laser p and lens 0 as foci. |r·u − p| + r = L has one solution along
+    u: r = (L² − |p|²) / (2 (L − u·p)). For a laser in the lens it is L/2.
+
+    Args:
+        path: Geometric path L [m], any shape.
+        directions: Unit vectors u from the lens, `[..., 3]`, broadcast against `path`.
+        laser_position: p [m], `[3]`.
+
+    Returns:
+        Range r [m]; NaN where L is NaN or too short to go from laser to lens.
+    """
+    length = np.asarray(path, dtype=np.float64)
+    laser = np.asarray(laser_position, dtype=np.float64)
+    baseline = np.linalg.norm(laser)
+    possible = length > baseline
+    safe = np.where(possible, length, baseline + 1.0)  # keeps the unused branch free of 0/0
+    distance = (safe - baseline) * (safe + baseline) / (2.0 * (safe - np.asarray(directions) @ laser))
+    return np.where(possible, distance, np.nan)
 
 
 @dataclass(frozen=True)
@@ -47,15 +96,21 @@ class LinesOfSight:
     laser: Floats
     laser_port: PortGeometry | None = None
 
+    @classmethod
+    def in_water(cls, view: Floats, laser: Floats, port: PortGeometry | None = None) -> LinesOfSight:
+        """Lines of sight of a lens in the water, along unit vectors."""
+        nothing = np.zeros(view.shape[:-1])
+        return cls(np.zeros(view.shape), view, nothing, nothing, laser, port)
+
     def __getitem__(self, index: Any) -> LinesOfSight:
-        """Those of some pixels."""
+        """The lines of some pixels."""
         parts = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
         return LinesOfSight(*parts, self.laser, self.laser_port)
 
     def flat(self) -> LinesOfSight:
-        """Those of all pixels in one row, `[P, 3]`."""
-        parts = (self.start.reshape(-1, 3), self.direction.reshape(-1, 3), self.lead.ravel(), self.delay.ravel())
-        return LinesOfSight(*parts, self.laser, self.laser_port)
+        """The lines of all pixels in one row, `[P, 3]`."""
+        start, direction = self.start.reshape(-1, 3), self.direction.reshape(-1, 3)
+        return replace(self, start=start, direction=direction, lead=self.lead.ravel(), delay=self.delay.ravel())
 
     def points(self, distance: ArrayLike) -> Floats:
         """Points in the camera frame at ranges [m]."""
@@ -78,9 +133,7 @@ class LinesOfSight:
     def path_from_range(self, distance: ArrayLike) -> Floats:
         """Path [m] at ranges."""
         along = np.asarray(distance, np.float64) - self.lead
-        if not self.bent:
-            return path_from_range(along, self.direction, self.laser)
-        return self._path_to(self.points(distance)) + along + self.delay
+        return self.light_at(self.points(distance))[2] + along + self.delay
 
     def range_from_path(self, path: ArrayLike) -> Floats:
         """Range [m] at which light has gone a path; NaN where it is too short."""
@@ -88,26 +141,22 @@ class LinesOfSight:
             return range_from_path(path, self.direction, self.laser)
         left = np.asarray(path, np.float64) - self.delay
         # Lines that begin where the laser's port hides them have no first point.
-        least = np.nan_to_num(self._path_to(self.start + _LEAST * self.direction))
+        least = np.nan_to_num(self.light_at(self.start + _LEAST * self.direction)[2])
         along = np.maximum(0.5 * (left - least), _LEAST)
         for _ in range(_STEPS):
-            points = self.start + along[..., None] * self.direction
-            light = self._light_to(points)
+            light, _, way = self.light_at(self.start + along[..., None] * self.direction)
             # The path rises with the range by 1 + the cosine between both directions of light.
             slope = np.maximum(1.0 + (light * self.direction).sum(axis=-1), 1e-3)
-            along = np.maximum(along - (self._path_to(points) + along - left) / slope, _LEAST)
+            along = np.maximum(along - (way + along - left) / slope, _LEAST)
         return np.where(left > least, along, np.nan) + self.lead
-
-    def light_to(self, distance: ArrayLike) -> Floats:
-        """Unit vectors in which the light of a laser that is a point comes to ranges."""
-        return self._light_to(self.points(distance))
 
     def light_at(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Of the light of a laser that is a point, at points in the camera frame: unit vectors, the length of its way
         in the water, and the length in water that takes as long as all of its way [m]; NaN where none comes."""
         if self.laser_port is None:
-            length = np.linalg.norm(points - self.laser, axis=-1)
-            return self._light_to(points), length, length
+            way = points - self.laser
+            length = np.linalg.norm(way, axis=-1)
+            return way / np.maximum(length, 1e-300)[..., None], length, length
         inside, light, length, path = self.laser_port.connect(points, self.laser)
         return light, length - self.laser_port.enter(self.laser, inside)[2], path
 
@@ -116,34 +165,25 @@ class LinesOfSight:
         """Whether there is a port, of camera or laser."""
         return self.laser_port is not None or bool(np.any(self.delay))
 
-    def _path_to(self, points: Floats) -> Floats:
-        if self.laser_port is not None:
-            return self.laser_port.connect(points, self.laser)[3]
-        return np.linalg.norm(points - self.laser, axis=-1)
-
-    def _light_to(self, points: Floats) -> Floats:
-        if self.laser_port is not None:
-            return self.laser_port.connect(points, self.laser)[1]
-        y = points - self.laser
-        return y / np.maximum(np.linalg.norm(y, axis=-1, keepdims=True), 1e-300)
-
 
 def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
     """Lines of sight of a scene's pixels `[H, W]`, or those that leave the lens centre along unit vectors."""
     view = pixel_directions(scene.camera) if view is None else view
     port, laser = camera_port(scene), np.array(scene.beam.position, np.float64)
     if port is None:
-        nothing = np.zeros(view.shape[:-1])
-        return LinesOfSight(np.zeros(view.shape), view, nothing, nothing, laser, laser_port(scene))
-    start, direction, lead, delay = port.enter(np.zeros(3), view)
-    return LinesOfSight(start, direction, lead, delay, laser, laser_port(scene))
+        return LinesOfSight.in_water(view, laser, laser_port(scene))
+    return LinesOfSight(*port.enter(np.zeros(3), view), laser, laser_port(scene))
 
 
 def lines_of_camera(camera: Camera) -> LinesOfSight:
-    """Those of a camera in the water, with a laser in its lens."""
-    view = pixel_directions(camera)
-    nothing = np.zeros(view.shape[:-1])
-    return LinesOfSight(np.zeros(view.shape), view, nothing, nothing, np.zeros(3))
+    """Lines of sight of a camera in the water, with a laser in its lens."""
+    return LinesOfSight.in_water(pixel_directions(camera), np.zeros(3))
+
+
+def gate_deviation(scene: Scene, directions: Floats) -> Floats:
+    """Standard deviation [m] of a depth that is guessed evenly over the gate; unit vectors are those in the water."""
+    gate = scene.gate
+    return 0.5 * scene.medium.pulse_speed * (gate.stop - gate.start) / math.sqrt(12.0) * directions[..., 2]
 
 
 def port_advance(scene: Scene) -> float:
@@ -167,6 +207,83 @@ def depth_per_time(scene: Scene, distance: Floats, view: Floats | None = None) -
         port = laser_port(scene)
         axis = np.array(beam.axis) if port is None else port.enter(beam.position, beam.axis)[1]
     lines = lines_of_sight(scene, view)
-    light = lines.light_to(distance) if axis is None else axis
+    light = lines.light_at(lines.points(distance))[0] if axis is None else axis
     # The path rises with the range by 1 + the cosine between both directions of light.
     return scene.medium.pulse_speed / (1.0 + (light * lines.direction).sum(axis=-1)) * lines.direction[..., 2]
+
+
+# The view and the beam as convex regions: planes are rows (n, d) with n·x + d >= 0 inside, `[P, 4]`; triangles are
+# `[F, 3, 3]` [m].
+
+
+def view_planes(camera: Camera) -> Floats:
+    """A pyramid that holds what the image shows, its tip at the lens centre."""
+    left, top, right, bottom = camera.view_box
+    sides = [[1, 0, -left, 0], [-1, 0, right, 0], [0, 1, -top, 0], [0, -1, bottom, 0], [0, 0, 1, 0]]
+    return np.array(sides, dtype=np.float64)
+
+
+def beam_planes(laser: Laser) -> Floats:
+    """24 planes around the beam, a pyramid or a prism that just holds it, 5 around a measured one; none if it is wider
+    than a half-space."""
+    axis, origin = np.array(laser.axis), np.array(laser.position)
+    if laser.profile != "collimated" and laser.half_angle_deg >= 90.0:
+        return np.zeros((0, 4))
+    if laser.profile == "measured":
+        wide, tall = profile_extent(laser)
+        right, down = profile_axes(laser.axis)
+        normals = np.array([wide * axis - right, wide * axis + right, tall * axis - down, tall * axis + down, axis])
+        return np.column_stack([normals, -normals @ origin])
+    other = np.eye(3)[np.argmin(np.abs(axis))]
+    b1 = np.cross(axis, other) / np.linalg.norm(np.cross(axis, other))
+    phi = np.arange(24) * (2.0 * math.pi / 24)
+    outward = np.cos(phi)[:, None] * b1 + np.sin(phi)[:, None] * np.cross(axis, b1)
+    slope, radius = 0.0, max(laser.beam_radius, 1e-6)
+    if laser.profile != "collimated":
+        slope = math.tan(laser.half_angle) * (_GAUSSIAN_EDGE if laser.profile == "gaussian" else 1.0)
+        radius = 0.0
+    normals = np.concatenate([slope * axis - outward, axis[None]])
+    offsets = -normals @ origin + np.append(np.full(24, radius), 0.0)
+    return np.column_stack([normals, offsets])
+
+
+def points_inside(triangles: Floats, planes: Floats) -> Floats:
+    """Floats of the triangles that are inside all planes, `[N, 3]`: none if and only if no triangle reaches in."""
+    whole, outside = np.ones(len(triangles), dtype=bool), np.zeros(len(triangles), dtype=bool)
+    for plane in planes:
+        distance = triangles @ plane[:3] + plane[3]
+        whole &= (distance >= 0.0).all(axis=1)
+        outside |= (distance < 0.0).all(axis=1)
+    found = [_spread(triangles[whole])]
+    for triangle in triangles[~whole & ~outside]:
+        polygon = _clip(triangle, planes)
+        if len(polygon):
+            fan = np.stack([np.broadcast_to(polygon[0], polygon[2:].shape), polygon[1:-1], polygon[2:]], axis=1)
+            found.append(_spread(fan))
+            if len(found) > 256:  # enough for every number that a check reports
+                break
+    return np.concatenate(found)
+
+
+def _spread(triangles: Floats) -> Floats:
+    """Floats evenly over each triangle; of many triangles the corners alone."""
+    steps = 6 if len(triangles) < 2000 else 1
+    weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
+    return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)
+
+
+def _clip(polygon: Floats, planes: Floats) -> Floats:
+    """The part of a convex polygon inside all planes (Sutherland & Hodgman 1974), `[K, 3]`, empty if there is none."""
+    for plane in planes:
+        distance = polygon @ plane[:3] + plane[3]
+        kept: list[Floats] = []
+        for i, (d, x) in enumerate(zip(distance, polygon, strict=True)):
+            before, y = distance[i - 1], polygon[i - 1]
+            if (d >= 0.0) != (before >= 0.0):
+                kept.append(y + (x - y) * (before / (before - d)))
+            if d >= 0.0:
+                kept.append(x)
+        if len(kept) < 3:
+            return np.zeros((0, 3))
+        polygon = np.array(kept)
+    return polygon

@@ -7,35 +7,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.io.text import read_columns
+from spadwarp.errors import ConfigError
+from spadwarp.scene.detector import Detector
+from spadwarp.scene.laser import Laser
+from spadwarp.scene.sections import field_range, read_table
 
-if TYPE_CHECKING:
-    from spadwarp.scene import Detector, Laser, Scene
-
-__all__ = [
-    "FILTER_COLUMNS",
-    "SPECTRUM_COLUMNS",
-    "SpectralLine",
-    "WaterLine",
-    "detection_efficiency",
-    "filter_band",
-    "filter_transmission",
-    "spectral_lines",
-    "water_lines",
-]
+__all__ = ["SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]
 
 Floats = NDArray[np.float64]
 
-SPECTRUM_COLUMNS = {"wavelength_nm": "[1e-9, 1e6]", "power": "[0, 1e30]"}
+_WAVELENGTHS = str(field_range(Laser, "wavelength_nm"))
+SPECTRUM_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "power": "[0, 1e30]"}
 """Columns of a laser's spectrum: vacuum wavelength [nm] and power per nm of any scale."""
-FILTER_COLUMNS = {"wavelength_nm": "[1e-9, 1e6]", "transmission": "[0, 1]"}
+FILTER_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "transmission": "[0, 1]"}
 """Columns of a filter: vacuum wavelength [nm] and transmission."""
 
 _MOST_LINES = 32
@@ -53,40 +42,6 @@ class SpectralLine(NamedTuple):
 
     wavelength_nm: float
     share: float
-
-
-class WaterLine(NamedTuple):
-    """A line of the light that passes the filter, in the water.
-
-    Attributes:
-        share: Photons, over those of a pulse of one line at `laser.wavelength_nm`.
-        extinction, scattering: [1/m].
-        speed: Of a pulse [m/s].
-    """
-
-    share: float
-    extinction: float
-    scattering: float
-    speed: float
-
-
-def water_lines(scene: Scene) -> list[WaterLine]:
-    """What passes the filter of a pulse, line by line; one line where nothing of the water follows the wavelength.
-
-    Raises `FileError` or `ConfigError` for a table, and `ConfigError` for a spectrum beyond where the water is known.
-    """
-    medium, lines = scene.medium, spectral_lines(scene.laser, scene.detector)
-    if len(lines) == 1 or not medium.follows_wavelength:
-        whole = math.fsum(line.share for line in lines)
-        return [WaterLine(whole, medium.extinction, medium.scattering, medium.pulse_speed)]
-    try:
-        waters = [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
-    except ArgumentError as error:
-        raise ConfigError(
-            f"laser: the spectrum reaches beyond where medium.chlorophyll, temperature and salinity hold: {error}",
-            source=None if scene.source is None else str(scene.source),
-        ) from None
-    return [WaterLine(share, water.extinction, water.scattering, water.pulse_speed) for share, water in waters]
 
 
 def filter_transmission(laser: Laser, detector: Detector, wavelength_nm: ArrayLike) -> Floats:
@@ -116,7 +71,7 @@ def filter_band(laser: Laser, detector: Detector) -> Floats | None:
 
 
 def spectral_lines(laser: Laser, detector: Detector) -> tuple[SpectralLine, ...]:
-    """What passes the filter of a pulse's photons, in up to 32 lines; one for a laser of one line.
+    """Lines of a pulse's photons that pass the filter, up to 32; one for a laser of one line.
 
     Raises `FileError` or `ConfigError` if a table cannot be read.
     """
@@ -154,10 +109,15 @@ def _passed(laser: Laser, detector: Detector) -> tuple[Floats, Floats]:
     # Both may be steep between the nodes of a coarse table.
     nodes = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in itertools.pairwise(nodes)]))
     density = np.interp(nodes, at, power, left=0.0, right=0.0) / np.trapezoid(power, at)
-    widths = np.gradient(nodes, edge_order=1)
-    widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
     passed = filter_transmission(laser, detector, nodes)
-    return nodes, density * widths * passed * nodes / laser.wavelength_nm
+    return nodes, density * widths_of(nodes) * passed * nodes / laser.wavelength_nm
+
+
+def widths_of(nodes: Floats) -> Floats:
+    """Widths that ascending wavelengths stand for, half of what is between it and its neighbours."""
+    widths = np.gradient(nodes)
+    widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
+    return widths
 
 
 def _gaussian(offset: Any) -> Any:
@@ -166,12 +126,10 @@ def _gaussian(offset: Any) -> Any:
 
 
 def _table(field: str, path: str, columns: dict[str, str]) -> tuple[Floats, Floats]:
-    try:
-        rows = read_columns(Path(path), columns)
-    except FileError as error:
-        raise FileError(f"{field} = {error}") from None
-    if len(rows) < 2 or (np.diff(rows[:, 0]) <= 0.0).any():
+    """Two columns of rising wavelengths and what is not all 0."""
+    at, values = read_table(field, path, columns)
+    if len(at) < 2 or (np.diff(at) <= 0.0).any():
         raise ConfigError(f"{field}: {path}: two rows or more with rising wavelengths are needed")
-    if not rows[:, 1].max() > 0.0:
+    if not values.max() > 0.0:
         raise ConfigError(f"{field}: {path}: holds no {next(reversed(columns))} above 0")
-    return rows[:, 0], rows[:, 1]
+    return at, values

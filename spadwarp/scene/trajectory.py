@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.errors import ConfigError
 from spadwarp.io.text import read_text
-from spadwarp.limits import check_integer, check_real, parse_number, shown
+from spadwarp.limits import check_integer, check_real, read_real, shown
+from spadwarp.scene.pose import rotation_angles
 from spadwarp.scene.scene import Scene
 
 __all__ = ["Trajectory", "load_trajectory"]
@@ -94,7 +95,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
                 continue
             if len(cells) != len(names):
                 raise ValueError(f"{len(cells)} values for {len(names)} names")
-            row = [_number(name, cell) for name, cell in zip(names, cells, strict=True)]
+            row = [read_real(name, cell, "[-1e19, 1e19]") for name, cell in zip(names, cells, strict=True)]
             if rows and not row[0] > rows[-1][0]:
                 raise ValueError(f"time = {row[0]:g} is not after {rows[-1][0]:g}")
             rows.append(row)
@@ -102,7 +103,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
                 raise ValueError(f"more than {_MOST_ROWS} rows")
         if not rows:
             raise ValueError("no row of numbers")
-    except (ValueError, ArgumentError, csv.Error) as error:
+    except (ValueError, csv.Error) as error:
         raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
     table = np.array(rows, np.float64)
     return Trajectory(times=table[:, 0], fields=names[1:], values=table[:, 1:], source=str(Path(path)))
@@ -117,15 +118,6 @@ def _names(cells: list[str]) -> tuple[str, ...]:
     return names
 
 
-def _number(name: str, cell: str) -> float:
-    try:
-        return check_real(name, parse_number(cell), "[-1e19, 1e19]")
-    except ArgumentError:
-        raise
-    except ValueError as error:
-        raise ValueError(f"{name} = {shown(cell)} {error}") from None
-
-
 def _rotations(fields: tuple[str, ...]) -> Iterator[list[int]]:
     """Columns of the angles of each rotation of which all three are given."""
     found: dict[str, dict[str, int]] = {}
@@ -137,8 +129,6 @@ def _rotations(fields: tuple[str, ...]) -> Iterator[list[int]]:
 
 def _turned(times: NDArray[np.float64], known: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
     from scipy.spatial.transform import Rotation, Slerp
-
-    from spadwarp.scene.pose import rotation_angles
 
     if len(known) < 2:
         return np.repeat(angles, len(times), axis=0)

@@ -14,11 +14,11 @@ import numpy as np
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import shown
 from spadwarp.scene import Scene
-from spadwarp.scene.grid_cells import grid_cells
+from spadwarp.scene.medium import grid_cells
 from spadwarp.transport.placement import config_error
 
 if TYPE_CHECKING:
-    from spadwarp.scene.grid_cells import GridCells
+    from spadwarp.scene.grid import GridCells
 
 __all__ = ["BlockParameters", "block_parameters", "block_scales", "check_blocks", "is_of_grid"]
 

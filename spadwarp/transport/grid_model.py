@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spadwarp.scene import Scene
-from spadwarp.scene.grid_cells import grid_cells
-from spadwarp.scene.pose import rotation_matrix, to_camera
+from spadwarp.scene.camera import to_camera
+from spadwarp.scene.medium import grid_cells
+from spadwarp.scene.pose import rotation_matrix
 
 if TYPE_CHECKING:
     import warp as wp

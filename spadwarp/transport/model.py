@@ -17,11 +17,12 @@ from spadwarp.errors import DeviceError
 from spadwarp.mesh import focus_distance
 from spadwarp.result import COMPONENTS
 from spadwarp.scene import Scene, phase_function
-from spadwarp.scene.beam_profile import load_profile, profile_extent
-from spadwarp.scene.geometry import scan_axes
-from spadwarp.scene.intrinsics import pixel_views, view_box
-from spadwarp.scene.port_rays import PortGeometry, camera_port, laser_port
+from spadwarp.scene.camera import pixel_views, view_box
+from spadwarp.scene.laser import load_profile, profile_extent
+from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scene import camera_port, laser_port
+from spadwarp.scene.sight import scan_axes
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.grid_model import grid_layers, grid_tracking
 from spadwarp.transport.placement import check_discs, check_domain, check_gate, config_error

@@ -8,8 +8,9 @@ import numpy as np
 
 from spadwarp.errors import ConfigError
 from spadwarp.scene import Scene
-from spadwarp.scene.port_rays import camera_port, laser_port
-from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scene import camera_port, laser_port
 
 __all__ = ["check_discs", "check_domain", "check_gate", "config_error"]
 

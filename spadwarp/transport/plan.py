@@ -12,7 +12,8 @@ from spadwarp.mesh import build_mesh
 from spadwarp.result import COMPONENTS, Result
 from spadwarp.result.photon_ids import Range, count, shard_of
 from spadwarp.result.result import physics_of
-from spadwarp.scene import Scene
+from spadwarp.scene import Scene, Transport
+from spadwarp.scene.sections import field_range
 from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.transport.tally_unit import scale_and_capacity
 
@@ -26,7 +27,7 @@ LAUNCH_SIZE = {"cpu": 1 << 16, "cuda": 1 << 26}
 # One CPU thread walks a whole launch, and counts its events in 32 bits.
 LARGEST_LAUNCH = {"cpu": 1 << 20, "cuda": 1 << 26}
 
-PHOTONS = "[1, 1000000000000]"
+PHOTONS = field_range(Transport, "photons")
 """Range of the photons of a run."""
 
 # Voxels that are read at the end of a batch for each of its photons, at most: 2 % of a photon's time, on a GPU too.

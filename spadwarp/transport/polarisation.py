@@ -57,7 +57,7 @@ def channel_rows(camera: Camera) -> list[list[float]]:
         return []
     if camera.polarisation == "stokes":
         return np.eye(4)[1:].tolist()
-    leak, double = 1.0 / camera.extinction_ratio, math.radians(2.0 * camera.analyser_angle_deg)
+    leak, double = 1.0 / camera.analyser_extinction_ratio, math.radians(2.0 * camera.analyser_angle_deg)
     part = 0.5 * (1.0 - leak)
     along = [0.5 * (1.0 + leak), part * math.cos(double), part * math.sin(double), 0.0]
     return [along, [along[0], -along[1], -along[2], 0.0]]

@@ -18,7 +18,8 @@ from spadwarp.limits import SEED, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.result.file import read_ledger
 from spadwarp.scene import Scene, SceneLike, as_scene
-from spadwarp.scene.pose import rotation_matrix, to_world
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport.block_derivatives import is_of_grid
 from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.transport.plan import LAUNCH_SIZE

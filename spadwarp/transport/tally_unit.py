@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.scene import Laser, Scene, phase_function
-from spadwarp.scene.beam_profile import load_profile, profile_extent
-from spadwarp.scene.frustum import view_planes
-from spadwarp.scene.port_rays import camera_port
+from spadwarp.scene.laser import load_profile, profile_extent
+from spadwarp.scene.scene import camera_port
+from spadwarp.scene.sight import view_planes
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh

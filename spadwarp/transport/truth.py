@@ -10,8 +10,7 @@ from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.sight import lines_of_sight
+from spadwarp.scene.sight import lines_of_sight, pixel_directions
 
 if TYPE_CHECKING:
     from spadwarp_kernels import Model

@@ -84,7 +84,7 @@ def _ledger(run: Run) -> list[Quantity]:
         "axis_threshold": 0.9998,
     }
     # The older word for "lu2024": the text of these tables seeds the photons.
-    water = {"extinction": 0.6, "albedo": "paper", "anisotropy": 0.924}
+    water = {"extinction": 0.6, "albedo": "lu2024", "anisotropy": 0.924}
     measured = []
     for estimator in ("analog", "next_event", "guided"):
         for termination, cutoff in (("cutoff", 0.05), ("roulette", 0.3)):

@@ -2,11 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from spadwarp.viz.curves import *  # noqa: F403
-from spadwarp.viz.notebook import *  # noqa: F403
-from spadwarp.viz.result import *  # noqa: F403
-from spadwarp.viz.scenes import *  # noqa: F403
-from spadwarp.viz.viewer import *  # noqa: F403
+from spadwarp.viz.curves import *
+from spadwarp.viz.notebook import *
+from spadwarp.viz.result import *
+from spadwarp.viz.scenes import *
+from spadwarp.viz.viewer import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = [*result.__all__, *scenes.__all__, *curves.__all__, *viewer.__all__, *notebook.__all__]  # noqa: F405
+    __all__ = [*result.__all__, *scenes.__all__, *curves.__all__, *viewer.__all__, *notebook.__all__]

@@ -19,8 +19,9 @@ from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_integer
 from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, TriangleMesh, build_mesh, builtin_names, make_builtin
 from spadwarp.scene import Scene
-from spadwarp.scene.grid_cells import grid_cells
-from spadwarp.scene.pose import rotation_matrix, to_camera, to_world
+from spadwarp.scene.camera import to_camera, to_world
+from spadwarp.scene.medium import grid_cells
+from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import truth_maps
 from spadwarp.viz.style import (
     BACKGROUND,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.limits import check_real
-from spadwarp.water.seawater import check_ranges, table_columns
+from spadwarp.water.seawater import RANGES, check_ranges, table_columns
 
 __all__ = ["Skylight", "clear_sky_irradiance", "daylight_attenuation", "surface_reflectance"]
 
@@ -66,8 +66,8 @@ def clear_sky_irradiance(
     Raises:
         ArgumentError: A value outside its range.
     """
-    elevation = check_real("sun_elevation_deg", sun_elevation_deg, "(0, 90]")
-    turbidity = check_real("aerosol_optical_depth", aerosol_optical_depth, "[0, 5]")
+    elevation = check_real("sun_elevation_deg", sun_elevation_deg, RANGES["sun_elevation_deg"])
+    turbidity = check_real("aerosol_optical_depth", aerosol_optical_depth, RANGES["aerosol_optical_depth"])
     check_ranges(wavelength_nm=wavelength_nm)
     nm = np.asarray(wavelength_nm, np.float64)
     rows = table_columns("clear_sky")
@@ -75,8 +75,21 @@ def clear_sky_irradiance(
     cosine = math.sin(math.radians(elevation))
     optical_depth = turbidity * (nm / 500.0) ** -_ANGSTROM
     albedo = _ALBEDO_400 * np.exp(-_ALBEDO_SLOPE * np.log(nm / 400.0) ** 2)
-    atmosphere = _Atmosphere(nm, vapour, ozone, mixed, optical_depth, albedo, cosine)
-    here, above = atmosphere.through(_air_mass(elevation)), atmosphere.through(1.8)
+    um2, ozone_mass = (nm / 1000.0) ** 2, (1.0 + 22.0 / 6370.0) / math.sqrt(cosine**2 + 2.0 * 22.0 / 6370.0)
+
+    def through(mass: float) -> _Transmittances:
+        of_vapour, of_gases = vapour * _WATER_VAPOUR * mass, mixed * mass
+        return _Transmittances(
+            rayleigh=np.exp(-mass / (um2**2 * (115.6406 - 1.3366 / um2))),
+            aerosol=np.exp(-optical_depth * mass),
+            scattered=np.exp(-albedo * optical_depth * mass),
+            absorbed=np.exp(-(1.0 - albedo) * optical_depth * mass),
+            vapour=np.exp(-0.2385 * of_vapour / (1.0 + 20.07 * of_vapour) ** 0.45),
+            ozone=np.exp(-ozone * _OZONE * ozone_mass),
+            mixed=np.exp(-1.41 * of_gases / (1.0 + 118.3 * of_gases) ** 0.45),
+        )
+
+    here, above = through(_air_mass(elevation)), through(1.8)
     direct = sun * cosine * here.rayleigh * here.aerosol * here.vapour * here.ozone * here.mixed
 
     logarithm = math.log(1.0 - _ASYMMETRY)
@@ -96,6 +109,9 @@ def clear_sky_irradiance(
 
 
 class _Transmittances(NamedTuple):
+    """Parts of the light that an air mass lets through, for each cause; eq 2-4 to 2-11, 3-9 and 3-10 of the report, as
+    in its code."""
+
     rayleigh: Any
     aerosol: Any
     scattered: Any
@@ -103,32 +119,6 @@ class _Transmittances(NamedTuple):
     vapour: Any
     ozone: Any
     mixed: Any
-
-
-class _Atmosphere(NamedTuple):
-    nm: Floats
-    vapour: Floats
-    ozone: Floats
-    mixed: Floats
-    optical_depth: Floats
-    albedo: Floats
-    cosine: float
-
-    def through(self, mass: float) -> _Transmittances:
-        """What an air mass lets through, part by part; eq 2-4 to 2-11, 3-9 and 3-10 of the report, as in its code."""
-        um2 = (self.nm / 1000.0) ** 2
-        vapour = self.vapour * _WATER_VAPOUR * mass
-        mixed = self.mixed * mass
-        ozone_mass = (1.0 + 22.0 / 6370.0) / math.sqrt(self.cosine**2 + 2.0 * 22.0 / 6370.0)
-        return _Transmittances(
-            rayleigh=np.exp(-mass / (um2**2 * (115.6406 - 1.3366 / um2))),
-            aerosol=np.exp(-self.optical_depth * mass),
-            scattered=np.exp(-self.albedo * self.optical_depth * mass),
-            absorbed=np.exp(-(1.0 - self.albedo) * self.optical_depth * mass),
-            vapour=np.exp(-0.2385 * vapour / (1.0 + 20.07 * vapour) ** 0.45),
-            ozone=np.exp(-self.ozone * _OZONE * ozone_mass),
-            mixed=np.exp(-1.41 * mixed / (1.0 + 118.3 * mixed) ** 0.45),
-        )
 
 
 def _air_mass(elevation_deg: float) -> float:
@@ -162,6 +152,6 @@ def daylight_attenuation(absorption: ArrayLike, backscattering: ArrayLike, *, su
         sun_elevation_deg: (0, 90] [°].
     """
     a, backward = np.asarray(absorption, np.float64), np.asarray(backscattering, np.float64)
-    zenith = 90.0 - check_real("sun_elevation_deg", sun_elevation_deg, "(0, 90]")
+    zenith = 90.0 - check_real("sun_elevation_deg", sun_elevation_deg, RANGES["sun_elevation_deg"])
     attenuation = (1.0 + 0.005 * zenith) * a + 4.18 * (1.0 - 0.52 * np.exp(-10.8 * a)) * backward
     return attenuation if attenuation.ndim else float(attenuation)

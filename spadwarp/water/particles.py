@@ -28,6 +28,7 @@ from spadwarp.io import write_text
 from spadwarp.limits import check_integer, check_real
 from spadwarp.water.scattering_matrix import MATRIX_COLUMNS, rayleigh_matrix
 from spadwarp.water.seawater import (
+    Coefficients,
     check_ranges,
     molecular_density,
     pure_water_absorption,
@@ -36,18 +37,8 @@ from spadwarp.water.seawater import (
     table_columns,
 )
 
-__all__ = [
-    "ParticleOptics",
-    "SizeDistribution",
-    "kopelevich_particles",
-    "log_normal",
-    "mie_particles",
-    "mixture",
-    "power_law",
-    "save_matrix_table",
-    "save_phase_table",
-    "single_size",
-]
+__all__ = ["ParticleOptics", "SizeDistribution", "kopelevich_particles", "log_normal", "mie_particles", "mixture"]
+__all__ += ["power_law", "save_matrix_table", "save_phase_table", "single_size"]
 
 Floats = NDArray[np.float64]
 
@@ -59,34 +50,19 @@ _LARGEST = 2e4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ParticleOptics:
+class ParticleOptics(Coefficients):
     """Optical properties at one wavelength of particles, or of water with particles in it.
 
     Attributes:
-        wavelength_nm: In vacuum [nm].
-        absorption, scattering: a and b [1/m].
         angles_deg: Scattering angles `[n]` [°], 0.01 to 180.
         density: Phase function at them [1/sr], of unit integral over the sphere.
         matrix: Elements m12, m22, m33, m34 and m44 of the scattering matrix at them, each over the phase function
             `[n, 5]`; None where only the phase function is known (Kopelevich's components).
     """
 
-    wavelength_nm: float
-    absorption: float
-    scattering: float
     angles_deg: Floats
     density: Floats
     matrix: Floats | None = None
-
-    @property
-    def extinction(self) -> float:
-        """c = a + b [1/m]."""
-        return self.absorption + self.scattering
-
-    @property
-    def albedo(self) -> float:
-        """b/c."""
-        return self.scattering / self.extinction
 
     @cached_property
     def mean_cosine(self) -> float:

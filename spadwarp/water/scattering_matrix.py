@@ -18,21 +18,11 @@ from numpy.typing import NDArray
 from spadwarp.errors import ConfigError
 from spadwarp.io.text import read_columns
 from spadwarp.limits import check_real
+from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION
 
-__all__ = [
-    "MATRIX_COLUMNS",
-    "WATER_DEPOLARISATION",
-    "rayleigh_matrix",
-    "read_matrix_table",
-    "scaled_rayleigh_matrix",
-    "voss_fry_matrix",
-]
+__all__ = ["MATRIX_COLUMNS", "rayleigh_matrix", "read_matrix_table", "scaled_rayleigh_matrix", "voss_fry_matrix"]
 
 Floats = NDArray[np.float64]
-
-WATER_DEPOLARISATION = 0.039
-"""Depolarisation ratio of pure water, of unpolarised light scattered by 90° (Farinato & Rowell 1976; measured again by
-Zhang et al., Appl. Opt. 58, 991 (2019): 0.039 ± 0.001, and 1e-4 to 2e-4 more for each g/kg of salt)."""
 
 MATRIX_COLUMNS = {"angle_deg": "[0, 180]"} | dict.fromkeys(("m12", "m22", "m33", "m34", "m44"), "[-1, 1]")
 """Columns of a table of a scattering matrix: scattering angle [°] and five elements, each over m11."""
@@ -61,7 +51,7 @@ def rayleigh_matrix(cosine: Floats, depolarisation_ratio: float = WATER_DEPOLARI
     Raises:
         ArgumentError: The ratio is outside its range.
     """
-    ratio = check_real("depolarisation_ratio", depolarisation_ratio, "[0, 0.5]")
+    ratio = check_real("depolarisation_ratio", depolarisation_ratio, RANGES["depolarisation_ratio"])
     cosine, d = np.asarray(cosine, np.float64), (1.0 - ratio) / (1.0 + ratio)
     squared = d * cosine**2
     elements = (squared - d, d + squared, 2.0 * d * cosine, 0.0 * cosine, (3.0 * d - 1.0) * cosine)
@@ -85,7 +75,7 @@ def scaled_rayleigh_matrix(cosine: Floats, largest: float = _AT_90_DEGREES) -> F
     Raises:
         ArgumentError: P is outside its range.
     """
-    part, cosine = check_real("largest", largest, "[0, 1]"), np.asarray(cosine, np.float64)
+    part, cosine = check_real("largest", largest, RANGES["largest"]), np.asarray(cosine, np.float64)
     zero, turned = 0.0 * cosine, 2.0 * cosine / (1.0 + cosine**2)
     return np.stack([part * (cosine**2 - 1.0) / (1.0 + cosine**2), zero + 1.0, turned, zero, turned], axis=-1)
 

@@ -20,48 +20,37 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.errors import ArgumentError
-from spadwarp.limits import shown
-from spadwarp.water.scattering_matrix import WATER_DEPOLARISATION
+from spadwarp.limits import Interval, shown
 
-__all__ = [
-    "WaterOptics",
-    "group_index",
-    "pure_water_absorption",
-    "pure_water_scattering",
-    "refractive_index",
-    "water_optics",
-]
+__all__ = ["WATER_DEPOLARISATION", "WaterOptics", "group_index", "molecular_density", "pure_water_absorption"]
+__all__ += ["pure_water_scattering", "refractive_index", "water_optics"]
 
-# What the formulas were fitted to; wavelengths in vacuum.
-_RANGES = {
-    "wavelength_nm": (400.0, 700.0),
-    "temperature": (0.0, 30.0),
-    "salinity": (0.0, 40.0),
-    "chlorophyll": (0.0, 30.0),
+WATER_DEPOLARISATION = 0.039
+"""Depolarisation ratio of pure water, of unpolarised light scattered by 90° (Farinato & Rowell 1976; measured again by
+Zhang et al., Appl. Opt. 58, 991 (2019): 0.039 ± 0.001, and 1e-4 to 2e-4 more for each g/kg of salt)."""
+
+RANGES = {
+    "wavelength_nm": "[400, 700] nm",
+    "temperature": "[0, 30] °C",
+    "salinity": "[0, 40] g/kg",
+    "chlorophyll": "[0, 30] mg/m³",
+    "sun_elevation_deg": "(0, 90] °",
+    "aerosol_optical_depth": "[0, 5]",
+    "depolarisation_ratio": "[0, 0.5]",
+    "largest": "[0, 1]",
 }
-_UNITS = {"wavelength_nm": "nm", "temperature": "°C", "salinity": "g/kg", "chlorophyll": "mg/m³"}
+"""Ranges in which the formulas hold, by the name of the argument; wavelengths in vacuum."""
 
 Value = Any  # a float for a float, else an array
 
 
 @dataclass(frozen=True)
-class WaterOptics:
-    """Optical properties of one water at one wavelength.
-
-    Attributes:
-        wavelength_nm: In vacuum [nm].
-        absorption, scattering: a and b [1/m], of water and of what is in it.
-        water_absorption, water_scattering: The part of the water itself [1/m].
-        phase_index, group_index: Refractive index, and the index for the time of flight.
-    """
+class Coefficients:
+    """Absorption a and scattering b [1/m] at a wavelength in vacuum [nm]."""
 
     wavelength_nm: float
     absorption: float
     scattering: float
-    water_absorption: float
-    water_scattering: float
-    phase_index: float
-    group_index: float
 
     @property
     def extinction(self) -> float:
@@ -72,6 +61,21 @@ class WaterOptics:
     def albedo(self) -> float:
         """b/c."""
         return self.scattering / self.extinction
+
+
+@dataclass(frozen=True)
+class WaterOptics(Coefficients):
+    """Optical properties of one water at one wavelength; `absorption` and `scattering` are of all that is in it.
+
+    Attributes:
+        water_absorption, water_scattering: The part of the water itself [1/m].
+        phase_index, group_index: Refractive index, and the index for the time of flight.
+    """
+
+    water_absorption: float
+    water_scattering: float
+    phase_index: float
+    group_index: float
 
 
 def water_optics(
@@ -220,14 +224,15 @@ def table_columns(name: str) -> tuple[NDArray[np.float64], ...]:
 
 
 def check_ranges(**values: ArrayLike) -> None:
+    """Raises `ArgumentError` for a number, or one of an array, outside the range of its name."""
     for name, value in values.items():
-        low, high = _RANGES[name]
+        interval = Interval.read(RANGES[name])
         try:
             array = np.asarray(value, float)
         except (TypeError, ValueError):
             raise ArgumentError(f"{name} = {shown(value)} is not a number") from None
-        if not ((array >= low) & (array <= high)).all():
-            raise ArgumentError(f"{name} = {shown(value)} is outside [{low:g}, {high:g}] {_UNITS[name]}")
+        if not interval.holds(array).all():
+            raise ArgumentError(f"{name} = {shown(value)} is outside {interval}")
 
 
 def _value(array: Any) -> Value:

@@ -13,7 +13,7 @@ from reference import crlb
 from spadwarp.analytic import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result.result import Truth
-from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import pixel_directions
 
 MAPS = (
     *("signal", "arrival", "backscatter", "alpha", "fisher", "sigma_time", "sigma_depth"),
@@ -114,7 +114,7 @@ def test_the_given_part_of_the_pixels_reports_backscatter(backscatter):
 def test_without_a_given_part_background_is_reported_as_often_as_false_peaks_are_expected():
     """A faint return in dark counts that are flat over the gate."""
     one = lidar_scene(
-        analytic={"backscatter": "constant", "pulses": 1_000_000},
+        analytic={"backscatter": "constant", "pulses_per_depth_frame": 1_000_000},
         laser={"pulse_energy": 2e-17, "half_angle_deg": 35.0},
         detector={"pdp": 0.2, "fill_factor": 0.1, "dark_count_rate": 4000.0},
     )

@@ -13,10 +13,9 @@ from spadwarp.checks import summary
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.files.loader import gate_of, stored_depth
 from spadwarp.scene import Scene, daylight_rate
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.port_rays import camera_port
-from spadwarp.scene.port_rays import laser_port as laser_port_of
-from spadwarp.scene.sight import lines_of_sight
+from spadwarp.scene.scene import camera_port
+from spadwarp.scene.scene import laser_port as laser_port_of
+from spadwarp.scene.sight import lines_of_sight, pixel_directions
 
 WATER = {"extinction": 0.3, "albedo": 0.8, "phase_index": "seawater", "group_index": "seawater"}
 WINDOW = {"distance": 0.05, "thickness": 0.01, "material": "BK7"}

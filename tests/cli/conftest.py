@@ -21,7 +21,7 @@ SECTIONS = {
     "laser": {"half_angle_deg": 20.0, "position": [-0.05, 0.0, 0.0], "pulse_energy": 1e-14, "repetition_rate": 1e7},
     "camera": {"width": 5, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.4},
     "gate": {"start_ns": 6.0, "bin_width_ps": 100.0, "bins": 150},
-    "detector": {"dark_count_rate": 1e3, "pulses": 5000},
+    "detector": {"dark_count_rate": 1e3, "pulses_per_frame": 5000},
     "transport": {"photons": 20_000, "seed": 1, "max_collisions": 12},
     "output": {"png": False},
 }

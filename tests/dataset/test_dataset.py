@@ -424,7 +424,7 @@ def test_errors_of_recipes_name_each_field():
         "pose": {"distance": -1.0, "yaw": 3.0},
         "water": {"attenuation_lengths": {"low": 2.0, "high": 1.0}},
         "frames": {"backscatter_fraction": [0.1, 1.5]},
-        "exposure": {"pulses": 5.0, "signal_photons": 5.0},
+        "exposure": {"pulses_per_depth_frame": 5.0, "signal_photons": 5.0},
     }
     with pytest.raises(spadwarp.ConfigError) as caught:
         Recipe.from_dict({**TABLES, **wrong})

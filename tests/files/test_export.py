@@ -220,7 +220,7 @@ def test_sensor_fusion_as_its_loader_reads_it(frames, detection, result, tmp_pat
         seen = item["bins"][0] >= 0
         assert seen.sum() > WIDTH * HEIGHT // 2
         assert np.abs(middle["bins_hr"] - item["bins"][0])[seen].max() * (BINS - 1) < 0.5 + 1e-3
-        view = spadwarp.scene.geometry.pixel_directions(result.scene.camera)
+        view = spadwarp.scene.sight.pixel_directions(result.scene.camera)
         light = -result.truth.reflectance * (result.truth.normal * view).sum(axis=-1)
         there = np.isfinite(light)
         ratio = (middle["intensity"] / light)[there]
@@ -295,7 +295,7 @@ def test_command(frames, tmp_path):
 
 RECIPE = {
     **{"name": "both kinds", "seed": 3, "scenes_per_target": 2, "scenes_per_shard": 2},
-    **{"pose": {"distance": 5.0}, "exposure": {"pulses": 3000}, "frames": {"per_scene": 2}},
+    **{"pose": {"distance": 5.0}, "exposure": {"pulses_per_depth_frame": 3000}, "frames": {"per_scene": 2}},
     "targets": {"builtin": ["staircase", "sphere"], "test": ["sphere"]},
     "gate": {"before": 1.5, "behind": 1.0, "bins": 40},
     "monte_carlo": {"share": 1.0, "photons": 20_000},

@@ -223,7 +223,7 @@ def test_time_tags_are_the_counts_one_by_one(mode):
 
 
 def test_a_shallow_counter_is_full():
-    found = detect(_spike(10), pulses=1_000_000, seed=1, detector=Detector(counter_depth=255), **CALL)
+    found = detect(_spike(10), pulses=1_000_000, seed=1, detector=Detector(max_count=255), **CALL)
     assert found.counts.max() == 255
 
 

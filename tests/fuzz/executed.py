@@ -19,7 +19,7 @@ from fuzz.isolation import Outcome, run_isolated
 BUG = 70  # exit code of a command that met an error nobody thought of
 # Fields in which infinity has a meaning.
 UNBOUNDED = re.compile(
-    r"(transport\.lateral_limit|scan\.distance|camera\.(focus_distance|extinction_ratio)|domain\.(lower|upper)|.*\.(lower|upper)|medium\.layers.*|.*max_path)"
+    r"(transport\.lateral_limit|scan\.distance|camera\.(focus_distance|analyser_extinction_ratio)|domain\.(lower|upper)|.*\.(lower|upper)|medium\.layers.*|.*max_path)"
 )
 
 

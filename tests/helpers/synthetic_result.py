@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from spadwarp.mesh import TriangleMesh, build_mesh
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import pixel_directions
+from spadwarp.scene.sight import pixel_directions
 
 UNIT = 2.0**-60
 

@@ -124,7 +124,7 @@ def test_start_is_that_of_a_lidar(light):
 
 def test_what_a_fit_leaves_out_is_refused(light):
     frames = exposure(light, {}, pulses=10)
-    for field, value in (("afterpulsing_probability", 0.1), ("counter_depth", 7)):
+    for field, value in (("afterpulsing_probability", 0.1), ("max_count", 7)):
         with pytest.raises(spadwarp.ConfigError, match=field):
             spadwarp.fit(frames, plate({f"detector.{field}": value}), unknown="depth", device="cpu")
     for argument, words in (

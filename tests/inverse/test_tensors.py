@@ -7,7 +7,7 @@ import spadwarp
 from helpers.inverse import CLEAR, plate
 from helpers.scenes import scene as small_scene
 from spadwarp.inverse.blocks import with_block_means
-from spadwarp.scene.grid_cells import grid_cells
+from spadwarp.scene.medium import grid_cells
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.physics

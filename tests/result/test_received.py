@@ -22,7 +22,7 @@ PLANE = {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0],
 def polarised(camera="analyser", **fields):
     """A wall in ocean water before a laser at 30° and an analyser that leaks a hundredth."""
     return scene(
-        camera=CAMERA | {"polarisation": camera, "analyser_angle_deg": 30.0, "extinction_ratio": 100.0},
+        camera=CAMERA | {"polarisation": camera, "analyser_angle_deg": 30.0, "analyser_extinction_ratio": 100.0},
         laser={"position": [-0.1, 0.0, 0.0], "polarisation": "linear", "polarisation_angle_deg": 30.0, **fields},
         medium={"extinction": 0.6, "albedo": 0.8, "scattering_matrix": "voss_fry"},
         gate={"start_ns": 2.0, "bin_width_ps": 500.0, "bins": 50},

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from helpers.synthetic_result import UNIT, make_result, make_scene
 from spadwarp.result.result import COMPONENTS, Result
-from spadwarp.scene.geometry import pixel_directions, range_from_path
+from spadwarp.scene.sight import pixel_directions, range_from_path
 
 SPEED = 299_792_458.0 / 1.3638
 

@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch")
 
 SECTIONS = {
     "laser": {"half_angle_deg": 20.0, "position": [-0.1, 0.0, 0.0], "pulse_energy": 1e-14, "repetition_rate": 1e7},
-    "detector": {"dark_count_rate": 1e4, "pulses": 2000},
+    "detector": {"dark_count_rate": 1e4, "pulses_per_frame": 2000},
     "transport": {"photons": 20_000, "seed": 1, "max_collisions": 12, "axis_threshold": 1.0},
 }
 SHAPE = (3, 4, 4, 8)

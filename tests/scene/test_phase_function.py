@@ -10,19 +10,11 @@ from helpers.scenes import scene
 from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.text import read_columns
 from spadwarp.scene import Medium
-from spadwarp.scene.phase import PHASE_COLUMNS
-from spadwarp.scene.preset import PHASE_TABLES
+from spadwarp.scene.tables import PHASE_TABLES
 
 WATER = {"extinction": 0.3, "albedo": 0.8}
 PETZOLD = Medium(**WATER, phase_function="tabulated", phase_table="petzold-average-particle")
-
-
-def medium_problems(**fields):
-    with pytest.raises(ConfigError) as caught:
-        scene(medium=fields)
-    return caught.value.problems
 
 
 def test_each_phase_function_is_the_one_of_its_fields():
@@ -94,26 +86,15 @@ def test_shipped_tables_are_sourced_and_offered(name):
     assert spadwarp.scene.phase_function(Medium(**WATER, phase_function="tabulated", phase_table=name)).mean_cosine > 0
 
 
-def test_a_table_may_have_comments_and_a_line_of_names(tmp_path):
-    path = tmp_path / "vsf.csv"
-    path.write_text("# where from\nangle_deg, value\n0,2\n\n90, 1\n180, 1\n")
-    angles, values = read_columns(path, PHASE_COLUMNS).T
-    np.testing.assert_array_equal(angles, [0, 90, 180])
-    np.testing.assert_array_equal(values, [2, 1, 1])
-
-
 @pytest.mark.parametrize(
     ("text", "error"),
     [
         ("0,1\n90,nan\n", "medium.phase_table: .*line 2: '90,nan' is not angle_deg,value in finite numbers"),
         ("0,1\n90\n", "line 2: '90' is not angle_deg,value in finite numbers"),
-        ("0,1\n90,x\n", "line 2"),
         ("0,1\n", "two or more"),
         ("90,1\n0,1\n", "ascending"),
         ("0,1\n190,1\n", r"line 2: angle_deg = 190 is outside \[0, 180\]"),
         ("0,1\n90,-1\n", r"line 2: value = -1 is outside \[0, 1e30\]"),
-        ("0,1e308\n90,1e308\n", "line 1: value = 1e[+]308 is outside"),
-        ("0,1\n90,nan\n", "line 2"),
         ("0,1\n90,inf\n", "line 2: value = inf is outside"),
         ("0,1\n" + "9" * 140_000 + ",1\n", "line 2: field larger than field limit"),
     ],
@@ -127,28 +108,20 @@ def test_a_bad_table_is_named(text, error, tmp_path):
     assert str(path) in str(caught.value)
 
 
-def test_a_missing_table_is_named(tmp_path):
-    medium = Medium(**WATER, phase_function="tabulated", phase_table=str(tmp_path / "none.csv"))
-    with pytest.raises(FileError, match=r"none\.csv: cannot be read: No such file"):
-        spadwarp.scene.phase_function(medium)
-
-
-def test_fields_belong_to_their_phase_function():
-    assert medium_problems(phase_function="tabulated") == (
-        "medium needs phase_table with phase_function = 'tabulated'",
-    )
-    assert medium_problems(phase_function="two_term_henyey_greenstein", g1=0.9) == (
-        "medium needs g2, alpha with phase_function = 'two_term_henyey_greenstein'",
-    )
-    assert medium_problems(phase_table="a.csv") == (
-        "medium.phase_table = 'a.csv' goes with phase_function = 'tabulated' only",
-    )
-    assert medium_problems(phase_function="tabulated", phase_table="petzold")[0].startswith(
-        "medium.phase_table = 'petzold' is not one of 'petzold-average-particle', the path of a .csv file"
-    )
-    assert medium_problems(phase_function="fournier_forand", junge_slope=5.5) == (
-        "medium.junge_slope = 5.5 is outside [3.05, 5)",
-    )
+@pytest.mark.parametrize(
+    ("fields", "problem"),
+    [
+        ({"phase_function": "tabulated"}, "medium needs phase_table with phase_function = 'tabulated'"),
+        ({"phase_function": "two_term_henyey_greenstein", "g1": 0.9}, "medium needs g2, alpha with phase_function = "),
+        ({"phase_table": "a.csv"}, "medium.phase_table = 'a.csv' goes with phase_function = 'tabulated' only"),
+        ({"phase_table": "petzold"}, "medium.phase_table = 'petzold' is not one of 'petzold-average-particle', the pa"),
+        ({"phase_function": "fournier_forand", "junge_slope": 5.5}, "medium.junge_slope = 5.5 is outside [3.05, 5)"),
+    ],
+)
+def test_fields_belong_to_their_phase_function(fields, problem):
+    with pytest.raises(ConfigError) as caught:
+        scene(medium=fields)
+    assert caught.value.problems[0].startswith(problem)
 
 
 def test_overriding_the_phase_function_drops_the_fields_of_the_old_one():
@@ -157,13 +130,3 @@ def test_overriding_the_phase_function_drops_the_fields_of_the_old_one():
     other = one.with_overrides(["medium.phase_function=fournier_forand"])
     assert (other.medium.phase_function, other.medium.phase_table) == ("fournier_forand", None)
     assert spadwarp.Scene.from_dict(other.to_dict()) == other
-
-
-def test_a_relative_table_starts_at_the_scene_file(tmp_path):
-    text = scene(medium={"phase_function": "tabulated", "phase_table": "vsf.csv"}).to_toml()
-    (tmp_path / "scene.toml").write_text(text)
-    one = spadwarp.load_scene(tmp_path / "scene.toml")
-    assert one.medium.phase_table == str(tmp_path / "vsf.csv")
-    assert spadwarp.load_scene(
-        tmp_path / "scene.toml", ["medium.phase_table=petzold-average-particle"]
-    ).medium == one.medium.model_copy(update={"phase_table": "petzold-average-particle"})

@@ -11,10 +11,9 @@ from reference import refraction
 from spadwarp.errors import ConfigError
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.scene import Scene
-from spadwarp.scene.geometry import pixel_directions
-from spadwarp.scene.materials import air_indices, window_indices
-from spadwarp.scene.preset import PRESETS
-from spadwarp.scene.sight import depth_from_time, lines_of_sight
+from spadwarp.scene.port import air_indices, window_indices
+from spadwarp.scene.sight import depth_from_time, lines_of_sight, pixel_directions
+from spadwarp.scene.tables import PRESETS
 
 SEAWATER = WATER | {"phase_index": "seawater", "group_index": "seawater"}
 WINDOW = {"distance": 0.05, "thickness": 0.01, "material": "BK7"}
@@ -61,7 +60,7 @@ def test_air():
     [
         ({"thickness": 0.01, "material": "BK7"}, "camera.port needs distance with shape = 'flat'"),
         ({"shape": "dome"}, "camera.port needs radius with shape = 'dome'"),
-        (WINDOW | {"radius": 0.1}, "camera.port.radius = 0.1 does not go with shape = 'flat'"),
+        (WINDOW | {"radius": 0.1}, "camera.port.radius = 0.1 goes with shape = 'dome' only"),
         (WINDOW | {"index": 1.5}, "camera.port needs either material or index"),
         ({"distance": 0.05, "thickness": 0.01}, "camera.port needs material or index and a thickness > 0, or neither"),
         (DOME | {"normal": [0.0, 0.1, 1.0]}, "normal = .* goes with shape = 'flat' only"),
@@ -113,7 +112,7 @@ def reference_paths(one, camera_port, laser_port, points):
         if port is None:
             total += np.linalg.norm(points - place, axis=1)
             continue
-        from spadwarp.scene.port_rays import camera_port as geometry_of
+        from spadwarp.scene.scene import camera_port as geometry_of
 
         behind = geometry_of(one if camera_port is not None else one.with_overrides({"camera.port": port}))
         normal = np.array(behind.normal)

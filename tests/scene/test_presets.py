@@ -2,8 +2,7 @@
 
 import pytest
 
-from spadwarp.scene import Camera, Medium, Scene, presets
-from spadwarp.scene.preset import PRESETS
+from spadwarp.scene import Camera, Medium, presets
 from spadwarp.water import pure_water_absorption
 
 MEDIA = presets("medium")
@@ -14,20 +13,6 @@ def test_every_preset_names_its_source():
         assert name == f"{preset.section}.{preset.name}"
         assert len(preset.source) > 30
         assert preset.values
-
-
-def test_sections_and_names():
-    assert set(PRESETS) == {"medium", "laser", "camera", "port", "detector", "gate"}
-    assert len(presets()) == sum(map(len, PRESETS.values()))
-    assert presets("laser").keys() == {"picoquant-visuv-532", "lu2024"}
-    assert presets("detector").keys() == {"photon-force-pf32", "photon-force-pf32-microlens", "lu2024"}
-    with pytest.raises(KeyError):
-        presets("targets")
-
-
-def test_what_presets_returns_is_the_callers_own():
-    presets("medium").clear()
-    assert presets("medium") == MEDIA
 
 
 @pytest.mark.parametrize("name", sorted(MEDIA))
@@ -90,14 +75,3 @@ def test_the_papers_camera_has_pixels_of_9_2_um_and_20_degrees():
     assert camera.focal_length * camera.pixel_tangent == pytest.approx(9.2e-6, rel=1e-3)
     assert camera.horizontal_fov_deg == 20.0
     assert camera.focal_length / (2 * camera.aperture_radius) == pytest.approx(2.0)
-
-
-def test_the_pf32s_window_is_56_ns():
-    one = Scene.from_dict(
-        {
-            "medium": {"preset": "uwoc-clear"},
-            "camera": {"preset": "photon-force-pf32", "focal_length": 0.0125, "f_number": 1.4},
-            "gate": {"preset": "photon-force-pf32"},
-        }
-    )
-    assert one.gate.stop == pytest.approx(56.32e-9)

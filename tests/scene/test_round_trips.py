@@ -167,29 +167,6 @@ def test_every_shipped_scene_loads_and_reloads(path):
     assert reloaded(one) == one
 
 
-def test_the_shipped_scenes_are_there():
-    assert {path.stem for path in SCENES} >= {"staircase_15m", "staircase_5m", "harbour_5m", "plane_5m"}
-
-
-OLDER_WORDS = {
-    "detector": ({"fold": False, "pulses": 500}, {"wrap": False, "pulses_per_frame": 500}),
-    "analytic": (
-        {"form": "paper", "count_law": "per_frame_paper", "pulses": 70},
-        {"form": "lu2024", "count_law": "per_frame_lu2024", "pulses_per_depth_frame": 70},
-    ),
-    "laser": ({"preset": "paper"}, {"preset": "lu2024"}),
-    "medium": ({"preset": None, "extinction": 0.4, "albedo": "paper"}, {"extinction": 0.4, "albedo": "lu2024"}),
-}
-
-
-@pytest.mark.parametrize("section", OLDER_WORDS)
-def test_older_words_load_as_the_words_for_them_now(section):
-    older, now = OLDER_WORDS[section]
-    assert scene(**{section: older}) == scene(**{section: now})
-    paths = {f"{section}.{name}": value for name, value in older.items()}
-    assert scene().with_overrides(paths) == scene().with_overrides(**{section: now})
-
-
 @pytest.mark.parametrize(
     ("mesh", "written"),
     [

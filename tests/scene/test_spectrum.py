@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 import spadwarp
@@ -136,9 +135,3 @@ def test_checks():
     beyond = texts(laser__linewidth_nm=80.0, medium={"chlorophyll": 0.5})
     assert any("the analytic simulator refuses" in text for text in beyond)
     assert not any("spectrum" in text or "filter" in text for text in texts(detector__filter_fwhm_nm=10.0))
-
-
-def test_wavelengths_take_units():
-    scene = plane(laser__linewidth_nm="0.5 nm", detector__filter_fwhm_nm="10 nm")
-    assert (scene.laser.linewidth_nm, scene.detector.filter_fwhm_nm) == (0.5, 10.0)
-    assert np.isclose(share(scene), 1.0, atol=2e-3)

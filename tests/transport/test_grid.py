@@ -13,7 +13,7 @@ import spadwarp
 from helpers.estimators import agreeing_cells, cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
-from spadwarp.scene.grid_cells import grid_cells
+from spadwarp.scene.medium import grid_cells
 from spadwarp.units import SPEED_OF_LIGHT
 
 pytestmark = pytest.mark.physics

@@ -10,7 +10,8 @@ from helpers.estimators import agreeing_cells
 from helpers.opencv import project_points
 from helpers.scenes import PLATE, scene
 from spadwarp.errors import ConfigError
-from spadwarp.scene.pose import rotation_angles, rotation_matrix, to_world
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.pose import rotation_angles, rotation_matrix
 
 pytestmark = pytest.mark.physics
 

@@ -285,7 +285,7 @@ def test_a_port_polarises_what_it_lets_through(device):
 
 def test_an_analyser_splits_the_stokes_vector(device, tmp_path):
     """co and cross from I, Q and U of the same photons; errors, files, merging and resuming of channels."""
-    analyser = {"polarisation": "analyser", "analyser_angle_deg": 30.0, "extinction_ratio": 50.0}
+    analyser = {"polarisation": "analyser", "analyser_angle_deg": 30.0, "analyser_extinction_ratio": 50.0}
     one = polarised(transport={"estimator": "guided"})
     split = one.with_overrides(camera=analyser)
     whole = spadwarp.simulate(split, photons=8192, device=device, uncertainty=True)
@@ -318,7 +318,7 @@ def test_an_analyser_splits_the_stokes_vector(device, tmp_path):
         ({"medium": {"scattering_matrix": "tabulated"}}, "needs matrix_table"),
         ({"medium": {"matrix_table": "a.csv"}}, "goes with scattering_matrix = 'tabulated' only"),
         ({"targets": [{**SHINY, "specular_index": 1.3415}]}, "specular_index = 1.3415 is that of the water"),
-        ({"camera": {"extinction_ratio": 0.5}}, r"extinction_ratio = 0\.5 .* is outside \[1, inf\]"),
+        ({"camera": {"analyser_extinction_ratio": 0.5}}, r"analyser_extinction_ratio = 0\.5 .* is outside \[1, inf\]"),
     ],
 )
 def test_what_does_not_go_with_polarised_light_is_refused_by_name(sections, message):

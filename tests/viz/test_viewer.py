@@ -175,7 +175,7 @@ def test_a_click_in_a_browser_shows_that_pixels_histogram(result, page, tmp_path
             "(({ tickvals, ticktext }) => tickvals.map((time, k) => [time, Number(ticktext[k])]))"
             "(document.getElementById('histogram').layout.xaxis2)"
         )
-        u = spadwarp.scene.geometry.pixel_directions(result.scene.camera)[7, 10]
+        u = spadwarp.scene.sight.pixel_directions(result.scene.camera)[7, 10]
         for time, distance in ticks:
             path = distance + np.linalg.norm(distance * u - np.array(result.scene.laser.position))
             assert time == pytest.approx(1e9 * path / result.pulse_speed, rel=1e-5)

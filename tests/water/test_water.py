@@ -8,7 +8,7 @@ import pytest
 import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.scene import Medium, Scene
-from spadwarp.scene.preset import WATER_INDICES
+from spadwarp.scene.tables import WATER_INDICES
 from spadwarp.water import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
 
 TABLES = {
@@ -45,14 +45,6 @@ def test_the_group_index_is_the_index_less_wavelength_times_slope():
 )
 def test_absorption_of_pure_water_as_published(wavelength, absorption):
     assert pure_water_absorption(wavelength) == absorption
-
-
-def test_the_absorption_minimum_is_where_pope_and_fry_found_it():
-    """0.0044 ± 0.0006 1/m at 418 nm (their abstract)."""
-    wavelength = np.linspace(400.0, 700.0, 3001)
-    absorption = pure_water_absorption(wavelength)
-    assert wavelength[absorption.argmin()] == pytest.approx(418.0, abs=1.0)
-    assert absorption.min() == pytest.approx(0.0044, abs=5e-5)
 
 
 def test_scattering_of_pure_seawater_is_that_of_zhang_hu_and_he():
@@ -165,8 +157,8 @@ def test_chlorophyll_and_coefficients_displace_each_other():
 @pytest.mark.parametrize(
     ("medium", "wavelength", "text"),
     [
-        ({"chlorophyll": 0.5, "preset": "uwoc-clear"}, 532.0, "medium.chlorophyll = 0.5 goes without preset"),
-        ({"chlorophyll": 0.5, "absorption": 0.1}, 532.0, "medium.chlorophyll = 0.5 goes without absorption"),
+        ({"chlorophyll": 0.5, "preset": "uwoc-clear"}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with pres"),
+        ({"chlorophyll": 0.5, "absorption": 0.1}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with abs"),
         ({"chlorophyll": 31.0}, 532.0, "medium.chlorophyll = 31.0 is outside [0, 30]"),
         ({"chlorophyll": 0.5}, 850.0, "laser.wavelength_nm = 850.0 is outside [400, 700]"),
     ],

@@ -1,25 +1,131 @@
-"""How a scene's tables are put together: presets, file, overrides; and how they are written back.
+"""Tables of a scene before they are validated: presets, the file, overrides, and how they are put together.
 
 Everything here works on plain dicts as `tomllib` gives them. A later layer wins field by field, except where fields
-exclude each other: there a later one displaces the earlier ones (`merge_section`).
+exclude each other: there a later one displaces the earlier ones (`merge_section`). A preset, `preset = "uwoc-harbour"`
+inside a section, lies under the section's own fields; it need not fill its section.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any, NamedTuple
 
 from spadwarp.errors import ConfigError
 from spadwarp.io.text import parse_toml
 from spadwarp.limits import parse_number, shown, suggestion
-from spadwarp.scene.coefficients import COEFFICIENTS, complete_coefficients
-from spadwarp.scene.phase_fields import PHASE_FIELDS
-from spadwarp.scene.preset import PRESETS, Preset
-from spadwarp.scene.renamed import current_fields
+
+__all__ = ["Preset", "parse_override", "presets"]
 
 Table = dict[str, Any]
 Key = tuple[str | int, ...]
+
+# (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`).
+# Time of flight uses the group index.
+WATER_INDICES: dict[str, tuple[float, float]] = {"seawater": (1.3415, 1.3638), "fresh": (1.3350, 1.3566)}
+
+# Tabulated phase functions: name -> (file in spadwarp/water/tables, source).
+PHASE_TABLES: dict[str, tuple[str, str]] = {
+    "petzold-average-particle": (
+        "petzold_average_particle.csv",
+        "Petzold 1972 (SIO Ref. 72-78), mean of three stations in San Diego harbour without the water's own "
+        "scattering, as tabulated by Mobley et al., Appl. Opt. 32, 7484 (1993)",
+    )
+}
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Fields of one section of a scene, `values`, and where they come from, `source`."""
+
+    section: str
+    name: str
+    values: Mapping[str, Any]
+    source: str
+
+
+def _read_presets() -> dict[str, dict[str, Preset]]:
+    tables = tomllib.loads((files("spadwarp.scene") / "presets.toml").read_text(encoding="utf-8"))
+    sources: dict[str, str] = tables.pop("sources")
+
+    def source(entry: Mapping[str, Any]) -> str:
+        text = sources.get(entry["source"], entry["source"])
+        return f"{text}; {entry['note']}" if "note" in entry else text
+
+    return {
+        section: {name: Preset(section, name, entry["values"], source(entry)) for name, entry in entries.items()}
+        for section, entries in tables.items()
+    }
+
+
+PRESETS = _read_presets()
+
+
+def presets(section: str | None = None) -> dict[str, Preset]:
+    """The presets of one section by name, or of all sections by `section.name`.
+
+    Raises `KeyError` for a section without presets.
+    """
+    if section is not None:
+        return dict(PRESETS[section])
+    return {f"{section}.{name}": preset for section, rows in PRESETS.items() for name, preset in rows.items()}
+
+
+COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
+
+
+def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
+    """All four coefficients from exactly two of them, the given ones as they are.
+
+    With `albedo = "lu2024"` absorption and scattering are the means (ω is uniform in (0, 0.97): mean 0.485).
+    Raises `ValueError` whose text names the fields, without the section.
+    """
+    if len(pair) != 2:
+        given = ", ".join(pair) or "none"
+        raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}, or chlorophyll; given: {given}")
+    a, b, c, albedo = (pair.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
+    if albedo == "lu2024":
+        if c is None:
+            raise ValueError("albedo = 'lu2024' goes with extinction only")
+        return {"absorption": c * (1.0 - 0.485), "scattering": c * 0.485, "extinction": c, "albedo": albedo}
+    if albedo is not None:
+        if c is None:
+            rest = albedo if a is None else 1.0 - albedo
+            if rest <= 0.0:
+                raise ValueError(f"albedo = {albedo} leaves the extinction undetermined; give extinction and albedo")
+            c = (b if a is None else a) / rest
+        a = c * (1.0 - albedo) if a is None else a
+        b = c * albedo if b is None else b
+    elif c is None:
+        c = a + b
+    else:
+        part, value = ("scattering", b) if a is None else ("absorption", a)
+        if value > c:
+            raise ValueError(f"{part} = {value} is outside [0, {c}], {c} being the extinction")
+        a = c - b if a is None else a
+        b = c - a if b is None else b
+    share = (b / c if c else 0.0) if albedo is None else albedo
+    return {"absorption": a, "scattering": b, "extinction": c, "albedo": share}
+
+
+class PhaseFields(NamedTuple):
+    """Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and
+    those with a default, which phase functions may share."""
+
+    needed: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+
+
+PHASE_FIELDS = {
+    "henyey_greenstein": PhaseFields(optional=("anisotropy",)),
+    "two_term_henyey_greenstein": PhaseFields(needed=("g1", "g2", "alpha")),
+    "fournier_forand": PhaseFields(optional=("particle_index", "junge_slope")),
+    "rayleigh": PhaseFields(optional=("depolarisation_ratio",)),
+    "tabulated": PhaseFields(needed=("phase_table",)),
+}
 
 # Overriding one coefficient of a complete medium keeps this other one.
 _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
@@ -78,7 +184,6 @@ def merge_section(section: str, base: Mapping[str, Any], layer: Mapping[str, Any
 
     A value of None takes the field back to its default.
     """
-    base, layer = current_fields(section, base), current_fields(section, layer)
     preset = _preset(section, layer)
     if preset is not None:
         base = merge_section(section, base, preset.values)
@@ -110,7 +215,7 @@ def _preset(section: str, fields: Mapping[str, Any]) -> Preset | None:
 
 
 def preset_hint(section: str, word: Any) -> str:
-    """What to add to an error about a word in place of a table: how a preset is taken."""
+    """A hint where a word stands in place of a table: how a preset is taken."""
     known = PRESETS.get(section, {})
     if word in known:
         return f'; a preset is taken by {{preset = "{word}"}}'
@@ -211,11 +316,10 @@ def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> tuple[Table,
     """
     if isinstance(overrides, str):
         overrides = [overrides]
-    pairs: Iterator[tuple[Key, Any]]
     if isinstance(overrides, Mapping):
-        pairs = ((parse_key(str(name)), value) for name, value in overrides.items())
+        pairs = [(parse_key(str(name)), value) for name, value in overrides.items()]
     elif isinstance(overrides, Sequence) and all(isinstance(text, str) for text in overrides):
-        pairs = (parse_override(text) for text in overrides)
+        pairs = [parse_override(text) for text in overrides]
     else:
         raise ConfigError(f"overrides = {shown(overrides)} are neither a dict nor texts such as 'section.field=value'")
     layer: Table = {}
@@ -223,14 +327,28 @@ def override_layer(overrides: Mapping[str, Any] | Sequence[str]) -> tuple[Table,
     for key, value in pairs:
         if any(isinstance(part, int) for part in key[2:]):
             items[key] = value
-            continue
-        for leaf, leaf_value in _leaves(key, value):
-            _insert(layer, leaf, leaf_value)
-    current = {
-        section: fields if section == "targets" or not isinstance(fields, Mapping) else current_fields(section, fields)
-        for section, fields in layer.items()
-    }
-    return current, items
+        else:
+            _insert(layer, key, value)
+    return layer, items
+
+
+def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
+    """Sets a field, or the fields of a section, a target, all targets or a table within a section."""
+    is_target, in_table = key[0] == "targets", key[:2] in _TABLES
+    if isinstance(value, Mapping) and len(key) < (3 if is_target or in_table else 2):
+        for name, inner in value.items():
+            _insert(layer, (*key, int(name) if _is_index(name) else str(name)), inner)
+        return
+    whole, shape = f"override {shown(key_text(key))}", tuple(map(type, key))
+    fits = shape in ((str,), (str, int, str) if is_target else (str, str)) or (in_table and len(key) == 3)
+    if not fits or (len(key) > 1 and not isinstance(layer.setdefault(key[0], {}), dict)):
+        raise ConfigError(f"{whole} does not name a field; write section.field or targets[0].field")
+    for depth, part in enumerate(key[:-1], 1):
+        layer = layer.setdefault(part, {})
+        if not isinstance(layer, dict):
+            hint = preset_hint(_TABLES[str(key[0]), str(key[1])], layer)
+            raise ConfigError(f"{whole}: {key_text(key[:depth])} = {shown(layer)} is not a table{hint}")
+    layer[key[-1]] = value
 
 
 def set_item(place: Any, key: Key, value: Any, *, done: Key = ()) -> Any:
@@ -252,40 +370,8 @@ def set_item(place: Any, key: Key, value: Any, *, done: Key = ()) -> Any:
     return {**(place if isinstance(place, Mapping) else {}), part: set_item(inner, rest, value, done=here)}
 
 
-def _leaves(key: Key, value: Any) -> Iterator[tuple[Key, Any]]:
-    """The fields of a value that may be a section, a target or all targets as nested mappings."""
-    if isinstance(value, Mapping) and len(key) < (3 if key[0] == "targets" or key in _TABLES else 2):
-        for name, inner in value.items():
-            yield from _leaves((*key, int(name) if _is_index(name) else str(name)), inner)
-    else:
-        yield key, value
-
-
 def _is_index(name: Any) -> bool:
     return re.fullmatch(r"[0-9]{1,9}", str(name)) is not None
-
-
-def _insert(layer: dict[Any, Any], key: Key, value: Any) -> None:
-    shape = tuple(map(type, key))
-    if shape == (str,):
-        layer[key[0]] = value
-        return
-    fields = layer.setdefault(key[0], {})
-    if shape == (str, int, str) and key[0] == "targets" and isinstance(fields, dict):
-        fields.setdefault(key[1], {})[key[2]] = value
-    elif shape == (str, str) and key[0] != "targets" and isinstance(fields, dict):
-        fields[key[1]] = value
-    elif shape == (str, str, str) and key[:2] in _TABLES and isinstance(fields, dict):
-        inner = fields.setdefault(key[1], {})
-        if not isinstance(inner, dict):
-            hint = preset_hint(_TABLES[str(key[0]), str(key[1])], inner)
-            text = f"override {shown(key_text(key))}: {key_text(key[:2])} = {shown(inner)} is not a table{hint}"
-            raise ConfigError(text)
-        inner[key[2]] = value
-    else:
-        raise ConfigError(
-            f"override {shown(key_text(key))} does not name a field; write section.field or targets[0].field"
-        )
 
 
 def key_text(key: Sequence[str | int]) -> str:
