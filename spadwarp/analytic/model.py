@@ -18,19 +18,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.analytic.grid import grid_backscatter, passed_by_grid
-from spadwarp.analytic.optics import scene_optics
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import WaterLine, daylight_rate, phase_function, water_lines
-from spadwarp.scene.port_rays import laser_port
-from spadwarp.scene.sight import depth_per_time, lines_of_sight
+from spadwarp.scene.grid_cells import GridCells, grid_cells
+from spadwarp.scene.port_rays import camera_port, laser_port
+from spadwarp.scene.pose import to_world
+from spadwarp.scene.sight import LinesOfSight, depth_per_time, lines_of_sight
+from spadwarp.transport.model import port_kind, port_parameters
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["BackscatterTable", "Map", "model_notes", "pixel_maps", "response_sigma", "source_name", "warn_of_model"]
+__all__ = ["model_notes", "pixel_maps"]
 
 Map = NDArray[np.float64]
 
@@ -141,7 +142,13 @@ def pixel_maps(
     names = ("alpha", "fisher", "sigma_time", "background_level", "outlier_probability")
     maps = {"signal": signal, "arrival": arrival, "backscatter": total_d.numpy(), "daylight": ambient}
     maps |= {name: values.numpy() for name, values in zip(names, statistics, strict=True)}
-    _check_alpha(scene, maps["alpha"])
+    largest = maps["alpha"].max(initial=0.0)
+    if chosen.count_law == "per_frame_lu2024" and largest > 1.0:
+        raise ConfigError(
+            f"analytic.count_law = 'per_frame_lu2024' needs alpha < 1; it reaches {largest:.4g} detections per pulse "
+            "here, use 'per_frame'",
+            source=source_name(scene),
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = maps["signal"] / maps["backscatter"]
     maps["signal_to_backscatter"] = np.where(maps["fisher"] > 0, ratio, np.nan)
@@ -167,6 +174,41 @@ def response_sigma(scene: Scene) -> float:
 def source_name(scene: Scene) -> str | None:
     """The file of a scene, for an error."""
     return str(scene.source) if scene.source else None
+
+
+def scene_optics(scene: Scene) -> tuple[Any, Any]:
+    """Optics of the kernels, and the parameters of the ports of a scene.
+
+    Raises `ConfigError` for a lens or a laser that reaches through its port.
+    """
+    from spadwarp_kernels import analytic as kernels
+
+    camera, laser = camera_port(scene), laser_port(scene)
+    ports: Any = kernels.Ports()
+    if camera is not None:
+        radius = 0.0 if scene.camera.pinhole else scene.camera.aperture_radius
+        ports.camera = port_parameters(scene, camera, (0.0, 0.0, 0.0), radius, 0.0)
+    if laser is not None:
+        ports.laser = port_parameters(scene, laser, scene.beam.position, 0.0, 0.0)
+    return kernels.make_optics(port_kind(camera), port_kind(laser)), ports
+
+
+def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Map:
+    """Probability that a maximum-likelihood fit takes background for the return.
+
+    Args:
+        signal: Recorded photons of the return.
+        level: Of background per standard deviation of the response.
+        lengths: Of the gate in standard deviations.
+        device: Warp device.
+    """
+    import warp as wp
+
+    from spadwarp_kernels.analytic import outlier_probabilities
+
+    target, columns = pick_device(device), (signal, level, lengths)
+    arrays: list[Any] = [wp.array(np.nan_to_num(column), dtype=wp.float64, device=target) for column in columns]
+    return outlier_probabilities(*arrays).numpy()
 
 
 # Parts
@@ -196,15 +238,6 @@ def _signal(lidar: Any, lines: list[WaterLine], arrays: list[Any], optics: Any) 
     even = np.full_like(total, 1.0 / len(parts))
     shares = [np.divide(signal, total, out=even.copy(), where=total > 0) for signal, _ in parts]
     return total, np.sum([share * time for share, (_, time) in zip(shares, parts, strict=True)], axis=0)
-
-
-def _check_alpha(scene: Scene, alpha: Map) -> None:
-    if scene.analytic.count_law == "per_frame_lu2024" and alpha.max(initial=0.0) > 1.0:
-        raise ConfigError(
-            f"analytic.count_law = 'per_frame_lu2024' needs alpha < 1; it reaches {alpha.max():.4g} detections per "
-            "pulse here, use 'per_frame'",
-            source=source_name(scene),
-        )
 
 
 def _backscatter(
@@ -331,3 +364,128 @@ def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
 def _phase_table(scene: Scene) -> Map:
     """Density [1/sr] at scattering angles uniform on [0, π]; at 0, where it may be infinite, that of 2e-5 rad."""
     return phase_function(scene.medium).density(np.maximum(np.linspace(0.0, np.pi, 4097), 2e-5))
+
+
+# Water cell by cell: what lines of sight and the beam lose in it, and what it scatters back
+
+# Pieces of a line of sight, and lines of sight at a time.
+_PIECES, _LINES = 400, 256
+
+
+def passed_by_grid(scene: Scene, views: Map, distances: Map) -> Map:
+    """Part of the light that passes the cells on its way from the laser to points and on to the lens, over what passes
+    the medium without cells; exact for the cells.
+
+    Args:
+        scene: The scene.
+        views: Unit vectors `[P, 3]` in which the lens sees the points.
+        distances: From the lens along the line of sight, which a port bends, `[P]` [m].
+    """
+    cells, c = grid_cells(scene.medium), scene.medium.extinction
+    sights = lines_of_sight(scene, views)
+    points = sights.points(distances)
+    depth = np.zeros(len(points))
+    for begin in (sights.start, _begin_of_light(scene, points)):
+        way = np.isfinite(begin + points).all(axis=-1, keepdims=True)
+        ends = (np.where(way, end, 0.0) for end in (begin, points))
+        first, last = (to_world(scene.camera, end) for end in ends)
+        depth += cells.optical_depths(first, last, c) - c * np.linalg.norm(last - first, axis=-1)
+    return np.exp(-depth)
+
+
+def _begin_of_light(scene: Scene, points: Map) -> Map:
+    """Where the laser's light to points `[P, 3]` enters the water, or is emitted in it [m]; NaN where there is no
+    way."""
+    beam, port = scene.beam, laser_port(scene)
+    laser, axis = np.array(beam.position), np.array(beam.axis)
+    if beam.profile != "collimated":
+        if port is None:
+            return np.broadcast_to(laser, points.shape)
+        return port.enter(laser, port.connect(points, laser)[0])[0]
+    if port is None:
+        return points - ((points - laser) @ axis)[:, None] * axis
+    # Behind a flat port, see `_not_covered`, a parallel beam stays one.
+    direction, normal = port.enter(laser, axis)[1], np.array(port.normal)
+    outside = points @ normal - (port.distance + port.thickness)
+    return points - (outside / (direction @ normal))[:, None] * direction
+
+
+def grid_backscatter(
+    scene: Scene,
+    views: Map,
+    paths: NDArray[np.float32],
+    cumulative: NDArray[np.float32],
+    total: Map,
+    gate: tuple[float, float],
+) -> NDArray[np.float32]:
+    """Detections per pulse and bin of light scattered once, `[P, T]`.
+
+    The beam's way to a point is taken to lose what the line of sight to it loses, by their lengths in the water, as it
+    does for a laser beside the camera.
+
+    Args:
+        scene: The scene.
+        views: Unit vectors in which the lens sees the pixels `[P, 3]`.
+        paths, cumulative, total: Table of `single_scatter_table` with a scattering coefficient of 1 / m everywhere.
+        gate: (start, stop) [s].
+    """
+    bins = max(1, round((gate[1] - gate[0]) / scene.gate.bin_width))
+    edges = np.linspace(*gate, bins + 1) * scene.medium.pulse_speed
+    cells, sights = grid_cells(scene.medium), lines_of_sight(scene, views)
+    parts = [
+        _part(scene, cells, sights[k : k + _LINES], paths[k : k + _LINES], cumulative[k : k + _LINES], edges)
+        for k in range(0, len(views), _LINES)
+    ]
+    return (np.concatenate(parts) * total[:, None]).astype(np.float32)
+
+
+def _part(
+    scene: Scene,
+    cells: GridCells,
+    sights: LinesOfSight,
+    paths: NDArray[np.float32],
+    cumulative: NDArray[np.float32],
+    edges: Map,
+) -> Map:
+    """The same for a total of 1, for some lines of sight and edges of bins in path [m]."""
+    medium = scene.medium
+    # Length in the water up to where the way by the laser has the longest path.
+    reach = np.nan_to_num(sights.range_from_path(paths[:, -1].astype(np.float64)) - sights.lead)
+    ends = reach[:, None] * np.linspace(0.0, 1.0, _PIECES + 1)
+    middle = 0.5 * (ends[:, 1:] + ends[:, :-1])
+    light, water, lengths = _light_on(sights, ends)
+    points = sights.start[:, None, :] + middle[..., None] * sights.direction[:, None, :]
+    at = np.nan_to_num(cells.in_cells(to_world(scene.camera, points)), nan=-1.0)
+    index = np.floor(np.clip(at, -1.0, cells.extinction.shape)).astype(np.int32)
+    inside = ((index >= 0) & (index < cells.extinction.shape)).all(axis=-1)
+    place = tuple(np.moveaxis(np.clip(index, 0, np.array(cells.extinction.shape) - 1), -1, 0))
+    extinction = np.where(inside, cells.extinction[place], medium.extinction)
+    scattering = np.where(inside, cells.scattering[place], medium.scattering)
+    excess = (extinction - medium.extinction) * np.diff(ends, axis=1)
+    excess = np.cumsum(excess, axis=1) - 0.5 * excess
+    weight = scattering * np.exp(-excess * (1.0 + water / np.maximum(middle, 1e-9)))
+    if cells.anisotropy is not None:
+        cosine = -(light * sights.direction[:, None, :]).sum(axis=-1)
+        own = np.where(inside, cells.anisotropy[place], medium.anisotropy)
+        weight *= _henyey_greenstein(cosine, own) / _henyey_greenstein(cosine, medium.anisotropy)
+    weight = np.nan_to_num(weight)  # where no light comes
+    result = np.zeros((len(paths), len(edges) - 1))
+    for row in range(len(paths)):
+        share = np.diff(np.interp(lengths[row], paths[row], cumulative[row]))
+        middles = 0.5 * (lengths[row, 1:] + lengths[row, :-1])
+        result[row] = np.histogram(middles, edges, weights=share * weight[row])[0]
+    return result
+
+
+def _light_on(sights: LinesOfSight, ends: Map) -> tuple[Map, Map, Map]:
+    """The laser's light on pieces of lines of sight: unit directions and lengths of its way in the water at their
+    middles, NaN where no light comes; the paths to the lens by their ends [m], there 0."""
+    light, water, path = sights.light_at(sights.start[:, None, :] + ends[..., None] * sights.direction[:, None, :])
+    between = light[:, 1:] + light[:, :-1]
+    between = between / np.maximum(np.linalg.norm(between, axis=-1, keepdims=True), 1e-9)
+    return between, 0.5 * (water[:, 1:] + water[:, :-1]), np.nan_to_num(path + ends + sights.delay[:, None])
+
+
+def _henyey_greenstein(cosine: Map, g: Map | float) -> Map:
+    """The phase function without its factor 1/4π."""
+    return (1.0 - np.square(g)) / (1.0 + np.square(g) - 2.0 * g * cosine) ** 1.5

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import pixel_maps
-from spadwarp.analytic.optics import scene_optics
+from spadwarp.analytic.model import pixel_maps, scene_optics
 from spadwarp.dataset.rendered import RenderedScene, StoredFrames, backscatter_profile, intensity_step, with_exposure
 from spadwarp.dataset.sampling import Plan, SceneDraw
 from spadwarp.device import pick_device

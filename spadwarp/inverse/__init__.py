@@ -1,27 +1,14 @@
 """From counts to the scene: derivatives, Fisher information, Cramér–Rao bounds of all unknowns, fits."""
 
-from spadwarp.inverse.bounds import Bound, Bounds, bounds
-from spadwarp.inverse.estimates import Estimate, EstimateMap, Fit, Iteration
-from spadwarp.inverse.exposure import Exposure, read_exposure
-from spadwarp.inverse.fitting import Fitter, fit
-from spadwarp.inverse.start import lidar_start
-from spadwarp.inverse.tensors import render
-from spadwarp.inverse.unknowns import Unknown, read_unknowns
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Bound",
-    "Bounds",
-    "Estimate",
-    "EstimateMap",
-    "Exposure",
-    "Fit",
-    "Fitter",
-    "Iteration",
-    "Unknown",
-    "bounds",
-    "fit",
-    "lidar_start",
-    "read_exposure",
-    "read_unknowns",
-    "render",
-]
+from spadwarp.inverse.cramer_rao import *  # noqa: F403
+from spadwarp.inverse.estimates import *  # noqa: F403
+from spadwarp.inverse.exposure import *  # noqa: F403
+from spadwarp.inverse.fitting import *  # noqa: F403
+from spadwarp.inverse.tensors import *  # noqa: F403
+from spadwarp.inverse.unknowns import *  # noqa: F403
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    _modules = (cramer_rao, estimates, exposure, fitting, tensors, unknowns)  # noqa: F405
+    __all__ = [name for module in _modules for name in module.__all__]

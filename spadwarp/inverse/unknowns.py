@@ -17,7 +17,7 @@ from spadwarp.scene.pose import to_world
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["BACKGROUND", "DEPTH", "Unknown", "moved", "read_unknowns", "with_values"]
+__all__ = ["Unknown", "read_unknowns"]
 
 DEPTH, BACKGROUND = "depth", "detector.ambient_rate"
 _SHORT = {name: f"medium.{name}" for name in ("absorption", "scattering", "anisotropy")} | {"background": BACKGROUND}
@@ -42,6 +42,11 @@ class Unknown:
     def is_positive(self) -> bool:
         """Whether its logarithm is searched, which keeps it positive."""
         return self.name not in (DEPTH, "medium.anisotropy")
+
+    @property
+    def largest_step(self) -> float:
+        """Of an iteration, on the scale that is searched."""
+        return 1.1 if self.is_positive else 0.05
 
     @property
     def is_light(self) -> bool:

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
-from spadwarp.analytic import BudgetRow, DepthErrorRow, model_notes, parse_values, parse_vary, simulate_analytic, sweep
-from spadwarp.analytic.photon_budget import budget
+from spadwarp.analytic import (
+    BudgetRow,
+    DepthErrorRow,
+    budget,
+    model_notes,
+    parse_values,
+    parse_vary,
+    simulate_analytic,
+    sweep,
+)
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 
 SCENE = scene(

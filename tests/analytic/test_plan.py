@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import spadwarp
-from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, pilot
+from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, planning
 from spadwarp.scene import Laser, Scene
 from spadwarp.units import range_from_time
 
@@ -141,14 +141,14 @@ def test_largest_range_falls_with_the_extinction():
 
 def test_the_brightest_pixel_has_light_where_a_run_is_so_short_that_few_have():
     scene = make(gate={"start_ns": 40.0, "bins": 600})
-    runs = pilot.trace(pilot.window(scene), 20_000, 1, "cpu")
+    runs = planning.trace(planning.window(scene), 20_000, 1, "cpu")
     row, column = np.unravel_index(runs[0].detections.sum(axis=-1).argmax(), runs[0].detections.shape[:2])
     for run in runs:
         kept = run.tallies[:, row, column].copy()
         run.tallies[...] = 0
         run.tallies[:, row, column] = kept
     detected = sum(run.detections[row, column].sum() for run in runs) / 2
-    assert pilot.measure(runs, scene, "cpu").brightest == pytest.approx(detected, rel=1e-9) and detected > 0.0
+    assert planning.measure(runs, scene, "cpu").brightest == pytest.approx(detected, rel=1e-9) and detected > 0.0
 
 
 def test_ranges_stand_for_an_unknown_target():

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from spadwarp.frames import first_photon_probabilities
-from spadwarp.inverse.equations import Equations, Law, planned_pulses
-from spadwarp.inverse.shifting import shifted
-from spadwarp.inverse.solving import solve
+from spadwarp.inverse.equations import Equations, Law, planned_pulses, solve
+from spadwarp.inverse.rendering import subbin_shift
 
 LAWS = {"first photon": Law(True, 0.0, 20), "free running": Law(False, 0.6, 18)}
 
@@ -64,7 +63,7 @@ def test_an_arrow_is_solved_as_the_whole_matrix():
 def test_a_shift_keeps_sum_and_shape():
     bins, delay = np.arange(40.0), np.array([0.0, 3.0, 0.3, -2.6])
     rows = np.exp(-0.5 * ((bins - 20) / 1.5) ** 2)[None].repeat(4, axis=0).astype(np.float32)
-    later = shifted(rows, delay)
+    later = subbin_shift(rows, delay)
     np.testing.assert_allclose(later.sum(axis=1), rows.sum(axis=1), rtol=1e-6)
     np.testing.assert_allclose(later @ bins / later.sum(axis=1), 20 + delay, atol=1e-5)
     np.testing.assert_allclose(later, np.exp(-0.5 * ((bins - 20 - delay[:, None]) / 1.5) ** 2), atol=1e-2)
