@@ -14,7 +14,7 @@ from spadwarp.inverse.equations import Pooled, planned_pulses, pseudo_inverse
 from spadwarp.inverse.estimates import correlations, not_identifiable
 from spadwarp.inverse.exposure import Exposure
 from spadwarp.inverse.fitting import BATCHES, SIMULATION, Fitter, State
-from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, start_value
+from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, scene_value
 from spadwarp.limits import check_integer
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.units import percent
@@ -81,7 +81,7 @@ class Bounds:
     def to_dict(self) -> dict[str, Any]:
         """The numbers without maps, for JSON."""
         return {
-            "bounds": {name: vars(one) for name, one in self.bounds.items()},
+            "bounds": {name: vars(item) for name, item in self.bounds.items()},
             "names": list(self.names),
             "covariance": self.covariance.tolist(),
             "correlation": self.correlation.tolist(),
@@ -127,7 +127,7 @@ def bounds(
     plan = Exposure(counts=None, pulses=pulses, window=(scene.gate.start, scene.gate.bins))
     fitter = Fitter(scene, unknown, plan, prior=prior, photons=photons, seed=seed, device=device)
     render, law, most = fitter.render, fitter.law, fitter.photons
-    state = State({item.name: start_value(scene, item) for item in fitter.unknowns}, [])
+    state = State({item.name: scene_value(scene, item) for item in fitter.unknowns}, [])
     number, level = max(most // 8, 8000), None
     while True:
         halves = render(state.values, photons=max(number // (2 * BATCHES), 1), batches=BATCHES)
@@ -175,7 +175,7 @@ def _table(
         scale, value = float(state.scale(unknown)), float(state.values[unknown.name])
         if unknown.per_pixel:
             with np.errstate(divide="ignore", invalid="ignore"):
-                together = np.sqrt(pooled.solution.own_bound[:, column, column]) * scale
+                together = np.sqrt(pooled.solution.pixel_bound[:, column, column]) * scale
                 alone_map = scale / np.sqrt(np.where(information[:, i] > 0, information[:, i], np.nan))
             maps[unknown.name], alone_maps[unknown.name] = together.reshape(seen.shape), alone_map.reshape(seen.shape)
             rows = slice(None) if unknown.name == BACKGROUND or not seen.any() else seen.reshape(-1)

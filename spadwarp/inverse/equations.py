@@ -233,37 +233,39 @@ class Solution:
 
     Attributes:
         shared: Step of what all pixels share, `[S]`.
-        own: Steps of the pixels' own unknowns, `[pixel, Q]`; NaN where a pixel knows nothing of them.
+        pixels: Steps of the pixels' own unknowns, `[pixel, Q]`; NaN where a pixel knows nothing of them.
         information: Fisher information of the shared unknowns when the own ones are unknown too, `[S, S]`.
         covariance: Of the shared, counts and simulation together, `[S, S]`.
         simulation: The part of it that is noise of the simulation.
-        own_covariance: `[pixel, Q, Q]`.
-        own_bound: Their Cramér–Rao bound, `[pixel, Q, Q]`.
+        pixel_covariance: `[pixel, Q, Q]`.
+        pixel_bound: Their Cramér–Rao bound, `[pixel, Q, Q]`.
         simulation_share: Largest variance by the simulation over that by the counts, of the shared unknowns;
             without any, of the median pixel.
         gain: What the step adds to the log-likelihood, of the shared unknowns in their covariance.
     """
 
     shared: Floats
-    own: Floats
+    pixels: Floats
     information: Floats
     covariance: Floats
     simulation: Floats
-    own_covariance: Floats
-    own_bound: Floats
+    pixel_covariance: Floats
+    pixel_bound: Floats
     simulation_share: float
     gain: float
 
 
-def solve(equations: Equations, is_own: NDArray[np.bool_], prior: tuple[Floats, Floats] | None = None) -> Solution:
+def solve(
+    equations: Equations, is_per_pixel: NDArray[np.bool_], prior: tuple[Floats, Floats] | None = None
+) -> Solution:
     """The Newton step of the equations.
 
     Args:
         equations: Of `Moments`.
-        is_own: Which unknowns each pixel has for itself, `[unknown]`.
+        is_per_pixel: Which unknowns each pixel has for itself, `[unknown]`.
         prior: Score and information on the shared unknowns from elsewhere, `[S]` both.
     """
-    s, q = np.flatnonzero(~is_own), np.flatnonzero(is_own)
+    s, q = np.flatnonzero(~is_per_pixel), np.flatnonzero(is_per_pixel)
     slope, score = equations.slope, equations.score
     pull, known_before = (np.zeros(s.size), np.zeros(s.size)) if prior is None else prior
     # What a pixel's own unknowns take of the shared ones: left and right of the inverse of their block.
@@ -274,42 +276,42 @@ def solve(equations: Equations, is_own: NDArray[np.bool_], prior: tuple[Floats, 
     inverse_matrix = pseudo_inverse(matrix)
     shared = inverse_matrix @ ((score[:, s] + np.einsum("psq,pq->ps", left, score[:, q])).sum(axis=0) + pull)
     # Each pixel's part of the reduced score is `mixing` times its score.
-    mixing = np.zeros((len(slope), s.size, is_own.size))
+    mixing = np.zeros((len(slope), s.size, is_per_pixel.size))
     mixing[:, np.arange(s.size), s] = 1.0
     mixing[:, :, q] = left
     by_counts = np.einsum("psi,pij,ptj->st", mixing, equations.noise, mixing, optimize=True) + np.diag(known_before)
     by_simulation = np.zeros_like(by_counts)
-    own_simulation = np.zeros_like(inverse)
+    pixel_simulation = np.zeros_like(inverse)
     for part in equations.simulation:  # of batches less their means
         if (batches := len(part)) > 1:  # the score has half of each half's mean
             reduced, rest = np.einsum("psi,bpi->bs", mixing, part), part[..., q]
             by_simulation += 0.25 * reduced.T @ reduced / (batches * (batches - 1))
-            own_simulation += 0.25 * np.einsum("bpi,bpj->pij", rest, rest) / (batches * (batches - 1))
-    own = np.einsum("pij,pj->pi", inverse, score[:, q]) - right @ shared
-    own_simulation = inverse @ own_simulation @ inverse.transpose(0, 2, 1)
-    own_noise = inverse @ equations.noise[:, q[:, None], q] @ inverse.transpose(0, 2, 1) + own_simulation
+            pixel_simulation += 0.25 * np.einsum("bpi,bpj->pij", rest, rest) / (batches * (batches - 1))
+    pixels = np.einsum("pij,pj->pi", inverse, score[:, q]) - right @ shared
+    pixel_simulation = inverse @ pixel_simulation @ inverse.transpose(0, 2, 1)
+    pixel_noise = inverse @ equations.noise[:, q[:, None], q] @ inverse.transpose(0, 2, 1) + pixel_simulation
     covariance = inverse_matrix @ (by_counts + by_simulation) @ inverse_matrix.T
-    own_covariance = own_noise + right @ covariance @ right.transpose(0, 2, 1)
+    pixel_covariance = pixel_noise + right @ covariance @ right.transpose(0, 2, 1)
     simulation = inverse_matrix @ by_simulation @ inverse_matrix.T
     if s.size:
         share = _largest_ratio(np.diag(simulation), np.diag(covariance - simulation))
         gain = 0.5 * float(shared @ np.linalg.pinv(covariance, rcond=1e-12) @ shared)
     else:
-        share = _largest_ratio(*(_median(part) for part in (own_simulation, own_covariance - own_simulation)))
-        variance = np.einsum("pii->pi", own_covariance)
-        gains = np.divide(own**2, variance, out=np.zeros_like(own), where=variance > 0)
+        share = _largest_ratio(*(_median(part) for part in (pixel_simulation, pixel_covariance - pixel_simulation)))
+        variance = np.einsum("pii->pi", pixel_covariance)
+        gains = np.divide(pixels**2, variance, out=np.zeros_like(pixels), where=variance > 0)
         gain = 0.5 * float(gains.sum(axis=1).mean())
     bound = 0.5 * (inverse_matrix + inverse_matrix.T)
-    own_bound = 0.5 * (inverse + inverse.transpose(0, 2, 1)) + right @ bound @ right.transpose(0, 2, 1)
-    own[~known], own_bound[~known], own_covariance[~known] = np.nan, np.nan, np.nan
+    pixel_bound = 0.5 * (inverse + inverse.transpose(0, 2, 1)) + right @ bound @ right.transpose(0, 2, 1)
+    pixels[~known], pixel_bound[~known], pixel_covariance[~known] = np.nan, np.nan, np.nan
     return Solution(
         shared=shared,
-        own=own,
+        pixels=pixels,
         information=0.5 * (matrix + matrix.T),
         covariance=covariance,
         simulation=simulation,
-        own_covariance=own_covariance,
-        own_bound=own_bound,
+        pixel_covariance=pixel_covariance,
+        pixel_bound=pixel_bound,
         simulation_share=share,
         gain=gain,
     )

@@ -33,7 +33,7 @@ class Estimate:
         standard_error: Of counts and simulation together.
         interval: 95 %; of positive values from the standard error of the logarithm.
         simulation: The part of the variance that is noise of the simulation.
-        start: Where the search began.
+        initial_guess: Where the search began.
         unit: "" for a plain number.
     """
 
@@ -42,7 +42,7 @@ class Estimate:
     standard_error: float
     interval: tuple[float, float]
     simulation: float
-    start: float
+    initial_guess: float
     unit: str = ""
 
 

@@ -21,7 +21,7 @@ from spadwarp.transport import truth_maps
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["Exposure", "lidar_start", "read_exposure"]
+__all__ = ["Exposure", "lidar_initial_guess", "read_exposure"]
 
 # Of backscatter from which absorption and scattering are guessed.
 _LEAST_COUNTS, _LEAST_BINS = 200, 12
@@ -89,8 +89,8 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
     if isinstance(counts, str | os.PathLike):
         path = Path(counts)
         name = str(path)
-        own = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
-        counts = FramesFile.load(path) if own else read_histograms(path, **facts)
+        is_frames = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
+        counts = FramesFile.load(path) if is_frames else read_histograms(path, **facts)
     gate = scene.gate
     start, width, irf, widths = gate.start, gate.bin_width, None, None
     values, noise = counts, None
@@ -139,7 +139,7 @@ def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], 
     return total.reshape(-1, total.shape[-1]), frames
 
 
-def lidar_start(scene: Scene, exposure: Exposure, *, device: str | None = None) -> dict[str, float]:
+def lidar_initial_guess(scene: Scene, exposure: Exposure, *, device: str | None = None) -> dict[str, float]:
     """Absorption and scattering [1/m] from the single-scatter lidar equation; empty where no backscatter is recorded.
 
     Counts of the whole image before the nearest target, without pile-up (Coates) and noise, times R², fall as

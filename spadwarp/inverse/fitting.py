@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.inverse.equations import Equations, Law, Moments, Pooled, Solution, solve, solve_pooled
 from spadwarp.inverse.estimates import NORMAL_95, Estimate, EstimateMap, Fit, Iteration, not_identifiable
-from spadwarp.inverse.exposure import Exposure, lidar_start, read_exposure
+from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposure
 from spadwarp.inverse.rendering import Half, Renderer
-from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, start_value, with_values
+from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
 from spadwarp.limits import SEED, check_integer, check_real
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport import truth_maps
@@ -72,7 +72,7 @@ def fit(
     scene: SceneLike,
     *,
     unknown: str | Sequence[str],
-    start: Mapping[str, float] | None = None,
+    initial_guess: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     pulses: int | None = None,
     photons: int | None = None,
@@ -94,8 +94,8 @@ def fit(
         scene: What is known, and where to start.
         unknown: Names, such as "medium.absorption,medium.scattering,targets[0].reflectance,depth:pixel"; see
             `spadwarp.inverse.read_unknowns`.
-        start: Values to start from, by name, depth as a shift from the scene's [m]; by default absorption and
-            scattering from the backscatter (`spadwarp.inverse.lidar_start`), the others of the scene.
+        initial_guess: Values to start from, by name, depth as a shift from the scene's [m]; by default absorption and
+            scattering from the backscatter (`spadwarp.inverse.lidar_initial_guess`), the others of the scene.
         prior: By name what is known from elsewhere: mean and standard deviation.
         pulses: Of one frame of the counts; by default those that the frames name, else of the scene's detector.
         photons: Of an iteration at most; as many are taken as keep the simulation below a tenth of the variance. By
@@ -112,7 +112,7 @@ def fit(
     scene = as_scene(scene)
     exposure = read_exposure(counts, scene, pulses=pulses, **facts)
     fitter = Fitter(scene, unknown, exposure, prior=prior, photons=photons, seed=seed, device=device)
-    return fitter.fit(start=start, progress=progress)
+    return fitter.fit(initial_guess=initial_guess, progress=progress)
 
 
 def _detector_law(detector: Detector, window: Any) -> Law:
@@ -214,11 +214,11 @@ class Fitter:
         return result
 
     def fit(
-        self, *, start: Mapping[str, float] | None = None, near: bool = False, progress: Progress | None = None
+        self, *, initial_guess: Mapping[str, float] | None = None, near: bool = False, progress: Progress | None = None
     ) -> Fit:
-        """Fits the exposure from `start`, as `spadwarp.fit` does; `near`: it is within some standard errors already."""
+        """Fits the exposure as `spadwarp.fit` does; `near`: the guess is within some standard errors already."""
         began, first = time.perf_counter(), self.render.photons
-        state = self._start(start)
+        state = self._initial_state(initial_guess)
         begin = state.means()
         report = (lambda text: None) if progress is None else lambda text: progress(f"fit: {text}", 0, 0)
         assert self.exposure.counts is not None
@@ -243,20 +243,20 @@ class Fitter:
             seconds=seconds,
         )
 
-    def _start(self, start: Mapping[str, float] | None) -> State:
-        given = {} if start is None else dict(start)
+    def _initial_state(self, initial_guess: Mapping[str, float] | None) -> State:
+        guess = {} if initial_guess is None else dict(initial_guess)
         names = {unknown.name for unknown in self.unknowns}
-        for name in given:
+        for name in guess:
             if name not in names:
-                raise ArgumentError(f"start: {name} is not an unknown; these are {', '.join(sorted(names))}")
-        water = {"medium.absorption", "medium.scattering"} & names - set(given)
+                raise ArgumentError(f"initial_guess: {name} is not an unknown; these are {', '.join(sorted(names))}")
+        water = {"medium.absorption", "medium.scattering"} & names - set(guess)
         if water:
-            lidar = lidar_start(self.scene, self.exposure, device=self.device)
-            given = {**{name: value for name, value in lidar.items() if name in water}, **given}
+            lidar = lidar_initial_guess(self.scene, self.exposure, device=self.device)
+            guess = {**{name: value for name, value in lidar.items() if name in water}, **guess}
         values: dict[str, Any] = {}
         for unknown in self.unknowns:
             name = unknown.name
-            value = check_real(f"start of {name}", given.get(name, start_value(self.scene, unknown)))
+            value = check_real(f"initial_guess of {name}", guess.get(name, scene_value(self.scene, unknown)))
             if unknown.is_positive and value <= 0.0:
                 value = 1.0 if name == BACKGROUND else 0.01
             values[name] = np.full(self.image[0] * self.image[1], value) if unknown.per_pixel else value
@@ -300,9 +300,9 @@ class Fitter:
             bent = bent or local.ratio != 1.0
             solution, converged, left = local.solution, self._converged(local), self._left(local)
             state.iterations.append(Iteration(values=state.means(), gain=solution.gain, photons=photons, coarse=False))
-            shared, own = iter(solution.shared), iter(solution.own.T)
+            shared, pixels = iter(solution.shared), iter(solution.pixels.T)
             for unknown in self.unknowns:
-                state.move(unknown, next(own) if unknown.per_pixel else next(shared))
+                state.move(unknown, next(pixels) if unknown.per_pixel else next(shared))
             report(state.text(5))
             needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
             more = min(needed, self.photons, needed if left <= _CONVERGED * max(len(self.shared), 1) else 4 * photons)
@@ -320,8 +320,8 @@ class Fitter:
         return solve_pooled(self.unknowns, moments, scales, self._solver(state), pooling_level=pooling_level)
 
     def _solver(self, state: State) -> Callable[[Equations], Solution]:
-        is_own, prior = np.array([unknown.per_pixel for unknown in self.unknowns]), self.prior_at(state)
-        return lambda equations: solve(equations, is_own, prior)
+        is_per_pixel, prior = np.array([unknown.per_pixel for unknown in self.unknowns]), self.prior_at(state)
+        return lambda equations: solve(equations, is_per_pixel, prior)
 
     def _converged(self, local: Local) -> bool:
         """Whether the step gains less than the noise of the counts, or leaves next to nothing."""
@@ -422,7 +422,7 @@ class Fitter:
 
     # The result
 
-    def _result(self, state: State, start: Mapping[str, float], solution: Solution, **facts: Any) -> Fit:
+    def _result(self, state: State, begin: Mapping[str, float], solution: Solution, **facts: Any) -> Fit:
         """The fit from its last values and the solution of its equations there."""
         truth = truth_maps(self.scene, device=self.device)
         middle, values = _middle_depth(truth.depth), state.values
@@ -442,12 +442,12 @@ class Fitter:
                 standard_error=error,
                 interval=interval,
                 simulation=solution.simulation[row, row] / variance if variance > 0 else math.nan,
-                start=start[unknown.name] + offset,
+                initial_guess=begin[unknown.name] + offset,
                 unit=unknown.unit,
             )
         for column, unknown in enumerate(unknown for unknown in self.unknowns if unknown.per_pixel):
-            errors = np.sqrt(np.maximum(solution.own_covariance[:, column, column], 0.0)) * state.scale(unknown)
-            value = np.where(np.isnan(solution.own[:, column]), np.nan, values[unknown.name]).reshape(self.image)
+            errors = np.sqrt(np.maximum(solution.pixel_covariance[:, column, column], 0.0)) * state.scale(unknown)
+            value = np.where(np.isnan(solution.pixels[:, column]), np.nan, values[unknown.name]).reshape(self.image)
             maps[unknown.name] = EstimateMap(
                 name=unknown.name,
                 value=value + truth.depth if unknown.name == DEPTH else value,

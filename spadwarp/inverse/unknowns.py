@@ -122,7 +122,7 @@ def _check_scene(scene: Scene, name: str, target: int | None) -> None:
             raise ConfigError(f"unknown: {name} goes with phase_function = 'henyey_greenstein', not {law!r}")
 
 
-def start_value(scene: Scene, unknown: Unknown) -> float:
+def scene_value(scene: Scene, unknown: Unknown) -> float:
     """The scene's own value; depth counts from where the targets are."""
     if unknown.name == DEPTH:
         return 0.0

@@ -38,13 +38,13 @@ def test_mean_of_first_photons_is_their_law(rates):
 
 def test_an_arrow_is_solved_as_the_whole_matrix():
     random = np.random.default_rng(3)
-    pixels, is_own = 5, np.array([False, True, False, True])
+    pixels, is_per_pixel = 5, np.array([False, True, False, True])
     factor = random.normal(size=(pixels, 4, 12))
     slope = factor @ factor.transpose(0, 2, 1)
     score = random.normal(size=(pixels, 4))
     batches = [np.zeros((1, pixels, 4))] * 2
     weights = np.zeros((pixels, 4, 1), np.float32)
-    found = solve(Equations(score, slope, slope, batches, weights), is_own)
+    found = solve(Equations(score, slope, slope, batches, weights), is_per_pixel)
     size = 2 + 2 * pixels
     matrix, right = np.zeros((size, size)), np.zeros(size)
     for p in range(pixels):
@@ -53,10 +53,10 @@ def test_an_arrow_is_solved_as_the_whole_matrix():
         right[place] += score[p]
     whole, inverse = np.linalg.solve(matrix, right), np.linalg.inv(matrix)
     np.testing.assert_allclose(found.shared, whole[:2], rtol=1e-9)
-    np.testing.assert_allclose(found.own.ravel(), whole[2:], rtol=1e-9)
+    np.testing.assert_allclose(found.pixels.ravel(), whole[2:], rtol=1e-9)
     np.testing.assert_allclose(found.covariance, inverse[:2, :2], rtol=1e-9)
     own = [inverse[2 + 2 * p : 4 + 2 * p, 2 + 2 * p : 4 + 2 * p] for p in range(pixels)]
-    np.testing.assert_allclose(found.own_bound, own, rtol=1e-9)
+    np.testing.assert_allclose(found.pixel_bound, own, rtol=1e-9)
     np.testing.assert_allclose(found.gain, 0.5 * whole[:2] @ np.linalg.inv(inverse[:2, :2]) @ whole[:2], rtol=1e-9)
 
 
