@@ -242,6 +242,8 @@ class Solution:
         simulation_share: Largest variance by the simulation over that by the counts, of the shared unknowns;
             without any, of the median pixel.
         gain: What the step adds to the log-likelihood, of the shared unknowns in their covariance.
+        slope_ratio: The depth's slope over that of the renderer's wide difference; 1 where no difference was seen; 0
+            where it is not known how far the depth can move without a change of the counts.
     """
 
     shared: Floats
@@ -253,6 +255,7 @@ class Solution:
     pixel_bound: Floats
     simulation_share: float
     gain: float
+    slope_ratio: float = 1.0
 
 
 def solve(

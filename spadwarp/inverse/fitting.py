@@ -35,7 +35,7 @@ from spadwarp.transport import truth_maps
 from spadwarp.units import percent
 
 if TYPE_CHECKING:
-    from spadwarp.scene import Detector, Scene
+    from spadwarp.scene import Detector
 
 __all__ = ["Fitter", "fit"]
 
@@ -227,14 +227,14 @@ class Fitter:
             trials = self.exposure.left()
         if not near:
             self._approach(state, trials, report)
-        halves, local, converged = self._refine(state, trials, report)
-        warnings = [*self.render.warnings(), *local.warnings(self.scene), *self.exposure.warnings()]
-        warnings += self._warnings(local.solution, converged)
+        halves, solution, converged = self._refine(state, trials, report)
+        warnings = [*self.render.warnings(), *self._slope_warnings(solution.slope_ratio), *self.exposure.warnings()]
+        warnings += self._warnings(solution, converged)
         seconds, photons = time.perf_counter() - began, self.render.photons - first
         return self._result(
             state,
             begin,
-            local.solution,
+            solution,
             iterations=tuple(state.iterations),
             converged=converged,
             warnings=tuple(warnings),
@@ -287,18 +287,17 @@ class Fitter:
                 return
             photons = min(2 * photons, self.photons // _FEWER)
 
-    def _refine(self, state: State, trials: Rows, report: Callable[[str], None]) -> tuple[list[Half], Local, bool]:
+    def _refine(self, state: State, trials: Rows, report: Callable[[str], None]) -> tuple[list[Half], Solution, bool]:
         """Fisher scoring with fresh photons: few at first, as many as the noise of the simulation asks for at last."""
         photons, level, bent = max(self.photons // _FEW, 8000), None, False
         for number in range(_FINE):
             batch = photons // (2 * BATCHES)
             halves = self.render(state.values, photons=batch, batches=BATCHES)
             level, equations, solution = self.solve(state, halves, trials, level)
-            local = Local(solution)
-            if bent or number >= _PATIENCE or self._converged(local):
-                local = self._locally_solved(equations, solution, state, halves, trials, batch)
-            bent = bent or local.ratio != 1.0
-            solution, converged, left = local.solution, self._converged(local), self._left(local)
+            if bent or number >= _PATIENCE or self._converged(solution):
+                solution = self._locally_solved(equations, solution, state, halves, trials, batch)
+            bent = bent or solution.slope_ratio != 1.0
+            converged, left = self._converged(solution), self._left(solution)
             state.iterations.append(Iteration(values=state.means(), gain=solution.gain, photons=photons, coarse=False))
             shared, pixels = iter(solution.shared), iter(solution.pixels.T)
             for unknown in self.unknowns:
@@ -310,7 +309,7 @@ class Fitter:
             if converged and not noisy:
                 break
             photons = max(photons, more)
-        return halves, local, converged
+        return halves, solution, converged
 
     def solve(self, state: State, halves: list[Half], trials: Rows | None, pooling_level: int | None) -> Pooled:
         """The step from a rendering; without `trials` of a plan of the exposure."""
@@ -323,25 +322,25 @@ class Fitter:
         is_per_pixel, prior = np.array([unknown.per_pixel for unknown in self.unknowns]), self.prior_at(state)
         return lambda equations: solve(equations, is_per_pixel, prior)
 
-    def _converged(self, local: Local) -> bool:
+    def _converged(self, solution: Solution) -> bool:
         """Whether the step gains less than the noise of the counts, or leaves next to nothing."""
         size = max(len(self.shared), 1)
-        return local.solution.gain <= _CONVERGED * size or self._left(local) <= _LEFT * size
+        return solution.gain <= _CONVERGED * size or self._left(solution) <= _LEFT * size
 
-    def _left(self, local: Local) -> float:
+    def _left(self, solution: Solution) -> float:
         """What the log-likelihood can still gain after the step.
 
         Newton's error is the square of the step; of the depth also what the slope changes within its error.
         """
-        solution = local.solution
         if len(self.shared) < len(self.unknowns):
             return solution.gain
+        bend = abs(1.0 - 1.0 / solution.slope_ratio) if solution.slope_ratio > 0.0 else 1.0
         straight = [
             0.5 if unknown.is_positive else self.render.depth_step if unknown.name == DEPTH else 0.025
             for unknown in self.shared
         ]
         parts = [step / size for step, size in zip(solution.shared, straight, strict=True)]
-        return solution.gain * min(float(np.max(np.square([*parts, local.bend]))), 1.0)
+        return solution.gain * min(float(np.max(np.square([*parts, bend]))), 1.0)
 
     def prior_at(self, state: State) -> tuple[Floats, Floats]:
         """Score and information of the priors on the searched scale, `[S]` both."""
@@ -362,7 +361,7 @@ class Fitter:
         halves: list[Half],
         trials: Rows,
         photons: int,
-    ) -> Local:
+    ) -> Solution:
         """Solves again with the slope by the common depth between the ends of its 95 % interval.
 
         Where no interval shorter than the wide difference has a slope that belongs to it, the light can move inside a
@@ -375,7 +374,7 @@ class Fitter:
         """
         depth = [unknown.name for unknown in self.shared]
         if DEPTH not in depth:
-            return Local(solution)
+            return solution
         row, column = depth.index(DEPTH), self.unknowns.index(self.shared[depth.index(DEPTH)])
         rates, scales = 0.5 * (halves[0].rates + halves[1].rates), state.scales(self.unknowns, len(trials))
         least = _LEAST * 0.5 * self.scene.medium.pulse_speed * self.scene.gate.stop
@@ -398,27 +397,45 @@ class Fitter:
 
         wide, step = equations.slope[:, column, column].sum(), interval(solution)
         if not step < _WIDE * self.render.depth_step:
-            return Local(solution)
+            return solution
         for _ in range(_TRIES):
             batches = slopes(0.0, step)
             shares = share(batches)
             if abs(shares.mean() - 1.0) < _SURE * shares.std(ddof=1) / math.sqrt(BATCHES):
-                return Local(solution)
+                return solution
             flat, steep = sorted((slopes(side * step / 2, step / 2).mean(axis=0) for side in (-1.0, 1.0)), key=share)
             slope = equations.slope.copy()
             slope[:, :, column] = flat if share(flat) < _ONE_SIDED * share(steep) else batches.mean(axis=0)
             ratio, needed = float(slope[:, column, column].sum() / wide), math.inf
             if ratio > 0.0:
-                local = Local(self._solver(state)(replace(equations, slope=slope)), ratio)
-                needed = interval(local.solution)
+                local = replace(self._solver(state)(replace(equations, slope=slope)), slope_ratio=ratio)
+                needed = interval(local)
                 if step / _CONSISTENT < needed < step * _CONSISTENT or needed == step == least:
                     return local
             step = min(needed, _LARGEST * step)
             if not step < _WIDE * self.render.depth_step:
                 break
         covariance = solution.covariance.copy()
-        covariance[row, row] += _bin_depth(self.scene) ** 2 / 6.0
-        return Local(replace(solution, covariance=covariance), 0.0)
+        covariance[row, row] += self._bin_depth**2 / 6.0
+        return replace(solution, covariance=covariance, slope_ratio=0.0)
+
+    @property
+    def _bin_depth(self) -> float:
+        """How much deeper a target is whose light comes a bin later [m]."""
+        return 0.5 * self.scene.medium.pulse_speed * self.scene.gate.bin_width
+
+    def _slope_warnings(self, ratio: float) -> list[str]:
+        """Sentences on light that lies in few bins."""
+        if _STRAIGHT < ratio < 1.0 / _STRAIGHT:
+            return []
+        bin_width, depth, error = self.scene.gate.bin_width_ps, 1e3 * self._bin_depth, ""
+        if not ratio > 0.0:
+            error = f", and its standard error is that of a place anywhere in a bin of {depth:.2g} mm"
+        return [
+            f"depth: before the instrument response, most light of a pixel lies in one or two bins of {bin_width:.4g} "
+            f"ps; the counts follow the depth only as this light crosses the edges of bins{error}. The depth of "
+            f"measured counts may be off by a part of {depth:.2g} mm: choose narrower bins"
+        ]
 
     # The result
 
@@ -538,46 +555,6 @@ def _coarse_step(
     information = (slopes * expected[:, None]).T @ slopes + np.diag(known)
     variance = np.diag(np.linalg.pinv(information))
     return best.x, np.sqrt(np.maximum(variance, 0.0))
-
-
-# Depth
-
-
-@dataclass(frozen=True, eq=False)
-class Local:
-    """A solution with the slope by the depth where the depth is looked for.
-
-    Attributes:
-        solution: The step and its covariance.
-        ratio: The depth's slope over that of the renderer's wide difference; 1 where no difference was seen; 0 where
-            it is not known how far the depth can move without a change of the counts.
-    """
-
-    solution: Solution
-    ratio: float = 1.0
-
-    @property
-    def bend(self) -> float:
-        """How much of the step may be wrong because the slope changes."""
-        return abs(1.0 - 1.0 / self.ratio) if self.ratio > 0.0 else 1.0
-
-    def warnings(self, scene: Scene) -> list[str]:
-        """Sentences on light that lies in few bins."""
-        if _STRAIGHT < self.ratio < 1.0 / _STRAIGHT:
-            return []
-        bin_width, depth, error = scene.gate.bin_width_ps, 1e3 * _bin_depth(scene), ""
-        if not self.ratio > 0.0:
-            error = f", and its standard error is that of a place anywhere in a bin of {depth:.2g} mm"
-        return [
-            f"depth: before the instrument response, most light of a pixel lies in one or two bins of {bin_width:.4g} "
-            f"ps; the counts follow the depth only as this light crosses the edges of bins{error}. The depth of "
-            f"measured counts may be off by a part of {depth:.2g} mm: choose narrower bins"
-        ]
-
-
-def _bin_depth(scene: Scene) -> float:
-    """How much deeper a target is whose light comes a bin later [m]."""
-    return 0.5 * scene.medium.pulse_speed * scene.gate.bin_width
 
 
 def _middle_depth(depth: NDArray[np.floating]) -> float:
