@@ -11,4 +11,4 @@ from spadwarp.analytic.sweeps import *  # noqa: F403
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (eye_safety, file, model, planning, result, sweeps)  # noqa: F405
-    __all__ = [name for module in _modules for name in module.__all__]
+    __all__ = sorted(name for module in _modules for name in module.__all__)

@@ -6,4 +6,4 @@ from spadwarp.checks.checks import *  # noqa: F403
 from spadwarp.checks.survey import *  # noqa: F403
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = checks.__all__ + survey.__all__  # noqa: F405
+    __all__ = sorted(checks.__all__ + survey.__all__)  # noqa: F405
