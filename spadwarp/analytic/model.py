@@ -435,8 +435,8 @@ def _part(
     weight = scattering * np.exp(-excess * (1.0 + water / np.maximum(middle, 1e-9)))
     if cells.anisotropy is not None:
         cosine = -(light * sights.direction[:, None, :]).sum(axis=-1)
-        own = np.where(inside, cells.anisotropy[place], medium.anisotropy)
-        weight *= _henyey_greenstein(cosine, own) / _henyey_greenstein(cosine, medium.anisotropy)
+        anisotropy = np.where(inside, cells.anisotropy[place], medium.anisotropy)
+        weight *= _henyey_greenstein(cosine, anisotropy) / _henyey_greenstein(cosine, medium.anisotropy)
     weight = np.nan_to_num(weight)  # where no light comes
     result = np.zeros((len(paths), len(edges) - 1))
     for row in range(len(paths)):

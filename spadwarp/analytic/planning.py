@@ -273,11 +273,11 @@ def plan(
         if not 0 < span[0] <= span[1] < math.inf:
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
         scene = with_plane(scene, span[1])
-    found = planner.propose(scene, span, propose_gate(scene, span, planner.margin), photons)
+    proposal = planner.propose(scene, span, propose_gate(scene, span, planner.margin), photons)
     if not largest_range:
-        return found
-    largest, limit = planner.largest_range(found.scene, 0.5 * sum(span), max(photons // 8, 1))
-    return dataclasses.replace(found, largest_range=largest, range_limit=limit)
+        return proposal
+    largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
+    return dataclasses.replace(proposal, largest_range=largest, range_limit=limit)
 
 
 def _real(name: str, value: Any, interval: str) -> float:
@@ -332,8 +332,10 @@ class _Planner:
         frame_time = pulses * scene.scan_positions / rate
         limit = _limit(scene, pilot, terms, pulses, self.method)
         # Given on its own, the analytic model's number would hold against a later change of the detector's.
-        own = None if scene.analytic.pulses_per_depth_frame is None else pulses
-        scene = scene.with_overrides(detector={"pulses_per_frame": pulses}, analytic={"pulses_per_depth_frame": own})
+        depth_pulses = None if scene.analytic.pulses_per_depth_frame is None else pulses
+        scene = scene.with_overrides(
+            detector={"pulses_per_frame": pulses}, analytic={"pulses_per_depth_frame": depth_pulses}
+        )
         compared = CHANNELS if small.camera.channels and not even else ()
         line = axis_line(target)
         optical_depth = target.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
@@ -422,13 +424,13 @@ class _Planner:
                 reason = "repetition rate"
                 return False
             try:
-                found = self.propose(target, span, gate, photons, even=True)
+                proposal = self.propose(target, span, gate, photons, even=True)
             except ConfigError:
                 reason = "no light of the target"
                 return False
-            if not found.reached:
-                reason = found.limit
-            return found.reached
+            if not proposal.reached:
+                reason = proposal.limit
+            return proposal.reached
 
         low, high = (start, 0.0) if is_reached(start) else (0.0, start)
         while not (low and high):
@@ -595,7 +597,7 @@ def measure(
         return {method: _depth_error(both, frames, histogram, method, device) for method in METHODS}
 
     error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
-    halves = [_depth_error(both, one, one.expected, "likelihood", device) for one in half_frames]
+    halves = [_depth_error(both, half, half.expected, "likelihood", device) for half in half_frames]
     bias = {method: median(values) for method, values in error.items()}
     piled: dict[str, float] = {method: 0.0 for method in METHODS}
     if scene.detector.mode == "first_photon":

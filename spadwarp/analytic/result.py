@@ -252,16 +252,16 @@ def _background(scene: Scene, maps: dict[str, Map]) -> tuple[Map, Map]:
     return np.where(estimated & (maps["backscatter"] > 0), fraction, 0.0), np.zeros(estimated.shape)
 
 
-def _profile(scene: Scene, given: Any) -> NDArray[np.float32] | None:
+def _profile(scene: Scene, profile: Any) -> NDArray[np.float32] | None:
     """Backscatter detections per pulse and bin, `[1 or P, T]`."""
-    if given is None:
+    if profile is None:
         return None
     camera, bins = scene.camera, scene.gate.bins
-    if isinstance(given, str | os.PathLike | Result):
-        given = as_result(given, "backscatter_profile")
-        values = given.component("backscatter") * (scene.laser.photons_per_pulse * scene.detections_per_photon)
+    if isinstance(profile, str | os.PathLike | Result):
+        run = as_result(profile, "backscatter_profile")
+        values = run.component("backscatter") * (scene.laser.photons_per_pulse * scene.detections_per_photon)
     else:
-        values = np.asarray(given, np.float64)
+        values = np.asarray(profile, np.float64)
     shape = (camera.height, camera.width, bins)
     if values.shape not in ((bins,), shape):
         raise ArgumentError(f"backscatter_profile has shape {values.shape}; ({bins},) or {shape} is needed")

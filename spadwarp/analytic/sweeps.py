@@ -170,7 +170,7 @@ def budget(
         names = [media] if isinstance(media, str) else media
         waters = media if isinstance(media, Mapping) else {name: {"preset": name} for name in names}
         scenes = [(name, scene.with_overrides(medium=fields)) for name, fields in waters.items()]
-    return [row for name, one in scenes for row in axis_rows(one, name, distances, reflectance, device)]
+    return [row for name, water in scenes for row in axis_rows(water, name, distances, reflectance, device)]
 
 
 def sweep(
@@ -209,15 +209,15 @@ def sweep(
         raise ArgumentError(f"vary = {shown(vary)} is neither 'section.field=from:to:count' nor (field, values)")
     check_integer("number of values to vary", len(values), f"[1, {_LONGEST}]")
     rows = tuple(row(scene.with_overrides({field: value}), device) for value in values)
-    found = Sweep(field=field, values=tuple(values), rows=rows)
-    if found.is_flat:
+    curves = Sweep(field=field, values=tuple(values), rows=rows)
+    if curves.is_flat:
         hint = ""
         if field in ("detector.pulses_per_frame", "detector.pulses"):
             hint = "; analytic.pulses_per_depth_frame or a count law per frame takes its place in this scene"
         warnings.warn(
             f"no number depends on {field}: the analytic model does not use it{hint}", SpadwarpWarning, stacklevel=2
         )
-    return found
+    return curves
 
 
 # Rows
@@ -230,8 +230,8 @@ def axis_line(scene: Scene) -> LinesOfSight:
 
 def face_reflectance(scene: Scene) -> float:
     """The number that the scene's first target has as its reflectance, else 0.5."""
-    given = scene.targets[0].reflectance if scene.targets else 0.5
-    return 0.5 if isinstance(given, str) else given
+    reflectance = scene.targets[0].reflectance if scene.targets else 0.5
+    return 0.5 if isinstance(reflectance, str) else reflectance
 
 
 def central_pixel(scene: Scene, truth: Truth) -> tuple[Any, ...]:
@@ -249,7 +249,7 @@ def axis_rows(
     """A row for each distance on the optical axis [m], for the scene's water of that name."""
     gate = (scene.gate.start, scene.gate.stop)
     line, length = axis_line(scene), gate[1] - gate[0]
-    arrival = np.array([line.path_from_range(one)[0] for one in distances]) / scene.medium.pulse_speed
+    arrival = np.array([line.path_from_range(distance)[0] for distance in distances]) / scene.medium.pulse_speed
     gates = [(gate, distances)]
     if not (gate[0] <= arrival.min() and arrival.max() <= gate[1]):
         starts = np.maximum(arrival - 0.5 * length, 0.0)
@@ -317,10 +317,10 @@ def _depth_error(scene: Scene, device: str | None) -> DepthErrorRow:
 def _distances(scene: Scene, ranges: Any) -> Map:
     lead = float(axis_line(scene).lead[0])
     if ranges is None:
-        return np.array([one for one in _RANGES if one > lead] or [lead + one for one in _RANGES])
+        return np.array([x for x in _RANGES if x > lead] or [lead + x for x in _RANGES])
     if isinstance(ranges, str | bytes) or not isinstance(ranges, Iterable):
         raise ArgumentError(f"ranges = {shown(ranges)} is not a list of distances [m]")
-    distances = sorted(check_real("ranges: an item", one, "[1e-6, 1e6] m") for one in ranges)
+    distances = sorted(check_real("ranges: an item", item, "[1e-6, 1e6] m") for item in ranges)
     check_integer("number of ranges", len(distances), f"[1, {_LONGEST}]")
     if distances[0] <= lead:
         raise ArgumentError(f"ranges: {distances[0]:g} m is not beyond the camera's port, which ends at {lead:g} m")

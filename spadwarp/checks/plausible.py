@@ -115,7 +115,7 @@ def _check_meshes(survey: Survey) -> None:
         guess = guess_unit(longest)
         if guess is not None and guess[0] != "m":
             scale = [guess[1] * factor for factor in target.scale]
-            shown = f"{scale[0]:g}" if len(set(scale)) == 1 else f"{[float(f'{one:g}') for one in scale]}"
+            shown = f"{scale[0]:g}" if len(set(scale)) == 1 else f"{[float(f'{factor:g}') for factor in scale]}"
             smaller = " x ".join(f"{side * guess[1]:.4g}" for side in extent)
             text += f"; if its unit is {guess[0]}, scale = {shown} makes it {smaller} m"
         survey.warn(f"targets[{index}].scale", text, longest=longest)

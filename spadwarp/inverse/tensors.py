@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, read_unknowns, with_values
+from spadwarp.inverse.unknowns import read_unknowns, with_values
 from spadwarp.limits import SEED, check_integer
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.grid import Grid
@@ -59,8 +59,8 @@ def render(
         import torch
     except ModuleNotFoundError as error:
         raise FileError("render needs torch: pip install 'spadwarp[torch]'") from error
-    given, seed = as_scene(scene), check_integer("seed", seed, SEED)
-    names, shape = _checked(given, parameters)
+    base, seed = as_scene(scene), check_integer("seed", seed, SEED)
+    names, shape = _checked(base, parameters)
     of_grid = [name for name in names if is_of_grid(name)]
 
     class Rendering(torch.autograd.Function):
@@ -68,7 +68,7 @@ def render(
         def forward(ctx: Any, *values: torch.Tensor) -> torch.Tensor:
             arrays = {name: value.detach().double().cpu().numpy() for name, value in zip(names, values, strict=True)}
             numbers = {name: float(value) for name, value in arrays.items() if name not in of_grid}
-            at = with_values(given, numbers)
+            at = with_values(base, numbers)
             run: dict[str, Any] = {"photons": photons, "seed": seed, "device": device}
             with tempfile.TemporaryDirectory() as folder:
                 if of_grid:
@@ -107,12 +107,12 @@ def _checked(scene: Scene, parameters: Mapping[str, torch.Tensor]) -> tuple[list
             shapes.add(tuple(value.shape))
             names.append(name)
             continue
-        one = unknowns[name]
-        if one.name in (DEPTH, BACKGROUND) or one.per_pixel:
-            raise ArgumentError(f"parameters: {one} has no scored derivative")
+        unknown = unknowns[name]
+        if not unknown.is_light or unknown.per_pixel:
+            raise ArgumentError(f"parameters: {unknown} has no scored derivative")
         if not isinstance(value, torch.Tensor) or value.numel() != 1:
-            raise ArgumentError(f"parameters: {one} is not a tensor of one number")
-        names.append(one.name)
+            raise ArgumentError(f"parameters: {unknown} is not a tensor of one number")
+        names.append(unknown.name)
     if len(shapes) > 1:
         raise ArgumentError(f"parameters: blocks of different numbers, {sorted(shapes)}")
     shape = shapes.pop() if shapes else None
@@ -143,16 +143,15 @@ def with_block_means(scene: Scene, means: Mapping[str, Floats], folder: Path) ->
             )
         arrays = {"extinction": _moved("extinction", extinction, means["extinction"]), "albedo": albedo}
     else:
-        own = {"absorption": extinction * (1.0 - albedo), "scattering": extinction * albedo}
-        arrays = {kind: _moved(kind, values, means[kind]) if kind in means else values for kind, values in own.items()}
+        arrays = {"absorption": extinction * (1.0 - albedo), "scattering": extinction * albedo}
+        arrays |= {kind: _moved(kind, arrays[kind], values) for kind, values in means.items()}
     if cells.anisotropy is not None:
         arrays["anisotropy"] = cells.anisotropy
     path = folder / "cells.npz"
     np.savez(path, size=cells.size, **arrays)
     old = scene.medium.grid
     assert old is not None
-    place: dict[str, Any] = {"translation": cells.centre, "rotation_deg": old.rotation_deg, "tracking": old.tracking}
-    grid = Grid(file=str(path), **place)
+    grid = Grid(file=str(path), translation=cells.centre, rotation_deg=old.rotation_deg, tracking=old.tracking)
     return scene.model_copy(update={"medium": scene.medium.model_copy(update={"grid": grid})})
 
 

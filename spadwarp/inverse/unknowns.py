@@ -73,15 +73,15 @@ def read_unknowns(scene: Scene, names: str | Sequence[str]) -> tuple[Unknown, ..
         ConfigError: The scene has no such value to start from: its layers, its albedo, its phase function.
     """
     words = [word.strip() for word in names.split(",")] if isinstance(names, str) else list(names)
-    found: list[Unknown] = []
+    unknowns: list[Unknown] = []
     for word in words:
-        one = _read(scene, word)
-        if one.name in [other.name for other in found]:
-            raise ArgumentError(f"unknown: {one.name} is named twice")
-        found.append(one)
-    if not found:
+        unknown = _read(scene, word)
+        if unknown.name in [other.name for other in unknowns]:
+            raise ArgumentError(f"unknown: {unknown.name} is named twice")
+        unknowns.append(unknown)
+    if not unknowns:
         raise ArgumentError("unknown: no name is given")
-    return tuple(found)
+    return tuple(unknowns)
 
 
 def _read(scene: Scene, word: Any) -> Unknown:
