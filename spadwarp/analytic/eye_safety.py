@@ -102,13 +102,19 @@ def eye_limit(laser: Laser, *, distance: float = 0.1, exposure: float = 100.0) -
     limit, criterion = _pulse_limit(laser, exposure)
     densest = _densest(laser)
     energy = limit * _AREA / _share(laser, distance, densest)
+    allowed = limit * _AREA / laser.pulse_energy  # share through the aperture
+    hazard = math.inf
+    if _share(laser, 0.0, densest) <= allowed:
+        hazard = 0.0
+    elif _share(laser, _FARTHEST, densest) <= allowed:
+        hazard = _first(lambda other: _share(laser, other, densest) <= allowed, _FARTHEST)
     return EyeLimit(
         distance=distance,
         exposure=exposure,
         pulse_energy=energy,
         average_power=energy * laser.repetition_rate,
         criterion=criterion,
-        hazard_distance=_hazard_distance(laser, limit * _AREA / laser.pulse_energy, densest),
+        hazard_distance=hazard,
     )
 
 
@@ -163,15 +169,6 @@ def _share(laser: Laser, distance: float, densest: float) -> float:
     if laser.profile == "measured":
         return min(1.0, densest * math.pi * tangent**2)
     return min(1.0, (math.sin(0.5 * math.atan(tangent)) / math.sin(0.5 * laser.half_angle)) ** 2)
-
-
-def _hazard_distance(laser: Laser, allowed: float, densest: float) -> float:
-    """The distance [m] at which the share through the aperture falls to `allowed`."""
-    if _share(laser, 0.0, densest) <= allowed:
-        return 0.0
-    if _share(laser, _FARTHEST, densest) > allowed:
-        return math.inf
-    return _first(lambda distance: _share(laser, distance, densest) <= allowed, _FARTHEST)
 
 
 def _first(is_reached: Callable[[float], bool], high: float) -> float:

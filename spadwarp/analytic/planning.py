@@ -265,7 +265,13 @@ def plan(
             f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'", source=source_name(scene)
         )
     if ranges is None:
-        span = _target_span(scene, device)
+        distance = truth_maps(scene, device=device).range
+        if np.isnan(distance).all():
+            raise ConfigError(
+                "no target is in view: give one in [[targets]], or the ranges where it may be",
+                source=source_name(scene),
+            )
+        span = float(np.nanmin(distance)), float(np.nanmax(distance))
     else:
         if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
             raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
@@ -455,16 +461,6 @@ class Gate(NamedTuple):
     start_ns: float
     bins: int
     largest_rate: float
-
-
-def _target_span(scene: Scene, device: str | None) -> tuple[float, float]:
-    """Least and largest range of the targets in view [m]. Raises `ConfigError` without any."""
-    distance = truth_maps(scene, device=device).range
-    if np.isnan(distance).all():
-        raise ConfigError(
-            "no target is in view: give one in [[targets]], or the ranges where it may be", source=source_name(scene)
-        )
-    return float(np.nanmin(distance)), float(np.nanmax(distance))
 
 
 def propose_gate(scene: Scene, span: tuple[float, float], margin: float) -> Gate:

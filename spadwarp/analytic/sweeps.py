@@ -270,13 +270,17 @@ def axis_rows(
         )
         background = maps["backscatter"] + (scene.detector.noise_rate + maps["daylight"]) * (stop - start)
         needed = _pulses_needed(scene, maps, background, stop - start, device)
-        for i, distance in enumerate(inside):
+        depths = (inside - line.lead[0]) * scene.medium.extinction
+        if scene.medium.grid is not None:
+            start_point = line.start[0].tolist()
+            depths = np.array([scene.optical_depth(start_point, line.points([x])[0].tolist()) for x in inside])
+        for i, (distance, depth) in enumerate(zip(inside, depths, strict=True)):
             rows.append(
                 BudgetRow(
                     medium=name or scene.medium.preset or "scene",
                     extinction=scene.medium.extinction,
                     range=float(distance),
-                    optical_depth=_optical_depth(scene, line, float(distance)),
+                    optical_depth=float(depth),
                     gate_start=start,
                     gate_stop=stop,
                     gate_moved=(start, stop) != gate,
@@ -325,13 +329,6 @@ def _distances(scene: Scene, ranges: Any) -> Map:
     if distances[0] <= lead:
         raise ArgumentError(f"ranges: {distances[0]:g} m is not beyond the camera's port, which ends at {lead:g} m")
     return np.array(distances)
-
-
-def _optical_depth(scene: Scene, line: LinesOfSight, distance: float) -> float:
-    """Up to a distance on the axis, one way."""
-    if scene.medium.grid is not None:
-        return scene.optical_depth(line.start[0].tolist(), line.points([distance])[0].tolist())
-    return float((distance - line.lead[0]) * scene.medium.extinction)
 
 
 def _pulses_needed(scene: Scene, maps: Mapping[str, Map], background: Map, gate: float, device: str | None) -> Map:
@@ -394,7 +391,7 @@ def parse_values(text: str, unit: str | None, *, name: str) -> list[Any]:
     parts = text.split(":")
     geometric = len(parts) == 4 and parts[3] == "log"
     try:
-        low, high = (float(_number(_bare(part), unit, name)) for part in parts[:2])
+        low, high = (float(_number(part.strip(), unit, name)) for part in parts[:2])
         count = parse_number(parts[2])
         if len(parts) > 3 + geometric or not math.isfinite(high - low) or (geometric and not min(low, high) > 0):
             raise ValueError
@@ -410,18 +407,15 @@ def parse_values(text: str, unit: str | None, *, name: str) -> list[Any]:
     return [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
 
 
-def _bare(text: str) -> Any:
-    """The number that a text is, else the text."""
-    try:
-        return parse_number(text)
-    except ValueError:
-        return text.strip()
-
-
 def _number(value: Any, unit: str | None, name: str) -> Any:
-    """A text that begins like a number as a number of the unit; all else as it is."""
-    if unit is None or not isinstance(value, str) or not value.lstrip("+-.")[:1].isdigit():
+    """A text that is a number, or begins like one with a unit, as a number of that unit; all else as it is."""
+    if not isinstance(value, str):
         return value
+    try:
+        return parse_number(value)
+    except ValueError:
+        if unit is None or not value.lstrip("+-.")[:1].isdigit():
+            return value
     try:
         return quantity(value, unit)
     except ValueError as error:

@@ -300,8 +300,8 @@ def solve(
         share = _largest_ratio(np.diag(simulation), np.diag(covariance - simulation))
         gain = 0.5 * float(shared @ np.linalg.pinv(covariance, rcond=1e-12) @ shared)
     else:
-        share = _largest_ratio(*(_median(part) for part in (pixel_simulation, pixel_covariance - pixel_simulation)))
-        variance = np.einsum("pii->pi", pixel_covariance)
+        variance, by_simulation = np.einsum("pii->pi", pixel_covariance), np.einsum("pii->pi", pixel_simulation)
+        share = _largest_ratio(np.nanmedian(by_simulation, axis=0), np.nanmedian(variance - by_simulation, axis=0))
         gains = np.divide(pixels**2, variance, out=np.zeros_like(pixels), where=variance > 0)
         gain = 0.5 * float(gains.sum(axis=1).mean())
     bound = 0.5 * (inverse_matrix + inverse_matrix.T)
@@ -338,11 +338,6 @@ def pseudo_inverse(matrix: Floats) -> Floats:
     """The inverse of a matrix whose rows and columns may have very different units."""
     scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), 1e-300))
     return np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
-
-
-def _median(blocks: Floats) -> Floats:
-    """Median over the pixels of the variances."""
-    return np.nanmedian(np.einsum("pii->pi", blocks), axis=0)
 
 
 def _largest_ratio(parts: Floats, wholes: Floats) -> float:
