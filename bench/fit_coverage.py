@@ -112,7 +112,7 @@ def main(asked):
         prior = {"targets[0].reflectance": (measured, CALIBRATED)} if calibrated else None
         choices = {"prior": prior, "photons": int(asked.photons), "seed": 5000 + number, "device": device}
         fit = Fitter(scene, f"{WATER},depth", read_exposure(frames, scene), **choices).fit(
-            start=wrong_start(scene, number)
+            initial_guess=wrong_start(scene, number)
         )
         true = {
             "medium.absorption": scene.medium.absorption,

@@ -17,18 +17,21 @@ Exposures are means over a 7 mm aperture in the middle of the beam, in clear wat
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_real
 from spadwarp.scene.laser import load_profile
+from spadwarp.scene.scene import laser_port
 
 if TYPE_CHECKING:
-    from spadwarp.scene import Laser
+    from spadwarp.scene import Laser, Scene
 
-__all__ = ["STANDARD", "EyeLimit", "axis_fluence", "eye_limit", "permissible_exposure"]
+__all__ = ["EyeLimit", "axis_fluence", "beam_axis_fluence", "eye_limit", "permissible_exposure", "scene_eye_limit"]
 
 STANDARD = "IEC 60825-1:2014, Table A.1 and A.3, small source, 7 mm aperture; a guide, not a classification"
 
@@ -99,13 +102,19 @@ def eye_limit(laser: Laser, *, distance: float = 0.1, exposure: float = 100.0) -
     limit, criterion = _pulse_limit(laser, exposure)
     densest = _densest(laser)
     energy = limit * _AREA / _share(laser, distance, densest)
+    allowed = limit * _AREA / laser.pulse_energy  # share through the aperture
+    hazard = math.inf
+    if _share(laser, 0.0, densest) <= allowed:
+        hazard = 0.0
+    elif _share(laser, _FARTHEST, densest) <= allowed:
+        hazard = _first(lambda other: _share(laser, other, densest) <= allowed, _FARTHEST)
     return EyeLimit(
         distance=distance,
         exposure=exposure,
         pulse_energy=energy,
         average_power=energy * laser.repetition_rate,
         criterion=criterion,
-        hazard_distance=_hazard_distance(laser, limit * _AREA / laser.pulse_energy, densest),
+        hazard_distance=hazard,
     )
 
 
@@ -162,14 +171,36 @@ def _share(laser: Laser, distance: float, densest: float) -> float:
     return min(1.0, (math.sin(0.5 * math.atan(tangent)) / math.sin(0.5 * laser.half_angle)) ** 2)
 
 
-def _hazard_distance(laser: Laser, allowed: float, densest: float) -> float:
-    """The distance [m] at which the share through the aperture falls to `allowed`."""
-    if _share(laser, 0.0, densest) <= allowed:
-        return 0.0
-    if _share(laser, _FARTHEST, densest) > allowed:
-        return math.inf
-    low, high = 1e-6, _FARTHEST
+def _first(is_reached: Callable[[float], bool], high: float) -> float:
+    """The least distance from 1e-6 m to `high` [m] from which on something is reached."""
+    low = 1e-6
     for _ in range(80):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if _share(laser, middle, densest) > allowed else (low, middle)
+        low, high = (low, middle) if is_reached(middle) else (middle, high)
     return high
+
+
+def as_if_bare(scene: Scene, distance: float) -> float:
+    """The distance [m] at which the middle of the beam has the irradiance that it has at a distance behind the laser's
+    port, if there were none: there it is narrower, and a little light is reflected."""
+    port, beam = laser_port(scene), scene.beam
+    if port is None or beam.profile == "collimated":
+        return distance
+    lead = float(port.enter(beam.position, beam.axis)[2])
+    return 1.0 / math.sqrt(port.spread(beam.position, beam.axis, max(distance, lead + 1e-6)))
+
+
+def beam_axis_fluence(scene: Scene, distance: float) -> float:
+    """`axis_fluence` of a scene's laser, behind its port if it has one [1/m²]."""
+    return axis_fluence(scene.laser, as_if_bare(scene, distance))
+
+
+def scene_eye_limit(scene: Scene, *, distance: float, exposure: float) -> EyeLimit:
+    """`eye_limit` of a scene's laser, for an eye in the water if the laser is behind a port."""
+    limit = eye_limit(scene.laser, distance=as_if_bare(scene, distance), exposure=exposure)
+    if laser_port(scene) is None:
+        return limit
+    hazard = limit.hazard_distance
+    if 0.0 < hazard < math.inf and scene.beam.profile != "collimated":
+        hazard = _first(lambda other: as_if_bare(scene, other) >= limit.hazard_distance, 1e9)
+    return dataclasses.replace(limit, distance=distance, hazard_distance=hazard)

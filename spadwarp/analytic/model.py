@@ -12,25 +12,26 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.analytic.grid import grid_backscatter, passed_by_grid
-from spadwarp.analytic.optics import scene_optics
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.scene import WaterLine, daylight_rate, phase_function, water_lines
-from spadwarp.scene.scene import laser_port
-from spadwarp.scene.sight import depth_per_time, lines_of_sight
+from spadwarp.scene import daylight_rate, phase_function, water_lines
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.grid import GridCells
+from spadwarp.scene.medium import grid_cells
+from spadwarp.scene.scene import camera_port, laser_port
+from spadwarp.scene.sight import LinesOfSight, depth_per_time, lines_of_sight
+from spadwarp.transport.model import port_kind, port_parameters
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["BackscatterTable", "Map", "model_notes", "pixel_maps", "response_sigma", "source_name", "warn_of_model"]
+__all__ = ["model_notes", "pixel_maps"]
 
 Map = NDArray[np.float64]
 
@@ -92,56 +93,46 @@ def pixel_maps(
         ConfigError: A scene that the model does not cover.
         ArgumentError: The scene's backscatter needs a profile.
     """
-    import warp as wp
-
     from spadwarp_kernels import analytic as kernels
 
-    device = pick_device(device)
     start, stop = gate or (scene.gate.start, scene.gate.stop)
-    lidar, optics = _lidar(scene, start, stop)
-    chosen = scene.analytic
     views = np.ascontiguousarray(view, np.float64)
     distances = np.nan_to_num(np.asarray(distance, np.float64), nan=0.0)
-    in_water = _way_in_water(scene, views, distances)
-
-    def on_device(values: ArrayLike, dtype: Any = wp.float64) -> Any:
-        kind = np.float32 if dtype is wp.float32 else np.float64
-        return wp.array(np.nan_to_num(np.ascontiguousarray(values, kind)), dtype=dtype, device=device)
-
-    view_d, distance_d, phase_d = on_device(views, wp.vec3d), on_device(in_water), on_device(_phase_table(scene))
-    lines = water_lines(scene)
-    surfaces = [view_d, distance_d, on_device(normal, wp.vec3d), on_device(reflectance)]
-    signal, arrival = _signal(lidar, lines, surfaces, optics)
+    model, chosen = _Model(scene, views, distances, pick_device(device), start, stop), scene.analytic
+    signal, arrival = model.signal(normal, reflectance)
     if scene.medium.grid is not None:
         signal = signal * passed_by_grid(scene, views, distances)
-    signal_d: Any = on_device(signal)
-    arrival_d: Any = wp.array(arrival, dtype=wp.float64, device=device)
-    lines_d = on_device([(lidar.photons * line.share, line.extinction, line.scattering) for line in lines], wp.vec3d)
-    total, table, profile = _backscatter(scene, backscatter_profile, lidar, phase_d, surfaces[:2], on_device, optics)
-    total_d = on_device(np.broadcast_to(total, distances.shape))
+    total, table, profile = model.backscatter(backscatter_profile)
+    backscatter = model.on_device(np.broadcast_to(total, distances.shape))
     ambient = daylight_rate(
         scene, view=views, distance=distances, normal=np.asarray(normal), reflectance=np.asarray(reflectance)
     )
     statistics = kernels.statistics_maps(
-        lidar,
-        phase_d,
-        on_device(profile, wp.float32),
-        view_d,
-        signal_d,
-        arrival_d,
-        total_d,
+        model.lidar,
+        model.phase,
+        model.on_device(profile, np.float32),
+        model.sights[0],
+        model.on_device(signal),
+        model.on_device(arrival, nan=np.nan),
+        backscatter,
         count_law=chosen.count_law,
         acquisitions=scene.pulses_per_depth_frame if chosen.count_law == "per_pulse" else chosen.frames,
         pulses_per_frame=chosen.exposure * scene.laser.repetition_rate,
         outliers=outliers,
-        lines=lines_d,
-        ambient=None if scene.daylight is None else on_device(ambient),
-        optics=optics,
+        lines=model.line_rows([line.scattering for line in model.lines]),
+        ambient=None if scene.daylight is None else model.on_device(ambient),
+        optics=model.optics,
     )
     names = ("alpha", "fisher", "sigma_time", "background_level", "outlier_probability")
-    maps = {"signal": signal, "arrival": arrival, "backscatter": total_d.numpy(), "daylight": ambient}
+    maps = {"signal": signal, "arrival": arrival, "backscatter": backscatter.numpy(), "daylight": ambient}
     maps |= {name: values.numpy() for name, values in zip(names, statistics, strict=True)}
-    _check_alpha(scene, maps["alpha"])
+    largest = maps["alpha"].max(initial=0.0)
+    if chosen.count_law == "per_frame_lu2024" and largest > 1.0:
+        raise ConfigError(
+            f"analytic.count_law = 'per_frame_lu2024' needs alpha < 1; it reaches {largest:.4g} detections per pulse "
+            "here, use 'per_frame'",
+            source=source_name(scene),
+        )
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = maps["signal"] / maps["backscatter"]
     maps["signal_to_backscatter"] = np.where(maps["fisher"] > 0, ratio, np.nan)
@@ -169,136 +160,149 @@ def source_name(scene: Scene) -> str | None:
     return str(scene.source) if scene.source else None
 
 
-# Parts
+def scene_optics(scene: Scene) -> tuple[Any, Any]:
+    """Optics of the kernels, and the parameters of the ports of a scene.
 
-
-def _way_in_water(scene: Scene, views: Map, distances: Map) -> Map:
-    """Length of the way in the water to ranges; 0 where there is nothing, or no way."""
-    if scene.camera.port is None:
-        return distances
-    return np.maximum(np.nan_to_num(distances - lines_of_sight(scene, views).lead, nan=0.0), 0.0)
-
-
-def _signal(lidar: Any, lines: list[WaterLine], arrays: list[Any], optics: Any) -> tuple[Map, Map]:
-    """S, summed over the lines, and the mean arrival time of their photons, `[P]`; `lidar` is as it was afterwards."""
+    Raises `ConfigError` for a lens or a laser that reaches through its port.
+    """
     from spadwarp_kernels import analytic as kernels
 
-    own = (lidar.photons, lidar.extinction, lidar.speed)
-    parts: list[tuple[Map, Map]] = []
-    for line in lines:
-        lidar.photons, lidar.extinction, lidar.speed = own[0] * line.share, line.extinction, line.speed
-        signal, arrival = kernels.signal_map(lidar, *arrays, optics=optics)
-        parts.append((signal.numpy(), arrival.numpy()))
-    lidar.photons, lidar.extinction, lidar.speed = own
-    if len(parts) == 1:
-        return parts[0]
-    total = np.sum([signal for signal, _ in parts], axis=0)
-    even = np.full_like(total, 1.0 / len(parts))
-    shares = [np.divide(signal, total, out=even.copy(), where=total > 0) for signal, _ in parts]
-    return total, np.sum([share * time for share, (_, time) in zip(shares, parts, strict=True)], axis=0)
+    camera, laser = camera_port(scene), laser_port(scene)
+    ports: Any = kernels.Ports()
+    if camera is not None:
+        radius = 0.0 if scene.camera.pinhole else scene.camera.aperture_radius
+        ports.camera = port_parameters(scene, camera, (0.0, 0.0, 0.0), radius, 0.0)
+    if laser is not None:
+        ports.laser = port_parameters(scene, laser, scene.beam.position, 0.0, 0.0)
+    return kernels.make_optics(port_kind(camera), port_kind(laser)), ports
 
 
-def _check_alpha(scene: Scene, alpha: Map) -> None:
-    if scene.analytic.count_law == "per_frame_lu2024" and alpha.max(initial=0.0) > 1.0:
-        raise ConfigError(
-            f"analytic.count_law = 'per_frame_lu2024' needs alpha < 1; it reaches {alpha.max():.4g} detections per "
-            "pulse here, use 'per_frame'",
-            source=source_name(scene),
-        )
+def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Map:
+    """Probability that a maximum-likelihood fit takes background for the return.
 
-
-def _backscatter(
-    scene: Scene,
-    given: NDArray[np.float32] | None,
-    lidar: Any,
-    phase: Any,
-    sights: list[Any],
-    on_device: Callable[..., Any],
-    optics: Any,
-) -> tuple[Map, BackscatterTable, NDArray[np.float32]]:
-    """Detections per pulse in the gate, their table, and their profile if the model takes one."""
+    Args:
+        signal: Recorded photons of the return.
+        level: Of background per standard deviation of the response.
+        lengths: Of the gate in standard deviations.
+        device: Warp device.
+    """
     import warp as wp
 
-    from spadwarp_kernels import BACKSCATTER_SOURCES
-    from spadwarp_kernels import analytic as kernels
+    from spadwarp_kernels.analytic import outlier_probabilities
 
-    chosen, gate, speed = scene.analytic, (lidar.start, lidar.stop), scene.medium.pulse_speed
-    profile = np.zeros((1, 1), np.float32)
-    if chosen.backscatter == "constant":
-        ends = np.array([[gate[0] * speed, gate[1] * speed]], np.float32)
-        total = np.array([chosen.backscatter_rate * (gate[1] - gate[0])])
-        return total, BackscatterTable(ends, np.array([[0.0, 1.0]], np.float32)), profile
-    if chosen.backscatter == "single_scatter":
-        # Through cells, the table of water that scatters 1/m, times what the cells do.
-        by_cells = scene.medium.grid is not None
-        rows = [
-            (lidar.photons * line.share, line.extinction, 1.0 if by_cells else line.scattering)
-            for line in water_lines(scene)
-        ]
-        found = kernels.single_scatter_table(lidar, phase, *sights, lines=on_device(rows, wp.vec3d), optics=optics)
-        paths, cumulative, total = (part.numpy() for part in found)
-        if not by_cells:
-            return total, BackscatterTable(paths, cumulative), profile
-        profile = grid_backscatter(scene, sights[0].numpy(), paths, cumulative, total, gate)
-        lidar.source = BACKSCATTER_SOURCES.index("monte_carlo")
-    elif given is None:
-        raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
-    else:
-        profile = given
-    return *_profile_table(profile, *gate, speed), profile
+    target, columns = pick_device(device), (signal, level, lengths)
+    arrays: list[Any] = [wp.array(np.nan_to_num(column), dtype=wp.float64, device=target) for column in columns]
+    return outlier_probabilities(*arrays).numpy()
 
 
-def _profile_table(
-    profile: NDArray[np.float32], start: float, stop: float, speed: float
-) -> tuple[Map, BackscatterTable]:
-    """Detections per pulse in the gate, and their table, from a profile per bin."""
-    cumulative = np.concatenate([np.zeros((len(profile), 1)), np.cumsum(profile, axis=1, dtype=np.float64)], axis=1)
-    paths = (np.linspace(start, stop, profile.shape[1] + 1) * speed).astype(np.float32)[None]
-    total = cumulative[:, -1:]
-    return total[:, 0], BackscatterTable(paths, (cumulative / np.maximum(total, 1e-300)).astype(np.float32))
+class _Model:
+    """A scene and lines of sight as the kernels take them. Raises `ConfigError` for what the model does not cover."""
+
+    def __init__(self, scene: Scene, views: Map, distances: Map, device: Any, start: float, stop: float) -> None:
+        if problems := [text for text, is_met in _not_covered(scene).items() if is_met]:
+            raise ConfigError(problems, source=source_name(scene))
+        self.scene, self.device, self.lines = scene, device, water_lines(scene)
+        self.lidar, self.optics = _lidar(scene, start, stop)
+        # At 0, where the density may be infinite, that of 2e-5 rad.
+        angles = np.maximum(np.linspace(0.0, np.pi, 4097), 2e-5)
+        self.phase = self.on_device(phase_function(scene.medium).density(angles))
+        in_water = distances
+        if scene.camera.port is not None:
+            in_water = np.maximum(np.nan_to_num(distances - lines_of_sight(scene, views).lead, nan=0.0), 0.0)
+        self.sights = [self.on_device(views), self.on_device(in_water)]
+
+    def on_device(self, values: ArrayLike, kind: Any = np.float64, *, nan: float = 0.0) -> Any:
+        """An array of numbers `[P]` or vectors `[P, 3]` in the device's memory."""
+        import warp as wp
+
+        rows = np.nan_to_num(np.ascontiguousarray(values, kind), nan=nan)
+        dtype: Any = wp.float32 if kind is np.float32 else wp.vec3d if rows.shape[1:] == (3,) else wp.float64
+        return wp.array(rows, dtype=dtype, device=self.device)
+
+    def line_rows(self, scattering: list[float]) -> Any:
+        """Photons per pulse, extinction and scattering of each line of the spectrum."""
+        lines = zip(self.lines, scattering, strict=True)
+        return self.on_device([(self.lidar.photons * line.share, line.extinction, b) for line, b in lines])
+
+    def signal(self, normal: ArrayLike, reflectance: ArrayLike) -> tuple[Map, Map]:
+        """S, summed over the lines, and the mean arrival time of their photons, `[P]`."""
+        from spadwarp_kernels import analytic as kernels
+
+        lidar, surfaces = self.lidar, [*self.sights, self.on_device(normal), self.on_device(reflectance)]
+        whole = (lidar.photons, lidar.extinction, lidar.speed)
+        parts: list[tuple[Map, Map]] = []
+        for line in self.lines:
+            lidar.photons, lidar.extinction, lidar.speed = whole[0] * line.share, line.extinction, line.speed
+            signal, arrival = kernels.signal_map(lidar, *surfaces, optics=self.optics)
+            parts.append((signal.numpy(), arrival.numpy()))
+        lidar.photons, lidar.extinction, lidar.speed = whole
+        if len(parts) == 1:
+            return parts[0]
+        total = np.sum([signal for signal, _ in parts], axis=0)
+        even = np.full_like(total, 1.0 / len(parts))
+        shares = [np.divide(signal, total, out=even.copy(), where=total > 0) for signal, _ in parts]
+        return total, np.sum([share * time for share, (_, time) in zip(shares, parts, strict=True)], axis=0)
+
+    def backscatter(self, profile: NDArray[np.float32] | None) -> tuple[Map, BackscatterTable, NDArray[np.float32]]:
+        """Detections per pulse in the gate, their table, and their profile if the model takes one."""
+        from spadwarp_kernels import BACKSCATTER_SOURCES
+        from spadwarp_kernels import analytic as kernels
+
+        lidar, chosen, speed = self.lidar, self.scene.analytic, self.scene.medium.pulse_speed
+        gate, empty = (lidar.start, lidar.stop), np.zeros((1, 1), np.float32)
+        if chosen.backscatter == "constant":
+            ends = np.array([[gate[0] * speed, gate[1] * speed]], np.float32)
+            total = np.array([chosen.backscatter_rate * (gate[1] - gate[0])])
+            return total, BackscatterTable(ends, np.array([[0.0, 1.0]], np.float32)), empty
+        if chosen.backscatter == "single_scatter":
+            # Through cells, the table of water that scatters 1/m, times what the cells do.
+            by_cells = self.scene.medium.grid is not None
+            rows = self.line_rows([1.0 if by_cells else line.scattering for line in self.lines])
+            table = kernels.single_scatter_table(lidar, self.phase, *self.sights, lines=rows, optics=self.optics)
+            paths, cumulative, total = (part.numpy() for part in table)
+            if not by_cells:
+                return total, BackscatterTable(paths, cumulative), empty
+            profile = grid_backscatter(self.scene, self.sights[0].numpy(), paths, cumulative, total, gate)
+            lidar.source = BACKSCATTER_SOURCES.index("monte_carlo")
+        elif profile is None:
+            raise ArgumentError("backscatter_profile is missing; analytic.backscatter = 'monte_carlo' needs it")
+        sums = np.concatenate([np.zeros((len(profile), 1)), np.cumsum(profile, axis=1, dtype=np.float64)], axis=1)
+        paths = (np.linspace(*gate, profile.shape[1] + 1) * speed).astype(np.float32)[None]
+        total = sums[:, -1:]
+        cumulative = (sums / np.maximum(total, 1e-300)).astype(np.float32)
+        return total[:, 0], BackscatterTable(paths, cumulative), profile
 
 
-def _not_covered(scene: Scene) -> list[str]:
-    """What the model cannot do, a line each."""
-    laser, chosen = scene.beam, scene.analytic
-    problems = []
-    if laser.profile == "measured":
-        problems.append("analytic: laser.profile = 'measured' has no closed form; simulate takes any")
-    if scene.scan.mode != "none":
-        problems.append(f"analytic: scan.mode = {scene.scan.mode!r} is not one beam for all pixels; simulate takes it")
-    if chosen.form == "lu2024" and (laser.profile != "uniform_cone" or laser.half_angle_deg >= 90):
-        problems.append(
-            f"analytic.form = 'lu2024' needs a uniform_cone laser of half_angle_deg < 90, not {laser.profile!r} "
-            f"of {laser.half_angle_deg}"
-        )
+def _not_covered(scene: Scene) -> dict[str, bool]:
+    """Sentences on what the model cannot do, and whether the scene asks for it."""
+    laser, chosen, medium = scene.beam, scene.analytic, scene.medium
     ported = scene.camera.port is not None or scene.laser.port is not None
-    if ported and chosen.form == "lu2024":
-        problems.append("analytic.form = 'lu2024' knows no camera.port or laser.port; 'radiometric' does")
-    if laser.profile == "collimated" and (port := laser_port(scene)) is not None and port.shape == "dome":
-        problems.append(
-            "analytic: laser.profile = 'collimated' does not stay parallel behind a dome, and has no closed form; "
-            "simulate takes it"
-        )
-    if scene.medium.layers:
-        problems.append(f"medium.layers: {len(scene.medium.layers)} given; the analytic simulator takes one water")
-    if scene.medium.grid is not None and chosen.form == "lu2024":
-        problems.append("analytic.form = 'lu2024' takes one water, and not medium.grid; 'radiometric' takes both")
-    if chosen.backscatter == "single_scatter" and laser.profile == "collimated":
-        problems.append(
-            "analytic.backscatter = 'single_scatter' needs a diverging laser.profile, not 'collimated'; "
-            "'monte_carlo' takes any"
-        )
-    return problems
+    port, parallel, lu2024 = laser_port(scene), laser.profile == "collimated", chosen.form == "lu2024"
+    return {
+        "analytic: laser.profile = 'measured' has no closed form; simulate takes any": laser.profile == "measured",
+        f"analytic: scan.mode = {scene.scan.mode!r} is not one beam for all pixels; simulate takes it": (
+            scene.scan.mode != "none"
+        ),
+        f"analytic.form = 'lu2024' needs a uniform_cone laser of half_angle_deg < 90, not {laser.profile!r} "
+        f"of {laser.half_angle_deg}": lu2024 and (laser.profile != "uniform_cone" or laser.half_angle_deg >= 90),
+        "analytic.form = 'lu2024' knows no camera.port or laser.port; 'radiometric' does": lu2024 and ported,
+        "analytic: laser.profile = 'collimated' does not stay parallel behind a dome, and has no closed form; "
+        "simulate takes it": parallel and port is not None and port.shape == "dome",
+        f"medium.layers: {len(medium.layers)} given; the analytic simulator takes one water": bool(medium.layers),
+        "analytic.form = 'lu2024' takes one water, and not medium.grid; 'radiometric' takes both": (
+            lu2024 and medium.grid is not None
+        ),
+        "analytic.backscatter = 'single_scatter' needs a diverging laser.profile, not 'collimated'; 'monte_carlo' "
+        "takes any": parallel and chosen.backscatter == "single_scatter",
+    }
 
 
 def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
-    """The scene and its optics as the kernels take it; raises `ConfigError` for what the model does not cover."""
+    """The scene and its optics as the kernels take it."""
     import warp as wp
 
     from spadwarp_kernels import BACKSCATTER_SOURCES, LASER_PROFILES, Lidar
 
-    if problems := _not_covered(scene):
-        raise ConfigError(problems, source=source_name(scene))
     laser, camera, chosen = scene.beam, scene.camera, scene.analytic
     lidar: Any = Lidar()
     lidar.lu2024 = int(chosen.form == "lu2024")
@@ -328,6 +332,121 @@ def _lidar(scene: Scene, start: float, stop: float) -> tuple[Any, Any]:
     return lidar, optics
 
 
-def _phase_table(scene: Scene) -> Map:
-    """Density [1/sr] at scattering angles uniform on [0, π]; at 0, where it may be infinite, that of 2e-5 rad."""
-    return phase_function(scene.medium).density(np.maximum(np.linspace(0.0, np.pi, 4097), 2e-5))
+# Water cell by cell: what lines of sight and the beam lose in it, and what it scatters back
+
+# Pieces of a line of sight, and lines of sight at a time.
+_PIECES, _LINES = 400, 256
+
+
+def passed_by_grid(scene: Scene, views: Map, distances: Map) -> Map:
+    """Part of the light that passes the cells on its way from the laser to points and on to the lens, over what passes
+    the medium without cells; exact for the cells.
+
+    Args:
+        scene: The scene.
+        views: Unit vectors `[P, 3]` in which the lens sees the points.
+        distances: From the lens along the line of sight, which a port bends, `[P]` [m].
+    """
+    cells, c = grid_cells(scene.medium), scene.medium.extinction
+    sights = lines_of_sight(scene, views)
+    points = sights.points(distances)
+    depth = np.zeros(len(points))
+    for begin in (sights.start, _begin_of_light(scene, points)):
+        way = np.isfinite(begin + points).all(axis=-1, keepdims=True)
+        ends = (np.where(way, end, 0.0) for end in (begin, points))
+        first, last = (to_world(scene.camera, end) for end in ends)
+        depth += cells.optical_depths(first, last, c) - c * np.linalg.norm(last - first, axis=-1)
+    return np.exp(-depth)
+
+
+def _begin_of_light(scene: Scene, points: Map) -> Map:
+    """Where the laser's light to points `[P, 3]` enters the water, or is emitted in it [m]; NaN where there is no
+    way."""
+    beam, port = scene.beam, laser_port(scene)
+    laser, axis = np.array(beam.position), np.array(beam.axis)
+    if beam.profile != "collimated":
+        if port is None:
+            return np.broadcast_to(laser, points.shape)
+        return port.enter(laser, port.connect(points, laser)[0])[0]
+    if port is None:
+        return points - ((points - laser) @ axis)[:, None] * axis
+    # Behind a flat port, see `_not_covered`, a parallel beam stays one.
+    direction, normal = port.enter(laser, axis)[1], np.array(port.normal)
+    outside = points @ normal - (port.distance + port.thickness)
+    return points - (outside / (direction @ normal))[:, None] * direction
+
+
+def grid_backscatter(
+    scene: Scene,
+    views: Map,
+    paths: NDArray[np.float32],
+    cumulative: NDArray[np.float32],
+    total: Map,
+    gate: tuple[float, float],
+) -> NDArray[np.float32]:
+    """Detections per pulse and bin of light scattered once, `[P, T]`.
+
+    The beam's way to a point is taken to lose what the line of sight to it loses, by their lengths in the water, as it
+    does for a laser beside the camera.
+
+    Args:
+        scene: The scene.
+        views: Unit vectors in which the lens sees the pixels `[P, 3]`.
+        paths, cumulative, total: Table of `single_scatter_table` with a scattering coefficient of 1 / m everywhere.
+        gate: (start, stop) [s].
+    """
+    bins = max(1, round((gate[1] - gate[0]) / scene.gate.bin_width))
+    edges = np.linspace(*gate, bins + 1) * scene.medium.pulse_speed
+    cells, sights = grid_cells(scene.medium), lines_of_sight(scene, views)
+    parts = [
+        _part(scene, cells, sights[k : k + _LINES], paths[k : k + _LINES], cumulative[k : k + _LINES], edges)
+        for k in range(0, len(views), _LINES)
+    ]
+    return (np.concatenate(parts) * total[:, None]).astype(np.float32)
+
+
+def _part(
+    scene: Scene,
+    cells: GridCells,
+    sights: LinesOfSight,
+    paths: NDArray[np.float32],
+    cumulative: NDArray[np.float32],
+    edges: Map,
+) -> Map:
+    """The same for a total of 1, for some lines of sight and edges of bins in path [m]."""
+    medium = scene.medium
+    # Length in the water up to where the way by the laser has the longest path.
+    reach = np.nan_to_num(sights.range_from_path(paths[:, -1].astype(np.float64)) - sights.lead)
+    ends = reach[:, None] * np.linspace(0.0, 1.0, _PIECES + 1)
+    middle = 0.5 * (ends[:, 1:] + ends[:, :-1])
+    # The laser's light at the middles: directions and lengths in the water, NaN where none comes; paths by the ends.
+    light, water, path = sights.light_at(sights.start[:, None, :] + ends[..., None] * sights.direction[:, None, :])
+    light, water = light[:, 1:] + light[:, :-1], 0.5 * (water[:, 1:] + water[:, :-1])
+    light = light / np.maximum(np.linalg.norm(light, axis=-1, keepdims=True), 1e-9)
+    lengths = np.nan_to_num(path + ends + sights.delay[:, None])
+    points = sights.start[:, None, :] + middle[..., None] * sights.direction[:, None, :]
+    at = np.nan_to_num(cells.in_cells(to_world(scene.camera, points)), nan=-1.0)
+    index = np.floor(np.clip(at, -1.0, cells.extinction.shape)).astype(np.int32)
+    inside = ((index >= 0) & (index < cells.extinction.shape)).all(axis=-1)
+    place = tuple(np.moveaxis(np.clip(index, 0, np.array(cells.extinction.shape) - 1), -1, 0))
+    extinction = np.where(inside, cells.extinction[place], medium.extinction)
+    scattering = np.where(inside, cells.scattering[place], medium.scattering)
+    excess = (extinction - medium.extinction) * np.diff(ends, axis=1)
+    excess = np.cumsum(excess, axis=1) - 0.5 * excess
+    weight = scattering * np.exp(-excess * (1.0 + water / np.maximum(middle, 1e-9)))
+    if cells.anisotropy is not None:
+        cosine = -(light * sights.direction[:, None, :]).sum(axis=-1)
+        anisotropy = np.where(inside, cells.anisotropy[place], medium.anisotropy)
+        weight *= _henyey_greenstein(cosine, anisotropy) / _henyey_greenstein(cosine, medium.anisotropy)
+    weight = np.nan_to_num(weight)  # where no light comes
+    result = np.zeros((len(paths), len(edges) - 1))
+    for row in range(len(paths)):
+        share = np.diff(np.interp(lengths[row], paths[row], cumulative[row]))
+        middles = 0.5 * (lengths[row, 1:] + lengths[row, :-1])
+        result[row] = np.histogram(middles, edges, weights=share * weight[row])[0]
+    return result
+
+
+def _henyey_greenstein(cosine: Map, g: Map | float) -> Map:
+    """The phase function without its factor 1/4π."""
+    return (1.0 - np.square(g)) / (1.0 + np.square(g) - 2.0 * g * cosine) ** 1.5

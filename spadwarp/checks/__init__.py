@@ -1,6 +1,9 @@
-"""What may be wrong with a scene that is valid, in numbers, before a photon is traced."""
+"""Warnings and notes on a scene that is valid, in numbers, before a photon is traced."""
 
-from spadwarp.checks.checks import check, summary
-from spadwarp.checks.message import CheckMessage
+from typing import TYPE_CHECKING
 
-__all__ = ["CheckMessage", "check", "summary"]
+from spadwarp.checks.checks import *
+from spadwarp.checks.survey import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = sorted(checks.__all__ + survey.__all__)

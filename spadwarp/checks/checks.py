@@ -2,42 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
-from spadwarp.checks.daylight import check_daylight
-from spadwarp.checks.grid import check_grid, grid_summary
-from spadwarp.checks.medium import check_medium
-from spadwarp.checks.message import CheckMessage
-from spadwarp.checks.optics import check_focus, check_ports, check_scan
+from spadwarp.analytic.model import source_name
+from spadwarp.checks.geometry import check_focus, check_ports, check_scan, check_targets
+from spadwarp.checks.light import check_daylight, check_polarisation, check_spectrum, check_statistics, check_timing
 from spadwarp.checks.plausible import check_plausible
-from spadwarp.checks.polarisation import check_polarisation
-from spadwarp.checks.spectrum import check_spectrum
-from spadwarp.checks.statistics import check_statistics
-from spadwarp.checks.survey import Survey
-from spadwarp.checks.targets import check_targets
-from spadwarp.checks.timing import check_timing
+from spadwarp.checks.survey import CheckMessage, OnAxis, Survey
+from spadwarp.checks.water import check_grid, check_medium, grid_summary
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh
-from spadwarp.scene import Scene, SceneLike, as_scene
+from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport import points_per_flight
 
 __all__ = ["check", "summary"]
 
 _CHECKS = (
-    check_plausible,
-    check_targets,
-    check_focus,
-    check_ports,
-    check_scan,
-    check_timing,
-    check_spectrum,
-    check_daylight,
-    check_medium,
-    check_grid,
-    check_polarisation,
-    check_statistics,
+    *(check_plausible, check_targets, check_focus, check_ports, check_scan, check_timing, check_spectrum),
+    *(check_daylight, check_medium, check_grid, check_polarisation, check_statistics),
 )
 
 
@@ -50,19 +35,13 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     """
     survey = Survey(as_scene(scene), mesh)
     points_per_flight(survey.scene)
-    _check_response(survey.scene)
-    messages = [message for find in _CHECKS for message in find(survey)]
-    return sorted(messages, key=lambda message: message.level != "warning")
-
-
-def _check_response(scene: Scene) -> None:
-    """Reads the response's file, which only depth and counts need: at the end of a run it would be too late."""
-    try:
-        detector_response(scene.detector, scene.laser)
+    try:  # read here, since only depth and counts need it: at the end of a run it would be too late
+        detector_response(survey.scene.detector, survey.scene.laser)
     except ArgumentError as error:
-        raise ConfigError(
-            f"detector.irf: {error}", source=None if scene.source is None else str(scene.source)
-        ) from None
+        raise ConfigError(f"detector.irf: {error}", source=source_name(survey.scene)) from None
+    for find in _CHECKS:
+        find(survey)
+    return sorted(survey.messages, key=lambda message: message.level != "warning")
 
 
 def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any]:
@@ -85,12 +64,16 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     def water(part: Any) -> dict[str, float]:
         return {"attenuation_length": part.attenuation_length, "albedo": part.scattering / part.extinction}
 
+    axis = dict.fromkeys(field.name for field in dataclasses.fields(OnAxis))
+    axis |= {} if survey.on_axis is None else vars(survey.on_axis)
+    del axis["distance"]
     return {
         **water(medium),
         "layers": [{"start": layer.start, **water(layer)} for layer in medium.layers],
         "grid": grid_summary(scene),
         "target_range": survey.target_range,
         "target_arrival_ns": survey.target_arrival_ns,
+        **axis,
         "optical_depth": survey.optical_depth,
         "gate_range": (survey.range_of(gate.start), survey.range_of(gate.stop)),
         "bin_range": survey.bin_range,
@@ -104,10 +87,6 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "photons_per_pulse": laser.photons_per_pulse,
         "average_power": laser.average_power,
         "peak_power": laser.peak_power,
-        "irradiance": survey.irradiance,
         "pde": scene.detections_per_photon,
-        "photons_per_pixel": survey.photons_per_pixel,
-        "signal_per_pulse": survey.signal_per_pulse,
-        "samples_per_pixel": survey.samples_per_pixel,
         "histogram_bytes": survey.histogram_bytes,
     }

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from spadwarp.checks.message import CheckMessage, warning
 from spadwarp.checks.survey import Survey
 from spadwarp.mesh import guess_unit
 from spadwarp.scene.port import Port
@@ -63,52 +61,46 @@ _FARTHEST = 1000.0  # [m] of a laser, a camera or a target
 _MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
 
 
-def check_plausible(survey: Survey) -> Iterator[CheckMessage]:
+def check_plausible(survey: Survey) -> None:
     """Values of the scene outside what is plausible, with the unit that was probably meant."""
-    scene = survey.scene
-    found = list(_check_fields(survey))
-    yield from found
-    laser = scene.laser
-    if laser.average_power > _MOST_POWER and not any(message.field.startswith("laser.") for message in found):
+    scene, laser = survey.scene, survey.scene.laser
+    tables = [(section, getattr(scene, section), fields) for section, fields in _PLAUSIBLE.items()]
+    ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
+    tables += [(name, port, _PORT) for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0]
+    for section, model, fields in tables:
+        for name, plausible in fields.items():
+            _check_value(survey, f"{section}.{name}", getattr(model, name), type(model).model_fields[name], plausible)
+    if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
         text = (
             f"{with_prefix(laser.pulse_energy, 'J')} at {with_prefix(laser.repetition_rate, 'Hz')} are "
             f"{with_prefix(laser.average_power, 'W')} on average"
         )
-        yield warning("laser.pulse_energy", text, average_power=laser.average_power)
+        survey.warn("laser.pulse_energy", text, average_power=laser.average_power)
     places = {"laser.position": laser.position, "camera.position": scene.camera.position}
     places |= {f"targets[{i}].translation": target.translation for i, target in enumerate(scene.targets)}
     for field, place in places.items():
         if (farthest := max(map(abs, place))) > _FARTHEST:
             text = f"{list(place)} m is {farthest:.4g} m away; in mm it would be {[1e-3 * x for x in place]} m"
-            yield warning(field, text, farthest=farthest)
-    yield from _check_meshes(survey)
+            survey.warn(field, text, farthest=farthest)
+    _check_meshes(survey)
 
 
-def _check_fields(survey: Survey) -> Iterator[CheckMessage]:
-    scene = survey.scene
-    tables = [(section, getattr(scene, section), fields) for section, fields in _PLAUSIBLE.items()]
-    ports = {"camera.port": scene.camera.port, "laser.port": scene.laser.port}
-    tables += [(name, port, _PORT) for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0]
-    for section, model, fields in tables:
-        for name, (low, high, units) in fields.items():
-            value = getattr(model, name)
-            if isinstance(value, float) and value != 0.0 and not low <= value <= high:
-                yield _message(f"{section}.{name}", value, type(model).model_fields[name], (low, high), units)
+def _check_value(survey: Survey, field: str, value: Any, info: Any, plausible: tuple[float, float, Any]) -> None:
+    low, high, units = plausible
+    if not isinstance(value, float) or value == 0.0 or low <= value <= high:
+        return
+    unit_of_field = field_unit(info) or "1"
+    unit = "" if unit_of_field == "1" else f" {unit_of_field}"
+    text = f"{value:g}{unit} is not plausible ({low:g} to {high:g}{unit} is)"
+    meant = {other: quantity(f"{value!r} {other}", unit_of_field) for other in units}
+    meant = {other: number for other, number in meant.items() if low <= number <= high}
+    if meant:
+        words = [f'"{value:g} {other}" ({number:g}{unit})' for other, number in meant.items()]
+        text += f"; did you mean {' or '.join(words)}?"
+    survey.warn(field, text, value=value, **{f"in_{other}": number for other, number in meant.items()})
 
 
-def _message(field: str, value: float, info: Any, span: tuple[float, float], units: tuple[str, ...]) -> CheckMessage:
-    own = field_unit(info) or "1"
-    unit = "" if own == "1" else f" {own}"
-    text = f"{value:g}{unit} is not plausible ({span[0]:g} to {span[1]:g}{unit} is)"
-    meant = {one: quantity(f"{value!r} {one}", own) for one in units}
-    good = {one: number for one, number in meant.items() if span[0] <= number <= span[1]}
-    if good:
-        text += "; did you mean " + " or ".join(f'"{value:g} {one}" ({number:g}{unit})' for one, number in good.items())
-        text += "?"
-    return warning(field, text, value=value, **{f"in_{one}": number for one, number in good.items()})
-
-
-def _check_meshes(survey: Survey) -> Iterator[CheckMessage]:
+def _check_meshes(survey: Survey) -> None:
     """The size of targets from files, whose unit most formats do not state."""
     for index, target in enumerate(survey.scene.targets):
         corners = survey.triangles[survey.target == index].reshape(-1, 3)
@@ -123,7 +115,7 @@ def _check_meshes(survey: Survey) -> Iterator[CheckMessage]:
         guess = guess_unit(longest)
         if guess is not None and guess[0] != "m":
             scale = [guess[1] * factor for factor in target.scale]
-            shown = f"{scale[0]:g}" if len(set(scale)) == 1 else f"{[float(f'{one:g}') for one in scale]}"
+            shown = f"{scale[0]:g}" if len(set(scale)) == 1 else f"{[float(f'{factor:g}') for factor in scale]}"
             smaller = " x ".join(f"{side * guess[1]:.4g}" for side in extent)
             text += f"; if its unit is {guess[0]}, scale = {shown} makes it {smaller} m"
-        yield warning(f"targets[{index}].scale", text, longest=longest)
+        survey.warn(f"targets[{index}].scale", text, longest=longest)

@@ -1,9 +1,11 @@
-"""A scene with its mesh, and the numbers that follow from both."""
+"""A scene with its mesh, the numbers that follow from both, and the findings about it."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from functools import cached_property
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,28 +19,69 @@ from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
 from spadwarp.units import range_from_time, time_from_path
 
-__all__ = ["Survey"]
+__all__ = ["CheckMessage"]
 
 Points = NDArray[np.float64]
 
 
-class Survey:
-    """What the camera sees of a scene's targets, and what of that the beam illuminates; occlusion is not considered.
+@dataclass(frozen=True)
+class CheckMessage:
+    """One finding: `warning` if the run will not show what the scene asks for, `note` if one should know it.
+
+    `field` names the place in the scene, `values` the numbers in `text` (units as in the text).
+    """
+
+    level: Literal["warning", "note"]
+    field: str
+    text: str
+    values: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.level}: {self.field}: {self.text}"
+
+
+@dataclass(frozen=True)
+class OnAxis:
+    """Unscattered light on the beam's axis at the range of the nearest illuminated point.
 
     Attributes:
+        distance: That range [m].
+        optical_depth: To it, one way.
+        irradiance: Mean over time [W/m²].
+        samples_per_pixel: Traced photons that reach one pixel's part of the target.
+        photons_per_pixel, signal_per_pulse: Photons from the target that a pixel receives, and detects, from a pulse.
+    """
+
+    distance: float
+    optical_depth: float
+    irradiance: float
+    samples_per_pixel: float
+    photons_per_pixel: float
+    signal_per_pulse: float
+
+
+class Survey:
+    """A scene's targets as the camera sees them and the beam illuminates them, without occlusion; and the findings.
+
+    Attributes:
+        messages: The findings so far.
         triangles, target, reflectance: The faces `[F, 3, 3]` [m] in the camera frame, their targets and reflectances.
         view, beam: Planes around the view and the beam, as in `spadwarp.scene.sight`.
         focus_distance: Depth that the lens images sharply [m]; None for a pinhole.
         illuminated: Points of the targets in both, `[N, 3]` [m].
         target_range: Nearest and farthest of them from the lens [m]; None if there are none.
-        target_path: Shortest and longest path from the laser by them to the lens [m], likewise.
+        target_arrival_ns: First and last unscattered return from them [ns], likewise.
         optical_depth: From the lens to the nearest of them, likewise.
+        on_axis: Light of the nearest; None if there is none, or it lies at the lens centre.
+        bin_range: Range that a bin covers [m].
+        irf_fwhm_ps: Width of the instrument response [ps], if pulse and jitter are Gaussian.
+        histogram_bytes: Memory of one set of tallies.
     """
 
     def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
         if mesh is None and scene.targets:
             mesh = build_mesh(scene)
-        self.scene = scene
+        self.scene, self.messages = scene, list[CheckMessage]()
         self.target = np.zeros(0, dtype=np.int32) if mesh is None else mesh.target
         self.reflectance = np.zeros(0) if mesh is None else mesh.reflectance
         self.triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
@@ -48,31 +91,42 @@ class Survey:
         # A scan brings its beam to all that is in view.
         self.beam = beam_planes(scene.beam) if scene.scan_positions == 1 else np.zeros((0, 4))
         self.illuminated = self.illuminated_part(self.triangles)
-        self.target_range = self.target_path = self.optical_depth = None
+        self.bin_range = range_from_time(scene.gate.bin_width, scene.medium.group_index)
+        self.irf_fwhm_ps = math.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps)
+        self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+        self.target_range = self.target_arrival_ns = self.optical_depth = self.on_axis = None
         if len(self.illuminated):
             ranges, paths = self.ranges(self.illuminated), self.paths(self.illuminated)
             self.target_range = float(ranges.min()), float(ranges.max())
-            self.target_path = float(paths.min()), float(paths.max())
+            self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
             self.optical_depth = scene.optical_depth((0.0, 0.0, 0.0), self.illuminated[ranges.argmin()].tolist())
+            if self.target_range[0]:
+                self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
+
+    def warn(self, field: str, text: str, **values: float) -> None:
+        """Adds a warning."""
+        self.messages.append(CheckMessage("warning", field, text, values))
+
+    def note(self, field: str, text: str, **values: float) -> None:
+        """Adds a note."""
+        self.messages.append(CheckMessage("note", field, text, values))
 
     def illuminated_part(self, triangles: Points) -> Points:
         """Points of triangles in the view and the beam, `[N, 3]`; behind ports, of those that planes in air hold."""
         if self.camera_port is None and self.laser_port is None:
             return points_inside(triangles, np.concatenate([self.view, self.beam]))
+        laser = self.scene.beam
+        sides = (
+            (self.view, self.camera_port, (0.0, 0.0, 1.0), np.zeros(3)),
+            (self.beam, self.laser_port, laser.axis, np.array(laser.position)),
+        )
         # Bent towards its normal, light stays within the planes in air, but about a tilted port.
         whole = [np.array([[0.0, 0.0, 1.0, 0.0]])]
-        for planes, port, axis in (
-            (self.view, self.camera_port, (0.0, 0.0, 1.0)),
-            (self.beam, self.laser_port, self.scene.beam.axis),
-        ):
+        for planes, port, axis, _ in sides:
             if port is None or port.shape == "dome" or np.dot(port.normal, axis) > 0.999:
                 whole.append(planes)
         points = points_inside(triangles, np.concatenate(whole))
-        laser = np.array(self.scene.beam.position)
-        for port, planes, origin in (
-            (self.camera_port, self.view, np.zeros(3)),
-            (self.laser_port, self.beam, laser),
-        ):
+        for planes, port, _, origin in sides:
             if port is not None and len(points):
                 ahead = origin + port.connect(points, origin)[0]
                 points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
@@ -86,12 +140,10 @@ class Survey:
 
     def paths(self, points: Points) -> Points:
         """Paths [m] from the laser by points `[N, 3]` to the lens, as lengths in water."""
-        laser = np.array(self.scene.beam.position)
-        to_lens, to_laser = np.linalg.norm(points, axis=1), np.linalg.norm(points - laser, axis=1)
-        if self.camera_port is not None:
-            to_lens = self.camera_port.connect(points, np.zeros(3))[3]
-        if self.laser_port is not None:
-            to_laser = self.laser_port.connect(points, laser)[3]
+        ends = ((self.laser_port, np.array(self.scene.beam.position)), (self.camera_port, np.zeros(3)))
+        to_laser, to_lens = (
+            np.linalg.norm(points - end, axis=1) if port is None else port.connect(points, end)[3] for port, end in ends
+        )
         return to_laser + to_lens
 
     def arrival_ns(self, path: float) -> float:
@@ -102,48 +154,29 @@ class Survey:
         """Range [m] of a round trip of `time` [s], laser at the lens."""
         return range_from_time(time, self.scene.medium.group_index) + (port_advance(self.scene) if time > 0.0 else 0.0)
 
-    @property
-    def bin_range(self) -> float:
-        """Range that a bin covers [m]."""
-        return range_from_time(self.scene.gate.bin_width, self.scene.medium.group_index)
-
-    @property
-    def target_arrival_ns(self) -> tuple[float, float] | None:
-        """First and last unscattered return of the targets [ns]."""
-        return (
-            None
-            if self.target_path is None
-            else (self.arrival_ns(self.target_path[0]), self.arrival_ns(self.target_path[1]))
+    def _on_axis(self, distance: float, optical_depth: float) -> OnAxis:
+        scene, passed = self.scene, math.exp(-optical_depth)
+        ballistic = self._pixel_share(distance) * passed
+        # Lambertian, towards the lens
+        collected = float(self.reflectance.max()) / math.pi * scene.camera.aperture_area / distance**2
+        share = ballistic * passed * _transmission(self.camera_port)
+        if self.camera_port is not None and self.camera_port.shape == "dome":
+            share *= (self.camera_port.index[0] / self.camera_port.index[2]) ** 2
+        photons = share * collected * scene.laser.photons_per_pulse
+        return OnAxis(
+            distance=distance,
+            optical_depth=optical_depth,
+            irradiance=beam_axis_fluence(scene, distance) * passed * scene.laser.average_power,
+            samples_per_pixel=scene.transport.photons / scene.scan_positions * ballistic,
+            photons_per_pixel=photons,
+            signal_per_pulse=photons * scene.detections_per_photon,
         )
-
-    @property
-    def irf_fwhm_ps(self) -> float:
-        """Width of the instrument response [ps], if pulse and jitter are Gaussian."""
-        return math.hypot(self.scene.laser.pulse_fwhm_ps, self.scene.detector.jitter_fwhm_ps)
-
-    @property
-    def histogram_bytes(self) -> int:
-        """Memory of one set of tallies."""
-        camera = self.scene.camera
-        return 3 * 8 * camera.width * camera.height * self.scene.gate.bins
-
-    @property
-    def distance(self) -> float | None:
-        """Range of the nearest illuminated point [m]; None if there is none, or it lies at the lens centre."""
-        return self.target_range[0] or None if self.target_range is not None else None
-
-    @cached_property
-    def ballistic_share(self) -> float | None:
-        """Part of the beam that reaches, unscattered, one pixel's footprint on the axis at the nearest point."""
-        if self.distance is None or self.optical_depth is None:
-            return None
-        return self._pixel_share(self.distance) * math.exp(-self.optical_depth)
 
     def _pixel_share(self, distance: float) -> float:
         """Part of the beam within one pixel's footprint at `distance` [m], on the beam's axis, without water."""
         laser, footprint = self.scene.laser, (self.scene.camera.pixel_tangent * distance) ** 2
-        footprint *= self._narrowed(self.camera_port) / self._narrowed(self.laser_port)
-        footprint *= self._transmission(self.laser_port)
+        footprint *= _narrowed(self.camera_port) / _narrowed(self.laser_port)
+        footprint *= _transmission(self.laser_port)
         if laser.profile == "uniform_cone":
             area = 2.0 * math.pi * (1.0 - math.cos(laser.half_angle)) * distance**2
         elif laser.profile == "gaussian":
@@ -155,50 +188,15 @@ class Survey:
             area = math.pi * laser.beam_radius**2
         return min(1.0, footprint / area) if area > 0.0 else 1.0
 
-    @staticmethod
-    def _narrowed(port: PortGeometry | None) -> float:
-        """By which a flat port makes a small solid angle about its normal smaller."""
-        return 1.0 if port is None or port.shape != "flat" else (port.index[0] / port.index[2]) ** 2
 
-    @staticmethod
-    def _transmission(port: PortGeometry | None) -> float:
-        """Of light that falls on a port at right angles."""
-        if port is None:
-            return 1.0
-        first, second, third = port.index
-        return (4.0 * first * second / (first + second) ** 2) * (4.0 * second * third / (second + third) ** 2)
+def _narrowed(port: PortGeometry | None) -> float:
+    """By which a flat port makes a small solid angle about its normal smaller."""
+    return 1.0 if port is None or port.shape != "flat" else (port.index[0] / port.index[2]) ** 2
 
-    @property
-    def samples_per_pixel(self) -> float | None:
-        """Traced photons that reach one pixel's part of the target unscattered."""
-        if self.ballistic_share is None:
-            return None
-        return self.scene.transport.photons / self.scene.scan_positions * self.ballistic_share
 
-    @property
-    def irradiance(self) -> float | None:
-        """Unscattered light on the beam's axis at the range of the nearest point, mean over time [W/m²]."""
-        if self.distance is None or self.optical_depth is None:
-            return None
-        return (
-            beam_axis_fluence(self.scene, self.distance)
-            * math.exp(-self.optical_depth)
-            * self.scene.laser.average_power
-        )
-
-    @property
-    def photons_per_pixel(self) -> float | None:
-        """Unscattered photons from the target that a pixel on the beam's axis receives from a pulse."""
-        if self.ballistic_share is None or self.distance is None or self.optical_depth is None:
-            return None
-        # Lambertian, towards the lens
-        collected = float(self.reflectance.max()) / math.pi * self.scene.camera.aperture_area / self.distance**2
-        share = self.ballistic_share * math.exp(-self.optical_depth) * self._transmission(self.camera_port)
-        if self.camera_port is not None and self.camera_port.shape == "dome":
-            share *= (self.camera_port.index[0] / self.camera_port.index[2]) ** 2
-        return share * collected * self.scene.laser.photons_per_pulse
-
-    @property
-    def signal_per_pulse(self) -> float | None:
-        """Unscattered photons from the target that a pixel on the beam's axis detects from a pulse."""
-        return None if self.photons_per_pixel is None else self.photons_per_pixel * self.scene.detections_per_photon
+def _transmission(port: PortGeometry | None) -> float:
+    """Of light that falls on a port at right angles."""
+    if port is None:
+        return 1.0
+    first, second, third = port.index
+    return (4.0 * first * second / (first + second) ** 2) * (4.0 * second * third / (second + third) ** 2)

@@ -104,7 +104,7 @@ def fit(
             spadwarp.files.locate(counts),
             scene,
             unknown=unknown,
-            start={name: value for name, (value,) in pairs(start, 1, "--start").items()} or None,
+            initial_guess={name: value for name, (value,) in pairs(start, 1, "--start").items()} or None,
             prior={name: (mean, deviation) for name, (mean, deviation) in pairs(prior, 2, "--prior").items()},
             pulses=pulses,
             photons=photons,
@@ -138,7 +138,7 @@ def _table(found: Fit) -> Table:
             rounded(one.value, one.standard_error),
             f"{one.standard_error:.2g}",
             " to ".join(rounded(end, one.standard_error) for end in one.interval),
-            rounded(one.start, one.standard_error),
+            rounded(one.initial_guess, one.standard_error),
             f"{percent(one.simulation)} %",
         )
     return table

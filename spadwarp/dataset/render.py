@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import pixel_maps
-from spadwarp.analytic.optics import scene_optics
+from spadwarp.analytic.model import pixel_maps, scene_optics
 from spadwarp.dataset.plan import Plan, SceneDraw
 from spadwarp.device import pick_device
 from spadwarp.errors import ConfigError, kernel_errors

@@ -1,14 +1,17 @@
-"""The likelihood's equations for unknowns: score, information and covariance, from two independent halves of photons.
+"""The likelihood's equations for unknowns and their solution, from two independent halves of photons.
 
 An expected histogram λ and its derivatives are Monte Carlo estimates. A square of one estimate is too large by its
 variance; a product of two independent estimates is right in the mean. So the weights of the score come from one half,
 what they weigh from the other, and both ways are averaged. Whatever the noise of the weights, the score's mean is 0 at
 the truth; what it costs is precision, and the covariance, which is that of the equations that were solved, has it.
+
+Pixels know of each other through the unknowns that they share alone: the matrix has the shape of an arrow. The pixels'
+own unknowns are eliminated (Schur's complement), so that the cost grows with the pixels and not with their cube.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -18,8 +21,7 @@ from numpy.typing import NDArray
 
 from spadwarp.device import core_count
 from spadwarp.inverse.rendering import Half
-
-__all__ = ["Cell", "Equations", "Law", "Means", "equations", "means_of", "planned_pulses"]
+from spadwarp.inverse.unknowns import DEPTH, Unknown
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
@@ -28,6 +30,8 @@ Cell = tuple[int, int, int]
 """Rows, columns and bins."""
 
 _PIXELS = 256  # of a part that a thread works on
+_LEVELS = (1, 2, 4, 8, 16)  # pixels along the side of a cell
+_MOST_BINS = 4  # of a cell
 
 
 class Law(NamedTuple):
@@ -106,133 +110,101 @@ class Equations:
         )
 
 
-def equations(
-    law: Law,
-    halves: list[Half],
-    trials: Rows | None,
-    counts: NDArray[np.integer] | None,
-    *,
-    pulses: float,
-    image: tuple[int, int],
-    cells: Sequence[Cell] | None = None,
-    means: Means | None = None,
-) -> Equations:
-    """The equations of counts `[pixel, bin]`, or of a plan of so many `pulses`, from two halves of photons.
+class Moments:
+    """Means of the counts by two halves of photons, their derivatives and variance, float32: what equations are of.
 
     Args:
         law, halves: The detector; what the photons say.
-        trials: Pulses that can still count in each bin; None: their mean.
-        counts: None for a plan.
+        trials: Pulses that can still count in each bin `[pixel, bin]`; None: their mean.
+        counts: `[pixel, bin]`; None for a plan.
         pulses: In all.
         image: (height, width).
-        cells: Of each unknown: rows, columns and bins over which its weights are averaged. Any weights give equations
-            that are right in the mean; noisy ones are less precise.
-        means: From `means_of` with the same arguments, for several equations of one rendering.
     """
-    pixels, unknowns = halves[0].rates.shape[0], halves[0].slopes.shape[0]
-    score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
-    noise = np.zeros_like(slope)
-    simulation = [np.zeros((len(half.batches), pixels, unknowns)) for half in halves]
-    mean_weights = np.empty((pixels, unknowns, law.recorded), np.float32)
-    cells = [(1, 1, 1)] * unknowns if cells is None else cells
-    own = means_of(law, halves, trials, counts, pulses=pulses) if means is None else means
-    with ThreadPoolExecutor(core_count()) as pool:
-        weights = [_weights(law, half, i, own, image, cells, pool) for i, half in enumerate(halves)]
+
+    def __init__(
+        self,
+        law: Law,
+        halves: list[Half],
+        trials: Rows | None,
+        counts: NDArray[np.integer] | None,
+        *,
+        pulses: float,
+        image: tuple[int, int],
+    ) -> None:
+        self.law, self.halves, self.image = law, halves, image
+        self.rates = 0.5 * (halves[0].rates + halves[1].rates)
+        self.trials = planned_pulses(law, self.rates, pulses) if trials is None else trials
+        pixels, unknowns = self.rates.shape[0], halves[0].slopes.shape[0]
+
+        def rows() -> Rows:
+            return np.empty((pixels, law.recorded), np.float32)
+
+        self.variance = rows()
+        self.slopes = [np.empty((pixels, unknowns, law.recorded), np.float32) for _ in halves]
+        self.batches = [[rows() for _ in half.batches] for half in halves]
+        self.rest = None if counts is None else [rows(), rows()]  # counts less their mean
 
         def part(chosen: slice) -> None:
-            for i, weight in enumerate(one[chosen] for one in weights):
-                slope[chosen] += 0.5 * np.matmul(weight, own.slopes[1 - i][chosen].transpose(0, 2, 1))
-                if own.rest is not None:
-                    score[chosen] += 0.5 * np.matmul(weight, own.rest[1 - i][chosen, :, None])[..., 0]
-                for batch, mean in enumerate(own.batches[1 - i]):
-                    simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
-            both = mean_weights[chosen]
-            np.multiply(weights[0][chosen] + weights[1][chosen], np.float32(0.5), out=both)
-            noise[chosen] = np.matmul(both * own.variance[chosen, None], both.transpose(0, 2, 1))
+            trials = self.trials[chosen]
+            for i, half in enumerate(halves):
+                slopes = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
+                self.slopes[i][chosen] = law.slopes(half.first[chosen], slopes, trials)
+                for mean, rates in zip(self.batches[i], half.batches, strict=True):
+                    mean[chosen] = law.mean(rates[chosen], trials)
+                if self.rest is not None and counts is not None:
+                    self.rest[i][chosen] = counts[chosen] - law.mean(half.rates[chosen], trials)
+            self.variance[chosen] = law.variance(law.mean(self.rates[chosen], trials), trials)
 
-        list(pool.map(part, _parts(pixels)))
-    return Equations(score, slope, noise, [one - one.mean(axis=0) for one in simulation], mean_weights)
+        with ThreadPoolExecutor(core_count()) as pool:
+            list(pool.map(part, _parts(pixels)))
 
+    def equations(self, cells: Sequence[Cell]) -> Equations:
+        """The equations of the counts, or of a plan of them.
 
-class Means(NamedTuple):
-    """What the equations take of a rendering whatever their cells are, float32.
+        `cells`: of each unknown the rows, columns and bins over which its weights are averaged. Any weights give
+        equations that are right in the mean; noisy ones are less precise.
+        """
+        pixels, unknowns = self.slopes[0].shape[:2]
+        score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
+        noise = np.zeros_like(slope)
+        simulation = [np.zeros((len(batches), pixels, unknowns)) for batches in self.batches]
+        mean_weights = np.empty((pixels, unknowns, self.law.recorded), np.float32)
+        with ThreadPoolExecutor(core_count()) as pool:
+            weights = [self._weights(i, cells, pool) for i in (0, 1)]
 
-    Attributes:
-        trials: Pulses that can still count in each bin.
-        slopes: Derivatives of the mean counts by each half, `[half][pixel, unknown, bin]`.
-        rest: Counts less their mean by each half, `[half][pixel, bin]`; None without counts.
-        batches: Mean counts by each batch of photons, `[half][batch][pixel, bin]`.
-        variance: Of the counts, by both halves.
-    """
+            def part(chosen: slice) -> None:
+                for i, weight in enumerate(half[chosen] for half in weights):
+                    slope[chosen] += 0.5 * np.matmul(weight, self.slopes[1 - i][chosen].transpose(0, 2, 1))
+                    if self.rest is not None:
+                        score[chosen] += 0.5 * np.matmul(weight, self.rest[1 - i][chosen, :, None])[..., 0]
+                    for batch, mean in enumerate(self.batches[1 - i]):
+                        simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
+                both = mean_weights[chosen]
+                np.multiply(weights[0][chosen] + weights[1][chosen], np.float32(0.5), out=both)
+                noise[chosen] = np.matmul(both * self.variance[chosen, None], both.transpose(0, 2, 1))
 
-    trials: Rows
-    slopes: list[Rows]
-    rest: list[Rows] | None
-    batches: list[list[Rows]]
-    variance: Rows
+            list(pool.map(part, _parts(pixels)))
+        return Equations(score, slope, noise, [part - part.mean(axis=0) for part in simulation], mean_weights)
 
+    def _weights(self, number: int, cells: Sequence[Cell], pool: ThreadPoolExecutor) -> Rows:
+        """By a half: derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
+        slopes, limits = self.slopes[number], self.halves[number].limits
+        variance = self.law.variance(self.batches[number][0], self.trials)
+        below = {cell: _in_cells(variance, self.image, cell) for cell in set(cells)}
+        weights = np.empty_like(slopes)
 
-def means_of(
-    law: Law, halves: list[Half], trials: Rows | None, counts: NDArray[np.integer] | None, *, pulses: float
-) -> Means:
-    """Of a rendering, for several `equations` of it; arguments are theirs."""
-    a, b = halves
-    left = planned_pulses(law, 0.5 * (a.rates + b.rates), pulses) if trials is None else trials
-    pixels, unknowns = a.rates.shape[0], a.slopes.shape[0]
+        def unknown(i: int) -> None:
+            under, above = below[cells[i]], _in_cells(slopes[:, i], self.image, cells[i])
+            weight = np.divide(above, under, out=np.zeros_like(above), where=under > 0)
+            np.clip(weight, -limits[i], limits[i], out=weight)
+            weights[:, i] = _expanded(weight, self.image, cells[i], slopes.shape[2])
 
-    def rows() -> Rows:
-        return np.empty((pixels, law.recorded), np.float32)
-
-    slopes = [np.empty((pixels, unknowns, law.recorded), np.float32) for _ in halves]
-    batches, variance = [[rows() for _ in half.batches] for half in halves], rows()
-    rest = None if counts is None else [rows(), rows()]
-
-    def part(chosen: slice) -> None:
-        trials = left[chosen]
-        for i, half in enumerate(halves):
-            own = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
-            slopes[i][chosen] = law.slopes(half.first[chosen], own, trials)
-            for mean, rates in zip(batches[i], half.batches, strict=True):
-                mean[chosen] = law.mean(rates[chosen], trials)
-            if rest is not None and counts is not None:
-                rest[i][chosen] = counts[chosen] - law.mean(half.rates[chosen], trials)
-        mean_rates = 0.5 * (a.rates[chosen] + b.rates[chosen])
-        variance[chosen] = law.variance(law.mean(mean_rates, trials), trials)
-
-    with ThreadPoolExecutor(core_count()) as pool:
-        list(pool.map(part, _parts(pixels)))
-    return Means(left, slopes, rest, batches, variance)
+        list(pool.map(unknown, range(len(cells))))
+        return weights
 
 
 def _parts(pixels: int) -> list[slice]:
     return [slice(first, min(first + _PIXELS, pixels)) for first in range(0, pixels, _PIXELS)]
-
-
-def _weights(
-    law: Law,
-    half: Half,
-    number: int,
-    means: Means,
-    image: tuple[int, int],
-    cells: Sequence[Cell],
-    pool: ThreadPoolExecutor,
-) -> Rows:
-    """Derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
-    slopes = means.slopes[number]
-    variance = law.variance(means.batches[number][0], means.trials)
-    below = {cell: _in_cells(variance, image, cell) for cell in set(cells)}
-    found = np.empty_like(slopes)
-
-    def unknown(i: int) -> None:
-        cell, limit = cells[i], half.limits[i]
-        under = below[cell]
-        above = _in_cells(slopes[:, i], image, cell)
-        weight = np.divide(above, under, out=np.zeros_like(above), where=under > 0)
-        np.clip(weight, -limit, limit, out=weight)
-        found[:, i] = _expanded(weight, image, cell, slopes.shape[2])
-
-    list(pool.map(unknown, range(len(cells))))
-    return found
 
 
 def _in_cells(rows: Rows, image: tuple[int, int], cell: Cell) -> Rows:
@@ -250,3 +222,177 @@ def _expanded(cube: Rows, image: tuple[int, int], cell: Cell, bins: int) -> Rows
         if cell[axis] > 1:
             cube = np.repeat(cube, cell[axis], axis=axis).take(range(size), axis=axis)
     return cube.reshape(-1, bins)
+
+
+# Solution
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A step towards the solution and its covariance; in the unit of the equations.
+
+    Attributes:
+        shared: Step of what all pixels share, `[S]`.
+        pixels: Steps of the pixels' own unknowns, `[pixel, Q]`; NaN where a pixel knows nothing of them.
+        information: Fisher information of the shared unknowns when the own ones are unknown too, `[S, S]`.
+        covariance: Of the shared, counts and simulation together, `[S, S]`.
+        simulation: The part of it that is noise of the simulation.
+        pixel_covariance: `[pixel, Q, Q]`.
+        pixel_bound: Their Cramér–Rao bound, `[pixel, Q, Q]`.
+        simulation_share: Largest variance by the simulation over that by the counts, of the shared unknowns;
+            without any, of the median pixel.
+        gain: What the step adds to the log-likelihood, of the shared unknowns in their covariance.
+        slope_ratio: The depth's slope over that of the renderer's wide difference; 1 where no difference was seen; 0
+            where it is not known how far the depth can move without a change of the counts.
+    """
+
+    shared: Floats
+    pixels: Floats
+    information: Floats
+    covariance: Floats
+    simulation: Floats
+    pixel_covariance: Floats
+    pixel_bound: Floats
+    simulation_share: float
+    gain: float
+    slope_ratio: float = 1.0
+
+
+def solve(
+    equations: Equations, is_per_pixel: NDArray[np.bool_], prior: tuple[Floats, Floats] | None = None
+) -> Solution:
+    """The Newton step of the equations.
+
+    Args:
+        equations: Of `Moments`.
+        is_per_pixel: Which unknowns each pixel has for itself, `[unknown]`.
+        prior: Score and information on the shared unknowns from elsewhere, `[S]` both.
+    """
+    s, q = np.flatnonzero(~is_per_pixel), np.flatnonzero(is_per_pixel)
+    slope, score = equations.slope, equations.score
+    pull, known_before = (np.zeros(s.size), np.zeros(s.size)) if prior is None else prior
+    # What a pixel's own unknowns take of the shared ones: left and right of the inverse of their block.
+    inverse, known = _inverses(slope[:, q[:, None], q])
+    left = -slope[:, s[:, None], q] @ inverse
+    right = inverse @ slope[:, q[:, None], s]
+    matrix = (slope[:, s[:, None], s] + left @ slope[:, q[:, None], s]).sum(axis=0) + np.diag(known_before)
+    inverse_matrix = pseudo_inverse(matrix)
+    shared = inverse_matrix @ ((score[:, s] + np.einsum("psq,pq->ps", left, score[:, q])).sum(axis=0) + pull)
+    # Each pixel's part of the reduced score is `mixing` times its score.
+    mixing = np.zeros((len(slope), s.size, is_per_pixel.size))
+    mixing[:, np.arange(s.size), s] = 1.0
+    mixing[:, :, q] = left
+    by_counts = np.einsum("psi,pij,ptj->st", mixing, equations.noise, mixing, optimize=True) + np.diag(known_before)
+    by_simulation = np.zeros_like(by_counts)
+    pixel_simulation = np.zeros_like(inverse)
+    for part in equations.simulation:  # of batches less their means
+        if (batches := len(part)) > 1:  # the score has half of each half's mean
+            reduced, rest = np.einsum("psi,bpi->bs", mixing, part), part[..., q]
+            by_simulation += 0.25 * reduced.T @ reduced / (batches * (batches - 1))
+            pixel_simulation += 0.25 * np.einsum("bpi,bpj->pij", rest, rest) / (batches * (batches - 1))
+    pixels = np.einsum("pij,pj->pi", inverse, score[:, q]) - right @ shared
+    pixel_simulation = inverse @ pixel_simulation @ inverse.transpose(0, 2, 1)
+    pixel_noise = inverse @ equations.noise[:, q[:, None], q] @ inverse.transpose(0, 2, 1) + pixel_simulation
+    covariance = inverse_matrix @ (by_counts + by_simulation) @ inverse_matrix.T
+    pixel_covariance = pixel_noise + right @ covariance @ right.transpose(0, 2, 1)
+    simulation = inverse_matrix @ by_simulation @ inverse_matrix.T
+    if s.size:
+        share = _largest_ratio(np.diag(simulation), np.diag(covariance - simulation))
+        gain = 0.5 * float(shared @ np.linalg.pinv(covariance, rcond=1e-12) @ shared)
+    else:
+        variance, by_simulation = np.einsum("pii->pi", pixel_covariance), np.einsum("pii->pi", pixel_simulation)
+        share = _largest_ratio(np.nanmedian(by_simulation, axis=0), np.nanmedian(variance - by_simulation, axis=0))
+        gains = np.divide(pixels**2, variance, out=np.zeros_like(pixels), where=variance > 0)
+        gain = 0.5 * float(gains.sum(axis=1).mean())
+    bound = 0.5 * (inverse_matrix + inverse_matrix.T)
+    pixel_bound = 0.5 * (inverse + inverse.transpose(0, 2, 1)) + right @ bound @ right.transpose(0, 2, 1)
+    pixels[~known], pixel_bound[~known], pixel_covariance[~known] = np.nan, np.nan, np.nan
+    return Solution(
+        shared=shared,
+        pixels=pixels,
+        information=0.5 * (matrix + matrix.T),
+        covariance=covariance,
+        simulation=simulation,
+        pixel_covariance=pixel_covariance,
+        pixel_bound=pixel_bound,
+        simulation_share=share,
+        gain=gain,
+    )
+
+
+def _inverses(blocks: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Inverses of the pixels' own blocks, 0 where a block is not positive, and where it is."""
+    known = np.ones(len(blocks), bool)
+    if blocks.shape[-1]:
+        scale = np.sqrt(np.maximum(np.einsum("pii->pi", blocks), 0.0))
+        known = (scale > 0).all(axis=1)
+        unit = np.where(known[:, None], scale, 1.0)
+        scaled = blocks / (unit[:, :, None] * unit[:, None, :])
+        known &= np.linalg.eigvalsh(0.5 * (scaled + scaled.transpose(0, 2, 1)))[:, 0] > 1e-4
+    result = np.zeros_like(blocks)
+    result[known] = np.linalg.inv(blocks[known])
+    return result, known
+
+
+def pseudo_inverse(matrix: Floats) -> Floats:
+    """The inverse of a matrix whose rows and columns may have very different units."""
+    scale = np.sqrt(np.maximum(np.abs(np.diag(matrix)), 1e-300))
+    return np.linalg.pinv(matrix / np.outer(scale, scale), rcond=1e-9) / np.outer(scale, scale)
+
+
+def _largest_ratio(parts: Floats, wholes: Floats) -> float:
+    return float(np.max(np.divide(parts, wholes, out=np.zeros_like(parts), where=wholes > 0), initial=0.0))
+
+
+class Pooled(NamedTuple):
+    """Equations with cells of `level` pixels on a side, and their solution."""
+
+    level: int
+    equations: Equations
+    solution: Solution
+
+
+def solve_pooled(
+    unknowns: Sequence[Unknown],
+    moments: Moments,
+    scales: Floats,
+    solve: Callable[[Equations], Solution],
+    *,
+    pooling_level: int | None,
+) -> Pooled:
+    """The equations with the cells that have the least standard errors, from coarse to fine.
+
+    Fine weights of the score are sharp but noisy, coarse ones know little of edges.
+
+    Args:
+        unknowns: In the order of the slopes.
+        moments: Of a rendering.
+        scales: Units of the unknowns, `[pixel, unknown]`.
+        solve: Solves equations in these units.
+        pooling_level: The coarsest that is tried, as that of an earlier rendering; None: the coarsest of all.
+    """
+    coarsest = max(moments.image) if pooling_level is None else pooling_level
+    levels = [size for size in _LEVELS if size <= coarsest]
+    if all(unknown.per_pixel for unknown in unknowns):
+        levels = [1]
+    best, least, worse = None, np.inf, 0
+    for size in reversed(levels):
+        equations = moments.equations([_cell(unknown, size) for unknown in unknowns]).times(scales)
+        solution = solve(equations)
+        variances = np.diag(solution.covariance)
+        total = float(np.log(np.maximum(variances, 1e-300)).sum()) if (variances > 0).all() else np.inf
+        if best is None or total < least:
+            best, least, worse = Pooled(size, equations, solution), total, 0
+        elif np.isfinite(least):
+            worse += 1
+        if worse == 2:  # the noise of the errors can hide one better level behind a worse one
+            break
+    assert best is not None
+    return best
+
+
+def _cell(unknown: Unknown, size: int) -> Cell:
+    """A pixel's own unknown has weights of its own; a shift in time needs every bin."""
+    if unknown.per_pixel:
+        return (1, 1, 1)
+    return (size, size, 1 if unknown.name == DEPTH else min(size, _MOST_BINS))

@@ -1,4 +1,4 @@
-"""What a fit gives: estimates with covariance and intervals, maps, what limits them."""
+"""Estimates of a fit: values with covariance and intervals, maps, what limits them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from spadwarp.units import percent
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["Estimate", "EstimateMap", "Fit", "Iteration", "correlations", "not_identifiable"]
+__all__ = ["Estimate", "EstimateMap", "Fit", "Iteration"]
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class Estimate:
         standard_error: Of counts and simulation together.
         interval: 95 %; of positive values from the standard error of the logarithm.
         simulation: The part of the variance that is noise of the simulation.
-        start: Where the search began.
+        initial_guess: Where the search began.
         unit: "" for a plain number.
     """
 
@@ -42,7 +42,7 @@ class Estimate:
     standard_error: float
     interval: tuple[float, float]
     simulation: float
-    start: float
+    initial_guess: float
     unit: str = ""
 
 
@@ -108,20 +108,19 @@ class Fit:
         return correlations(self.covariance)
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{one.name} {one.value:.4g} ± {one.standard_error:.2g}" for one in self.estimates.values())
-        maps = ", ".join(f"{name} of each pixel" for name in self.maps)
-        return f"Fit({', '.join(filter(None, (values, maps)))})"
+        values = [f"{item.name} {item.value:.4g} ± {item.standard_error:.2g}" for item in self.estimates.values()]
+        return f"Fit({', '.join([*values, *(f'{name} of each pixel' for name in self.maps)])})"
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers without maps, for JSON."""
         return {
-            "estimates": {name: vars(one) for name, one in self.estimates.items()},
+            "estimates": {name: vars(item) for name, item in self.estimates.items()},
             "names": list(self.names),
             "covariance": self.covariance.tolist(),
             "correlation": self.correlation.tolist(),
             "converged": self.converged,
             "warnings": list(self.warnings),
-            "iterations": [{**vars(one), "values": dict(one.values)} for one in self.iterations],
+            "iterations": [{**vars(item), "values": dict(item.values)} for item in self.iterations],
             "pulses": self.pulses,
             "counts": int(self.counts.sum()),
             "photons": self.photons,
@@ -144,15 +143,16 @@ def correlations(covariance: Floats) -> Floats:
 
 def not_identifiable(names: Sequence[str], covariance: Floats, positive: Sequence[bool]) -> list[str]:
     """Sentences on unknowns that the counts do not tell apart, or not at all."""
-    found = []
+    sentences = []
     correlation = correlations(covariance)
     for i, name in enumerate(names):
         for j in range(i):
             if abs(correlation[i, j]) > _CORRELATED:
-                found.append(
+                sentences.append(
                     f"{names[j]} and {name} are hardly told apart (correlation {correlation[i, j]:+.4f}): hold one of "
                     "them fixed, or give it a prior"
                 )
         if positive[i] and np.sqrt(covariance[i, i]) > _UNSURE:
-            found.append(f"{name}: the counts say little of it (standard error {percent(covariance[i, i] ** 0.5)} %)")
-    return found
+            error = percent(covariance[i, i] ** 0.5)
+            sentences.append(f"{name}: the counts say little of it (standard error {error} %)")
+    return sentences

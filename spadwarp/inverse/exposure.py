@@ -1,4 +1,4 @@
-"""Counts to fit: frames of spadwarp or measured histograms, on the time axis and in the image of a scene."""
+"""Counts to fit, on the time axis and in the image of a scene; and what their backscatter says of the water."""
 
 from __future__ import annotations
 
@@ -13,12 +13,21 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError
 from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
+from spadwarp.frames.spad import LIMIT
 from spadwarp.limits import check_integer
+from spadwarp.scene import phase_function
+from spadwarp.transport import truth_maps
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["Exposure", "read_exposure"]
+__all__ = ["Exposure", "lidar_initial_guess", "read_exposure"]
+
+# Of backscatter from which absorption and scattering are guessed.
+_LEAST_COUNTS, _LEAST_BINS = 200, 12
+_LEAST_SPAN = 1.3  # last over first range, for a slope that says something of the water
+_NEARER = 0.95  # of the range of the nearest target
+_SHARE = 0.2  # of the scattering that the slope contains: most of it goes on forward
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,6 +58,18 @@ class Exposure:
         before -= self.counts
         return np.maximum(self.pulses - before, 0).astype(np.float32)
 
+    def warnings(self) -> list[str]:
+        """Sentences on simulated counts that hold more noise than their photons have."""
+        noise = self.monte_carlo_noise
+        if noise is None or noise <= LIMIT:
+            return []
+        return [
+            f"the counts are simulated, and the simulation traced too few photons for {self.pulses} pulses: its noise, "
+            f"the same in every frame, is {noise:.2g} times the shot noise of the counts (95th percentile of the "
+            f"pixels); the standard errors do not contain it. {math.ceil((noise / LIMIT) ** 2)} times the photons "
+            f"would make it {LIMIT:g}"
+        ]
+
 
 def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **facts: Any) -> Exposure:
     """Counts of a frames file, of `Frames`, of `Histograms` or an array, for a scene of the same image.
@@ -68,8 +89,8 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
     if isinstance(counts, str | os.PathLike):
         path = Path(counts)
         name = str(path)
-        own = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
-        counts = FramesFile.load(path) if own else read_histograms(path, **facts)
+        is_frames = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
+        counts = FramesFile.load(path) if is_frames else read_histograms(path, **facts)
     gate = scene.gate
     start, width, irf, widths = gate.start, gate.bin_width, None, None
     values, noise = counts, None
@@ -116,3 +137,45 @@ def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], 
     frames = array.shape[0] if array.ndim == 4 else 1
     total = array.sum(axis=0, dtype=np.int64) if array.ndim == 4 else array.astype(np.int64)
     return total.reshape(-1, total.shape[-1]), frames
+
+
+def lidar_initial_guess(scene: Scene, exposure: Exposure, *, device: str | None = None) -> dict[str, float]:
+    """Absorption and scattering [1/m] from the single-scatter lidar equation; empty where no backscatter is recorded.
+
+    Counts of the whole image before the nearest target, without pile-up (Coates) and noise, times R², fall as
+    exp(−2KR), R half the path. Their level is N η (Ω_view/Ω_beam) A b p(π) v Δt/2, from which b follows with the
+    scene's phase function. Light that is scattered forward is not lost, so that K is a + 0.2 b rather than a + b.
+    It is right within a factor of about 3, which is what a start needs.
+    """
+    assert exposure.counts is not None
+    start, bins = exposure.window
+    dt, speed = scene.gate.bin_width, scene.medium.pulse_speed
+    distance = 0.5 * speed * (start + dt * (np.arange(bins) + 0.5))
+    seen = truth_maps(scene, device=device).range
+    nearest = float(np.nanmin(seen)) if np.isfinite(seen).any() else math.inf
+    # From where on the beam fills the view.
+    baseline = float(np.linalg.norm(scene.beam.position))
+    overlap = 2.0 * baseline / math.tan(min(scene.laser.half_angle, 1.5)) if scene.laser.half_angle > 0 else 0.0
+    inside = (distance > max(overlap, 5.0 * scene.camera.aperture_radius)) & (distance < _NEARER * nearest)
+    counts, left = exposure.counts.sum(axis=0), np.maximum(exposure.left().sum(axis=0), 1.0)
+    inside &= left > 0.05 * exposure.pulses * len(exposure.counts)
+    rate = -np.log1p(-np.minimum(counts / left, 0.99)) - scene.detector.noise_rate * dt
+    inside &= (rate > 0) & (counts > 0)
+    if inside.sum() < _LEAST_BINS or counts[inside].sum() < _LEAST_COUNTS:
+        return {}
+    if distance[inside][-1] < _LEAST_SPAN * distance[inside][0]:
+        return {}
+    x, y = distance[inside], np.log(rate[inside] * distance[inside] ** 2)
+    slope, level = np.polyfit(x, y, 1, w=np.sqrt(counts[inside]))
+    camera = scene.camera
+    view = camera.pixel_tangent**2  # of a pixel [sr]
+    beam = 2.0 * math.pi * (1.0 - math.cos(scene.laser.half_angle))
+    backward = float(phase_function(scene.medium).density(np.array([math.pi]))[0])
+    caught = scene.laser.photons_per_pulse * scene.detections_per_photon * min(view / max(beam, 1e-12), 1.0)
+    scattering = math.exp(level) / (caught * camera.aperture_area * backward * 0.5 * speed * dt)
+    decay = max(-0.5 * slope, 0.02)
+    scattering = min(max(scattering, 0.05 * decay), 10.0 * decay)
+    return {
+        "medium.absorption": max(decay - _SHARE * scattering, 0.2 * decay),
+        "medium.scattering": scattering,
+    }

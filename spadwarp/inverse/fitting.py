@@ -1,49 +1,70 @@
-"""Maximum likelihood of counts: water, surfaces, background and depth from one exposure."""
+"""Maximum likelihood of counts: water, surfaces, background and depth from one exposure.
+
+From a rough start, pixels are added up in blocks and an exponential model of each is fitted between two renderings: a
+histogram in water is nearly an exponential of its unknowns, of absorption times path, of the logarithm of a
+reflectance. Steps of Newton's method, which takes it for a straight line, overshoot or stall from starts that are wrong
+by factors. Then Fisher scoring on all pixels and bins.
+
+Light lies in bins until the instrument response spreads it. Where most of a pixel's light lies in one or two bins, the
+expected counts follow the depth only as light crosses the edges of these bins: hardly at all while it stays inside one,
+fast while it crosses. The difference over about half of the response, which makes smooth weights, gives the mean slope
+over several millimetres; the slope within the depth's error can be a part of it, or a multiple. Any weights give right
+equations, but the step and the covariance need the slope where the depth is looked for.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.inverse.coarse import blocks_of, coarse_step, in_cells
-from spadwarp.inverse.depth_slope import Local, locally_solved
-from spadwarp.inverse.equations import Law
-from spadwarp.inverse.estimates import Fit, Iteration
-from spadwarp.inverse.exposure import Exposure, read_exposure
+from spadwarp.inverse.equations import Equations, Law, Moments, Pooled, Solution, solve, solve_pooled
+from spadwarp.inverse.estimates import NORMAL_95, Estimate, EstimateMap, Fit, Iteration, not_identifiable
+from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposure
 from spadwarp.inverse.rendering import Half, Renderer
-from spadwarp.inverse.report import estimates_of
-from spadwarp.inverse.solving import Solution, solve
-from spadwarp.inverse.start import lidar_start
-from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, start_value
-from spadwarp.inverse.weighing import solved
+from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
 from spadwarp.limits import SEED, check_integer, check_real
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport import truth_maps
+from spadwarp.units import percent
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector
 
-__all__ = ["BATCHES", "PHOTONS", "SIMULATION", "Fitter", "checked_prior", "detector_law", "fit"]
+__all__ = ["Fitter", "fit"]
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]
 
-PHOTONS = {"cpu": 20_000_000, "cuda": 400_000_000}
+BATCHES = 4  # of photons in each half, and of a difference of depths
+SIMULATION = 0.1  # of the variance by the counts
+_PHOTONS = {"cpu": 20_000_000, "cuda": 400_000_000}
+
+# Iterations: how many, with how many photons, until when.
 _COARSE, _FINE = 16, 8  # renderings at most
 _FEWEST, _FEWER, _FEW = 128, 32, 16  # divide the photons: of the first coarse rendering, the last, the first fine one
-BATCHES = 4  # of photons in each half
+_ACROSS = 4  # blocks along each side of the image in coarse steps; more of them are noisier
 _SETTLED = 0.3  # of the largest coarse step: from there Fisher scoring converges, and few photons say no more
 _CONVERGED = 1.0  # gain of the log-likelihood for each unknown: half of it is expected from the counts' own noise
 _PATIENCE = 3  # fine renderings, after which the depth's slope is looked at
 _LEFT = 0.01  # gain for each unknown that a further step would bring: a seventh of a standard error
-SIMULATION = 0.1  # of the variance by the counts
-_STEP = {"log": 1.1, "depth": 0.05, "anisotropy": 0.05}
+
+# The slope by the depth, over the interval that is stated for the depth.
+_WIDE = 0.7  # of the renderer's step: an interval of this size has the slope that is known already
+_CONSISTENT = 1.5  # ratio of the interval that was found to that of the difference
+_LARGEST = 3.0  # ratio of one difference to that before
+_TRIES = 6
+_LEAST = 1e-5  # of the range of the last bin: positions are float32
+_STRAIGHT = 0.75  # ratio of two slopes; below, a warning
+_SURE = 3.0  # standard errors by which a slope has to differ from the wide one
+_ONE_SIDED = 0.5  # ratio of the slopes of both sides: below, the flatter one decides
 
 
 def fit(
@@ -51,7 +72,7 @@ def fit(
     scene: SceneLike,
     *,
     unknown: str | Sequence[str],
-    start: Mapping[str, float] | None = None,
+    initial_guess: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     pulses: int | None = None,
     photons: int | None = None,
@@ -73,8 +94,8 @@ def fit(
         scene: What is known, and where to start.
         unknown: Names, such as "medium.absorption,medium.scattering,targets[0].reflectance,depth:pixel"; see
             `spadwarp.inverse.read_unknowns`.
-        start: Values to start from, by name, depth as a shift from the scene's [m]; by default absorption and
-            scattering from the backscatter (`spadwarp.inverse.lidar_start`), the others of the scene.
+        initial_guess: Values to start from, by name, depth as a shift from the scene's [m]; by default absorption and
+            scattering from the backscatter (`spadwarp.inverse.lidar_initial_guess`), the others of the scene.
         prior: By name what is known from elsewhere: mean and standard deviation.
         pulses: Of one frame of the counts; by default those that the frames name, else of the scene's detector.
         photons: Of an iteration at most; as many are taken as keep the simulation below a tenth of the variance. By
@@ -91,10 +112,10 @@ def fit(
     scene = as_scene(scene)
     exposure = read_exposure(counts, scene, pulses=pulses, **facts)
     fitter = Fitter(scene, unknown, exposure, prior=prior, photons=photons, seed=seed, device=device)
-    return fitter.fit(start=start, progress=progress)
+    return fitter.fit(initial_guess=initial_guess, progress=progress)
 
 
-def detector_law(detector: Detector, window: Any) -> Law:
+def _detector_law(detector: Detector, window: Any) -> Law:
     """How a detector counts in the model. Raises `ConfigError` for what it leaves out."""
     if detector.afterpulsing_probability > 0:
         raise ConfigError(
@@ -107,40 +128,42 @@ def detector_law(detector: Detector, window: Any) -> Law:
 
 
 @dataclass
-class _State:
+class State:
     """Values of the unknowns; those of pixels `[pixel]`, depth as a shift."""
 
     values: dict[str, Any]
     iterations: list[Iteration]
 
+    def scale(self, unknown: Unknown) -> Any:
+        """d(value)/d(what is searched): the value where its logarithm is."""
+        value = self.values[unknown.name]
+        return np.where(value, value, 1.0) if unknown.is_positive else 1.0
+
     def scales(self, unknowns: Sequence[Unknown], pixels: int) -> Floats:
-        """d(value)/d(what is searched), `[pixel, unknown]`."""
+        """The same of several, `[pixel, unknown]`."""
         scales = np.ones((pixels, len(unknowns)))
-        for column, one in enumerate(unknowns):
-            if one.is_positive:
-                scales[:, column] = self.values[one.name]
+        for column, unknown in enumerate(unknowns):
+            scales[:, column] = self.scale(unknown)
         return scales
 
-    def shared(self) -> dict[str, float]:
+    def means(self) -> dict[str, float]:
         """One number for each name: that of a map is its mean."""
         return {name: float(np.nanmean(value)) for name, value in self.values.items()}
 
-    def move(self, one: Unknown, step: Any) -> None:
+    def text(self, digits: int) -> str:
+        """For a report of progress."""
+        return ", ".join(f"{name} {value:.{digits}g}" for name, value in self.means().items())
+
+    def move(self, unknown: Unknown, step: Any) -> None:
         """Takes a step on the scale that is searched."""
-        largest = _STEP[_kind(one)]
-        step = np.clip(np.nan_to_num(step), -largest, largest)
-        value = self.values[one.name]
-        value = value * np.exp(step) if one.is_positive else value + step
-        if one.name.endswith("reflectance"):
+        step = np.clip(np.nan_to_num(step), -unknown.largest_step, unknown.largest_step)
+        value = self.values[unknown.name]
+        value = value * np.exp(step) if unknown.is_positive else value + step
+        if unknown.name.endswith("reflectance"):
             value = np.minimum(value, 1.0)
-        if one.name == "medium.anisotropy":
+        if unknown.name == "medium.anisotropy":
             value = np.clip(value, -0.99, 0.99)
-        self.values[one.name] = value if one.per_pixel else float(value)
-
-
-def _kind(one: Unknown) -> str:
-    """The scale on which an unknown is searched."""
-    return "log" if one.is_positive else "depth" if one.name == DEPTH else "anisotropy"
+        self.values[unknown.name] = value if unknown.per_pixel else float(value)
 
 
 class Fitter:
@@ -166,206 +189,379 @@ class Fitter:
 
         self.scene = as_scene(scene)
         self.unknowns = read_unknowns(self.scene, unknown)
+        self.shared = [unknown for unknown in self.unknowns if not unknown.per_pixel]
         self.exposure, self.device = exposure, device
         kind = "cuda" if pick_device(device).is_cuda else "cpu"
-        self.photons = PHOTONS[kind] if photons is None else check_integer("photons", photons, "[1000, 1e12]")
+        self.photons = _PHOTONS[kind] if photons is None else check_integer("photons", photons, "[1000, 1e12]")
         seed = check_integer("seed", seed, SEED)
         self.render = Renderer(self.scene, self.unknowns, exposure, device=device, seed=seed)
-        self.prior = checked_prior(prior or {}, self.unknowns)
-        self.law = detector_law(self.scene.detector, self.render.window)
-        self._image = (self.scene.camera.height, self.scene.camera.width)
+        self.prior = self._checked(prior or {})
+        self.law = _detector_law(self.scene.detector, self.render.window)
+        self.image = (self.scene.camera.height, self.scene.camera.width)
 
-    # One fit
+    def _checked(self, prior: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation by name. Raises `ArgumentError`."""
+        names = [unknown.name for unknown in self.shared]
+        result = {}
+        for name, pair in prior.items():
+            if name not in names:
+                known = ", ".join(names)
+                raise ArgumentError(f"prior: {name} is not an unknown of the whole exposure; these are {known}")
+            if not (isinstance(pair, tuple | list) and len(pair) == 2):
+                raise ArgumentError(f"prior of {name} = {pair!r} is not (mean, standard deviation)")
+            mean = check_real(f"prior of {name}: mean", pair[0])
+            result[name] = (mean, check_real(f"prior of {name}: standard deviation", pair[1], "(0, inf)"))
+        return result
 
     def fit(
-        self, *, start: Mapping[str, float] | None = None, near: bool = False, progress: Progress | None = None
+        self, *, initial_guess: Mapping[str, float] | None = None, near: bool = False, progress: Progress | None = None
     ) -> Fit:
-        """Fits the exposure from `start`, as `spadwarp.fit` does; `near`: it is within some standard errors already."""
-        began = time.perf_counter()
-        first = self.render.photons
-        state = self._start(start)
-        begin = state.shared()
+        """Fits the exposure as `spadwarp.fit` does; `near`: the guess is within some standard errors already."""
+        began, first = time.perf_counter(), self.render.photons
+        state = self._initial_state(initial_guess)
+        begin = state.means()
         report = (lambda text: None) if progress is None else lambda text: progress(f"fit: {text}", 0, 0)
-        trials = self.exposure.left() if self.law.first_photon else self._all_pulses()
+        assert self.exposure.counts is not None
+        trials = np.full(self.exposure.counts.shape, self.exposure.pulses, np.float32)
+        if self.law.first_photon:
+            trials = self.exposure.left()
         if not near:
             self._approach(state, trials, report)
-        halves, local, converged = self._refine(state, trials, report)
-        return estimates_of(
-            scene=self.scene,
-            unknowns=self.unknowns,
-            values=state.values,
-            start=begin,
-            solution=local.solution,
-            scales=state.scales(self.unknowns, len(trials)),
-            iterations=state.iterations,
+        halves, solution, converged = self._refine(state, trials, report)
+        warnings = [*self.render.warnings(), *self._slope_warnings(solution.slope_ratio), *self.exposure.warnings()]
+        warnings += self._warnings(solution, converged)
+        seconds, photons = time.perf_counter() - began, self.render.photons - first
+        return self._result(
+            state,
+            begin,
+            solution,
+            iterations=tuple(state.iterations),
             converged=converged,
-            prior=self.prior,
-            exposure=self.exposure,
-            expected=self.law.mean(0.5 * (halves[0].rates + halves[1].rates), trials),
-            truth=truth_maps(self.scene, device=self.device),
-            edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
-            photons=self.render.photons - first,
-            seconds=time.perf_counter() - began,
-            warnings=[*self.render.warnings(), *local.warnings(self.scene)],
+            warnings=tuple(warnings),
+            expected=self.law.mean(0.5 * (halves[0].rates + halves[1].rates), trials).reshape(*self.image, -1),
+            photons=photons,
+            seconds=seconds,
         )
 
-    def _all_pulses(self) -> NDArray[np.float32]:
-        assert self.exposure.counts is not None
-        return np.full(self.exposure.counts.shape, self.exposure.pulses, np.float32)
-
-    def _start(self, start: Mapping[str, float] | None) -> _State:
-        given = {} if start is None else dict(start)
-        names = {one.name for one in self.unknowns}
-        for name in given:
+    def _initial_state(self, initial_guess: Mapping[str, float] | None) -> State:
+        guess = {} if initial_guess is None else dict(initial_guess)
+        names = {unknown.name for unknown in self.unknowns}
+        for name in guess:
             if name not in names:
-                raise ArgumentError(f"start: {name} is not an unknown; these are {', '.join(sorted(names))}")
-        water = {"medium.absorption", "medium.scattering"} & names - set(given)
+                raise ArgumentError(f"initial_guess: {name} is not an unknown; these are {', '.join(sorted(names))}")
+        water = {"medium.absorption", "medium.scattering"} & names - set(guess)
         if water:
-            lidar = lidar_start(self.scene, self.exposure, device=self.device)
-            given = {**{name: value for name, value in lidar.items() if name in water}, **given}
+            lidar = lidar_initial_guess(self.scene, self.exposure, device=self.device)
+            guess = {**{name: value for name, value in lidar.items() if name in water}, **guess}
         values: dict[str, Any] = {}
-        for one in self.unknowns:
-            value = check_real(f"start of {one.name}", given.get(one.name, start_value(self.scene, one)))
-            if one.is_positive and value <= 0.0:
-                value = 1.0 if one.name == BACKGROUND else 0.01
-            values[one.name] = np.full(self._image[0] * self._image[1], value) if one.per_pixel else value
-        return _State(values, [])
+        for unknown in self.unknowns:
+            name = unknown.name
+            value = check_real(f"initial_guess of {name}", guess.get(name, scene_value(self.scene, unknown)))
+            if unknown.is_positive and value <= 0.0:
+                value = 1.0 if name == BACKGROUND else 0.01
+            values[name] = np.full(self.image[0] * self.image[1], value) if unknown.per_pixel else value
+        return State(values, [])
 
     # Iterations
 
-    def _approach(self, state: _State, trials: NDArray[np.float32], report: Callable[[str], None]) -> None:
+    def _approach(self, state: State, trials: Rows, report: Callable[[str], None]) -> None:
         """Coarse steps of the shared unknowns, with few photons at first, until Fisher scoring can do the rest."""
-        shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
-        if not shared:
+        if not self.shared:
             return
-        blocks, photons = blocks_of(self._image), self.photons // _FEWEST
-        largest = np.array([0.7 if self.unknowns[i].is_positive else 0.02 for i in shared])
+        photons, columns = self.photons // _FEWEST, [self.unknowns.index(unknown) for unknown in self.shared]
+        largest = np.array([0.7 if unknown.is_positive else 0.02 for unknown in self.shared])
         assert self.exposure.counts is not None
         for _ in range(_COARSE):
             photons = max(photons, 1000)
             (half,) = self.render(state.values, photons=photons, halves=1)
-            scales = state.scales(self.unknowns, 1)[0]
-            cells = in_cells(self.law, half, trials, self.exposure.counts, scales, blocks)
-            cells.slopes = cells.slopes[:, shared]
-            pull, information = self._prior_at(state, shared)
-            step, error = coarse_step(cells, largest, pull, information)
+            half = replace(half, slopes=half.slopes[columns], limits=half.limits[columns])
+            scales = state.scales(self.shared, 1)[0]
+            blocks = _in_blocks(self.law, half, trials, self.exposure.counts, scales, self.image)
+            step, error = _coarse_step(*blocks, largest, self.prior_at(state))
             gain = 0.5 * float(np.sum((step / np.maximum(error, 1e-12)) ** 2))
-            state.iterations.append(Iteration(values=state.shared(), gain=gain, photons=photons, coarse=True))
-            for i, one in zip(shared, step, strict=True):
-                state.move(self.unknowns[i], one)
-            report(", ".join(f"{name} {value:.4g}" for name, value in state.shared().items()))
+            state.iterations.append(Iteration(values=state.means(), gain=gain, photons=photons, coarse=True))
+            for unknown, part in zip(self.shared, step, strict=True):
+                state.move(unknown, part)
+            report(state.text(4))
             if (np.abs(step) < np.maximum(2.0 * error, _SETTLED * largest)).all():
                 return
             photons = min(2 * photons, self.photons // _FEWER)
 
-    def _refine(
-        self, state: _State, trials: NDArray[np.float32], report: Callable[[str], None]
-    ) -> tuple[list[Half], Local, bool]:
+    def _refine(self, state: State, trials: Rows, report: Callable[[str], None]) -> tuple[list[Half], Solution, bool]:
         """Fisher scoring with fresh photons: few at first, as many as the noise of the simulation asks for at last."""
-        shared = [i for i, one in enumerate(self.unknowns) if not one.per_pixel]
         photons, level, bent = max(self.photons // _FEW, 8000), None, False
         for number in range(_FINE):
-            halves = self.render(state.values, photons=photons // (2 * BATCHES), batches=BATCHES)
-            look = bent or number >= _PATIENCE
-            level, local = self._solved(state, halves, trials, shared, level, look, photons // (2 * BATCHES))
-            bent = bent or local.ratio != 1.0
-            solution, converged, left = local.solution, self._converged(local), self._left(local)
-            state.iterations.append(Iteration(values=state.shared(), gain=solution.gain, photons=photons, coarse=False))
-            self._step(state, solution)
-            report(", ".join(f"{name} {value:.5g}" for name, value in state.shared().items()))
+            batch = photons // (2 * BATCHES)
+            halves = self.render(state.values, photons=batch, batches=BATCHES)
+            level, equations, solution = self.solve(state, halves, trials, level)
+            if bent or number >= _PATIENCE or self._converged(solution):
+                solution = self._locally_solved(equations, solution, state, halves, trials, batch)
+            bent = bent or solution.slope_ratio != 1.0
+            converged, left = self._converged(solution), self._left(solution)
+            state.iterations.append(Iteration(values=state.means(), gain=solution.gain, photons=photons, coarse=False))
+            shared, pixels = iter(solution.shared), iter(solution.pixels.T)
+            for unknown in self.unknowns:
+                state.move(unknown, next(pixels) if unknown.per_pixel else next(shared))
+            report(state.text(5))
             needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
-            more = min(needed, self.photons, needed if left <= _CONVERGED * max(len(shared), 1) else 4 * photons)
+            more = min(needed, self.photons, needed if left <= _CONVERGED * max(len(self.shared), 1) else 4 * photons)
             noisy = solution.simulation_share > SIMULATION and more > 1.2 * photons
             if converged and not noisy:
                 break
             photons = max(photons, more)
-        return halves, local, converged
+        return halves, solution, converged
 
-    def _solved(
-        self,
-        state: _State,
-        halves: list[Half],
-        trials: NDArray[np.float32],
-        shared: Sequence[int],
-        level: int | None,
-        look: bool,
-        photons: int,
-    ) -> tuple[int, Local]:
-        """The level of cells and the step from a rendering.
+    def solve(self, state: State, halves: list[Half], trials: Rows | None, pooling_level: int | None) -> Pooled:
+        """The step from a rendering; without `trials` of a plan of the exposure."""
+        counts, pulses = self.exposure.counts, self.exposure.pulses
+        moments = Moments(self.law, halves, trials, counts, pulses=pulses, image=self.image)
+        scales = state.scales(self.unknowns, self.image[0] * self.image[1])
+        return solve_pooled(self.unknowns, moments, scales, self._solver(state), pooling_level=pooling_level)
 
-        Where the fit has converged, and with `look`, the depth's slope is traced anew around the present depth with so
-        many `photons`.
-        """
-        scales, prior = state.scales(self.unknowns, len(trials)), self._prior_at(state, shared)
-        given: dict[str, Any] = {"law": self.law, "halves": halves, "trials": trials}
-        counted = {"counts": self.exposure.counts, "pulses": self.exposure.pulses}
-        level, equations, solution = solved(
-            self.unknowns, scales, level=level, image=self._image, prior=prior, **given, **counted
-        )
-        wide = Local(solution, 1.0)
-        if not (look or self._converged(wide)):
-            return level, wide
-        is_own = np.array([one.per_pixel for one in self.unknowns])
-        return level, locally_solved(
-            equations,
-            solution,
-            lambda found: solve(found, is_own, prior=prior[1], pull=prior[0]),
-            render=self.render,
-            values=state.values,
-            scales=scales,
-            photons=photons,
-            **given,
-        )
+    def _solver(self, state: State) -> Callable[[Equations], Solution]:
+        is_per_pixel, prior = np.array([unknown.per_pixel for unknown in self.unknowns]), self.prior_at(state)
+        return lambda equations: solve(equations, is_per_pixel, prior)
 
-    def _converged(self, local: Local) -> bool:
+    def _converged(self, solution: Solution) -> bool:
         """Whether the step gains less than the noise of the counts, or leaves next to nothing."""
-        size = max(sum(not one.per_pixel for one in self.unknowns), 1)
-        return local.solution.gain <= _CONVERGED * size or self._left(local) <= _LEFT * size
+        size = max(len(self.shared), 1)
+        return solution.gain <= _CONVERGED * size or self._left(solution) <= _LEFT * size
 
-    def _left(self, local: Local) -> float:
+    def _left(self, solution: Solution) -> float:
         """What the log-likelihood can still gain after the step.
 
         Newton's error is the square of the step; of the depth also what the slope changes within its error.
         """
-        solution = local.solution
-        shared = [one for one in self.unknowns if not one.per_pixel]
-        if len(shared) < len(self.unknowns):
+        if len(self.shared) < len(self.unknowns):
             return solution.gain
-        straight = {"log": 0.5, "depth": self.render.depth_step, "anisotropy": 0.025}
-        parts = [step / straight[_kind(one)] for one, step in zip(shared, solution.shared, strict=True)]
-        parts.append(local.bend)
-        return solution.gain * min(float(np.max(np.square(parts))), 1.0)
+        bend = abs(1.0 - 1.0 / solution.slope_ratio) if solution.slope_ratio > 0.0 else 1.0
+        straight = [
+            0.5 if unknown.is_positive else self.render.depth_step if unknown.name == DEPTH else 0.025
+            for unknown in self.shared
+        ]
+        parts = [step / size for step, size in zip(solution.shared, straight, strict=True)]
+        return solution.gain * min(float(np.max(np.square([*parts, bend]))), 1.0)
 
-    def _step(self, state: _State, solution: Solution) -> None:
-        shared, own = iter(solution.shared), iter(solution.own.T)
-        for one in self.unknowns:
-            state.move(one, next(own) if one.per_pixel else next(shared))
-
-    def _prior_at(self, state: _State, shared: Sequence[int]) -> tuple[Floats, Floats]:
+    def prior_at(self, state: State) -> tuple[Floats, Floats]:
         """Score and information of the priors on the searched scale, `[S]` both."""
-        pull, information = np.zeros(len(shared)), np.zeros(len(shared))
-        for row, i in enumerate(shared):
-            one = self.unknowns[i]
-            if one.name in self.prior:
-                mean, deviation = self.prior[one.name]
-                value = state.values[one.name]
-                scale = value if one.is_positive else 1.0
+        pull, information = np.zeros(len(self.shared)), np.zeros(len(self.shared))
+        for row, unknown in enumerate(self.shared):
+            if unknown.name in self.prior:
+                mean, deviation = self.prior[unknown.name]
+                scale = float(state.scale(unknown))
                 information[row] = (scale / deviation) ** 2
-                pull[row] = (mean - value) * scale / deviation**2
+                pull[row] = (mean - state.values[unknown.name]) * scale / deviation**2
         return pull, information
 
+    def _locally_solved(
+        self,
+        equations: Equations,
+        solution: Solution,
+        state: State,
+        halves: list[Half],
+        trials: Rows,
+        photons: int,
+    ) -> Solution:
+        """Solves again with the slope by the common depth between the ends of its 95 % interval.
 
-def checked_prior(
-    prior: Mapping[str, tuple[float, float]], unknowns: Sequence[Unknown]
-) -> dict[str, tuple[float, float]]:
-    """Mean and standard deviation by name. Raises `ArgumentError`."""
-    names = [one.name for one in unknowns if not one.per_pixel]
-    found = {}
-    for name, pair in prior.items():
-        if name not in names:
-            raise ArgumentError(f"prior: {name} is not an unknown of the whole exposure; these are {', '.join(names)}")
-        if not (isinstance(pair, tuple | list) and len(pair) == 2):
-            raise ArgumentError(f"prior of {name} = {pair!r} is not (mean, standard deviation)")
-        mean = check_real(f"prior of {name}: mean", pair[0])
-        found[name] = (mean, check_real(f"prior of {name}: standard deviation", pair[1], "(0, inf)"))
-    return found
+        Where no interval shorter than the wide difference has a slope that belongs to it, the light can move inside a
+        bin: the depth's variance then is that of two places anywhere in the same bin.
+
+        Args:
+            equations, solution: With the renderer's wide difference, on the scale that is searched.
+            state, halves, trials: What the equations are made of.
+            photons: Of a difference.
+        """
+        depth = [unknown.name for unknown in self.shared]
+        if DEPTH not in depth:
+            return solution
+        row, column = depth.index(DEPTH), self.unknowns.index(self.shared[depth.index(DEPTH)])
+        rates, scales = 0.5 * (halves[0].rates + halves[1].rates), state.scales(self.unknowns, len(trials))
+        least = _LEAST * 0.5 * self.scene.medium.pulse_speed * self.scene.gate.stop
+
+        def interval(solution: Solution) -> float:
+            return max(NORMAL_95 * math.sqrt(max(solution.covariance[row, row], 0.0)), least)
+
+        def slopes(shift: float, step: float) -> Floats:
+            each = max(photons // BATCHES, 1)
+            result = np.empty((BATCHES, *scales.shape))
+            batches = self.render.depth_slopes(state.values, shift=shift, step=step, photons=each, batches=BATCHES)
+            for batch, rows in zip(result, batches, strict=True):
+                counts = self.law.slopes(rates, rows[:, None], trials)
+                batch[:] = np.matmul(equations.weights, counts.transpose(0, 2, 1))[..., 0] * scales
+            return result * scales[:, column, None]
+
+        def share(slope: Floats) -> Floats:
+            shares: Floats = slope[..., column].sum(axis=-1) / wide
+            return shares
+
+        wide, step = equations.slope[:, column, column].sum(), interval(solution)
+        if not step < _WIDE * self.render.depth_step:
+            return solution
+        for _ in range(_TRIES):
+            batches = slopes(0.0, step)
+            shares = share(batches)
+            if abs(shares.mean() - 1.0) < _SURE * shares.std(ddof=1) / math.sqrt(BATCHES):
+                return solution
+            flat, steep = sorted((slopes(side * step / 2, step / 2).mean(axis=0) for side in (-1.0, 1.0)), key=share)
+            slope = equations.slope.copy()
+            slope[:, :, column] = flat if share(flat) < _ONE_SIDED * share(steep) else batches.mean(axis=0)
+            ratio, needed = float(slope[:, column, column].sum() / wide), math.inf
+            if ratio > 0.0:
+                local = replace(self._solver(state)(replace(equations, slope=slope)), slope_ratio=ratio)
+                needed = interval(local)
+                if step / _CONSISTENT < needed < step * _CONSISTENT or needed == step == least:
+                    return local
+            step = min(needed, _LARGEST * step)
+            if not step < _WIDE * self.render.depth_step:
+                break
+        covariance = solution.covariance.copy()
+        covariance[row, row] += self._bin_depth**2 / 6.0
+        return replace(solution, covariance=covariance, slope_ratio=0.0)
+
+    @property
+    def _bin_depth(self) -> float:
+        """How much deeper a target is whose light comes a bin later [m]."""
+        return 0.5 * self.scene.medium.pulse_speed * self.scene.gate.bin_width
+
+    def _slope_warnings(self, ratio: float) -> list[str]:
+        """Sentences on light that lies in few bins."""
+        if _STRAIGHT < ratio < 1.0 / _STRAIGHT:
+            return []
+        bin_width, depth, error = self.scene.gate.bin_width_ps, 1e3 * self._bin_depth, ""
+        if not ratio > 0.0:
+            error = f", and its standard error is that of a place anywhere in a bin of {depth:.2g} mm"
+        return [
+            f"depth: before the instrument response, most light of a pixel lies in one or two bins of {bin_width:.4g} "
+            f"ps; the counts follow the depth only as this light crosses the edges of bins{error}. The depth of "
+            f"measured counts may be off by a part of {depth:.2g} mm: choose narrower bins"
+        ]
+
+    # The result
+
+    def _result(self, state: State, begin: Mapping[str, float], solution: Solution, **facts: Any) -> Fit:
+        """The fit from its last values and the solution of its equations there."""
+        truth = truth_maps(self.scene, device=self.device)
+        middle, values = _middle_depth(truth.depth), state.values
+        estimates, maps = {}, {}
+        for row, unknown in enumerate(self.shared):
+            offset = middle if unknown.name == DEPTH else 0.0
+            variance = solution.covariance[row, row]
+            value, error = values[unknown.name] + offset, math.sqrt(max(variance, 0.0))
+            if unknown.is_positive:  # the error is of the logarithm
+                factor = math.exp(min(NORMAL_95 * error, 700.0))
+                interval, error = (value / factor, value * factor), error * value
+            else:
+                interval = (value - NORMAL_95 * error, value + NORMAL_95 * error)
+            estimates[unknown.name] = Estimate(
+                name=unknown.name,
+                value=value,
+                standard_error=error,
+                interval=interval,
+                simulation=solution.simulation[row, row] / variance if variance > 0 else math.nan,
+                initial_guess=begin[unknown.name] + offset,
+                unit=unknown.unit,
+            )
+        for column, unknown in enumerate(unknown for unknown in self.unknowns if unknown.per_pixel):
+            errors = np.sqrt(np.maximum(solution.pixel_covariance[:, column, column], 0.0)) * state.scale(unknown)
+            value = np.where(np.isnan(solution.pixels[:, column]), np.nan, values[unknown.name]).reshape(self.image)
+            maps[unknown.name] = EstimateMap(
+                name=unknown.name,
+                value=value + truth.depth if unknown.name == DEPTH else value,
+                standard_error=errors.reshape(self.image),
+                unit=unknown.unit,
+            )
+        depth = maps[DEPTH].value if DEPTH in maps else None
+        if DEPTH in estimates:
+            depth = truth.depth + values[DEPTH]
+        assert self.exposure.counts is not None
+        return Fit(
+            scene=with_values(self.scene, state.means()),
+            estimates=estimates,
+            maps=maps,
+            names=[unknown.name for unknown in self.shared],
+            covariance=solution.covariance,
+            depth=depth,
+            counts=self.exposure.counts.reshape(*self.image, -1),
+            edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
+            pulses=self.exposure.pulses,
+            **facts,
+        )
+
+    def _warnings(self, solution: Solution, converged: bool) -> list[str]:
+        sentences = []
+        if not converged:
+            sentences.append("not converged: the last step still promised more likelihood than the noise of the counts")
+        if solution.simulation_share > SIMULATION:
+            sentences.append(
+                f"the noise of the simulation is {percent(solution.simulation_share)} % of that of the counts in the "
+                "variances, above 10 %: give more photons; the standard errors contain it"
+            )
+        names = [unknown.name for unknown in self.shared]
+        if any(name not in self.prior for name in names):
+            positive = [unknown.is_positive for unknown in self.shared]
+            sentences += not_identifiable(names, solution.covariance, positive)
+        return sentences
+
+
+# Coarse steps
+
+
+def _in_blocks(
+    law: Law, half: Half, trials: Rows, counts: NDArray[Any], scales: Floats, image: tuple[int, int]
+) -> tuple[Floats, Floats, Floats]:
+    """Counts, their mean `[block, bin]` and its relative derivatives `[unknown, block, bin]` in blocks of pixels.
+
+    `scales` `[unknown]`: units of the unknowns.
+    """
+    rows, columns = (np.arange(size) * min(_ACROSS, size) // size for size in image)
+    blocks = (rows[:, None] * (columns[-1] + 1) + columns).reshape(-1)
+    shape = (int(blocks.max()) + 1, law.recorded)
+    observed, mean = np.zeros(shape), np.zeros(shape)
+    slopes = np.zeros((len(scales), *shape))
+    for block in range(shape[0]):
+        chosen = np.flatnonzero(blocks == block)
+        by_unknowns = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
+        observed[block] = counts[chosen].sum(axis=0)
+        mean[block] = law.mean(half.rates[chosen], trials[chosen]).sum(axis=0)
+        slopes[:, block] = law.slopes(half.rates[chosen], by_unknowns, trials[chosen]).sum(axis=0) * scales[:, None]
+    mean += 1e-3  # of a count: a block that no photon has reached can still have one
+    limits = (half.limits * scales)[:, None, None]
+    return observed, mean, np.clip(slopes / mean, -limits, limits)
+
+
+def _coarse_step(
+    counts: Floats, mean: Floats, slopes: Floats, largest: Floats, prior: tuple[Floats, Floats]
+) -> tuple[Floats, Floats]:
+    """Step of the unknowns within ± `largest` `[unknown]` that maximises the likelihood, and its standard errors.
+
+    The exponential model: means times exp(Σ relative derivative · step). `prior`: score and information from elsewhere.
+    """
+    from scipy.optimize import minimize
+
+    pull, known = prior
+    slopes = slopes.reshape(largest.size, -1).T
+    mean, counts = mean.reshape(-1), counts.reshape(-1)
+    linear, total = counts @ slopes + pull, max(counts.sum(), 1.0)
+
+    def loss(step: Floats) -> tuple[float, Floats]:
+        expected = mean * np.exp(np.minimum(slopes @ step, 60.0))
+        value = expected.sum() - linear @ step + 0.5 * (known * step * step).sum()
+        return value / total, (expected @ slopes - linear + known * step) / total
+
+    bounds = [(-size, size) for size in largest]
+    best = minimize(loss, np.zeros(largest.size), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-12})
+    expected = mean * np.exp(np.minimum(slopes @ best.x, 60.0))
+    information = (slopes * expected[:, None]).T @ slopes + np.diag(known)
+    variance = np.diag(np.linalg.pinv(information))
+    return best.x, np.sqrt(np.maximum(variance, 0.0))
+
+
+def _middle_depth(depth: NDArray[np.floating]) -> float:
+    """Depth in the pixel nearest to the middle of the image that sees a target [m]; 0 without any."""
+    rows, columns = np.nonzero(np.isfinite(depth))
+    if not rows.size:
+        return 0.0
+    height, width = depth.shape
+    nearest = np.argmin((rows - 0.5 * (height - 1)) ** 2 + (columns - 0.5 * (width - 1)) ** 2)
+    return float(depth[rows[nearest], columns[nearest]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.frames import InstrumentResponse, Receiver, detector_response
+from spadwarp.frames import Receiver, detector_response
 from spadwarp.frames.receiver import Window
-from spadwarp.inverse.derivatives import DepthDifference
-from spadwarp.inverse.shifting import shifted
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, moved, with_values
 from spadwarp.scene import noise_rate
 from spadwarp.scene.sight import lines_of_sight
@@ -24,8 +22,6 @@ if TYPE_CHECKING:
     from spadwarp.result import Truth
     from spadwarp.scene import Scene
 
-__all__ = ["Half", "Renderer", "Values"]
-
 Rows = NDArray[np.float32]
 _WIDEST_BIN = 0.5  # least width of the response in bins, for a histogram that follows the depth smoothly
 Values = Mapping[str, Any]
@@ -34,7 +30,7 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Half:
-    """What one group of photons says.
+    """Rates and derivatives by one group of photons.
 
     Attributes:
         rates: λ, expected detections per pulse, float32 `[pixel, bin]`.
@@ -93,7 +89,7 @@ class Renderer:
     def warnings(self) -> list[str]:
         """Sentences on what the linear model of the bins does not cover."""
         width, bin_width = self._response_width, self.scene.gate.bin_width
-        if width >= _WIDEST_BIN * bin_width or all(one.name != DEPTH for one in self.unknowns):
+        if width >= _WIDEST_BIN * bin_width or all(unknown.name != DEPTH for unknown in self.unknowns):
             return []
         return [
             f"depth: the instrument response, {width * 1e12:.3g} ps, is much shorter than a bin, "
@@ -104,58 +100,49 @@ class Renderer:
     @property
     def window(self) -> Window:
         """The detector's bins in time."""
-        scene = self.scene
-        return self._receiver(scene, {}).window
-
-    @property
-    def apart(self) -> bool:
-        """Whether light of the targets is held apart, because each pixel places it."""
-        return any(one.per_pixel and one.name != BACKGROUND for one in self.unknowns)
+        return self._receiver(self.scene, {}).window
 
     def __call__(self, values: Values, *, photons: int, halves: int = 2, batches: int = 1) -> list[Half]:
         """Groups of `photons` · `batches` photons each, which are independent of each other."""
-        shared, scene = self._at(values)
-        names = [one.name for one in self.unknowns if one.is_light]
+        scene = self._at(values)
+        names = [unknown.name for unknown in self.unknowns if unknown.is_light]
         scored = self._tracer(scene, photons, names)
         plain = scored if batches == 1 or not names else self._tracer(scene, photons, ())
         depth = None
-        if any(one.name == DEPTH for one in self.unknowns):
-            depth = DepthDifference(scene, self.depth_step, photons=photons, kept=self._kept, **self._choices)
+        if any(unknown.name == DEPTH for unknown in self.unknowns):
+            depth = self._depth_difference(scene, self.depth_step, photons)
         self.truth = scored.truth
-        receiver = self._receiver(scene, values)
-        place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
+        receiver = self._placed(scene, values)
+        limits = [1.0 / self.depth_step if unknown.name == DEPTH else 1e30 for unknown in self.unknowns]
         groups = []
         for _ in range(halves):
             number = self._take(photons)
             light, slopes = scored(number, photons)
             if depth is not None:
-                slopes[DEPTH] = depth(number, photons)
-            first = _rates(receiver, light, place)
+                slopes[DEPTH] = depth(number)
+            first = receiver.rates(light)
             group = [first]
             for _ in range(batches - 1):
-                group.append(_rates(receiver, plain(self._take(photons), photons)[0], place))
+                group.append(receiver.rates(plain(self._take(photons), photons)[0]))
             rates: Rows = first if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
-            groups.append(Half(rates, _slopes(receiver, slopes, self.unknowns, place), first, self._limits, group))
+            unknowns = receiver.slopes(slopes, self.unknowns)
+            groups.append(Half(rates, unknowns, first, np.array(limits, np.float32), group))
         return groups
 
     def depth_slopes(self, values: Values, *, shift: float, step: float, photons: int, batches: int) -> list[Rows]:
         """dλ/d(depth) `[pixel, bin]` by differences over `shift` ± `step` [m], each of so many photons of its own."""
-        shared, scene = self._at(values)
-        difference = DepthDifference(moved(scene, shift), step, photons=photons, kept=self._kept, **self._choices)
-        receiver = self._receiver(scene, values)
-        place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
-        depth = [one for one in self.unknowns if one.name == DEPTH]
-        lights = (difference(self._take(photons), photons) for _ in range(batches))
-        return [_slopes(receiver, {DEPTH: light}, depth, place)[0] for light in lights]
+        scene = self._at(values)
+        difference = self._depth_difference(moved(scene, shift), step, photons)
+        receiver = self._placed(scene, values)
+        depth = [unknown for unknown in self.unknowns if unknown.name == DEPTH]
+        lights = (difference(self._take(photons)) for _ in range(batches))
+        return [receiver.slopes({DEPTH: light}, depth)[0] for light in lights]
 
-    def _at(self, values: Values) -> tuple[dict[str, float], Scene]:
-        """One number for each unknown, and the scene with them."""
-        shared = {name: float(np.mean(value)) for name, value in values.items()}
-        return shared, self._with_focus(with_values(self.scene, shared))
-
-    @property
-    def _limits(self) -> Rows:
-        return np.array([1.0 / self.depth_step if one.name == DEPTH else 1e30 for one in self.unknowns], np.float32)
+    def _at(self, values: Values) -> Scene:
+        """The scene with one number for each unknown."""
+        return self._with_focus(
+            with_values(self.scene, {name: float(np.mean(value)) for name, value in values.items()})
+        )
 
     def _take(self, photons: int) -> int:
         """The first of photons that were not traced before."""
@@ -168,10 +155,36 @@ class Renderer:
         self._tally = tracer.tally
         return tracer
 
+    def _depth_difference(self, scene: Scene, step: float, photons: int) -> Callable[[int], ExpectedLight]:
+        """Derivative by the depth of the targets [1/m] from a first photon on: of two runs with the same photons and
+        the targets at ± `step` [m]."""
+        far, near = (
+            LightTracer(moved(scene, shift), kept=self._kept.setdefault(name, {}), photons=photons, **self._choices)
+            for name, shift in (("far", step), ("near", -step))
+        )
+
+        def slope(far: Any, near: Any) -> Any:
+            import warp as wp
+
+            if far is None:
+                return None
+            return wp.array((far.numpy() - near.numpy()) * (0.5 / step), dtype=wp.float32, device=far.device)
+
+        def difference(first: int) -> ExpectedLight:
+            beyond, before = (tracer(first, photons)[0] for tracer in (far, near))
+            return ExpectedLight(slope(beyond.total, before.total), slope(beyond.target, before.target))
+
+        return difference
+
+    @property
+    def _apart(self) -> bool:
+        """Whether light of the targets is held apart, because each pixel places it."""
+        return any(unknown.per_pixel and unknown.name != BACKGROUND for unknown in self.unknowns)
+
     @property
     def _choices(self) -> dict[str, Any]:
         """Of all tracers; one tally serves them in turn."""
-        return {"seed": self.seed, "device": self.device, "apart": self.apart, "tally": self._tally}
+        return {"seed": self.seed, "device": self.device, "apart": self._apart, "tally": self._tally}
 
     def _with_focus(self, scene: Scene) -> Scene:
         """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved.
@@ -197,54 +210,71 @@ class Renderer:
             ambient = noise_rate(scene, self.truth)[..., 0] - scene.detector.noise_rate
         background = np.asarray(values.get(BACKGROUND, 0.0))
         if background.ndim:
-            own = np.reshape(background, (camera.height, camera.width))
+            rates = np.reshape(background, (camera.height, camera.width))
             detector = detector.model_copy(update={"ambient_rate": 0.0})
-            ambient = own if ambient is None else ambient + own
-        response: InstrumentResponse | None = self.exposure.irf
+            ambient = rates if ambient is None else ambient + rates
         return Receiver.of(
             detector,
             scene.laser,
             shape=(camera.height, camera.width, gate.bins),
             axis=(gate.start, gate.bin_width),
-            irf=response,
+            irf=self.exposure.irf,
             window=self.exposure.window,
             tdc_widths=self.exposure.tdc_widths,
             ambient=ambient,
             device=pick_device(self.device),
         )
 
-
-@dataclass(frozen=True, eq=False)
-class _Placement:
-    """How each pixel changes the light of the targets: a delay in bins and a factor, both `[pixel]`."""
-
-    delay: NDArray[np.float64]
-    factor: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls, scene: Scene, values: Values, shared: Mapping[str, float], unknowns: Sequence[Unknown], receiver: Receiver
-    ) -> _Placement:
+    def _placed(self, scene: Scene, values: Values) -> _PlacedReceiver:
+        receiver = self._receiver(scene, values)
+        if not self._apart:
+            return _PlacedReceiver(receiver)
         pixels = scene.camera.width * scene.camera.height
         delay, factor = np.zeros(pixels), np.ones(pixels)
-        for one in unknowns:
-            if not one.per_pixel or one.name == BACKGROUND:
+        for unknown in self.unknowns:
+            value = values[unknown.name]
+            if unknown.per_pixel and unknown.name == DEPTH:
+                delay += (np.asarray(value) - float(np.mean(value))) * _bins_per_metre(scene).reshape(-1)
+            elif unknown.per_pixel and unknown.name != BACKGROUND:
+                factor *= np.asarray(value) / float(np.mean(value))
+        return _PlacedReceiver(receiver, delay, factor)
+
+
+@dataclass(frozen=True, eq=False)
+class _PlacedReceiver:
+    """The receiver, and how each pixel changes the light of the targets: a delay in bins and a factor, `[pixel]`."""
+
+    receiver: Receiver
+    delay: NDArray[np.float64] | None = None
+    factor: NDArray[np.float64] | None = None
+
+    def rates(self, light: ExpectedLight) -> Rows:
+        """λ of light."""
+        rates: Rows = self.receiver.hazard(light.total).numpy()
+        return rates if self.delay is None else rates + self._change(light)
+
+    def slopes(self, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown]) -> Rows:
+        """Derivatives of λ, `[unknown, pixel, bin]`."""
+        widths = np.diff(self.receiver.window.edges).astype(np.float32)
+        pixels = self.receiver.image[0] * self.receiver.image[1]
+        result = np.empty((len(unknowns), pixels, widths.size), np.float32)
+        for row, unknown in zip(result, unknowns, strict=True):
+            if unknown.name == BACKGROUND:
+                row[:] = widths
                 continue
-            if one.name == DEPTH:
-                per_metre = bins_per_metre(scene).reshape(-1)
-                delay += (np.asarray(values[DEPTH]) - shared[DEPTH]) * per_metre
-            else:
-                factor *= np.asarray(values[one.name]) / shared[one.name]
-        return cls(delay, factor)
+            row[:] = self.receiver.slope(slopes[unknown.name].total).numpy()
+            if self.delay is not None:
+                row += self._change(slopes[unknown.name])
+        return result
 
-    def change(self, receiver: Receiver, light: ExpectedLight) -> Rows:
-        """What it adds to λ, or to its derivative: the light of the targets in its new place, less that in the old."""
-        assert light.target is not None
-        target = _through(receiver, light.target, with_noise=False)
-        return shifted(target, self.delay) * self.factor.astype(np.float32)[:, None] - target
+    def _change(self, light: ExpectedLight) -> Rows:
+        """What is added to λ, or to its derivative: the light of the targets in its new place, less that in the old."""
+        assert light.target is not None and self.delay is not None and self.factor is not None
+        target: Rows = self.receiver.slope(light.target).numpy()
+        return subbin_shift(target, self.delay) * self.factor.astype(np.float32)[:, None] - target
 
 
-def bins_per_metre(scene: Scene) -> NDArray[np.float64]:
+def _bins_per_metre(scene: Scene) -> NDArray[np.float64]:
     """Delay of a return in bins for each metre that its target is deeper, `[H, W]`."""
     lines, middle = lines_of_sight(scene), 0.5 * scene.medium.pulse_speed * (scene.gate.start + scene.gate.stop) * 0.5
     step = 1e-3 * middle
@@ -252,30 +282,28 @@ def bins_per_metre(scene: Scene) -> NDArray[np.float64]:
     return (ends[1] - ends[0]) / (2.0 * step * scene.medium.pulse_speed * scene.gate.bin_width)
 
 
-def _through(receiver: Receiver, rows: Any, *, with_noise: bool) -> Rows:
-    found: Rows = (receiver.hazard(rows) if with_noise else receiver.slope(rows)).numpy()
-    return found
+def subbin_shift(rows: Rows, delay: NDArray[np.float64]) -> Rows:
+    """Rows `[pixel, bin]` later by `delay` `[pixel]` bins, by a cubic through four bins (Lagrange); 0 comes in.
 
-
-def _rates(receiver: Receiver, light: ExpectedLight, place: _Placement | None) -> Rows:
-    """λ of light."""
-    rates = _through(receiver, light.total, with_noise=True)
-    return rates if place is None else rates + place.change(receiver, light)
-
-
-def _slopes(
-    receiver: Receiver, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown], place: _Placement | None
-) -> Rows:
-    """Derivatives of λ, `[unknown, pixel, bin]`."""
-    widths = np.diff(receiver.window.edges).astype(np.float32)
-    pixels = receiver.image[0] * receiver.image[1]
-    found = np.empty((len(unknowns), pixels, widths.size), np.float32)
-    for row, one in zip(found, unknowns, strict=True):
-        if one.name == BACKGROUND:
-            row[:] = widths
-            continue
-        light = slopes[one.name]
-        row[:] = _through(receiver, light.total, with_noise=False)
-        if place is not None:
-            row += place.change(receiver, light)
-    return found
+    For histograms that the instrument response has smoothed: of a Gaussian with a standard deviation of 1.5 bins, the
+    largest error is 1 % of its height; sum and centroid are exact.
+    """
+    if not delay.any():
+        return rows
+    whole = np.floor(delay).astype(np.int64)
+    x = (delay - whole)[:, None]
+    # Of the values in bins k − whole + 1, + 0, − 1, − 2, for the place x bins before k − whole.
+    weights = (
+        x * (x - 1) * (x - 2) / -6.0,
+        (x + 1) * (x - 1) * (x - 2) / 2.0,
+        (x + 1) * x * (x - 2) / -2.0,
+        (x + 1) * x * (x - 1) / 6.0,
+    )
+    bins = np.arange(rows.shape[1])
+    result = np.zeros_like(rows)
+    for offset, weight in zip((1, 0, -1, -2), weights, strict=True):
+        source = bins - whole[:, None] + offset
+        inside = (source >= 0) & (source < rows.shape[1])
+        taken = np.take_along_axis(rows, np.clip(source, 0, rows.shape[1] - 1), axis=1)
+        result += np.where(inside, taken, 0.0) * weight.astype(np.float32)
+    return result

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
-from spadwarp.inverse.blocks import with_block_means
-from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, read_unknowns, with_values
+from spadwarp.inverse.unknowns import read_unknowns, with_values
 from spadwarp.limits import SEED, check_integer
 from spadwarp.scene import Scene, SceneLike, as_scene
+from spadwarp.scene.grid import Grid
+from spadwarp.scene.medium import grid_cells
 from spadwarp.transport import resolve_derivatives, simulate
 from spadwarp.transport.block_derivatives import is_of_grid
 
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
     import torch
 
 __all__ = ["render"]
+
+Floats = NDArray[np.float64]
 
 
 def render(
@@ -55,8 +59,8 @@ def render(
         import torch
     except ModuleNotFoundError as error:
         raise FileError("render needs torch: pip install 'spadwarp[torch]'") from error
-    given, seed = as_scene(scene), check_integer("seed", seed, SEED)
-    names, shape = _checked(given, parameters)
+    base, seed = as_scene(scene), check_integer("seed", seed, SEED)
+    names, shape = _checked(base, parameters)
     of_grid = [name for name in names if is_of_grid(name)]
 
     class Rendering(torch.autograd.Function):
@@ -64,7 +68,7 @@ def render(
         def forward(ctx: Any, *values: torch.Tensor) -> torch.Tensor:
             arrays = {name: value.detach().double().cpu().numpy() for name, value in zip(names, values, strict=True)}
             numbers = {name: float(value) for name, value in arrays.items() if name not in of_grid}
-            at = with_values(given, numbers)
+            at = with_values(base, numbers)
             run: dict[str, Any] = {"photons": photons, "seed": seed, "device": device}
             with tempfile.TemporaryDirectory() as folder:
                 if of_grid:
@@ -103,14 +107,62 @@ def _checked(scene: Scene, parameters: Mapping[str, torch.Tensor]) -> tuple[list
             shapes.add(tuple(value.shape))
             names.append(name)
             continue
-        one = unknowns[name]
-        if one.name in (DEPTH, BACKGROUND) or one.per_pixel:
-            raise ArgumentError(f"parameters: {one} has no scored derivative")
+        unknown = unknowns[name]
+        if not unknown.is_light or unknown.per_pixel:
+            raise ArgumentError(f"parameters: {unknown} has no scored derivative")
         if not isinstance(value, torch.Tensor) or value.numel() != 1:
-            raise ArgumentError(f"parameters: {one} is not a tensor of one number")
-        names.append(one.name)
+            raise ArgumentError(f"parameters: {unknown} is not a tensor of one number")
+        names.append(unknown.name)
     if len(shapes) > 1:
         raise ArgumentError(f"parameters: blocks of different numbers, {sorted(shapes)}")
     shape = shapes.pop() if shapes else None
     resolve_derivatives(scene, [name for name in names if is_of_grid(name)], shape)
     return names, shape
+
+
+# Blocks of a grid
+
+
+def with_block_means(scene: Scene, means: Mapping[str, Floats], folder: Path) -> Scene:
+    """The scene with other cells: the same addition to all of a block, so that its mean is the one given.
+
+    Args:
+        scene: With a grid, divided into blocks as `simulate` divides it.
+        means: By "absorption" and "scattering", or by "extinction" at fixed albedo, `[x, y, z]` [1/m].
+        folder: For the file of the cells, without which the scene is of no use.
+
+    Raises `ArgumentError` where cells would be negative.
+    """
+    cells = grid_cells(scene.medium)
+    extinction, albedo = cells.extinction.astype(np.float64), cells.albedo.astype(np.float64)
+    arrays: dict[str, Any]
+    if "extinction" in means:
+        if len(means) > 1:
+            raise ArgumentError(
+                "medium.grid.extinction cannot be combined with medium.grid.absorption and medium.grid.scattering"
+            )
+        arrays = {"extinction": _moved("extinction", extinction, means["extinction"]), "albedo": albedo}
+    else:
+        arrays = {"absorption": extinction * (1.0 - albedo), "scattering": extinction * albedo}
+        arrays |= {kind: _moved(kind, arrays[kind], values) for kind, values in means.items()}
+    if cells.anisotropy is not None:
+        arrays["anisotropy"] = cells.anisotropy
+    path = folder / "cells.npz"
+    np.savez(path, size=cells.size, **arrays)
+    old = scene.medium.grid
+    assert old is not None
+    grid = Grid(file=str(path), translation=cells.centre, rotation_deg=old.rotation_deg, tracking=old.tracking)
+    return scene.model_copy(update={"medium": scene.medium.model_copy(update={"grid": grid})})
+
+
+def _moved(kind: str, cells: Floats, means: Floats) -> Floats:
+    shape = [n for count, along in zip(means.shape, cells.shape, strict=True) for n in (count, along // count)]
+    blocks = cells.reshape(shape)
+    step = means[:, None, :, None, :, None] - blocks.mean(axis=(1, 3, 5), keepdims=True)
+    moved = (blocks + step).reshape(cells.shape)
+    if not moved.min() >= 0.0:
+        worst = float(moved.min())
+        raise ArgumentError(
+            f"medium.grid.{kind}: the means of the blocks make cells of {worst:.3g} 1/m, outside [0, inf)"
+        )
+    return moved

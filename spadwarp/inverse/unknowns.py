@@ -17,7 +17,7 @@ from spadwarp.scene.camera import to_world
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["BACKGROUND", "DEPTH", "Unknown", "moved", "read_unknowns", "with_values"]
+__all__ = ["Unknown", "read_unknowns"]
 
 DEPTH, BACKGROUND = "depth", "detector.ambient_rate"
 _SHORT = {name: f"medium.{name}" for name in ("absorption", "scattering", "anisotropy")} | {"background": BACKGROUND}
@@ -44,6 +44,11 @@ class Unknown:
         return self.name not in (DEPTH, "medium.anisotropy")
 
     @property
+    def largest_step(self) -> float:
+        """Of an iteration, on the scale that is searched."""
+        return 1.1 if self.is_positive else 0.05
+
+    @property
     def is_light(self) -> bool:
         """Whether its derivative is one of the scored quantities of transport."""
         return self.name not in (DEPTH, BACKGROUND)
@@ -68,15 +73,15 @@ def read_unknowns(scene: Scene, names: str | Sequence[str]) -> tuple[Unknown, ..
         ConfigError: The scene has no such value to start from: its layers, its albedo, its phase function.
     """
     words = [word.strip() for word in names.split(",")] if isinstance(names, str) else list(names)
-    found: list[Unknown] = []
+    unknowns: list[Unknown] = []
     for word in words:
-        one = _read(scene, word)
-        if one.name in [other.name for other in found]:
-            raise ArgumentError(f"unknown: {one.name} is named twice")
-        found.append(one)
-    if not found:
+        unknown = _read(scene, word)
+        if unknown.name in [other.name for other in unknowns]:
+            raise ArgumentError(f"unknown: {unknown.name} is named twice")
+        unknowns.append(unknown)
+    if not unknowns:
         raise ArgumentError("unknown: no name is given")
-    return tuple(found)
+    return tuple(unknowns)
 
 
 def _read(scene: Scene, word: Any) -> Unknown:
@@ -117,7 +122,7 @@ def _check_scene(scene: Scene, name: str, target: int | None) -> None:
             raise ConfigError(f"unknown: {name} goes with phase_function = 'henyey_greenstein', not {law!r}")
 
 
-def start_value(scene: Scene, unknown: Unknown) -> float:
+def scene_value(scene: Scene, unknown: Unknown) -> float:
     """The scene's own value; depth counts from where the targets are."""
     if unknown.name == DEPTH:
         return 0.0

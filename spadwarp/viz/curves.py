@@ -16,8 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from numpy.typing import NDArray
 
-from spadwarp.analytic.photon_budget import OUTLIERS, TOLERANCE, BudgetRow
-from spadwarp.analytic.sweeps import Sweep
+from spadwarp.analytic.sweeps import OUTLIERS, TOLERANCE, BudgetRow, Sweep
 from spadwarp.scene import Scene
 from spadwarp.viz.style import (
     BLUE,

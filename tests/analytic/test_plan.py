@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import spadwarp
-from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, pilot
+from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, planning
 from spadwarp.scene import Laser, Scene
 from spadwarp.units import range_from_time
 
@@ -141,14 +141,14 @@ def test_largest_range_falls_with_the_extinction():
 
 def test_the_brightest_pixel_has_light_where_a_run_is_so_short_that_few_have():
     scene = make(gate={"start_ns": 40.0, "bins": 600})
-    runs = pilot.trace(pilot.window(scene), 20_000, 1, "cpu")
+    runs = planning.trace(planning.window(scene), 20_000, 1, "cpu")
     row, column = np.unravel_index(runs[0].detections.sum(axis=-1).argmax(), runs[0].detections.shape[:2])
     for run in runs:
         kept = run.tallies[:, row, column].copy()
         run.tallies[...] = 0
         run.tallies[:, row, column] = kept
     detected = sum(run.detections[row, column].sum() for run in runs) / 2
-    assert pilot.measure(runs, scene, "cpu").brightest == pytest.approx(detected, rel=1e-9) and detected > 0.0
+    assert planning.measure(runs, scene, "cpu").brightest == pytest.approx(detected, rel=1e-9) and detected > 0.0
 
 
 def test_ranges_stand_for_an_unknown_target():
@@ -163,7 +163,6 @@ def test_ranges_stand_for_an_unknown_target():
         ({"depth_error": "2 ns"}, "depth_error = '2 ns' is a time; a length is needed"),
         ({"ranges": ("3 m", "2 m")}, "least <= largest"),
         ({"depth_error": 0.0}, "depth_error = 0.0"),
-        ({"ranges": (5.0, 3.0)}, "least <= largest"),
         ({"ranges": 5.0}, "ranges = 5.0 is not (least"),
         ({"method": "guess"}, "'guess' is not one of"),
         ({"margin": -1.0}, "margin = -1.0"),
@@ -187,9 +186,8 @@ def test_daylight_is_noise(found):
 
 
 def test_a_scene_without_a_target_says_what_it_needs():
-    scene = Scene.from_dict({name: fields for name, fields in SCENE.items() if name != "targets"})
     with pytest.raises(spadwarp.ConfigError, match="no target is in view"):
-        proposal(scene)
+        proposal(make().with_overrides(targets=[]))
 
 
 # Eye safety. The accessible emission limits of class 1 (IEC 60825-1:2014, Table 3) are the MPE times the area of 7 mm.
@@ -233,32 +231,25 @@ def test_single_exposures_are_those_of_class_1(duration, nm, energy):
     assert permissible_exposure(duration, nm) * np.pi * 3.5e-3**2 == pytest.approx(energy, rel=0.02)
 
 
-def test_mpe_is_continuous():
+def test_mpe_is_continuous_and_has_a_range():
     for nm in (532.0, 900.0):
         below, above = permissible_exposure(10.0 * (1 - 1e-9), nm), permissible_exposure(10.0, nm)
         assert above == pytest.approx(below, rel=0.02)
     assert permissible_exposure(5e-6, 532.0) == pytest.approx(2e-3, rel=0.05)
-    with pytest.raises(spadwarp.ArgumentError, match="outside \\[400, 1050\\]"):
-        permissible_exposure(1.0, 1550.0)
-    for duration in (-1.0, math.nan, None):
-        with pytest.raises(spadwarp.ArgumentError, match="duration = "):
-            permissible_exposure(duration, 532.0)
+    for duration, nm, words in ((1.0, 1550.0, r"outside \[400, 1050\]"), (-1.0, 532.0, "duration = ")):
+        with pytest.raises(spadwarp.ArgumentError, match=words):
+            permissible_exposure(duration, nm)
 
 
 @pytest.mark.parametrize("profile", ["uniform_cone", "gaussian"])
 def test_the_hazard_distance_is_where_the_limit_is(profile):
+    """Far away the aperture sees the fluence on the axis."""
     laser = Laser(profile=profile, half_angle_deg=5.0)
     distance = eye_limit(laser).hazard_distance
     assert eye_limit(laser, distance=distance).pulse_energy == pytest.approx(laser.pulse_energy, rel=1e-6)
     assert distance < eye_limit(laser.model_copy(update={"pulse_energy": 1e-6})).hazard_distance
-
-
-def test_the_aperture_far_away_sees_the_fluence_on_the_axis():
-    for profile in ("uniform_cone", "gaussian"):
-        laser = Laser(profile=profile, half_angle_deg=5.0)
-        limit = eye_limit(laser, distance=5.0)
-        per_area = permissible_exposure(100.0, 532.0) / (100.0 * laser.repetition_rate)
-        assert limit.pulse_energy == pytest.approx(per_area / axis_fluence(laser, 5.0), rel=1e-4)
+    per_area = permissible_exposure(100.0, 532.0) / (100.0 * laser.repetition_rate)
+    assert eye_limit(laser, distance=5.0).pulse_energy == pytest.approx(per_area / axis_fluence(laser, 5.0), rel=1e-4)
 
 
 def test_proposals_go_into_json(found):

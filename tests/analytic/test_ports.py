@@ -8,7 +8,7 @@ from scipy import stats
 
 import spadwarp
 from spadwarp.analytic import pixel_maps, scene_eye_limit
-from spadwarp.analytic.optics import as_if_bare
+from spadwarp.analytic.eye_safety import as_if_bare
 from spadwarp.checks import summary
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.files.loader import gate_of, stored_depth

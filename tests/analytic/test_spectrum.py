@@ -9,8 +9,8 @@ from scipy.integrate import quad
 
 import spadwarp
 from helpers.lidar import lidar
+from reference import crlb
 from spadwarp.analytic import pixel_maps
-from spadwarp.units import PLANCK, SPEED_OF_LIGHT
 from spadwarp_kernels import analytic as kernels
 
 pytestmark = pytest.mark.physics
@@ -21,16 +21,6 @@ def on_axis(scene, distance, **options):
     return pixel_maps(scene, view=axis, distance=[distance], normal=-axis, reflectance=[0.4], device="cpu", **options)[
         0
     ]
-
-
-def eq_7(scene, distance, nm, extinction):
-    """Equation 7 as printed (K = 8), with PDE = PDP × fill factor, for one wavelength."""
-    laser, camera = scene.laser, scene.camera
-    photons = laser.pulse_energy * nm * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
-    # pitch/f_number = pixel_tangent · aperture diameter
-    pitch_over_n = camera.pixel_tangent * 2.0 * camera.aperture_radius
-    spot = math.pi * distance**2 * math.tan(laser.half_angle) ** 2
-    return photons * scene.detector.pde * 0.4 * math.exp(-2.0 * extinction * distance) * pitch_over_n**2 / (8.0 * spot)
 
 
 def test_signal_is_the_integral_of_equation_7():
@@ -45,11 +35,14 @@ def test_signal_is_the_integral_of_equation_7():
         },
     )  # fmt: skip
     four_ln2 = 4.0 * math.log(2.0)
+    energy, pde, tangent = scene.laser.pulse_energy, scene.detector.pde, math.tan(scene.laser.half_angle)
+    pitch = scene.camera.pixel_tangent * 2.0 * scene.camera.aperture_radius  # over the f-number
 
     def integrand(nm):
         spectrum = math.sqrt(four_ln2 / math.pi) / 30.0 * math.exp(-four_ln2 * ((nm - 590.0) / 30.0) ** 2)
         passed = 0.8 * math.exp(-four_ln2 * ((nm - 580.0) / 25.0) ** 2)
-        return spectrum * passed * eq_7(scene, 14.0, nm, spadwarp.water.water_optics(nm, chlorophyll=0.5).extinction)
+        extinction = spadwarp.water.water_optics(nm, chlorophyll=0.5).extinction
+        return spectrum * passed * crlb.eq7(energy, nm * 1e-9, pde, 0.4, extinction, 14.0, pitch, 1.0, tangent)
 
     expected = quad(integrand, 530.0, 650.0, limit=400, points=np.arange(532.5, 650.0, 2.5))[0]
     maps = on_axis(scene, 14.0, gate=(1e-7, 2e-7))

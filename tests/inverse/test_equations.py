@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from spadwarp.frames import first_photon_probabilities
-from spadwarp.inverse.equations import Equations, Law, planned_pulses
-from spadwarp.inverse.shifting import shifted
-from spadwarp.inverse.solving import solve
+from spadwarp.inverse.equations import Equations, Law, planned_pulses, solve
+from spadwarp.inverse.rendering import subbin_shift
 
 LAWS = {"first photon": Law(True, 0.0, 20), "free running": Law(False, 0.6, 18)}
 
@@ -39,13 +38,13 @@ def test_mean_of_first_photons_is_their_law(rates):
 
 def test_an_arrow_is_solved_as_the_whole_matrix():
     random = np.random.default_rng(3)
-    pixels, is_own = 5, np.array([False, True, False, True])
+    pixels, is_per_pixel = 5, np.array([False, True, False, True])
     factor = random.normal(size=(pixels, 4, 12))
     slope = factor @ factor.transpose(0, 2, 1)
     score = random.normal(size=(pixels, 4))
     batches = [np.zeros((1, pixels, 4))] * 2
     weights = np.zeros((pixels, 4, 1), np.float32)
-    found = solve(Equations(score, slope, slope, batches, weights), is_own)
+    found = solve(Equations(score, slope, slope, batches, weights), is_per_pixel)
     size = 2 + 2 * pixels
     matrix, right = np.zeros((size, size)), np.zeros(size)
     for p in range(pixels):
@@ -54,17 +53,17 @@ def test_an_arrow_is_solved_as_the_whole_matrix():
         right[place] += score[p]
     whole, inverse = np.linalg.solve(matrix, right), np.linalg.inv(matrix)
     np.testing.assert_allclose(found.shared, whole[:2], rtol=1e-9)
-    np.testing.assert_allclose(found.own.ravel(), whole[2:], rtol=1e-9)
+    np.testing.assert_allclose(found.pixels.ravel(), whole[2:], rtol=1e-9)
     np.testing.assert_allclose(found.covariance, inverse[:2, :2], rtol=1e-9)
     own = [inverse[2 + 2 * p : 4 + 2 * p, 2 + 2 * p : 4 + 2 * p] for p in range(pixels)]
-    np.testing.assert_allclose(found.own_bound, own, rtol=1e-9)
+    np.testing.assert_allclose(found.pixel_bound, own, rtol=1e-9)
     np.testing.assert_allclose(found.gain, 0.5 * whole[:2] @ np.linalg.inv(inverse[:2, :2]) @ whole[:2], rtol=1e-9)
 
 
 def test_a_shift_keeps_sum_and_shape():
     bins, delay = np.arange(40.0), np.array([0.0, 3.0, 0.3, -2.6])
     rows = np.exp(-0.5 * ((bins - 20) / 1.5) ** 2)[None].repeat(4, axis=0).astype(np.float32)
-    later = shifted(rows, delay)
+    later = subbin_shift(rows, delay)
     np.testing.assert_allclose(later.sum(axis=1), rows.sum(axis=1), rtol=1e-6)
     np.testing.assert_allclose(later @ bins / later.sum(axis=1), 20 + delay, atol=1e-5)
     np.testing.assert_allclose(later, np.exp(-0.5 * ((bins - 20 - delay[:, None]) / 1.5) ** 2), atol=1e-2)

@@ -10,7 +10,7 @@ import spadwarp
 from helpers.cli import DEVICE, run, tables
 from helpers.inverse import TRUTH, UNKNOWN, plate
 from spadwarp.frames import Receiver
-from spadwarp.inverse import Fitter, lidar_start, read_exposure
+from spadwarp.inverse import Fitter, lidar_initial_guess, read_exposure
 
 pytestmark = [pytest.mark.physics, pytest.mark.filterwarnings("ignore::spadwarp.errors.SpadwarpWarning")]
 DETECTORS = {
@@ -39,7 +39,7 @@ def test_estimates_are_within_their_errors(light, detector):
         exposure(light, overrides),
         plate(overrides),
         unknown=UNKNOWN,
-        start={"medium.absorption": 0.75, "medium.scattering": 0.25},
+        initial_guess={"medium.absorption": 0.75, "medium.scattering": 0.25},
         photons=1_000_000,
         seed=5,
         device="cpu",
@@ -72,6 +72,8 @@ def test_each_pixel_has_its_depth(light):
     depth = found.maps["depth"]
     normal = (depth.value - 1.5) / depth.standard_error
     assert np.isfinite(normal).all() and np.abs(normal).max() < 6 and found.estimates == {}
+    both = spadwarp.fit(frames, plate(), unknown=UNKNOWN + ",background:pixel", photons=20_000, device="cpu")
+    assert both.names == list(TRUTH) and both.maps["detector.ambient_rate"].value.shape == (8, 8)
 
 
 # Nearly all light of a pixel in one bin before the response. Half of the response is 12 mm, the error below 1 mm.
@@ -115,11 +117,11 @@ def test_no_error_of_the_depth_is_below_its_bound(depth, is_inside):
 def test_start_is_that_of_a_lidar(light):
     frames = exposure(light, {"laser.pulse_energy": 1e-11}, pulses=200_000)
     scene = plate({"laser.pulse_energy": 1e-11})
-    start = lidar_start(scene, read_exposure(frames, scene), device="cpu")
+    start = lidar_initial_guess(scene, read_exposure(frames, scene), device="cpu")
     for name, value in start.items():
         assert 1 / 3.5 < value / TRUTH[name] < 3.5, name
     late = plate({"gate.start_ns": 13.5})
-    assert lidar_start(late, read_exposure(np.zeros((8, 8, 160), int), late), device="cpu") == {}
+    assert lidar_initial_guess(late, read_exposure(np.zeros((8, 8, 160), int), late), device="cpu") == {}
 
 
 def test_what_a_fit_leaves_out_is_refused(light):
@@ -128,7 +130,7 @@ def test_what_a_fit_leaves_out_is_refused(light):
         with pytest.raises(spadwarp.ConfigError, match=field):
             spadwarp.fit(frames, plate({f"detector.{field}": value}), unknown="depth", device="cpu")
     for argument, words in (
-        ({"start": {"medium.absorption": 1.0}}, "is not an unknown"),
+        ({"initial_guess": {"medium.absorption": 1.0}}, "is not an unknown"),
         ({"prior": {"depth": 1.0}}, "standard deviation"),
         ({"photons": 10}, "photons = 10"),
     ):

@@ -6,7 +6,7 @@ import pytest
 import spadwarp
 from helpers.inverse import CLEAR, plate
 from helpers.scenes import scene as small_scene
-from spadwarp.inverse.blocks import with_block_means
+from spadwarp.inverse.tensors import with_block_means
 from spadwarp.scene.medium import grid_cells
 
 torch = pytest.importorskip("torch")
@@ -77,7 +77,10 @@ def test_blocks_of_a_grid(tmp_path):
         ({"medium.grid.extinction": torch.ones(2, 2)}, "is not a tensor"),
         ({"medium.grid.extinction": torch.ones(3, 1, 1)}, "possible are 1, 2, 4"),
         ({"medium.grid.absorption": torch.zeros(1, 1, 1)}, "outside"),
-        ({f"medium.grid.{name}": torch.ones(1, 1, 1) for name in ("absorption", "extinction")}, "goes without"),
+        (
+            {f"medium.grid.{name}": torch.ones(1, 1, 1) for name in ("absorption", "extinction")},
+            "cannot be combined with",
+        ),
     ):
         with pytest.raises(spadwarp.SpadwarpError, match=words):
             spadwarp.inverse.render(one, values, **choices)

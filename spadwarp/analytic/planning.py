@@ -1,0 +1,771 @@
+"""An experiment from the depth error that is asked for: gate, pulses, laser power, largest range, what limits it.
+
+A short Monte Carlo run on a window of the image measures counts, background and the error that scattering leaves. The
+window has the pixels of the camera about the target pixel nearest to the optical axis, so that light which is scattered
+from other parts of the target into them is all there. Two runs of equal length are compared: what differs between them
+is noise of the runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.analytic.eye_safety import EyeLimit, beam_axis_fluence, scene_eye_limit
+from spadwarp.analytic.model import false_peaks, source_name
+from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
+from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.frames import (
+    METHODS,
+    Method,
+    detect,
+    detector_response,
+    first_photon_probabilities,
+    information_from_histogram,
+)
+from spadwarp.frames.depth import arrival_time
+from spadwarp.frames.response import FWHM_PER_SIGMA
+from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
+from spadwarp.result import CHANNELS, Channel, merge, received
+from spadwarp.scene import SceneLike, Transport, as_scene, noise_rate
+from spadwarp.scene.camera import to_world
+from spadwarp.scene.sections import field_range
+from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight, port_advance
+from spadwarp.transport import simulate, truth_maps
+from spadwarp.units import quantity, range_from_time, time_from_path, time_from_range, with_prefix
+
+if TYPE_CHECKING:
+    from spadwarp.frames import Frames
+    from spadwarp.result import Result
+    from spadwarp.scene import Scene
+
+__all__ = ["PILE_UP", "Pilot", "Proposal", "plan"]
+
+Floats = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+PILE_UP = 0.05
+"""Detections per pulse of the brightest pixels up to which pile-up is small: the usual rule of 1 to 5 % (O'Connor &
+Phillips, Time-correlated single photon counting, 1984)."""
+
+_SIDE = 16  # largest width and height of the window [pixels]
+_MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
+_MANY_PHOTONS = 100.0  # of the return, from which on the width of the response is the cheaper thing to improve
+_MOST_PULSES = 2**31 - 1
+_MOST_BINS = 1_000_000
+_LEAST = 1e-6  # beyond a port [m]
+_FARTHEST = 200.0  # of the search for the largest range [m]
+_STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pilot:
+    """Detections in a window of the image, medians over its pixels with a target unless said otherwise.
+
+    Attributes:
+        pixels: Their number.
+        unscattered, target: Detections of the target per pulse in the gate, without scattered light and with it.
+        backscatter, noise: Of backscatter, and of dark counts and ambient light.
+        brightest: Detections of light per pulse of the brightest hundredth of the pixels; of the brightest one, where
+            so short a run has light in fewer.
+        bound: Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N.
+        shot_noise: The same without background and pile-up.
+        information_noise: Part of the runs' information on the depth that was their noise, which `bound` and
+            `shot_noise` leave out.
+        floor: Estimator → median |error| of depth that is left after any number of pulses [m].
+        bias: Estimator → median error, positive if too far [m].
+        unscattered_floor: The same as `floor`, of unscattered light alone: slopes and edges within a pixel, bins.
+        pile_up: Estimator → change of depth by pile-up, median [m]; 0 in free-running mode.
+        run_noise: Median |error| of `floor` in a pixel that comes from the shortness of the runs [m].
+        peak, level: Detections per pulse of the return within ±3σ of its peak, and of background per σ under it, σ
+            that of the response.
+        photons: Of both runs.
+    """
+
+    pixels: int
+    unscattered: float
+    target: float
+    backscatter: float
+    noise: float
+    brightest: float
+    bound: float
+    shot_noise: float
+    information_noise: float
+    floor: dict[str, float]
+    bias: dict[str, float]
+    unscattered_floor: dict[str, float]
+    pile_up: dict[str, float]
+    run_noise: float
+    peak: float
+    level: float
+    photons: int
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Proposal:
+    """A proposed experiment.
+
+    Attributes:
+        scene: The scene with the proposed gate, pulses, repetition rate and pulse energy, ready to simulate.
+        depth_error, time: Asked for [m]; longest time for a depth frame [s].
+        method: Estimator whose floor counts.
+        target_range: Least and largest range of the target [m].
+        optical_depth: Of the water before the nearest of it, one way, along the axis.
+        gate_range: Ranges at the ends of the gate, laser at the lens and behind its port [m].
+        unambiguous_range: At the proposed repetition rate [m].
+        largest_rate: Repetition rate up to which the gate ends before the next pulse [Hz].
+        pile_up_energy: Pulse energy at which the brightest pixels detect `PILE_UP` photons a pulse [J].
+        eye: Limit of laser power for the eye.
+        energy_limit: What sets the pulse energy: "" (the scene's own), "pile-up" or "eye".
+        irradiance: On the beam's axis at the nearest range of the target, unscattered light, mean over time [W/m²].
+        pulses: Of a depth frame: for the depth error where it can be reached, else those after which more gain little.
+        pulses_for: What sets them: "depth error"; "false peaks", fewer than 1 % of them; "floor", where the depth error
+            is out of reach; "out of reach", where 2³¹ pulses are too few.
+        frame_time: For these pulses [s], at all positions of a scan.
+        reached: Whether the depth error is reached, within the time.
+        terms: Name → part of the depth error at these pulses [m], "total" last; squares add up.
+        limit: The largest of them.
+        advice: What would help.
+        pilot: What was measured by Monte Carlo.
+        channels: The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera
+            without one.
+        largest_range: For a plane square to the axis, depth error and time as asked for [m]; NaN: not sought, 0: none.
+        range_limit: What limits it.
+    """
+
+    scene: Scene
+    depth_error: float
+    time: float
+    method: str
+    target_range: tuple[float, float]
+    optical_depth: float
+    gate_range: tuple[float, float]
+    unambiguous_range: float
+    largest_rate: float
+    pile_up_energy: float
+    eye: EyeLimit
+    energy_limit: str
+    irradiance: float
+    pulses: int
+    pulses_for: str
+    frame_time: float
+    reached: bool
+    terms: dict[str, float]
+    limit: str
+    advice: str
+    pilot: Pilot
+    channels: dict[str, Pilot] = field(default_factory=dict)
+    largest_range: float = math.nan
+    range_limit: str = ""
+
+    def __repr__(self) -> str:
+        error, pulses = 1e3 * self.terms["total"], self.pulses
+        return f"Proposal({error:.3g} mm with {pulses} pulses, {self.frame_time:.3g} s; limit: {self.limit})"
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
+
+    @property
+    def values(self) -> dict[str, float | int]:
+        """The proposed values by the names of the scene's fields."""
+        proposed = {
+            "gate": ("start_ns", "bin_width_ps", "bins"),
+            "laser": ("repetition_rate", "pulse_energy"),
+            "detector": ("pulses_per_frame",),
+        }
+        return {
+            f"{section}.{name}": getattr(getattr(self.scene, section), name)
+            for section, names in proposed.items()
+            for name in names
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the scene, in numbers and text that JSON can hold."""
+        fields = {name: value for name, value in vars(self).items() if name != "scene"}
+        for name in ("eye", "pilot"):
+            fields[name] = dataclasses.asdict(fields[name])
+        channels = {name: dataclasses.asdict(pilot) for name, pilot in self.channels.items()}
+        return {"values": self.values, **fields, "channels": channels}
+
+
+def plan(
+    scene: SceneLike,
+    *,
+    depth_error: float | str = 0.01,
+    time: float | str = 1.0,
+    ranges: tuple[float | str, float | str] | None = None,
+    margin: float | str = 0.25,
+    method: Method = "likelihood",
+    full_power: bool = False,
+    eye_distance: float | str | None = None,
+    eye_exposure: float | str = 100.0,
+    photons: int = 2_000_000,
+    seed: int = 0,
+    largest_range: bool = True,
+    channel: Channel = "I",
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> Proposal:
+    """Proposes gate, pulses, repetition rate and pulse energy for a depth error, and says what limits it.
+
+    Counts, background and the error that scattering leaves are measured by a Monte Carlo run of a window of the image
+    (`spadwarp.analytic.Pilot`); the Cramér–Rao bound is that of its histograms. The bound falls with the pulses; the
+    floor, the error of an estimator that takes the scattered light for unscattered, does not. Lengths and times may be
+    text with a unit, such as "2 cm".
+
+    Args:
+        scene: Water, laser, camera, detector, target; of the gate the bins' width alone.
+        depth_error: Asked for [m], of a single pixel, in the median.
+        time: Longest time for a depth frame [s].
+        ranges: Least and largest range where the target may be [m]; default: that of the scene's targets. If given, the
+            target is a plane at the largest, with the reflectance of the scene's first target, else 0.5.
+        margin: Range of water that the gate holds before and behind the target [m].
+        method: Estimator whose floor counts.
+        full_power: Take the largest pulse energy within the limits, not only the scene's if it is within them.
+        eye_distance: An eye at this distance from the laser limits the pulse energy [m]; default: reported for 0.1 m,
+            and no limit.
+        eye_exposure: For which it looks into the beam [s].
+        photons: Of the Monte Carlo run.
+        seed: Of it.
+        largest_range: Whether to look for the largest range, which takes several shorter runs.
+        channel: Light that counts, of a camera with an analyser; see `spadwarp.result.received`.
+        device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
+        progress: Called with ("trace", photons done, photons asked for) and the like.
+
+    Raises:
+        ConfigError: No target in view, or no light from it.
+        ArgumentError: An argument out of range.
+    """
+    scene = as_scene(scene)
+    photons = check_integer("photons", photons, field_range(Transport, "photons"))
+    check_choice("method", method, METHODS)
+    check_choice("channel", channel, CHANNELS)
+    planner = _Planner(
+        depth_error=_real("depth_error", depth_error, "[1e-9, 1e9] m"),
+        time=_real("time", time, "[1e-9, 1e9] s"),
+        margin=_real("margin", margin, "[0, 1e6] m"),
+        method=method,
+        full_power=full_power,
+        eye_distance=None if eye_distance is None else _real("eye_distance", eye_distance, "[0, 1e9] m"),
+        eye_exposure=_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"),
+        seed=check_integer("seed", seed, SEED),
+        device=device,
+        channel=channel,
+        progress=progress,
+    )
+    if channel != "I" and not scene.camera.channels:
+        raise ConfigError(
+            f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'", source=source_name(scene)
+        )
+    if ranges is None:
+        distance = truth_maps(scene, device=device).range
+        if np.isnan(distance).all():
+            raise ConfigError(
+                "no target is in view: give one in [[targets]], or the ranges where it may be",
+                source=source_name(scene),
+            )
+        span = float(np.nanmin(distance)), float(np.nanmax(distance))
+    else:
+        if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
+            raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
+        span = _real("ranges", ranges[0], "(-inf, inf) m"), _real("ranges", ranges[1], "(-inf, inf) m")
+        if not 0 < span[0] <= span[1] < math.inf:
+            raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
+        scene = with_plane(scene, span[1])
+    proposal = planner.propose(scene, span, propose_gate(scene, span, planner.margin), photons)
+    if not largest_range:
+        return proposal
+    largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
+    return dataclasses.replace(proposal, largest_range=largest, range_limit=limit)
+
+
+def _real(name: str, value: Any, interval: str) -> float:
+    """An argument that may be text with a unit, as a number within an interval and of its unit."""
+    try:
+        value = quantity(value, interval.split()[-1]) if isinstance(value, str) else value
+    except ValueError as error:
+        raise ArgumentError(f"{name} = {shown(value)} {error}") from None
+    return check_real(name, value, interval)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Planner:
+    """The question: arguments of `plan`."""
+
+    depth_error: float
+    time: float
+    margin: float
+    method: Method
+    full_power: bool
+    eye_distance: float | None
+    eye_exposure: float
+    seed: int
+    device: str | None
+    channel: Channel
+    progress: Progress | None
+
+    def propose(
+        self, scene: Scene, span: tuple[float, float], gate: Gate, photons: int, *, even: bool = False
+    ) -> Proposal:
+        """The experiment with a target at these ranges: light, pulse energy, pulses, error; `even` as in `measure`."""
+        rate, target = scene.laser.repetition_rate, scene
+        if scene.detector.wrap and rate > gate.largest_rate:
+            rate = _rounded_down(gate.largest_rate)
+        fields = {"start_ns": gate.start_ns, "bins": gate.bins}
+        scene = scene.with_overrides(gate=fields, laser={"repetition_rate": rate}, transport={"max_path": None})
+        small = window(scene, self.device)
+        runs = trace(small, photons, self.seed, self.device, None if even else self.progress)
+        pilot = measure(runs, scene, self.device, even=even, channel=self.channel)
+        eye = scene_eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
+        piled = scene.laser.pulse_energy * max(PILE_UP - pilot.noise, 0.0) / pilot.brightest
+        allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": eye.pulse_energy})
+        energy_limit = min(allowed, key=allowed.__getitem__)
+        lowest = allowed[energy_limit]
+        if lowest > 0 and ((self.full_power and not even) or scene.laser.pulse_energy > lowest):
+            scene = scene.with_overrides(laser={"pulse_energy": _rounded_down(lowest)})
+            pilot = measure(runs, scene, self.device, even=even, channel=self.channel)
+        else:
+            energy_limit = ""
+        pulses, purpose = self._pulses(scene, pilot)
+        terms = _terms(pilot, pulses, self.method)
+        frame_time = pulses * scene.scan_positions / rate
+        limit = _limit(scene, pilot, terms, pulses, self.method)
+        # Given on its own, the analytic model's number would hold against a later change of the detector's.
+        depth_pulses = None if scene.analytic.pulses_per_depth_frame is None else pulses
+        scene = scene.with_overrides(
+            detector={"pulses_per_frame": pulses}, analytic={"pulses_per_depth_frame": depth_pulses}
+        )
+        compared = CHANNELS if small.camera.channels and not even else ()
+        line = axis_line(target)
+        optical_depth = target.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
+        fluence = beam_axis_fluence(scene, span[0]) * math.exp(-optical_depth)
+        index, advance = scene.medium.group_index, port_advance(target)
+        return Proposal(
+            scene=scene,
+            depth_error=self.depth_error,
+            time=self.time,
+            method=self.method,
+            target_range=span,
+            optical_depth=optical_depth,
+            gate_range=tuple(range_from_time(end, index) + advance for end in (scene.gate.start, scene.gate.stop)),
+            unambiguous_range=range_from_time(1.0 / rate, index) + advance,
+            largest_rate=gate.largest_rate,
+            pile_up_energy=piled,
+            eye=eye,
+            energy_limit=energy_limit,
+            irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate,
+            pulses=pulses,
+            pulses_for=purpose,
+            frame_time=frame_time,
+            reached=purpose in ("depth error", "false peaks") and frame_time <= self.time,
+            terms=terms,
+            limit=limit,
+            advice=self._advice(limit, purpose, frame_time, rate, gate.largest_rate),
+            pilot=pilot,
+            channels={name: measure(runs, scene, self.device, channel=name) for name in compared},
+        )
+
+    def _pulses(self, scene: Scene, pilot: Pilot) -> tuple[int, str]:
+        """Pulses of a depth frame, and what they are for.
+
+        For the depth error that the floor leaves, but at least as many as bring false peaks below `OUTLIERS`; where the
+        floor is too high, until the bound is a third of it: then the error is within 6 % of the floor.
+        """
+        fixed = math.hypot(pilot.floor[self.method], pilot.pile_up[self.method])
+        left = math.sqrt(max(self.depth_error**2 - fixed**2, 0.0))
+        purpose = "depth error" if left > 0 else "floor"
+        wanted, peaks = (
+            (pilot.bound / (left or fixed / 3.0)) ** 2,
+            _pulses_without_false_peaks(scene, pilot, self.device),
+        )
+        if peaks > wanted:
+            wanted, purpose = peaks, "false peaks" if left > 0 else "floor"
+        if not wanted <= _MOST_PULSES:
+            return _MOST_PULSES, "out of reach"
+        digits = 10.0 ** max(0, math.floor(math.log10(max(wanted, 1.0))) - 1)
+        return int(min(max(1.0, math.ceil(wanted / digits) * digits), _MOST_PULSES)), purpose
+
+    def _advice(self, limit: str, purpose: str, frame_time: float, rate: float, largest: float) -> str:
+        """What would help: time, where the pulses reach the depth error but take too long."""
+        advice = _ADVICE[limit]
+        if purpose not in ("depth error", "false peaks"):
+            return advice + ("; more pulses do not help" if limit == "forward scattering" else "")
+        if frame_time <= self.time:
+            return advice
+        faster = f"; this gate allows up to {with_prefix(largest, 'Hz')}" if largest > rate else ""
+        if limit == "shot noise":
+            return (
+                f"more light per pulse (energy, aperture, reflectance), a longer time (--time) or a higher repetition "
+                f"rate: these pulses take {with_prefix(frame_time, 's')} at {with_prefix(rate, 'Hz')}{faster}"
+            )
+        return (
+            f"a longer time (--time): these pulses reach the depth error, but take {with_prefix(frame_time, 's')} at a "
+            f"repetition rate of {with_prefix(rate, 'Hz')}{faster}; fewer pulses are needed with {advice}"
+        )
+
+    def largest_range(self, scene: Scene, start: float, photons: int) -> tuple[float, str]:
+        """The largest range [m] of a plane, to 3 %, and what limits it there; sought from `start` on, 0: there is none.
+
+        The repetition rate and the pulse energy are the scene's, the gate follows the plane.
+        """
+        reason = ""
+
+        def is_reached(distance: float) -> bool:
+            nonlocal reason
+            if distance <= axis_line(scene).lead[0]:
+                reason = "the port"
+                return False
+            if self.progress is not None:
+                self.progress(f"a plane at {distance:.3g} m", 0, 0)
+            target, span = with_plane(scene, distance), (distance, distance)
+            gate = propose_gate(target, span, self.margin)
+            if scene.detector.wrap and gate.largest_rate < scene.laser.repetition_rate:
+                reason = "repetition rate"
+                return False
+            try:
+                proposal = self.propose(target, span, gate, photons, even=True)
+            except ConfigError:
+                reason = "no light of the target"
+                return False
+            if not proposal.reached:
+                reason = proposal.limit
+            return proposal.reached
+
+        low, high = (start, 0.0) if is_reached(start) else (0.0, start)
+        while not (low and high):
+            distance = low * _STEP if low else high / _STEP
+            if distance > _FARTHEST:
+                return low, "not sought beyond 200 m"
+            if distance < start / 40.0:
+                return 0.0, reason
+            low, high = (distance, high) if is_reached(distance) else (low, distance)
+        while high / low > _RESOLUTION:
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if is_reached(middle) else (low, middle)
+        return low, reason
+
+
+# Targets and gates
+
+
+class Gate(NamedTuple):
+    """Start [ns], as a file holds it, bins, and the rate up to which a pulse's gate ends before the next pulse [Hz]."""
+
+    start_ns: float
+    bins: int
+    largest_rate: float
+
+
+def propose_gate(scene: Scene, span: tuple[float, float], margin: float) -> Gate:
+    """A gate for returns from a span of ranges [m], with `margin` [m] and the instrument response on both sides.
+
+    The bins keep their width. Raises `ConfigError` for a gate of more than a million bins.
+    """
+    lines, index = lines_of_sight(scene).flat(), scene.medium.group_index
+    # A pixel whose light does not get through the port has no time; one that is still in the port has that of its end.
+    times = [time_from_path(lines.path_from_range(np.maximum(r, lines.lead + _LEAST)), index) for r in span]
+    spread, width = time_from_range(margin, index), scene.gate.bin_width
+    before, after = detector_response(scene.detector, scene.laser).support
+    start = max(0.0, math.floor((np.nanmin(times[0]) + before - spread) / width) * width)
+    start_ns = round(start * 1e9, 6)
+    bins = math.ceil((np.nanmax(times[1]) + after + spread - start_ns * 1e-9) / width)
+    if bins > _MOST_BINS:
+        raise ConfigError(
+            f"gate.bin_width_ps = {scene.gate.bin_width_ps:g}: a gate for {span[0]:.4g} to {span[1]:.4g} m takes "
+            f"{bins} bins, more than {_MOST_BINS}",
+            source=source_name(scene),
+        )
+    return Gate(start_ns, bins, 1.0 / (start_ns * 1e-9 + bins * width))
+
+
+def with_plane(scene: Scene, distance: float) -> Scene:
+    """The scene with a plane square to the optical axis as its only target, larger than the view and the beam, at a
+    range on the axis."""
+    camera = scene.camera
+    widest = max(abs(edge) for edge in camera.view_box)
+    if scene.laser.profile != "collimated":
+        widest = max(widest, math.tan(min(scene.laser.half_angle, math.radians(80.0))))
+    offset = max(map(abs, scene.beam.position)) + scene.laser.beam_radius
+    side = 2.4 * (distance * widest + offset)
+    point = axis_line(scene).points(distance)[0]  # A tilted port bends the axis.
+    side += 2.0 * float(np.abs(point[:2]).max())
+    place = to_world(camera, point) if camera.is_posed else point
+    plane = {
+        "builtin": "plane",
+        "size": [side, side],
+        "translation": [float(x) for x in place],
+        "rotation_deg": list(camera.rotation_deg),
+        "reflectance": face_reflectance(scene),
+    }
+    return scene.with_overrides({"targets": [plane]})
+
+
+# The Monte Carlo run
+
+
+def window(scene: Scene, device: str | None = None) -> Scene:
+    """The scene with a camera of the pixels about the target pixel nearest to the axis, 16 × 16 at most.
+
+    Raises `ConfigError` where no target is in view.
+    """
+    camera = scene.camera
+    row, column = central_pixel(scene, truth := truth_maps(scene, device=device))
+    hit = ~np.isnan(truth.depth)
+    width, height = min(_SIDE, camera.width), min(_SIDE, camera.height)
+    if (width, height) == (camera.width, camera.height):
+        return scene
+    left, top = (camera.width - width) // 2, (camera.height - height) // 2
+    middle = hit[top : top + height, left : left + width]
+    centred = (camera.width - width) % 2 == 0 == (camera.height - height) % 2 and middle.mean() > 0.25
+    if centred and camera.is_plain:  # the kernels of a plain camera are those of the whole image
+        fov = 2.0 * math.atan(0.5 * width * camera.pixel_tangent)
+        return scene.with_overrides(camera={"width": width, "height": height, "horizontal_fov_deg": math.degrees(fov)})
+    left = int(np.clip(column - width // 2, 0, camera.width - width))
+    top = int(np.clip(row - height // 2, 0, camera.height - height))
+    (fx, fy), (cx, cy) = camera.focal_pixels, camera.principal_point
+    centre = {"cx": cx - 0.5 - left, "cy": cy - 0.5 - top}
+    return scene.with_overrides(camera={"width": width, "height": height, "fx": fx, "fy": fy, **centre})
+
+
+def trace(
+    scene: Scene, photons: int, seed: int, device: str | None, progress: Progress | None = None
+) -> tuple[Result, Result]:
+    """Two runs of half the photons each."""
+    half = max(1, photons // 2)
+
+    def report(stage: str, done: int, total: int) -> None:
+        if progress is not None and total:
+            progress(stage, traced + done, 2 * half)
+        elif progress is not None and not traced:
+            progress(stage, done, total)
+
+    runs = []
+    for traced in (0, half):
+        options: dict[str, Any] = {"first_photon": traced, "seed": seed, "device": device, "progress": report}
+        runs.append(simulate(scene, photons=half, **options))
+    return runs[0], runs[1]
+
+
+def measure(
+    runs: tuple[Result, Result],
+    scene: Scene,
+    device: str | None = None,
+    *,
+    even: bool = False,
+    channel: Channel = "I",
+) -> Pilot:
+    """Numbers of `scene`, whose laser's energy and detector may differ from those of the runs, in a channel of an
+    analyser.
+
+    `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
+    its modulus.
+    """
+    first, second = (received(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs)
+    both = merge([first, second])
+    clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
+    frames, clear_frames, *half_frames = (
+        detect(run, pulses=1, seed=0, device=device) for run in (both, clear, first, second)
+    )
+    light = frames.expected.astype(np.float64)
+    background = np.broadcast_to(frames.background, light.shape).astype(np.float64)
+    signal = light - background
+    seen = np.isfinite(both.truth.depth) & (signal.sum(axis=-1) > 0)
+    if not seen.any():
+        raise ConfigError(
+            "no light of the target reaches the pixels near the axis: `spadwarp check` says why",
+            source=source_name(scene),
+        )
+
+    def median(values: Any) -> float:
+        values = np.asarray(values)[seen]
+        finite = values[np.isfinite(values)]
+        return float(np.median(finite)) if finite.size else math.inf
+
+    def errors(frames: Frames, histogram: Any) -> dict[str, Any]:
+        """Depth by each estimator, from a histogram without noise, less the true depth [m]."""
+        return {method: _depth_error(both, frames, histogram, method, device) for method in METHODS}
+
+    error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
+    halves = [_depth_error(both, half, half.expected, "likelihood", device) for half in half_frames]
+    bias = {method: median(values) for method, values in error.items()}
+    piled: dict[str, float] = {method: 0.0 for method in METHODS}
+    if scene.detector.mode == "first_photon":
+        recorded = errors(frames, first_photon_probabilities(light, device=device))
+        piled = {method: median(recorded[method] - error[method]) for method in METHODS}
+    scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
+    peak, level = _return(signal, background, both.scene)
+    bound, shot, information_noise = _bounds(both, (first, second), seen, device)
+    detected = both.detections.sum(axis=-1)
+    noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
+    return Pilot(
+        pixels=int(seen.sum()),
+        unscattered=median(both.component("ballistic").sum(axis=-1) * scale),
+        target=median(signal.sum(axis=-1)),
+        backscatter=median(both.component("backscatter").sum(axis=-1) * scale),
+        noise=noise,
+        brightest=float(np.quantile(detected, 0.99) or detected.max()),
+        bound=bound,
+        shot_noise=shot,
+        information_noise=information_noise,
+        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()},
+        bias=bias,
+        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
+        pile_up=piled,
+        run_noise=median(0.5 * np.abs(halves[0] - halves[1])),
+        peak=median(peak),
+        level=median(level),
+        photons=both.photons,
+    )
+
+
+def _as_traced(traced: Scene, wanted: Scene) -> Scene:
+    """The traced scene with what a detector sees of the wanted one."""
+    laser = traced.laser.model_copy(
+        update={name: getattr(wanted.laser, name) for name in ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")}
+    )
+    return traced.model_copy(update={"laser": laser, "detector": wanted.detector})
+
+
+def _depth_error(result: Result, frames: Frames, histogram: Any, method: Any, device: str | None) -> Floats:
+    """Depth by an estimator that knows the background, less the true depth [m]."""
+    time = arrival_time(
+        histogram,
+        gate_start=frames.gate_start,
+        bin_width=frames.bin_width,
+        method=method,
+        irf=frames.irf,
+        background=frames.background,
+        device=device,
+    )
+    return depth_from_time(time, scene=result.scene) - result.truth.depth
+
+
+def _sigma(scene: Scene) -> float:
+    """Standard deviation of the response, or of a bin where it is shorter [s]."""
+    return max(detector_response(scene.detector, scene.laser).fwhm, scene.gate.bin_width) / FWHM_PER_SIGMA
+
+
+def _return(signal: Floats, background: Floats, scene: Scene) -> tuple[Floats, Floats]:
+    """Detections per pulse about the return's peak, and of background per σ under it."""
+    bins_per_sigma = _sigma(scene) / scene.gate.bin_width
+    reach = max(1, round(3.0 * _sigma(scene) / scene.gate.bin_width))
+    top = signal.argmax(axis=-1)[..., None]
+    near = np.clip(top + np.arange(-reach, reach + 1), 0, signal.shape[-1] - 1)
+    inside = np.abs(near - top) <= reach
+    peak = (np.take_along_axis(signal, near, axis=-1) * inside).sum(axis=-1)
+    return peak, np.take_along_axis(background, near, axis=-1).mean(axis=-1) * bins_per_sigma
+
+
+def _bounds(
+    result: Result, runs: tuple[Result, Result], seen: NDArray[np.bool_], device: str | None
+) -> tuple[float, float, float]:
+    """Bounds of depth for one pulse [m], medians: as the detector records it, and without background and pile-up; and
+    the part of the information that was noise of the runs, for which the bounds are larger.
+
+    From products of the slopes of both runs, which noise does not change in the mean. One pixel has too few photons to
+    say what part is noise, and few bright photons rule a mean over pixels: medians of both are compared. Inf where
+    nearly all is noise.
+    """
+    scene = result.scene
+    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
+    signal, first, second = (
+        (run.component("ballistic") + run.component("forward_scattered")) * scale for run in (result, *runs)
+    )
+    background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
+    options: dict[str, Any] = {
+        "bin_width": scene.gate.bin_width,
+        "irf": detector_response(scene.detector, scene.laser),
+        "signal_halves": (first, second),
+        "device": device,
+    }
+    law: Any = "first_photon" if scene.detector.mode == "first_photon" else "poisson"
+    slope = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
+
+    def bound(background: Any, law: Any) -> tuple[float, float]:
+        information, noise = information_from_histogram(signal, background, law=law, **options)
+        known = seen & (information > 0)
+        if not known.any():
+            return math.inf, 1.0
+        part = float(np.median(noise[known]) / np.median(information[known]))
+        left = 1.0 - part if part < _MOST_NOISE else 0.0
+        with np.errstate(divide="ignore"):
+            return float(np.median(slope[known] / np.sqrt(left * information[known]))), part
+
+    recorded, part = bound(background, law)
+    return recorded, bound(0.0, "poisson")[0], part
+
+
+# Pulses, and parts of the depth error
+
+
+def _rounded_down(value: float, digits: int = 3) -> float:
+    """With so many digits, not above the value."""
+    text = f"{value:.{digits - 1}e}"
+    step = 10.0 ** (int(text.partition("e")[2]) - digits + 1)
+    return float(f"{float(text) - (step if float(text) > value else 0.0):.{digits}g}")
+
+
+def _pulses_without_false_peaks(scene: Scene, pilot: Pilot, device: str | None) -> float:
+    """Pulses after which a fit takes background for the return with a probability of `OUTLIERS`; inf beyond 1e12."""
+    pulses = np.geomspace(1.0, 1e12, 481)
+    lengths = np.full_like(pulses, (scene.gate.stop - scene.gate.start) / _sigma(scene))
+    few = np.flatnonzero(false_peaks(pulses * pilot.peak, pulses * pilot.level, lengths, device) <= OUTLIERS)
+    return float(pulses[few[0]]) if few.size else math.inf
+
+
+def _terms(pilot: Pilot, pulses: int, method: str) -> dict[str, float]:
+    """Parts of the depth error [m]; squares add up."""
+    bound, shot = pilot.bound / math.sqrt(pulses), pilot.shot_noise / math.sqrt(pulses)
+    floor, piled = pilot.floor[method], abs(pilot.pile_up[method])
+    return {
+        "shot noise": min(shot, bound),
+        "background": math.sqrt(max(bound**2 - shot**2, 0.0)),
+        "Cramér–Rao bound": bound,
+        "forward scattering": floor,
+        "pile-up": piled,
+        "total": math.hypot(bound, floor, piled),
+    }
+
+
+def _limit(scene: Scene, pilot: Pilot, terms: dict[str, float], pulses: int, method: str) -> str:
+    """What the depth error is made of for the most part."""
+    largest = max(("shot noise", "background", "forward scattering", "pile-up"), key=terms.__getitem__)
+    if largest == "background":
+        return "backscatter" if pilot.backscatter >= pilot.noise else "dark counts and ambient light"
+    if largest == "forward scattering" and 0.5 * pilot.floor[method] < pilot.unscattered_floor[method] < math.inf:
+        bin_range = range_from_time(scene.gate.bin_width, scene.medium.group_index)
+        return "bin width" if pilot.floor[method] <= bin_range else "pixel size"
+    if largest == "shot noise" and pulses * pilot.peak > _MANY_PHOTONS:
+        widths = {
+            "jitter": scene.detector.jitter_fwhm_ps,
+            "pulse duration": scene.laser.pulse_fwhm_ps,
+            "bin width": scene.gate.bin_width_ps,
+        }
+        if scene.detector.irf.lower().endswith(".csv"):  # laser and detector measured together
+            del widths["pulse duration"]
+            widths["jitter"] = 1e12 * detector_response(scene.detector, scene.laser).fwhm
+        return max(widths, key=widths.__getitem__)
+    return largest
+
+
+_ADVICE = {
+    "shot noise": "more pulses, energy, aperture or reflectance; the error falls with the root of the photons",
+    "jitter": "a detector with less jitter: the error is proportional to the width of the response, while photons act "
+    "only by their root",
+    "pulse duration": "a shorter pulse: the error is proportional to the width of the response, while photons act only "
+    "by their root",
+    "bin width": "narrower bins, gate.bin_width_ps: where light is within a bin is not known",
+    "backscatter": "a gate that begins closer to the target, more distance between laser and lens, a narrower view",
+    "dark counts and ambient light": "a shorter gate, a narrower spectral filter, a cooler or quieter detector",
+    "forward scattering": "a shorter distance, clearer water, a narrower beam or view",
+    "pixel size": "smaller pixels: slopes and edges of the target within one pixel, also without scattered light",
+    "pile-up": "less pulse energy, or Coates' correction (`spadwarp detect --coates`)",
+}
