@@ -17,7 +17,7 @@ _ROOMS = {
     "water": (),
     "mesh": (),
     "checks": ("check",),
-    "transport": ("simulate", "truth_maps"),
+    "transport": ("RunOptions", "simulate", "truth_maps"),
     "parallel": ("Ray",),
     "result": ("Result", "load_result", "merge"),
     "frames": ("Frames", "arrival_time", "crlb", "detect"),
@@ -47,6 +47,7 @@ __all__ = [  # written out for type checkers
     "MeshError",
     "Ray",
     "Result",
+    "RunOptions",
     "Scene",
     "SpadwarpError",
     "__version__",
@@ -106,7 +107,7 @@ if TYPE_CHECKING:
     from spadwarp.result import Result, load_result, merge
     from spadwarp.run import export
     from spadwarp.scene import Scene, load_scene
-    from spadwarp.transport import simulate, truth_maps
+    from spadwarp.transport import RunOptions, simulate, truth_maps
 else:
 
     def __getattr__(name: str) -> Any:

@@ -139,7 +139,7 @@ def plan(
         photons: Of the Monte Carlo run.
         seed: Of it.
         largest_range: Whether to look for the largest range, which takes several shorter runs.
-        channel: Light that counts, of a camera with an analyser; see `spadwarp.result.received`.
+        channel: Light that counts, of a camera with an analyser; see `spadwarp.result.analyser_channel`.
         device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
         progress: Called with ("trace", photons done, photons asked for) and the like.
 

@@ -21,11 +21,11 @@ from spadwarp.errors import ConfigError
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.estimators import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.result import Channel, merge, received
+from spadwarp.result import Channel, analyser_channel, merge
 from spadwarp.scene import noise_rate
 from spadwarp.scene.geometry import pixel_directions
 from spadwarp.scene.sight import depth_from_time, depth_per_time
-from spadwarp.transport import simulate, truth_maps
+from spadwarp.transport import RunOptions, simulate, truth_maps
 
 if TYPE_CHECKING:
     from spadwarp.frames import Frames
@@ -126,7 +126,12 @@ def trace(
 
     runs = []
     for traced in (0, half):
-        options: dict[str, Any] = {"first_photon": traced, "seed": seed, "device": device, "progress": report}
+        options: dict[str, Any] = {
+            "run": RunOptions(first_photon=traced),
+            "seed": seed,
+            "device": device,
+            "progress": report,
+        }
         runs.append(simulate(scene, photons=half, **options))
     return runs[0], runs[1]
 
@@ -145,7 +150,9 @@ def measure(
     `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
     its modulus.
     """
-    first, second = (received(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs)
+    first, second = (
+        analyser_channel(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs
+    )
     both = merge([first, second])
     frames = detect(both, pulses=1, seed=0, device=device)
     light = frames.expected.astype(np.float64)

@@ -19,14 +19,14 @@ class DepthDifference:
     Args:
         scene: With the targets in the middle.
         step: [m].
-        kept: Meshes of earlier scenes.
+        mesh_cache: Meshes of earlier scenes.
         choices: Other arguments of `LightTracer`.
     """
 
-    def __init__(self, scene: Scene, step: float, *, kept: dict[str, Any], **choices: Any) -> None:
+    def __init__(self, scene: Scene, step: float, *, mesh_cache: dict[str, Any], **choices: Any) -> None:
         self._step = step
         self._far, self._near = (
-            LightTracer(moved(scene, sign * step), kept=kept.setdefault(name, {}), **choices)
+            LightTracer(moved(scene, sign * step), mesh_cache=mesh_cache.setdefault(name, {}), **choices)
             for name, sign in (("far", 1.0), ("near", -1.0))
         )
 

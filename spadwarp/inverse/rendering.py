@@ -120,7 +120,7 @@ class Renderer:
         plain = scored if batches == 1 or not names else self._tracer(scene, photons, ())
         depth = None
         if any(one.name == DEPTH for one in self.unknowns):
-            depth = DepthDifference(scene, self.depth_step, photons=photons, kept=self._kept, **self._choices)
+            depth = DepthDifference(scene, self.depth_step, photons=photons, mesh_cache=self._kept, **self._choices)
         self.truth = scored.truth
         receiver = self._receiver(scene, values)
         place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
@@ -141,7 +141,7 @@ class Renderer:
     def depth_slopes(self, values: Values, *, shift: float, step: float, photons: int, batches: int) -> list[Rows]:
         """dλ/d(depth) `[pixel, bin]` by differences over `shift` ± `step` [m], each of so many photons of its own."""
         shared, scene = self._at(values)
-        difference = DepthDifference(moved(scene, shift), step, photons=photons, kept=self._kept, **self._choices)
+        difference = DepthDifference(moved(scene, shift), step, photons=photons, mesh_cache=self._kept, **self._choices)
         receiver = self._receiver(scene, values)
         place = _Placement.of(scene, values, shared, self.unknowns, receiver) if self.apart else None
         depth = [one for one in self.unknowns if one.name == DEPTH]
@@ -164,14 +164,14 @@ class Renderer:
 
     def _tracer(self, scene: Scene, photons: int, names: Sequence[str]) -> LightTracer:
         kept = self._kept.setdefault("scored" if names else "plain", {})
-        tracer = LightTracer(scene, photons=photons, derivatives=names, kept=kept, **self._choices)
+        tracer = LightTracer(scene, photons=photons, derivatives=names, mesh_cache=kept, **self._choices)
         self._tally = tracer.tally
         return tracer
 
     @property
     def _choices(self) -> dict[str, Any]:
         """Of all tracers; one tally serves them in turn."""
-        return {"seed": self.seed, "device": self.device, "apart": self.apart, "tally": self._tally}
+        return {"seed": self.seed, "device": self.device, "separate_targets": self.apart, "tally": self._tally}
 
     def _with_focus(self, scene: Scene) -> Scene:
         """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved.

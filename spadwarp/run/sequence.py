@@ -78,7 +78,7 @@ def simulate_sequence(
             with warnings.catch_warnings():
                 if number:  # said of the first frame
                     warnings.simplefilter("ignore", SpadwarpWarning)
-                result = simulate(at, photons=photons, seed=own, device=device, kept=kept)
+                result = simulate(at, photons=photons, seed=own, device=device, mesh_cache=kept)
                 part = detect(
                     result, pulses=pulses, frames=1, first_frame=number, seed=seed, tags=tags, device=_first(device)
                 )

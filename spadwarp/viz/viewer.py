@@ -18,7 +18,7 @@ from spadwarp.frames.export import FrameSequence
 from spadwarp.frames.monte_carlo_noise import noise_caption
 from spadwarp.frames.sequence_file import SequenceFile
 from spadwarp.io.paths import check_apart
-from spadwarp.result import Channel, Result, received
+from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight
 from spadwarp.viz import style
@@ -90,7 +90,7 @@ def view(
         path: The file to write.
         method: Estimator of depth; default: "centroid" for a result, the last of the file for frames.
         frame: Number of the frame, from 0, where the source holds frames.
-        channel: Of a result: which light counts, see `spadwarp.result.received`.
+        channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
         device: Warp device for the depth frame.
 
     Raises:
@@ -106,7 +106,7 @@ def view(
     if isinstance(held, SequenceFile):
         raise ArgumentError(f"{held.path} holds a scene that moves: `spadwarp video` shows it, frame by frame")
     if isinstance(held, Result):
-        page = _of_result(received(held, channel), method, device)
+        page = _of_result(analyser_channel(held, channel), method, device)
     elif channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels")
     else:

@@ -18,7 +18,7 @@ def cells(one, device, photons, seeds=32, pixels=False):
     for seed in range(seeds):
         result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
         assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
-        assert result.ledger_report()["exact"]
+        assert result.energy_report()["exact"]
         parts = [result.tallies.sum(axis=(1, 2)), result.tallies.sum(axis=(0, 3))][: 2 if pixels else 1]
         rows.append(np.concatenate([part.ravel() for part in parts]) * (result.unit / photons))
     return np.array(rows)

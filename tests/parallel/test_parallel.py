@@ -103,21 +103,25 @@ class Killer:
 @pytest.mark.parametrize(("uncertainty", "kills"), [(False, 3), (True, 1)])
 def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, uncertainty, kills, whole, tmp_path):
     killer = Killer(kills, seed=kills)
-    options = {"uncertainty": uncertainty, "checkpoint": tmp_path / "checkpoint.h5", "checkpoint_every": 0.0}
+    run = spadwarp.RunOptions(checkpoint=tmp_path / "checkpoint.h5", checkpoint_every=0.0)
+    options = {"uncertainty": uncertainty, "run": run}
     run = spadwarp.simulate(scene(), **RUN, engine=Ray(workers=2), progress=killer, **options)
     same(run, whole[uncertainty])
     assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == kills
     assert kills + 1 <= len(run.provenance["workers"]) <= kills + 2 and run.provenance["device"] == "2 Ray workers"
     # The checkpoint is consistent, whatever was lost, and can be resumed.
     kept = spadwarp.load_result(tmp_path / "checkpoint.h5")
-    assert kept.partial and 0 < kept.photons < PHOTONS and kept.ledger_report()["exact"]
-    same(spadwarp.simulate(scene(), device="cpu", resume=kept), whole[uncertainty])
+    assert kept.partial and 0 < kept.photons < PHOTONS and kept.energy_report()["exact"]
+    same(spadwarp.simulate(scene(), device="cpu", run=spadwarp.RunOptions(resume=kept)), whole[uncertainty])
 
 
 def test_a_run_can_be_resumed_over_ray(cluster, whole):
-    parts = [spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=True, shard=(n, 5)) for n in (5, 1)]
+    parts = [
+        spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=True, run=spadwarp.RunOptions(shard=(n, 5)))
+        for n in (5, 1)
+    ]
     gaps = spadwarp.merge(parts)
-    same(spadwarp.simulate(scene(), engine=Ray(workers=1), resume=gaps), whole[True])
+    same(spadwarp.simulate(scene(), engine=Ray(workers=1), run=spadwarp.RunOptions(resume=gaps)), whole[True])
     assert gaps.photons < PHOTONS / 2  # untouched
 
 
@@ -137,10 +141,12 @@ def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
 
     fired = []
     part = spadwarp.simulate(scene(), photons=10**8, seed=5, engine=Ray(workers=2), progress=interrupt)
-    assert part.partial and 10_000 <= part.photons < 10**8 and part.ledger_report()["exact"]
+    assert part.partial and 10_000 <= part.photons < 10**8 and part.energy_report()["exact"]
     # The photons it has, whichever they are, are those of a local run.
     parts = [
-        spadwarp.simulate(scene(), photons=stop - start, first_photon=start, seed=5, device="cpu")
+        spadwarp.simulate(
+            scene(), photons=stop - start, seed=5, device="cpu", run=spadwarp.RunOptions(first_photon=start)
+        )
         for start, stop in part.photon_ranges
     ]
     assert spadwarp.merge(parts).tallies.tobytes() == part.tallies.tobytes()

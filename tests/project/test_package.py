@@ -51,7 +51,7 @@ def test_kernels_import_warp_numpy_and_the_standard_library_only():
         assert not foreign, f"{path.name} imports {foreign}"
 
 
-# Themselves loaded when there are pictures to draw, or a network to run.
+# Themselves loaded when there are photons to trace, pictures to draw, or a network to run.
 LOADED_LATE = {
     "denoise/belief_propagation.py",
     "denoise/context.py",
@@ -76,17 +76,13 @@ LOADED_LATE = {
     "denoise/two_surfaces.py",
     "denoise/volumes.py",
     "denoise/votes.py",
-    "transport/device_worker.py",
-    "transport/polarisation.py",
-    "transport/local_workers.py",
-    "transport/model.py",
 }
 
 
 def test_heavy_packages_are_imported_where_they_are_used():
     for path in sources("spadwarp"):
         name = path.relative_to(ROOT / "spadwarp").as_posix()
-        if name not in LOADED_LATE and not name.startswith("viz/"):
+        if name not in LOADED_LATE and not name.startswith(("transport/", "viz/")):
             top = {name.split(".")[0] for name in imports(path, top_only=True)}
             assert top.isdisjoint(HEAVY), f"{path.name} imports {top & HEAVY}"
 

@@ -58,7 +58,7 @@ def test_unknown_names_are_refused(result: Result) -> None:
         ("photons", 0, "photons = 0"),
         ("photon_ranges", ((0, 5),), "5 ids"),
         ("tallies", np.zeros((3, 12, 16, 47), dtype=np.int64), r"int64 \(3, 12, 16, 48\)"),
-        ("tallies", np.zeros((3, 12, 16, 48)), "tallies are float64"),
+        ("tallies", np.zeros((3, 12, 16, 48)), "tallies: float64"),
     ],
 )
 def test_arrays_and_numbers_that_do_not_fit_the_scene_are_refused(
@@ -133,13 +133,15 @@ def test_range_from_path_undoes_the_path(
 
 
 def test_ledger_closes_exactly_and_names_what_is_missing(result: Result) -> None:
-    report = result.ledger_report()
+    report = result.energy_report()
     assert report["exact"]
     assert report["difference"] == 0
     assert report["fractions"] == {"absorbed_water": 0.75, "weight_cutoff": 0.5, "roulette": -0.25}
-    leaky = dataclasses.replace(result, ledger={**result.ledger, "absorbed_water": result.ledger["absorbed_water"] - 1})
-    assert not leaky.ledger_report()["exact"]
-    assert leaky.ledger_report()["difference"] == 1
+    leaky = dataclasses.replace(
+        result, energy_balance={**result.energy_balance, "absorbed_water": result.energy_balance["absorbed_water"] - 1}
+    )
+    assert not leaky.energy_report()["exact"]
+    assert leaky.energy_report()["difference"] == 1
 
 
 def test_summary_is_plain_numbers(result: Result) -> None:

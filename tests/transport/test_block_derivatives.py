@@ -46,7 +46,7 @@ def test_blocks_share_the_derivatives_of_one_water(estimator, tracking, everywhe
     result = simulated(one, device, WITH_TARGET, (4, 3, 5))
     # On a GPU products are rounded with sums (FMA), in kernels of two texts not the same ones.
     np.testing.assert_allclose(result.tallies, plain.tallies, rtol=0 if device == "cpu" else 1e-6, atol=device != "cpu")
-    assert (result.ledger, result.counters) == (plain.ledger, plain.counters)
+    assert (result.energy_balance, result.counters) == (plain.energy_balance, plain.counters)
     assert list(result.derivatives)[:2] == [WATER[3], "medium.grid.absorption[0,0,0]"]
     assert len(result.derivatives) == 1 + 3 * 60
     rtol = 1e-5 if device == "cpu" else 2e-2  # on a GPU some histories differ
@@ -163,8 +163,10 @@ def test_files_merge_and_resume(everywhere, tmp_path):
     one = scene(medium={"grid": {**everywhere, "tracking": "delta"}}, transport={"estimator": "next_event"})
     asked = one, "cpu", WITH_TARGET, (2, 1, 5)
     whole = simulated(*asked, 4096, uncertainty=True)
-    halves = [simulated(*asked, 4096, uncertainty=True, shard=(k, 2)) for k in (1, 2)]
-    resumed = spadwarp.simulate(one, photons=4096, device="cpu", resume=simulated(*asked, 2048))
+    halves = [simulated(*asked, 4096, uncertainty=True, run=spadwarp.RunOptions(shard=(k, 2))) for k in (1, 2)]
+    resumed = spadwarp.simulate(
+        one, photons=4096, device="cpu", run=spadwarp.RunOptions(resume=simulated(*asked, 2048))
+    )
     loaded = spadwarp.load_result(whole.save(tmp_path / "result.h5"))
     for other in (loaded, spadwarp.merge(halves), resumed):
         np.testing.assert_array_equal(other.derivatives[NAMES[1]], whole.derivatives[NAMES[1]])
@@ -187,10 +189,10 @@ def test_names_and_what_is_refused(everywhere, tmp_path):
         (one, NAMES[0], (4, 3, 4), "possible are 1, 2, 5, 10"),
         (one, NAMES[0], (4, 3), "list of 3 whole numbers"),
         (one, "medium.grid.anisotropy", None, "is not one of medium.grid.absorption"),
-        (one, names[1], (1, 2, 1), "blocks go with names of all blocks"),
+        (one, names[1], (1, 2, 1), "blocks need names of all blocks"),
         (one, "medium.grid.absorption[0,1,0]", None, "are not all blocks in their order"),
         (one, "absorption", None, "medium.grid.absorption and others go by block"),
-        (one, "reflectance", (1, 1, 1), "blocks go with derivatives by"),
+        (one, "reflectance", (1, 1, 1), "blocks need derivatives by"),
         (scene(), NAMES[0], None, "has no medium.grid"),
         (clear, NAMES[1], None, "is 0 in 8 of 8 cells"),
         (scene(medium={"grid": everywhere}, domain=walls), NAMES[0], None, "leave out domain.outside_index"),

@@ -42,7 +42,7 @@ def test_the_photons_stay_the_same(estimator, device):
     one = scene(transport={"estimator": estimator})
     plain, result = simulated(one, device, (), 20_000), simulated(one, device, ALL, 20_000)
     np.testing.assert_array_equal(result.tallies, plain.tallies)
-    assert result.ledger == plain.ledger
+    assert result.energy_balance == plain.energy_balance
     assert result.counters == plain.counters
     assert list(result.derivatives) == list(ALL)
     assert not plain.derivatives
@@ -208,8 +208,10 @@ def test_errors_between_batches_are_those_between_seeds(device):
 def test_files_merge_and_resume(tmp_path):
     one = scene(transport={"estimator": "guided"})
     whole = simulated(one, "cpu", ALL, 4096, uncertainty=True)
-    halves = [simulated(one, "cpu", ALL, 4096, uncertainty=True, shard=(k, 2)) for k in (1, 2)]
-    resumed = spadwarp.simulate(one, photons=4096, device="cpu", resume=simulated(one, "cpu", ALL, 2048))
+    halves = [simulated(one, "cpu", ALL, 4096, uncertainty=True, run=spadwarp.RunOptions(shard=(k, 2))) for k in (1, 2)]
+    resumed = spadwarp.simulate(
+        one, photons=4096, device="cpu", run=spadwarp.RunOptions(resume=simulated(one, "cpu", ALL, 2048))
+    )
     loaded = spadwarp.load_result(whole.save(tmp_path / "result.h5"))
     for other in (loaded, spadwarp.merge(halves), resumed):
         assert other.derivative_tallies.names == ALL
@@ -222,9 +224,11 @@ def test_files_merge_and_resume(tmp_path):
     labelled = loaded.to_xarray().derivative.sel(parameter=ALL[1], component="backscatter")
     np.testing.assert_array_equal(labelled, whole.derivatives[ALL[1]][2])
     with pytest.raises(spadwarp.ConfigError, match="list of derivatives"):
-        spadwarp.merge([halves[0], simulated(one, "cpu", ALL[:2], 4096, uncertainty=True, shard=(2, 2))])
+        spadwarp.merge(
+            [halves[0], simulated(one, "cpu", ALL[:2], 4096, uncertainty=True, run=spadwarp.RunOptions(shard=(2, 2)))]
+        )
     with pytest.raises(spadwarp.ConfigError, match=r"the run to resume has medium.absorption, .* not medium.sc"):
-        simulated(one, "cpu", ["scattering"], 4096, resume=halves[0])
+        simulated(one, "cpu", ["scattering"], 4096, run=spadwarp.RunOptions(resume=halves[0]))
     with pytest.raises(KeyError, match="none were asked for"):
         simulated(one, "cpu", (), 256).derivatives["medium.absorption"]
     with pytest.raises(spadwarp.ConfigError, match="holds no batches"):

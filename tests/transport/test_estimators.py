@@ -171,9 +171,9 @@ def test_estimators_share_one_ledger(end, device):
     def ledger(estimator, photons=20_000, seed=0):
         run = one.with_overrides({"transport.estimator": estimator})
         result = spadwarp.simulate(run, photons=photons, seed=seed, device=device)
-        assert result.ledger_report()["exact"]
+        assert result.energy_report()["exact"]
         counts = {name: result.counters[name] for name in ("water_collisions", "surface_events")}
-        return {**result.ledger, **counts}
+        return {**result.energy_balance, **counts}
 
     entry = next(iter(end))
     analog = ledger("analog")

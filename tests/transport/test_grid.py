@@ -64,7 +64,7 @@ def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, devic
         )
         for medium in ({}, {"grid": {**one_water, "tracking": tracking}})
     )
-    assert cellular.tallies.any() and cellular.ledger_report()["exact"] and cellular.counters["invalid"] == 0
+    assert cellular.tallies.any() and cellular.energy_report()["exact"] and cellular.counters["invalid"] == 0
     rtol = 0.05 if (estimator, tracking) == ("guided", "delta") else 2e-3 if device == "cpu" else 2e-2
     np.testing.assert_allclose(
         cellular.histogram.sum(axis=(0, 1)), plain.histogram.sum(axis=(0, 1)), rtol=rtol, atol=1e-6

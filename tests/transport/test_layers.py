@@ -34,10 +34,10 @@ def test_layers_of_one_water_are_that_water(estimator, device):
         )
         for medium in ({}, SAME)
     )
-    assert layered.tallies.any() and layered.ledger_report()["exact"]
+    assert layered.tallies.any() and layered.energy_report()["exact"]
     if device == "cpu":
         np.testing.assert_array_equal(layered.tallies, plain.tallies)
-        assert layered.ledger == plain.ledger and layered.counters == plain.counters
+        assert layered.energy_balance == plain.energy_balance and layered.counters == plain.counters
     else:
         np.testing.assert_allclose(layered.tallies.sum(axis=(1, 2)), plain.tallies.sum(axis=(1, 2)), rtol=1e-3)
 

@@ -14,10 +14,10 @@ NAMES = ["medium.absorption", "medium.scattering", "targets[0].reflectance"]
 
 def test_light_and_derivatives_are_those_of_simulate():
     scene = plate()
-    tracer = LightTracer(scene, photons=20_000, seed=5, device="cpu", derivatives=NAMES, apart=True)
+    tracer = LightTracer(scene, photons=20_000, seed=5, device="cpu", derivatives=NAMES, separate_targets=True)
     tracer(0, 20_000)  # what was traced before does not stay
     light, slopes = tracer(20_000, 20_000)
-    run = {"photons": 20_000, "first_photon": 20_000, "seed": 5, "device": "cpu"}
+    run = {"photons": 20_000, "run": spadwarp.RunOptions(first_photon=20_000), "seed": 5, "device": "cpu"}
     result = spadwarp.simulate(scene, derivatives=NAMES, **run)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     np.testing.assert_allclose(light.total.numpy(), result.detections.reshape(64, -1), rtol=1e-6)

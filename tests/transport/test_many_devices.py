@@ -53,7 +53,8 @@ def test_devices_with_tallies_of_their_own_add_up_to_one(device, uncertainty, wh
     if device.startswith("cuda"):
         one = spadwarp.simulate(scene(), **RUN, device="cuda:0", uncertainty=uncertainty)
     seen = []
-    options = {**RUN, "device": device, "threads": 4, "launch_size": 3000, "uncertainty": uncertainty}
+    run = spadwarp.RunOptions(threads=4, launch_size=3000)
+    options = {**RUN, "device": device, "uncertainty": uncertainty, "run": run}
     cut = spadwarp.simulate(scene(), **options, progress=lambda *report: seen.append(report))
     same(cut, one)
     assert cut.provenance["device"] == device or device == "cuda:all"
@@ -97,16 +98,20 @@ def test_devices_that_do_not_go_together_are_refused():
 @pytest.mark.parametrize("uncertainty", [False, True])
 def test_shards_add_up_to_the_run_and_gaps_can_be_filled(uncertainty, whole):
     parts = [
-        spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=uncertainty, shard=(number, 5))
+        spadwarp.simulate(
+            scene(), **RUN, device="cpu", uncertainty=uncertainty, run=spadwarp.RunOptions(shard=(number, 5))
+        )
         for number in (4, 1, 5, 2)
     ]
     assert [part.requested[0] for part in parts] != sorted(part.requested[0] for part in parts)
     gap = spadwarp.merge(parts)
     assert len(gap.photon_ranges) == 2 and gap.requested == whole[uncertainty].requested
     assert len(gap.provenance["parts"]) == 4
-    third = spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=uncertainty, shard=(3, 5))
+    third = spadwarp.simulate(
+        scene(), **RUN, device="cpu", uncertainty=uncertainty, run=spadwarp.RunOptions(shard=(3, 5))
+    )
     same(spadwarp.merge([gap, third]), whole[uncertainty])
-    filled = spadwarp.simulate(scene(), device="cpu", resume=gap)
+    filled = spadwarp.simulate(scene(), device="cpu", run=spadwarp.RunOptions(resume=gap))
     same(filled, whole[uncertainty])
     assert [part["photon_ranges"] for part in filled.provenance["parts"]][-1] == [list(third.requested)]
 
@@ -119,26 +124,26 @@ def test_an_interrupted_shard_knows_where_it_ends(whole):
 
     fired = []
     # Few threads: many would have walked all photons before the first of them is reported.
-    options = {**RUN, "device": "cpu", "threads": 2, "shard": (2, 2), "launch_size": 1000}
+    options = {**RUN, "device": "cpu", "run": spadwarp.RunOptions(threads=2, shard=(2, 2), launch_size=1000)}
     part = spadwarp.simulate(scene(), **options, progress=interrupt)
     assert part.partial and part.requested == (PHOTONS // 2, PHOTONS) and fired == [PHOTONS // 2]
-    rest = spadwarp.simulate(scene(), device="cpu", resume=part)
+    rest = spadwarp.simulate(scene(), device="cpu", run=spadwarp.RunOptions(resume=part))
     assert not rest.partial
-    first = spadwarp.simulate(scene(), **RUN, device="cpu", shard=(1, 2))
+    first = spadwarp.simulate(scene(), **RUN, device="cpu", run=spadwarp.RunOptions(shard=(1, 2)))
     same(spadwarp.merge([rest, first]), whole[False])
 
 
 def test_parts_that_make_no_sense_are_refused(whole):
     for shard, words in {(0, 4): "0/4", (5, 4): "5/4", (1, 10**6): "too few"}.items():
         with pytest.raises((spadwarp.ArgumentError, spadwarp.ConfigError), match=words):
-            spadwarp.simulate(scene(), **RUN, device="cpu", shard=shard)
+            spadwarp.simulate(scene(), **RUN, device="cpu", run=spadwarp.RunOptions(shard=shard))
     for shard in (3, (1, 2, 3), (1.5, 2), ("1", 2)):
         with pytest.raises(spadwarp.ArgumentError, match=r"^shard"):
-            spadwarp.simulate(scene(), **RUN, device="cpu", shard=shard)
+            spadwarp.simulate(scene(), **RUN, device="cpu", run=spadwarp.RunOptions(shard=shard))
     with pytest.raises(spadwarp.ConfigError, match="relative_error"):
-        spadwarp.simulate(scene(), **RUN, device="cpu", shard=(1, 2), relative_error=0.1)
+        spadwarp.simulate(scene(), **RUN, device="cpu", relative_error=0.1, run=spadwarp.RunOptions(shard=(1, 2)))
     with pytest.raises(spadwarp.ConfigError, match="shard"):
-        spadwarp.simulate(scene(), device="cpu", shard=(1, 2), resume=whole[False])
+        spadwarp.simulate(scene(), device="cpu", run=spadwarp.RunOptions(shard=(1, 2), resume=whole[False]))
 
 
 # Checkpoints and failures
@@ -164,15 +169,19 @@ def failing_after(calls, monkeypatch, error):
 def test_a_device_that_disappears_costs_what_was_not_kept(device, uncertainty, whole, tmp_path, monkeypatch):
     place = tmp_path / "checkpoint.h5"
     failing_after(120, monkeypatch, "CUDA error 719: unspecified launch failure")
-    options = {**RUN, "device": device, "uncertainty": uncertainty, "launch_size": 1000, "threads": 2}
+    options = {**RUN, "device": device, "uncertainty": uncertainty}
     with pytest.raises(spadwarp.DeviceError) as caught:
-        spadwarp.simulate(scene(), **options, checkpoint=place, checkpoint_every=0.0)
+        spadwarp.simulate(
+            scene(),
+            **options,
+            run=spadwarp.RunOptions(threads=2, launch_size=1000, checkpoint=place, checkpoint_every=0.0),
+        )
     monkeypatch.undo()
     kept = spadwarp.load_result(place)
-    assert kept.partial and 0 < kept.photons <= 120_000 and kept.ledger_report()["exact"]
+    assert kept.partial and 0 < kept.photons <= 120_000 and kept.energy_report()["exact"]
     assert "cpu failed: CUDA error 719" in str(caught.value)
     assert f"{place}: the {kept.photons} photons that were done" in str(caught.value)
-    same(spadwarp.simulate(scene(), device="cpu", resume=kept), whole[uncertainty])
+    same(spadwarp.simulate(scene(), device="cpu", run=spadwarp.RunOptions(resume=kept)), whole[uncertainty])
 
 
 def test_a_device_without_memory_is_named(monkeypatch):
@@ -196,22 +205,31 @@ def test_a_full_disk_costs_no_photons(whole, tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
 
     # Few threads: many would have walked all photons before the first checkpoint is due.
-    options = {**RUN, "device": "cpu", "threads": 2, "launch_size": 2000, "progress": fill}
+    options = {**RUN, "device": "cpu", "progress": fill}
     try:
         with pytest.warns(RuntimeWarning, match=r"the run continues: .*checkpoint\.h5: cannot be written"):
-            result = spadwarp.simulate(scene(), **options, checkpoint=place, checkpoint_every=0.0)
+            result = spadwarp.simulate(
+                scene(),
+                **options,
+                run=spadwarp.RunOptions(threads=2, launch_size=2000, checkpoint=place, checkpoint_every=0.0),
+            )
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     same(result, whole[False])
     kept = spadwarp.load_result(place)
     assert kept.photons == 1000 and [path.name for path in tmp_path.iterdir()] == ["checkpoint.h5"]
-    same(spadwarp.simulate(scene(), photons=PHOTONS, device="cpu", resume=kept), whole[False])
+    same(spadwarp.simulate(scene(), photons=PHOTONS, device="cpu", run=spadwarp.RunOptions(resume=kept)), whole[False])
 
 
 def test_a_resumed_run_counts_all_batches_for_its_stopping_rule(whole):
     part = whole[True]
     seen = []
-    options = {"photons": 64 * part.batch_size, "device": "cpu", "resume": part, "relative_error": 1e-6}
+    options = {
+        "photons": 64 * part.batch_size,
+        "device": "cpu",
+        "run": spadwarp.RunOptions(resume=part),
+        "relative_error": 1e-6,
+    }
     run = spadwarp.simulate(scene(), **options, progress=lambda *report: seen.append(report[0]))
     assert run.photons == 64 * part.batch_size
     assert [remark.split(" after ")[1] for remark in seen if remark.startswith("error")][-1].startswith(

@@ -123,9 +123,9 @@ def test_analog_counts_what_it_drops_for_too_many_reflections(device):
     assert dropped - none <= gained < 1.1 * (dropped - none)
     assert results[0].counters["reflections"] > 10_000
     for result in results:
-        assert result.ledger_report()["exact"]
+        assert result.energy_report()["exact"]
     # The transport itself, up to the light of last events, is the same: no weight is taken by what is dropped.
-    assert results[0].ledger["absorbed_water"] == results[1].ledger["absorbed_water"]
+    assert results[0].energy_balance["absorbed_water"] == results[1].energy_balance["absorbed_water"]
 
 
 def test_ballistic_light_has_not_been_reflected(device):

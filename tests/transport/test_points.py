@@ -89,7 +89,13 @@ def test_records_of_photons_have_no_points(device):
 
 def test_results_of_other_points_are_not_added(device):
     one, two = (
-        spadwarp.simulate(with_points(scene(), points), photons=100, first_photon=first, seed=1, device=device)
+        spadwarp.simulate(
+            with_points(scene(), points),
+            photons=100,
+            seed=1,
+            device=device,
+            run=spadwarp.RunOptions(first_photon=first),
+        )
         for points, first in ((1, 0), (2, 100))
     )
     with pytest.raises(ConfigError, match="scene of the results differs in transport"):
@@ -112,7 +118,9 @@ def test_results_of_other_points_are_not_added(device):
 def test_what_goes_with_one_point_alone_is_refused(changes, named, device):
     one = scene().with_overrides({"transport.points_per_flight": 2, **changes})
     for refuse in (lambda: spadwarp.simulate(one, photons=100, device=device), lambda: spadwarp.check(one)):
-        with pytest.raises(ConfigError, match=f"transport.points_per_flight = 2 does not go with {named}; take 1"):
+        with pytest.raises(
+            ConfigError, match=f"transport.points_per_flight = 2 cannot be combined with {named}; take 1"
+        ):
             refuse()
     with pytest.raises(ConfigError, match="points_per_flight"):
         scene(transport={"points_per_flight": 4})

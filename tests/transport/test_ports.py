@@ -60,7 +60,7 @@ def test_equal_indices_are_a_camera_in_the_water(device):
         for port in ports:
             one = ported(port, medium=medium, transport={"estimator": estimator, "axis_threshold": 1.0})
             result = spadwarp.simulate(one, photons=photons, seed=3, device=device)
-            assert "laser_port" not in result.ledger
+            assert "laser_port" not in result.energy_balance
             runs.append(result.tallies.sum(axis=(1, 2, 3)) * (result.unit / photons))
         assert runs[1] == pytest.approx(runs[0], rel=1e-6)
         # Of a tilted one the empty wedge differs; its water is what counts.

@@ -87,7 +87,7 @@ def test_counts_of_photons_a_position_hold_for_any_range_of_ids():
     one = scene(**CONFOCAL)
     whole = spadwarp.simulate(one, photons=1000, seed=5, device="cpu")
     parts = [
-        spadwarp.simulate(one, photons=count, first_photon=first, seed=5, device="cpu")
+        spadwarp.simulate(one, photons=count, seed=5, device="cpu", run=spadwarp.RunOptions(first_photon=first))
         for first, count in ((0, 333), (333, 667))
     ]
     for result in (whole, *parts):
@@ -97,7 +97,7 @@ def test_counts_of_photons_a_position_hold_for_any_range_of_ids():
         np.testing.assert_array_equal(result.unit / result.tally_value, expected)
     joined = spadwarp.merge(parts)
     np.testing.assert_array_equal(joined.histogram, whole.histogram)
-    resumed = spadwarp.simulate(one, photons=1000, resume=parts[0], device="cpu")
+    resumed = spadwarp.simulate(one, photons=1000, device="cpu", run=spadwarp.RunOptions(resume=parts[0]))
     np.testing.assert_array_equal(resumed.tallies, whole.tallies)
 
 

@@ -185,7 +185,7 @@ def test_laser_and_camera_may_change_places_in_turbid_water(name, device):
 def test_equal_indices_leave_guided_as_it_is(device, monkeypatch):
     """Photon by photon, in water that begins at the window: flights then end there with and without it. Those of a
     dome, whose view has a margin, do not: the means are the same."""
-    monkeypatch.setattr("spadwarp.transport.model.check_domain", lambda *_: None)  # lets a lens stay outside the water
+    monkeypatch.setattr("spadwarp.transport.model._check_domain", lambda *_: None)  # lets a lens stay outside the water
     water = {"index": 1.3415, "group_index": 1.3638, "inside_index": 1.3415, "inside_group_index": 1.3638}
     window = {"distance": 0.15, "thickness": 0.05, **water}
     dome = {"shape": "dome", "radius": 0.15, "thickness": 0.05, **water}

@@ -14,18 +14,24 @@ from helpers.scenes import PLATE, TREE, scene
 
 
 def _bits(result):
-    return result.tallies.tobytes(), dict(result.ledger), dict(result.counters)
+    return result.tallies.tobytes(), dict(result.energy_balance), dict(result.counters)
 
 
 @pytest.mark.parametrize("targets", [[PLATE], [TREE]], ids=["plate", "tree"])
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
 def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, targets, device):
     one = scene(transport={"estimator": estimator}, targets=targets)
-    whole = spadwarp.simulate(one, photons=20_000, seed=2**63 + 5, device=device, threads=1, launch_size=20_000)
+    whole = spadwarp.simulate(
+        one, photons=20_000, seed=2**63 + 5, device=device, run=spadwarp.RunOptions(threads=1, launch_size=20_000)
+    )
     assert whole.tallies.any()
     for threads, launch_size in [(1, 777), (2, 1000), (3, 4096)]:
         cut = spadwarp.simulate(
-            one, photons=20_000, seed=2**63 + 5, device=device, threads=threads, launch_size=launch_size
+            one,
+            photons=20_000,
+            seed=2**63 + 5,
+            device=device,
+            run=spadwarp.RunOptions(threads=threads, launch_size=launch_size),
         )
         assert _bits(cut) == _bits(whole)
     other = spadwarp.simulate(one, photons=20_000, seed=2**63 + 6, device=device)
@@ -58,11 +64,13 @@ def test_the_ledger_closes_exactly(estimator, **values):
         transport=transport | {"termination": "roulette" if values["roulette"] else "cutoff"},
     )
     result = spadwarp.simulate(one, photons=2000, seed=values["seed"], device="cpu")
-    report = result.ledger_report()
+    report = result.energy_report()
     assert report["difference"] == 0 and report["exact"]
     assert result.counters["invalid"] == 0
     entries = {
-        name: value for name, value in result.ledger.items() if name not in ("roulette", "importance_sampling_residual")
+        name: value
+        for name, value in result.energy_balance.items()
+        if name not in ("roulette", "importance_sampling_residual")
     }
     assert all(value >= 0 for value in entries.values())
 
@@ -71,7 +79,7 @@ def test_the_ledger_closes_exactly(estimator, **values):
 def test_signed_entries_of_the_ledger_have_expectation_zero(device):
     """Guided directions and roulette move weight between photons and create none, on the mean over 32 seeds."""
     one = scene(transport={"estimator": "guided", "termination": "roulette", "weight_cutoff": 0.2})
-    rows = [spadwarp.simulate(one, photons=20_000, seed=seed, device=device).ledger for seed in range(32)]
+    rows = [spadwarp.simulate(one, photons=20_000, seed=seed, device=device).energy_balance for seed in range(32)]
     for name in ("importance_sampling_residual", "roulette"):
         values = np.array([row[name] for row in rows], np.float64)
         assert values.std() > 0
@@ -107,7 +115,7 @@ def test_a_closed_target_keeps_its_light(device):
         transport={"estimator": "next_event", "max_collisions": 100},
     )
     result = spadwarp.simulate(one, photons=20_000, seed=1, device=device)
-    assert sum(value for name, value in result.ledger.items() if name.startswith("exit")) == 0
+    assert sum(value for name, value in result.energy_balance.items() if name.startswith("exit")) == 0
     assert not result.tallies.any()
     assert result.counters["surface_events"] > 20_000
 
@@ -119,13 +127,13 @@ def test_every_light_path_ends_for_a_reason_and_records_agree_with_the_ledger(de
         transport={"max_path": 6.0, "lateral_limit": 2.5, "max_collisions": 5},
     )
     records = spadwarp.transport.trace(one, photons=50_000, seed=4, device=device)
-    assert sum(records.ledger.values()) == round(50_000 / records.ledger_unit)
+    assert sum(records.energy_balance.values()) == round(50_000 / records.energy_balance_unit)
     for name in ("exit_z_low", "exit_z_high", "max_path", "max_collisions", "lateral_limit"):
         ended = records.ended(name)
         assert ended.any()
         # Weights are rounded to half a ledger unit each.
-        expected = records.weight[ended].sum(dtype=np.float64) / records.ledger_unit
-        assert abs(records.ledger[name] - expected) <= 0.5 * ended.sum() + 1e-6 * expected
+        expected = records.weight[ended].sum(dtype=np.float64) / records.energy_balance_unit
+        assert abs(records.energy_balance[name] - expected) <= 0.5 * ended.sum() + 1e-6 * expected
     np.testing.assert_allclose(records.position[records.ended("exit_z_high"), 2], 2.0, atol=2e-6)
     np.testing.assert_allclose(np.linalg.norm(records.direction, axis=1), 1.0, atol=1e-6)
     assert (records.collisions[records.ended("max_collisions")] == 5).all()
@@ -158,7 +166,12 @@ def test_interrupt_keeps_what_is_done():
 
     fired = threading.Event()
     result = spadwarp.simulate(
-        one, photons=10**7, seed=1, device="cpu", threads=2, launch_size=1000, progress=interrupt
+        one,
+        photons=10**7,
+        seed=1,
+        device="cpu",
+        progress=interrupt,
+        run=spadwarp.RunOptions(threads=2, launch_size=1000),
     )
     assert result.partial and 3000 <= result.photons < 10**7
     assert result.photon_ranges == ((0, result.photons),)
@@ -168,7 +181,13 @@ def test_interrupt_keeps_what_is_done():
 
 def test_progress_is_reported_in_order():
     seen = []
-    spadwarp.simulate(scene(), photons=5000, device="cpu", launch_size=1000, progress=lambda *a: seen.append(a))
+    spadwarp.simulate(
+        scene(),
+        photons=5000,
+        device="cpu",
+        progress=lambda *a: seen.append(a),
+        run=spadwarp.RunOptions(launch_size=1000),
+    )
     assert seen[0][0] == "compile"
     assert [done for stage, done, _ in seen if stage == "trace"][-1] == 5000
     counts = [done for stage, done, _ in seen if stage == "trace"]
@@ -181,7 +200,7 @@ def test_progress_is_reported_in_order():
         ({"photons": 0}, "photons = 0 is outside [1, 1000000000000]"),
         ({"seed": -1}, "seed = -1 is outside"),
         ({"device": "cuda:99"}, "device = 'cuda:99' is not one of cpu"),
-        ({"launch_size": 0}, "launch_size"),
+        ({"run": spadwarp.RunOptions(launch_size=2**21)}, "launch_size = 2097152 is outside [1, 1048576]"),
     ],
 )
 def test_wrong_use_is_named(arguments, text):

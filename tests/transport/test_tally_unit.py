@@ -155,7 +155,10 @@ def test_an_overflow_is_an_error_and_not_a_histogram(monkeypatch):
 
 def test_a_merge_beyond_the_tally_is_refused():
     one = scene()
-    parts = [spadwarp.simulate(one, photons=1000, seed=1, first_photon=1000 * k, device="cpu") for k in range(2)]
+    parts = [
+        spadwarp.simulate(one, photons=1000, seed=1, device="cpu", run=spadwarp.RunOptions(first_photon=1000 * k))
+        for k in range(2)
+    ]
     full = [dataclasses.replace(part, tallies=np.where(part.tallies > 0, 2**61, 0)) for part in parts]
     with pytest.raises(SpadwarpError, match="a histogram bin overflowed"):
         spadwarp.merge(full)

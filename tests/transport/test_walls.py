@@ -37,7 +37,7 @@ def beam(direction, domain, *, medium=(), max_collisions=7, **sections):
 
 
 def emitted(records):
-    return round(len(records.id) / records.ledger_unit)
+    return round(len(records.id) / records.energy_balance_unit)
 
 
 def test_a_beam_between_two_faces_keeps_the_products_of_their_reflectances(device):
@@ -50,10 +50,10 @@ def test_a_beam_between_two_faces_keeps_the_products_of_their_reflectances(devic
     np.testing.assert_allclose(records.direction, np.tile([0.3 * cosine, 0, cosine], (64, 1)), atol=1e-5)
     assert (records.collisions == 7).all() and records.ended("max_collisions").all()
     # What is not reflected leaves by the face, and nothing is lost.
-    leaves = records.ledger["exit_z_high"] / emitted(records)
+    leaves = records.energy_balance["exit_z_high"] / emitted(records)
     r_high, r_low = reflectance(cosine, 2.0), reflectance(cosine, 1.0)
     assert leaves == pytest.approx((1 - r_high) * sum((r_high * r_low) ** k for k in range(4)), rel=1e-4)
-    assert sum(records.ledger.values()) == emitted(records)
+    assert sum(records.energy_balance.values()) == emitted(records)
 
 
 def test_beyond_the_critical_angle_all_light_is_reflected(device):
@@ -61,7 +61,7 @@ def test_beyond_the_critical_angle_all_light_is_reflected(device):
     slab = {"shape": "slab", "lower": -1.0, "upper": 1.0, "outside_index": {"z_low": 1.0, "z_high": 1.0}}
     records = trace(beam([np.tan(np.radians(50)), 0.0, 1.0], slab, max_collisions=30), photons=64, device=device)
     assert (records.weight == 1.0).all() and (records.collisions == 30).all()
-    assert records.ledger["max_collisions"] == emitted(records)
+    assert records.energy_balance["max_collisions"] == emitted(records)
     below = trace(beam([np.tan(np.radians(47)), 0.0, 1.0], slab, max_collisions=1), photons=64, device=device)
     np.testing.assert_allclose(below.weight, reflectance(np.cos(np.radians(47)), 1.0), rtol=1e-3)
 
@@ -76,8 +76,8 @@ def test_light_in_a_white_box_stays_and_fills_it(rotation, device):
     one = beam([0.2, 0.1, 1.0], box, medium={"extinction": 1.0}, max_collisions=120)
     one = one.with_overrides(camera=pose)
     records = trace(one, photons=20_000, device=device)
-    assert records.ledger["max_collisions"] == pytest.approx(emitted(records), rel=1e-5)
-    assert sum(records.ledger.values()) == emitted(records)
+    assert records.energy_balance["max_collisions"] == pytest.approx(emitted(records), rel=1e-5)
+    assert sum(records.energy_balance.values()) == emitted(records)
     low, high = np.array(box["lower"]), np.array(box["upper"])
     # The last event is a reflection for a part of the photons, which are then on a face; the others scatter where light
     # is, in all directions alike.
