@@ -78,8 +78,7 @@ def simulate(
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
-    One seed gives the same bits on one kind of device, whatever their number, the engine and the
-    `RunOptions`.
+    One seed gives the same bits on one kind of device, whatever their number, the engine and the `RunOptions`.
 
     Args:
         scene: From `spadwarp.load_scene`, or the path of its file.

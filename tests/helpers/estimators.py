@@ -24,6 +24,15 @@ def cells(one, device, photons, seeds=32, pixels=False):
     return np.array(rows)
 
 
+def means(one, device, photons, seeds):
+    """Fractions of emitted photons in all pixels: mean and standard error by bin, then of all bins together."""
+    runs = [spadwarp.simulate(one, photons=photons, seed=seed, device=device) for seed in range(seeds)]
+    rows = np.array([run.tallies.sum(axis=(0, 1, 2)) * (run.unit / photons) for run in runs])
+    totals = rows.sum(axis=1)
+    error, total_error = (part.std(axis=0, ddof=1) / math.sqrt(seeds) for part in (rows, totals))
+    return rows.mean(axis=0), error, totals.mean(), total_error
+
+
 def clear_at_the_lens(one):
     """The scene with clear water behind the lens and up to 0.3 m before it, as it is where that is so already."""
     medium, camera = one.medium, one.camera
