@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 try:
     import resource
@@ -30,11 +31,11 @@ class ConfigError(SpadwarpError):
     `scene.toml: medium.g = 1.2 is outside (-1, 1)`.
     """
 
-    def __init__(self, problems: str | Iterable[str], *, source: str | None = None) -> None:
+    def __init__(self, problems: str | Iterable[str], *, source: str | Path | None = None) -> None:
         """`problems`: one line each, without the file; `source`: the file they are in (None: made in Python)."""
         lines = [problems] if isinstance(problems, str) else list(problems)
         self.problems: tuple[str, ...] = tuple(lines)
-        self.source = source
+        self.source = None if source is None else str(source)
         prefix = f"{source}: " if source else ""
         super().__init__("\n".join(prefix + line for line in lines))
 

@@ -36,6 +36,8 @@ WALLS = {
     "outside_index": {"x_high": 1.49, "y_low": 1.0},
 }
 CELLS = {"shape": "plume", "size": 1.2, "cells": 12, "extinction": 3.0, "seed": 5, "translation": [0.0, 0.0, 1.2]}
+DOME = {"shape": "dome", "radius": 0.3, "thickness": 0.01, "material": "acrylic"}
+TWO_TERMS = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
 LAYERS = {"layers": [{"start": 1.2, "extinction": 1.5, "albedo": 0.6}]}
 STOKES = {"medium": {"scattering_matrix": "scaled_rayleigh"}, "camera": {"polarisation": "stokes"}}
 
@@ -46,17 +48,17 @@ SCENES = {
     "tree": {"targets": [TREE]},
     "glossy": {"targets": [GLOSSY, {**PLATE, "translation": [0.0, 0.0, 2.5]}]},
     "flat port": {"camera": {"port": FLAT}},
-    "dome": {"camera": {"port": {"shape": "dome", "radius": 0.3, "thickness": 0.01, "material": "acrylic"}}, "laser": {"port": "camera"}},
+    "dome": {"camera": {"port": DOME}, "laser": {"port": "camera"}},
     "walls": {"domain": WALLS, "targets": [{**PLATE, "size": [1.0, 0.8], "translation": [-0.1, 0.0, 2.0]}]},
     "cells": {"medium": {"grid": CELLS}},
     "cells by regular tracking": {"medium": {"grid": {**CELLS, "tracking": "regular"}}, "targets": [TREE]},
     "layers": {"medium": LAYERS},
     "table": {"medium": {"phase_function": "fournier_forand"}},
-    "two-term table in layers": {"medium": {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9, **LAYERS}, "targets": [TREE]},
+    "two-term table in layers": {"medium": {**TWO_TERMS, **LAYERS}, "targets": [TREE]},
     "polarised": {**STOKES, "laser": {"polarisation": "linear"}},
     "polarised walls": {**STOKES, "domain": WALLS},
     "near axis": {"transport": {"axis_threshold": 0.97}},
-    "random albedo and roulette": {"medium": {"albedo": "paper"}, "transport": {"termination": "roulette"}},
+    "random albedo and roulette": {"medium": {"albedo": "lu2024"}, "transport": {"termination": "roulette"}},
     "thin lens": {"camera": {"focus_distance": 2.0, "aperture_diameter": 0.1}, "targets": [TREE]},
     "confocal": {"scan": {"mode": "confocal"}, "laser": {"half_angle_deg": 2.0}},
 }  # fmt: skip
@@ -74,7 +76,7 @@ def traced(name, estimator="guided", **options):
 
 def of_run(name, estimator="guided", **options):
     result = traced(name, estimator, **options)
-    return [result.tallies, *(np.array(sorted(part.values())) for part in (result.ledger, result.counters))]
+    return [result.tallies, *(np.array(sorted(part.values())) for part in (result.energy_balance, result.counters))]
 
 
 @functools.cache
@@ -114,7 +116,7 @@ def of_dataset():
 def of_parts():
     """Two runs that go on from each other, and two shards."""
     first = spadwarp.simulate(scene(), photons=5_000, seed=5, device="cpu", uncertainty=True)
-    whole = spadwarp.simulate(scene(), photons=10_000, resume=first, device="cpu")
+    whole = spadwarp.simulate(scene(), photons=10_000, run=spadwarp.RunOptions(resume=first), device="cpu")
     return [whole.tallies, whole.standard_error]
 
 

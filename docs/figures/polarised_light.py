@@ -71,7 +71,7 @@ def ratios(optical_depth: float, *, photons: int, seed: int) -> NDArray[np.float
     gated = (path > GATED[0]) & (path < GATED[1])
     target, near, water = (np.zeros(len(CHANNELS)) for _ in range(3))
     for k, channel in enumerate(CHANNELS):
-        seen = spadwarp.result.received(result, channel)
+        seen = spadwarp.result.analyser_channel(result, channel)
         back = seen.component("backscatter")
         target[k] = (seen.component("ballistic") + seen.component("forward_scattered"))[..., gated].sum()
         near[k], water[k] = back[..., gated].sum(), back.sum()

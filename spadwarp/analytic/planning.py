@@ -32,12 +32,12 @@ from spadwarp.frames import (
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
-from spadwarp.result import CHANNELS, Channel, merge, received
+from spadwarp.result import CHANNELS, Channel, analyser_channel, merge
 from spadwarp.scene import SceneLike, Transport, as_scene, noise_rate
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight, port_advance
-from spadwarp.transport import simulate, truth_maps
+from spadwarp.transport import RunOptions, simulate, truth_maps
 from spadwarp.units import quantity, range_from_time, time_from_path, time_from_range, with_prefix
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ def plan(
         photons: Of the Monte Carlo run.
         seed: Of it.
         largest_range: Whether to look for the largest range, which takes several shorter runs.
-        channel: Light that counts, of a camera with an analyser; see `spadwarp.result.received`.
+        channel: Light that counts, of a camera with an analyser; see `spadwarp.result.analyser_channel`.
         device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
         progress: Called with ("trace", photons done, photons asked for) and the like.
 
@@ -549,7 +549,8 @@ def trace(
 
     runs = []
     for traced in (0, half):
-        options: dict[str, Any] = {"first_photon": traced, "seed": seed, "device": device, "progress": report}
+        run = RunOptions(first_photon=traced)
+        options: dict[str, Any] = {"run": run, "seed": seed, "device": device, "progress": report}
         runs.append(simulate(scene, photons=half, **options))
     return runs[0], runs[1]
 
@@ -568,7 +569,9 @@ def measure(
     `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
     its modulus.
     """
-    first, second = (received(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs)
+    first, second = (
+        analyser_channel(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs
+    )
     both = merge([first, second])
     clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
     frames, clear_frames, *half_frames = (

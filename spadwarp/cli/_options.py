@@ -217,7 +217,7 @@ def load_run(place: Path, channel: Channel = Channel.I) -> Result:
     """The result in a file, or in the directory of a run; a checkpoint where there is no result."""
     path = spadwarp.files.locate(place)
     result = spadwarp.load_result(place / "result.h5" if path.is_dir() else path)
-    return spadwarp.result.received(result, channel.value)
+    return spadwarp.result.analyser_channel(result, channel.value)
 
 
 def read_part(text: str | None, option: str) -> tuple[int, int] | None:

@@ -53,7 +53,7 @@ def _lines(summary: Mapping[str, Any], outside: Mapping[str, float]) -> dict[str
     """A result's summary by headings."""
     image, gate, medium = summary["image"], summary["gate"], summary["medium"]
     made = defaultdict(lambda: "unknown", summary["provenance"])
-    depth, ledger, timing = summary["truth"]["depth_m"], summary["ledger"], summary["timing"]
+    depth, ledger, timing = summary["truth"]["depth_m"], summary["energy_balance"], summary["timing"]
     fractions, counters = ledger["fractions"], summary["counters"]
     photons = opt.count(summary["photons"]) + (", interrupted" if summary["partial"] else "")
     water = ", ".join(f"{name.replace('_', ' ')} {_number(value)}" for name, value in medium.items())

@@ -168,16 +168,18 @@ def simulate(
             photons=photons,
             device=device,
             engine=engine,
-            threads=threads,
             progress=_joined_at_the_end(report, pictures),
             uncertainty=uncertainty,
             relative_error=relative_error,
-            first_photon=first_photon,
-            shard=shard,
-            resume=earlier,
-            checkpoint=out / run.CHECKPOINT if checkpoint > 0 else None,
-            checkpoint_every=checkpoint,
             derivatives=names,
+            run=spadwarp.RunOptions(
+                threads=threads,
+                first_photon=first_photon,
+                shard=shard,
+                resume=earlier,
+                checkpoint=out / run.CHECKPOINT if checkpoint > 0 else None,
+                checkpoint_every=checkpoint,
+            ),
         )
     device = opt.one_device(device, engine)
     files = run.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
@@ -325,7 +327,7 @@ def described(result: Result, files: RunFiles) -> str:
     seconds = result.timing.get("trace", 0.0)
     speed = f" ({result.photons / seconds:.3g}/s)" if seconds > 0 else ""
     collected = summary["collected_fraction"]
-    ledger = summary["ledger"]
+    ledger = summary["energy_balance"]
     returned = np.isfinite(frame)
     lines = {
         "photons": f"{opt.count(result.photons)}, seed {result.seed}, on {result.provenance.get('device', 'unknown')} "

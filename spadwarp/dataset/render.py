@@ -15,10 +15,10 @@ from spadwarp.dataset.plan import Plan, SceneDraw
 from spadwarp.device import pick_device
 from spadwarp.errors import ConfigError, kernel_errors
 from spadwarp.frames import Frames, crlb, detect
-from spadwarp.result import Truth, degree_of_polarisation, received
+from spadwarp.result import Truth, analyser_channel, degree_of_polarisation
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
-from spadwarp.transport import simulate, truth_maps
+from spadwarp.transport import RunOptions, simulate, truth_maps
 from spadwarp.units import path_from_time
 
 PROFILE_BINS = 64
@@ -230,11 +230,11 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     """Traces the scene's photons, exposes the camera for each frame and finds its depth."""
     assert draw.photons is not None
     scene = draw.scene
-    result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, threads=threads)
+    result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, run=RunOptions(threads=threads))
     if result.partial:
         raise KeyboardInterrupt
     polarisation = degree_of_polarisation(result).astype(np.float16) if result.channels else None
-    result = received(result, plan.recipe.monte_carlo.channel)
+    result = analyser_channel(result, plan.recipe.monte_carlo.channel)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     water = result.component("backscatter")
     returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale

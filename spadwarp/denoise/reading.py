@@ -78,7 +78,7 @@ def read_depth(
         path: The file.
         as_depth: Three dimensions in `.npy`, `.mat` and `.h5` are frames `[N, H, W]` of depth, not a histogram.
         channel: Of an EXR; default: the first of Z, depth, range, A that it has. Of a result of polarised light: "I",
-            "co" or "cross", see `spadwarp.result.received`; default: "I", all light.
+            "co" or "cross", see `spadwarp.result.analyser_channel`; default: "I", all light.
         scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
         method: Estimator for histograms; default: `"likelihood"` for counts, `"matched"` for rates, and `"centroid"`
             where the response is not known.

@@ -85,7 +85,7 @@ def run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[Se
         weight = records.weight * records.ended(face)
         error = float(weight.std()) / math.sqrt(_PHOTONS)
         tests.append(_compared(name, float(weight.mean(dtype=float)), reference, math.hypot(error, _ROUNDING)))
-    difference = float(result.ledger_report()["difference"])
+    difference = float(result.energy_report()["difference"])
     tests.append(SelfTest("energy that is not accounted for", difference, 0.0, 0.0, difference == 0))
     return tests, seconds
 

@@ -20,7 +20,7 @@ from spadwarp.frames import export as writers
 from spadwarp.frames.export import FrameSequence, SequenceFrame
 from spadwarp.io.arrays import write_array, write_exr
 from spadwarp.limits import check_choice
-from spadwarp.result.received import Channel, received
+from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.result import COMPONENTS, Result
 from spadwarp.scene import noise_rate
 from spadwarp.scene.camera import CALIBRATION_ENDINGS, save_calibration
@@ -211,7 +211,7 @@ def export(
         frames: Only this one, from 0, or these.
         split: Of a dataset: "train", "validation", "test" or "all".
         result: The result that the `Frames` were drawn from; `.mat` needs its truth.
-        channel: Of a result: which light counts, see `spadwarp.result.received`.
+        channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
 
     Returns:
         The files that were written.
@@ -231,7 +231,7 @@ def export(
         if ending in CALIBRATION_ENDINGS:
             return [_write_calibration(opened, path)]
         if isinstance(opened, Result):
-            return [_write_result(received(opened, channel), path, ending, frames)]
+            return [_write_result(analyser_channel(opened, channel), path, ending, frames)]
         if channel != "I":
             raise ArgumentError(f"channel = {channel!r}: only results have channels")
         chosen = _chosen(opened, frames)

@@ -25,8 +25,8 @@ from spadwarp.io.hdf5 import hdf5_format, read_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file
 from spadwarp.limits import check_real, shown
+from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.file import load_result
-from spadwarp.result.received import Channel, received
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -130,7 +130,7 @@ def read_histograms(
         gate_start: Time of flight at the start of bin 0, or at tag 0 [s].
         irf: The response that the histograms contain.
         sum_frames: Add frames up.
-        channel: Of a result: which light counts, see `spadwarp.result.received`.
+        channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
 
     Raises:
         FileError: No such file, not readable, of an unknown kind, without such an array, or with values that are
@@ -201,7 +201,7 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
             response=file.irf,
             scene=file.scene,
         )
-    result = received(load_result(path), channel)
+    result = analyser_channel(load_result(path), channel)
     scene = result.scene
     return Histograms(
         values=result.histogram,

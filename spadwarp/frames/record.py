@@ -242,7 +242,7 @@ def simulate_sequence(
             with warnings.catch_warnings():
                 if number:  # said of the first frame
                     warnings.simplefilter("ignore", SpadwarpWarning)
-                result = simulate(at, photons=photons, seed=frame_seed, device=device, kept=kept)
+                result = simulate(at, photons=photons, seed=frame_seed, device=device, mesh_cache=kept)
                 part = detect(result, first_frame=number, **options)
             times = {method: part.arrival_time(method, device=first_device) for method in methods}
             file.add_frame(result, part, {method: depth_from_time(time, scene=at) for method, time in times.items()})

@@ -151,7 +151,7 @@ class Renderer:
 
     def _tracer(self, scene: Scene, photons: int, names: Sequence[str]) -> LightTracer:
         kept = self._kept.setdefault("scored" if names else "plain", {})
-        tracer = LightTracer(scene, photons=photons, derivatives=names, kept=kept, **self._choices)
+        tracer = LightTracer(scene, photons=photons, derivatives=names, mesh_cache=kept, **self._choices)
         self._tally = tracer.tally
         return tracer
 
@@ -159,7 +159,9 @@ class Renderer:
         """Derivative by the depth of the targets [1/m] from a first photon on: of two runs with the same photons and
         the targets at ± `step` [m]."""
         far, near = (
-            LightTracer(moved(scene, shift), kept=self._kept.setdefault(name, {}), photons=photons, **self._choices)
+            LightTracer(
+                moved(scene, shift), mesh_cache=self._kept.setdefault(name, {}), photons=photons, **self._choices
+            )
             for name, shift in (("far", step), ("near", -step))
         )
 
@@ -184,7 +186,7 @@ class Renderer:
     @property
     def _choices(self) -> dict[str, Any]:
         """Of all tracers; one tally serves them in turn."""
-        return {"seed": self.seed, "device": self.device, "apart": self._apart, "tally": self._tally}
+        return {"seed": self.seed, "device": self.device, "separate_targets": self._apart, "tally": self._tally}
 
     def _with_focus(self, scene: Scene) -> Scene:
         """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved.

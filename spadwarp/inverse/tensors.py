@@ -16,8 +16,8 @@ from spadwarp.limits import SEED, check_integer
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.grid import Grid
 from spadwarp.scene.medium import grid_cells
-from spadwarp.transport import resolve_derivatives, simulate
-from spadwarp.transport.block_derivatives import is_of_grid
+from spadwarp.transport import RunOptions, resolve_derivatives, simulate
+from spadwarp.transport.derivatives import is_block_name
 
 if TYPE_CHECKING:
     import torch
@@ -61,7 +61,7 @@ def render(
         raise FileError("render needs torch: pip install 'spadwarp[torch]'") from error
     base, seed = as_scene(scene), check_integer("seed", seed, SEED)
     names, shape = _checked(base, parameters)
-    of_grid = [name for name in names if is_of_grid(name)]
+    of_grid = [name for name in names if is_block_name(name)]
 
     class Rendering(torch.autograd.Function):
         @staticmethod
@@ -69,16 +69,18 @@ def render(
             arrays = {name: value.detach().double().cpu().numpy() for name, value in zip(names, values, strict=True)}
             numbers = {name: float(value) for name, value in arrays.items() if name not in of_grid}
             at = with_values(base, numbers)
-            run: dict[str, Any] = {"photons": photons, "seed": seed, "device": device}
+            options: dict[str, Any] = {"photons": photons, "seed": seed, "device": device}
             with tempfile.TemporaryDirectory() as folder:
                 if of_grid:
                     means = {name.rpartition(".")[2]: arrays[name] for name in of_grid}
                     at = with_block_means(at, means, Path(folder))
-                result = simulate(at, **run)
+                result = simulate(at, **options)
                 scale = at.laser.photons_per_pulse * at.detections_per_photon
                 ctx.slopes = None
                 if any(ctx.needs_input_grad):
-                    other = simulate(at, first_photon=photons, derivatives=names, blocks=shape, **run)
+                    other = simulate(
+                        at, derivatives=names, blocks=shape, run=RunOptions(first_photon=photons), **options
+                    )
                     ctx.slopes = [(scale * other.derivatives[name].sum(axis=-4)).astype(np.float32) for name in names]
             return torch.as_tensor(scale * result.histogram, dtype=values[0].dtype, device=values[0].device)
 
@@ -89,7 +91,7 @@ def render(
             return tuple((gradient * cube).sum((-3, -2, -1)) for cube in slopes)
 
     return Rendering.apply(  # type: ignore[no-any-return,no-untyped-call]
-        *(value if is_of_grid(name) else value.reshape(()) for name, value in parameters.items())
+        *(value if is_block_name(name) else value.reshape(()) for name, value in parameters.items())
     )
 
 
@@ -97,7 +99,7 @@ def _checked(scene: Scene, parameters: Mapping[str, torch.Tensor]) -> tuple[list
     """Full names of the parameters, those of a grid without the block, and the numbers of blocks."""
     import torch
 
-    plain = [name for name in parameters if not is_of_grid(name)]
+    plain = [name for name in parameters if not is_block_name(name)]
     unknowns = dict(zip(plain, read_unknowns(scene, plain), strict=True)) if plain else {}
     names, shapes = list[str](), set[tuple[int, ...]]()
     for name, value in parameters.items():
@@ -116,7 +118,7 @@ def _checked(scene: Scene, parameters: Mapping[str, torch.Tensor]) -> tuple[list
     if len(shapes) > 1:
         raise ArgumentError(f"parameters: blocks of different numbers, {sorted(shapes)}")
     shape = shapes.pop() if shapes else None
-    resolve_derivatives(scene, [name for name in names if is_of_grid(name)], shape)
+    resolve_derivatives(scene, [name for name in names if is_block_name(name)], shape)
     return names, shape
 
 

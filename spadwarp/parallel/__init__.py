@@ -1,7 +1,11 @@
 """Jobs on the devices of this host, or on Ray's workers on one machine or many."""
 
-from spadwarp.parallel.forked import Forked
-from spadwarp.parallel.jobs import run_jobs
-from spadwarp.parallel.worker import Ray, Worker, interruptible
+from typing import TYPE_CHECKING
 
-__all__ = ["Forked", "Ray", "Worker", "interruptible", "run_jobs"]
+from spadwarp.parallel import forked, jobs, worker
+from spadwarp.parallel.forked import *
+from spadwarp.parallel.jobs import *
+from spadwarp.parallel.worker import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    __all__ = forked.__all__ + jobs.__all__ + worker.__all__

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import gc
-import os
-import pickle
-import select
-import signal
+import multiprocessing
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any
 
@@ -36,11 +35,8 @@ class Forked:
 
     def results(self) -> list[Any]:
         """Of all calls, in their order; waits for them. Raises what they raise."""
-        found: list[tuple[Any] | None] = []
-        while self._running:
-            one = self._running.pop(0)
-            found.append(None if one is None else _result(*one))
-        return [call() if one is None else one[0] for call, one in zip(self._calls, found, strict=True)]
+        found = [None if copy is None else _result(*copy) for copy in self._running]
+        return [call() if item is None else item[0] for call, item in zip(self._calls, found, strict=True)]
 
     def __enter__(self) -> Forked:
         return self
@@ -48,61 +44,39 @@ class Forked:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for one in self._running:
-            if one is not None:
-                _end(*one)
+        for process, source in filter(None, self._running):
+            source.close()
+            process.kill()
+            process.join()
         self._running = []
 
 
-def _begin(call: Callable[[], Any]) -> tuple[int, int] | None:
-    """Process and the file that its result comes from; None where there is no further process."""
+def _begin(call: Callable[[], Any]) -> tuple[BaseProcess, Connection] | None:
+    """Process and the connection that its result comes from; None where there is no further process."""
+    context = multiprocessing.get_context("fork")
     try:
-        source, target = os.pipe()
-    except OSError:
-        return None
-    try:
-        with warnings.catch_warnings():
+        source, target = context.Pipe(duplex=False)
+        process = context.Process(target=_send, args=(call, source, target), daemon=True)
+        with target, warnings.catch_warnings():
             # Python warns of copies of a process with threads; the copy takes none of their locks.
             warnings.simplefilter("ignore", DeprecationWarning)
-            process = os.fork()
+            process.start()
     except OSError:
-        os.close(source)
-        os.close(target)
         return None
-    if process == 0:
-        code = 1
-        try:
-            gc.disable()  # arrays of a GPU that are garbage are the parent's to free
-            os.close(source)
-            with open(target, "wb") as file:
-                pickle.dump((call(),), file)
-            code = 0
-        finally:
-            os._exit(code)
-    os.close(target)
     return process, source
 
 
-def _result(process: int, source: int) -> tuple[Any] | None:
+def _send(call: Callable[[], Any], source: Connection, target: Connection) -> None:
+    gc.disable()  # arrays of a GPU that are garbage are the parent's to free
+    source.close()
+    with suppress(BaseException):  # where nothing is sent, the call is made again
+        target.send((call(),))
+
+
+def _result(process: BaseProcess, source: Connection) -> tuple[Any] | None:
     """What the call returned; None if it failed."""
-    data = b""
-    try:
-        while select.select([source], [], [], _PATIENCE)[0]:
-            part = os.read(source, 1 << 16)
-            if not part:
-                break
-            data += part
-    finally:
-        _end(process, source)
-    with suppress(EOFError, pickle.UnpicklingError):
-        found: tuple[Any] = pickle.loads(data)
-        return found
+    with suppress(EOFError, OSError):
+        if source.poll(_PATIENCE):
+            found: tuple[Any] = source.recv()
+            return found
     return None
-
-
-def _end(process: int, source: int) -> None:
-    os.close(source)
-    with suppress(OSError):
-        os.kill(process, signal.SIGKILL)
-    with suppress(OSError):
-        os.waitpid(process, 0)

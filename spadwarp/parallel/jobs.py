@@ -9,12 +9,19 @@ job is not defined, so that a job must hold all that its value depends on, its s
 
 from __future__ import annotations
 
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from typing import Any, TypeVar
 
-from spadwarp.device import pick_devices
-from spadwarp.parallel.local import run_here, run_in_processes
+from spadwarp.device import core_count, pick_devices
+from spadwarp.errors import DeviceError
 from spadwarp.parallel.ray import run_on_ray
 from spadwarp.parallel.worker import Ray, Worker
 
@@ -56,7 +63,76 @@ def run_jobs(
         yield from run_on_ray(work, jobs, engine=engine, device=device, stopped=stopped, note=note)
         return
     devices = [found.alias for found in pick_devices(device)]
-    if len(devices) == 1:
-        yield from run_here(work, jobs, Worker(devices[0]), stopped)
-    else:
-        yield from run_in_processes(work, jobs, devices, stopped)
+    if len(devices) > 1:
+        yield from _run_in_processes(work, jobs, devices, stopped)
+        return
+    worker = Worker(devices[0], stopped=stopped)
+    for job in _until(stopped, jobs):
+        yield job, work(job, worker)
+
+
+def _until(stopped: threading.Event, jobs: Iterable[Job]) -> Iterator[Job]:
+    """The jobs, of which none is taken any more once the event is set."""
+    queue = iter(jobs)
+    while not stopped.is_set():
+        try:
+            job = next(queue)
+        except StopIteration:
+            return
+        yield job
+
+
+def _run_in_processes(
+    work: Callable[[Job, Worker], Value], jobs: Iterable[Job], devices: Sequence[str], stopped: threading.Event
+) -> Iterator[tuple[Job, Value]]:
+    """A process for each device: Warp loads kernels in one thread, and jobs hold Python's lock between launches."""
+    context = multiprocessing.get_context("spawn")
+    slots = context.SimpleQueue()
+    for device in devices:
+        slots.put((device, max(1, core_count() // len(devices)) if device == "cpu" else None))
+    ended = context.Event()
+    queue = _until(stopped, jobs)
+    running: dict[Future[Value], Job] = {}
+    pool = ProcessPoolExecutor(len(devices), mp_context=context, initializer=_begin, initargs=(slots, ended))
+    try:
+        while True:
+            if stopped.is_set():
+                ended.set()
+            for job in islice(queue, len(devices) - len(running)):
+                running[pool.submit(_run, work, job)] = job
+            if not running:
+                return
+            # With a timeout: Python handles a signal only when the wait for a lock ends.
+            for future in wait(running, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future.result()
+    except BrokenProcessPool as error:
+        raise DeviceError(
+            f"a process on one of {', '.join(devices)} was killed, perhaps because memory ran out"
+        ) from error
+    finally:
+        ended.set()
+        pool.shutdown(cancel_futures=True)
+
+
+_worker: Worker
+
+
+def _begin(slots: Any, ended: Any) -> None:
+    """Run first in a new process, which ignores Ctrl-C and SIGTERM and ends when the process that started it does."""
+    global _worker
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    device, threads = slots.get()
+    _worker = Worker(device, threads, ended)
+
+
+def _run(work: Callable[[Job, Worker], Value], job: Job) -> Value:
+    return work(job, _worker)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    multiprocessing.connection.wait([parent.sentinel])
+    os._exit(1)

@@ -18,13 +18,13 @@ from typing import Any, Literal, TypeVar
 
 from spadwarp.device import core_count, physical_memory, pick_device, processor_name
 from spadwarp.errors import ConfigError, DeviceError
-from spadwarp.parallel.worker import Ray, Worker
+from spadwarp.parallel.worker import Event, Ray, Worker
 
 Job = TypeVar("Job")
 Value = TypeVar("Value")
 Note = Callable[[str], None]
 
-__all__ = ["Event", "RayWorker", "RayWorkers", "run_on_ray"]
+__all__ = ["RayWorker", "RayWorkers", "run_on_ray"]
 
 # How often a job whose worker was lost runs again; a job that loses more is likely what kills them.
 _RETRIES = 3
@@ -67,15 +67,6 @@ class RayWorker:
     metadata: dict[str, Any] | None = None
 
 
-@dataclass(frozen=True)
-class Event:
-    """A worker joined, returned a value, or was lost with what it was doing."""
-
-    kind: Literal["joined", "returned", "lost"]
-    worker: RayWorker
-    value: Any = None
-
-
 class RayWorkers:
     """Workers for the length of a `with` block.
 
@@ -100,7 +91,8 @@ class RayWorkers:
         note: Note | None = None,
     ) -> None:
         if device not in (None, "cpu", "cuda", "cuda:all"):
-            raise ConfigError(f"device = {device!r} does not go with Ray, which gives each worker its GPU: cpu or cuda")
+            text = "cannot be combined with Ray, which gives each worker its GPU: cpu or cuda"
+            raise ConfigError(f"device = {device!r} {text}")
         self._engine, self._device, self._prepare = engine, device, prepare
         self._value_bytes, self._note = value_bytes, note or (lambda text: None)
         self._pending: dict[Any, tuple[Literal["joined", "returned"], RayWorker]] = {}
@@ -182,7 +174,8 @@ class RayWorkers:
         self._pending[worker.actor.run.remote(work, arguments)] = "returned", worker
 
     def wait(self, timeout: float) -> list[Event]:
-        """What has happened, waiting for `timeout` seconds at most. Raises what a worker raised."""
+        """Events, waiting for `timeout` seconds at most: a worker "joined", "returned" a value, or was "lost" with what
+        it was doing. Raises what a worker raised."""
         if self._patience < time.monotonic() and all(worker.metadata is None for worker in self.workers):
             self._note(f"no worker has joined yet; the cluster has {self._resources()}")
             self._patience = math.inf

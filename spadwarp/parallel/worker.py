@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_integer, shown
@@ -51,6 +51,14 @@ class Worker:
     threads: int | None = None
     stopped: threading.Event = field(default_factory=threading.Event)
     state: dict[str, Any] = field(default_factory=dict)
+
+
+class Event(NamedTuple):
+    """Something that a worker did."""
+
+    kind: str
+    worker: Any
+    value: Any = None
 
 
 _handled = threading.Lock()

@@ -25,27 +25,14 @@ from spadwarp.io.hdf5 import (
 )
 from spadwarp.io.paths import file_within
 from spadwarp.limits import check_integer, shown
-from spadwarp.result.batch_moments import moments_of
 from spadwarp.result.photon_ids import Ranges, joined
 from spadwarp.result.result import COMPONENTS, Result, Truth, physics_of
-from spadwarp.result.signed_file import SIGNED_DIMENSIONS, read_signed, write_signed
-from spadwarp.result.signed_tallies import SignedTallies
+from spadwarp.result.tallies import SignedTallies, moments_of
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes
 
-__all__ = [
-    "FORMAT",
-    "FORMAT_VERSION",
-    "ResultHead",
-    "ResultLike",
-    "as_result",
-    "load_result",
-    "load_truth_maps",
-    "read_head",
-    "save_depth_exr",
-    "save_result",
-    "save_truth_maps",
-]
+__all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps"]
+__all__ += ["save_depth_exr", "save_result", "save_truth_maps"]
 
 FORMAT = "spadwarp result"
 FORMAT_VERSION = 1
@@ -53,9 +40,14 @@ FORMAT_VERSION = 1
 _CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
 _PHOTONS = f"[1, {2**64 - 1}]"
 _UNITS = "[1e-30, 1e30]"  # photons
-_RECORDS = ("ledger", "counters", "batch_moments", "timing", "provenance")  # as JSON: its integers have no limit
+_RECORDS = (
+    "energy_balance",
+    "counters",
+    "batch_moments",
+    "timing",
+    "provenance",
+)  # as JSON: its integers have no limit
 _TRUTH = ("depth", "range", "normal", "reflectance")
-_OLDER_NAMES = {"second_moment": "squares", "importance_sampling_residual": "directed"}  # in files of format version 1
 _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
     "times laser_photons_per_pulse * detector_pde (with the filter before it) it is the expected detections per pulse. "
@@ -89,29 +81,34 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     _, height, width, bins = result.tallies.shape
     columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
     rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))
-    packed = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
+    chunk = (rows, columns, bins)
+    options = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
+    signed = {"derivatives": result.derivative_tallies, "channels": result.channel_tallies}
 
     with write_hdf5(path) as file:
         file.attrs.update(
             {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
         )
-        write_packed(file, "tallies", result.tallies, chunks=(1, rows, columns, bins), compression=compression)
-        if result.second_moment is not None:
-            chunks = (1, rows, columns, bins)
-            write_packed(file, "second_moment", result.second_moment, chunks=chunks, compression=compression)
-        for group in ("derivatives", "channels"):
-            signed = result.derivative_tallies if group == "derivatives" else result.channel_tallies
-            write_signed(file, group, signed, chunks=(1, 1, rows, columns, bins), compression=compression)
+        arrays: dict[str, Any] = {"tallies": result.tallies, "second_moment": result.second_moment}
+        for group, found in signed.items():
+            if found is not None:
+                file.attrs[group] = list(found.names)
+                arrays |= {f"{group}/tallies": found.tallies, f"{group}/second_moment": found.second_moment}
+                file.create_dataset(f"{group}/unit", data=np.array(found.units))
+        for name, array in arrays.items():
+            if array is not None:
+                chunks = (*[1] * (array.ndim - len(chunk)), *chunk)
+                write_packed(file, name, array, chunks=chunks, compression=compression)
         file.create_dataset("bin_edges", data=result.bin_edges)
         if result.scene.scan_positions > 1:
-            file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **packed)
+            file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **options)
         file.create_dataset("photon_ranges", data=np.array(result.photon_ranges, dtype=np.uint64))
         file.create_dataset("requested", data=np.array(result.requested, dtype=np.uint64))
         file.create_dataset("config", data=result.scene.to_toml())
         for name in _RECORDS:
             file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
         for name in _TRUTH:
-            file.create_dataset(f"truth/{name}", data=getattr(result.truth, name), **packed)
+            file.create_dataset(f"truth/{name}", data=getattr(result.truth, name), **options)
         name_dimensions(file, _coordinates(result), _DIMENSIONS)
     return Path(path)
 
@@ -130,10 +127,32 @@ def _coordinates(result: Result) -> dict[str, Coordinate | int | None]:
     }
 
 
+_VOXELS = (*PIXELS, "time")
 _DIMENSIONS = {
-    "tallies": (("component", *PIXELS, "time"), "1", "times unit over photons: fraction of the emitted photons"),
-    "second_moment": (("word", *PIXELS, "time"), "1", "sum over batches of the squared tally"),
-    **SIGNED_DIMENSIONS,
+    "tallies": (("component", *_VOXELS), "1", "times unit over photons: fraction of the emitted photons"),
+    "second_moment": (("word", *_VOXELS), "1", "sum over batches of the squared tally"),
+    "derivatives/tallies": (
+        ("parameter", "component", *_VOXELS),
+        "1",
+        "times derivatives/unit over photons: derivative of the fraction of the emitted photons",
+    ),
+    "derivatives/second_moment": (
+        ("word", "parameter", *_VOXELS),
+        "1",
+        "sum over batches of the squared tally of the derivative",
+    ),
+    "derivatives/unit": (("parameter",), "1", "of the tallies of each parameter"),
+    "channels/tallies": (
+        ("channel", "component", *_VOXELS),
+        "1",
+        "times channels/unit over photons: fraction of the emitted photons in each channel",
+    ),
+    "channels/second_moment": (
+        ("word", "channel", *_VOXELS),
+        "1",
+        "sum over batches of the squared tally of the channel",
+    ),
+    "channels/unit": (("channel",), "1", "of the tallies of each channel"),
     "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
     "photon_ranges": (("run", "limit"), "1", "ids of the photons"),
     "requested": (("limit",), "1", "ids of the requested photons"),
@@ -153,28 +172,30 @@ def load_result(path: str | Path) -> Result:
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         head = _head(file)
-        scene, batch_size = head.scene, head.batch_size
-        height, width, bins = scene.camera.height, scene.camera.width, scene.gate.bins
-        tallies = file.array("tallies", np.int64, (len(COMPONENTS), height, width, bins))
+        scene, batches = head.scene, head.batch_size > 0
+        shape = (len(COMPONENTS), scene.camera.height, scene.camera.width, scene.gate.bins)
+        tallies = file.array("tallies", np.int64, shape)
         if tallies.min() < 0:
             file.refuse("tallies", "are negative in some bins")
-        moments = [name for name in ("second_moment", _OLDER_NAMES["second_moment"]) if name in file]
-        if bool(moments) != bool(batch_size):
-            file.refuse("second_moment", f"does not go with batches of {batch_size} photons")
-        result = Result(
+        if ("second_moment" in file) != batches:
+            file.refuse("second_moment", f"does not go with batches of {head.batch_size} photons")
+        channels = _signed_tallies(file, "channels", shape, batches)
+        expected = scene.camera.tallied_channels
+        if (() if channels is None else channels.names) != expected:
+            file.refuse("channels", f"are not {', '.join(expected) or 'none'}, those of the scene's camera")
+        return Result(
             **vars(head),
             tallies=tallies,
-            second_moment=file.array(moments[0], np.uint64, (2, height, width, bins)) if moments else None,
-            truth=_truth(file, (height, width)),
-            ledger=read_ledger(file),
+            second_moment=file.array("second_moment", np.uint64, (2, *shape[1:])) if batches else None,
+            truth=_truth(file, shape[1:3]),
+            energy_balance=file.integers("energy_balance"),
             counters=file.integers("counters"),
-            batch_moments=_batch_moments(file) if moments else {},
-            derivative_tallies=read_signed(file, "derivatives", tallies.shape, bool(moments)),
-            channel_tallies=_channels(file, scene, tallies.shape, bool(moments)),
+            batch_moments=_batch_moments(file),
+            derivative_tallies=_signed_tallies(file, "derivatives", shape, batches),
+            channel_tallies=channels,
             timing=file.numbers("timing"),
             provenance=_provenance(file),
         )
-    return result
 
 
 ResultLike = Result | str | os.PathLike[str]
@@ -200,7 +221,7 @@ class ResultHead:
     unit: float
     photons: int
     seed: int
-    ledger_unit: float
+    energy_balance_unit: float
     partial: bool
     batch_size: int
     photon_ranges: Ranges
@@ -226,42 +247,49 @@ def _head(file: Hdf5File) -> ResultHead:
     photons = file.integer("photons", _PHOTONS)
     if not ranges or any(start >= stop for start, stop in ranges) or len(joined(ranges)) > len(ranges):
         file.refuse("photon_ranges", "are not ranges of photon ids")
-    requested = (ranges[0][0], ranges[-1][1])
-    if "requested" in file:  # files of version 0.1.0 do not have it
-        start, stop = map(int, file.array("requested", np.uint64, (2,)))
-        if not start <= requested[0] < requested[1] <= stop:
-            file.refuse("requested", f"from {start} to {stop} does not hold the photons that were traced")
-        requested = start, stop
+    start, stop = map(int, file.array("requested", np.uint64, (2,)))
+    if not start <= ranges[0][0] < ranges[-1][1] <= stop:
+        file.refuse("requested", f"from {start} to {stop} does not hold the photons that were traced")
+    focus = file.attribute("camera_focus_distance")  # NaN stands for all depths
+    focus = focus if isinstance(focus, float) and np.isnan(focus) else file.real("camera_focus_distance", "(0, inf]")
     return ResultHead(
         scene=Scene.from_toml(file.text("config"), source=file.text_attribute("source", None)),
         unit=file.real("unit", _UNITS),
         photons=photons,
         seed=file.integer("seed"),
-        ledger_unit=file.real("ledger_unit", _UNITS),
+        energy_balance_unit=file.real("energy_balance_unit", _UNITS),
         partial=file.flag("partial"),
         batch_size=file.integer("batch_size", _PHOTONS.replace("[1", "[0"), default=0),
         photon_ranges=ranges,
-        requested=requested,
-        focus_distance=_focus_distance(file),
+        requested=(start, stop),
+        focus_distance=None if np.isnan(focus) else focus,
     )
 
 
-def _channels(file: Hdf5File, scene: Scene, shape: tuple[int, ...], batches: bool) -> SignedTallies | None:
-    found = read_signed(file, "channels", shape, batches)
-    expected = scene.camera.tallied_channels
-    if (() if found is None else found.names) != expected:
-        file.refuse("channels", f"are not {', '.join(expected) or 'none'}, those of the scene's camera")
-    return found
+def _signed_tallies(file: Hdf5File, group: str, shape: tuple[int, ...], batches: bool) -> SignedTallies | None:
+    """Of a group beside tallies of a shape, with second moments where there are batches; None without the group."""
+    if group not in file:
+        return None
+    names = tuple(np.ravel(file.attribute(group)).tolist())
+    count = len(names)
+    if not all(isinstance(name, str) for name in names) or len(set(names)) < count:
+        file.refuse(group, "are not names")
+    units = file.array(f"{group}/unit", np.float64, (count,))
+    if not all(unit > 0 and np.frexp(unit)[0] == 0.5 for unit in units):
+        file.refuse(f"{group}/unit", "are not powers of two")
+    return SignedTallies(
+        names,
+        file.array(f"{group}/tallies", np.int64, (count, *shape)),
+        tuple(map(float, units)),
+        file.array(f"{group}/second_moment", np.uint64, (2, count, *shape[1:])) if batches else None,
+    )
 
 
 def _batch_moments(file: Hdf5File) -> dict[str, int]:
-    """Of the components' totals; files of older versions have none."""
-    if "batch_moments" not in file:
-        return {}
-    found = file.integers("batch_moments", bits=256)
-    if found and found.keys() != moments_of(COMPONENTS, [0] * len(COMPONENTS)).keys():
+    moments = file.integers("batch_moments", bits=256)
+    if moments and moments.keys() != moments_of(COMPONENTS, [0] * len(COMPONENTS)).keys():
         file.refuse("batch_moments", "are not those of the components")
-    return found
+    return moments
 
 
 def _truth(file: Hdf5File, shape: tuple[int, int]) -> Truth:
@@ -274,24 +302,12 @@ def _truth(file: Hdf5File, shape: tuple[int, int]) -> Truth:
     return Truth(**maps)
 
 
-def read_ledger(file: Hdf5File) -> dict[str, int]:
-    """The ledger in an open file of a result or of photon records, its entries by the names of today."""
-    newer = {older: name for name, older in _OLDER_NAMES.items()}
-    return {newer.get(name, name): value for name, value in file.integers("ledger").items()}
-
-
 def _provenance(file: Hdf5File) -> dict[str, Any]:
     made = file.table("provenance")
     parts = made.get("parts", [])
     if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
         file.refuse("provenance", "holds parts that are no tables")
     return made
-
-
-def _focus_distance(file: Hdf5File) -> float | None:
-    """NaN in files stands for all depths; files of version 0.1.0 do not have it."""
-    value = file.attribute("camera_focus_distance", np.nan)
-    return None if isinstance(value, float) and np.isnan(value) else file.real("camera_focus_distance", "(0, inf]")
 
 
 def _attributes(result: Result) -> dict[str, Any]:
@@ -302,7 +318,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         "unit": result.unit,
         "photons": result.photons,
         "seed": str(result.seed),
-        "ledger_unit": result.ledger_unit,
+        "energy_balance_unit": result.energy_balance_unit,
         "partial": result.partial,
         "batch_size": result.batch_size,
         "components": list(COMPONENTS),

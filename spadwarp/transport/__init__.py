@@ -1,30 +1,17 @@
 """Photon transport: a scene in, a `Result`, truth maps or photon records out."""
 
-from spadwarp.transport.derivatives import derivative_names, resolve_derivatives
-from spadwarp.transport.light import ExpectedLight, LightTracer
-from spadwarp.transport.loading import prepare_kernels
-from spadwarp.transport.points import points_per_flight
-from spadwarp.transport.records import PhotonRecords, load_records, save_records, trace
-from spadwarp.transport.simulation import Progress, provenance, simulate
-from spadwarp.transport.tally_unit import PHOTON_CAPACITY, photon_capacity, tally_scale
-from spadwarp.transport.truth import truth_maps
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "PHOTON_CAPACITY",
-    "ExpectedLight",
-    "LightTracer",
-    "PhotonRecords",
-    "Progress",
-    "derivative_names",
-    "load_records",
-    "photon_capacity",
-    "points_per_flight",
-    "prepare_kernels",
-    "provenance",
-    "resolve_derivatives",
-    "save_records",
-    "simulate",
-    "tally_scale",
-    "trace",
-    "truth_maps",
-]
+from spadwarp.transport import derivatives, light, model, plan, records, simulation, tally_unit, workers
+from spadwarp.transport.derivatives import *
+from spadwarp.transport.light import *
+from spadwarp.transport.model import *
+from spadwarp.transport.plan import *
+from spadwarp.transport.records import *
+from spadwarp.transport.simulation import *
+from spadwarp.transport.tally_unit import *
+from spadwarp.transport.workers import *
+
+if not TYPE_CHECKING:  # type checkers follow the stars
+    _modules = (derivatives, light, model, plan, records, simulation, tally_unit, workers)
+    __all__ = [name for module in _modules for name in module.__all__]

@@ -4,28 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Protocol
 
+from spadwarp.parallel.worker import Event
 from spadwarp.result import Tallies, Truth
 from spadwarp.result.photon_ids import IdQueue, Range, Ranges, count, joined
 
-__all__ = ["Event", "Executor", "Workers"]
-
 # Seconds that a block of photons takes: long beside the milliseconds of handing it out, short beside a checkpoint's.
 _BLOCK_SECONDS = 5.0
-
-
-class Event(NamedTuple):
-    """What a worker did.
-
-    "progress": more photons of its block are done (value: their number). "traced": its block is done, or was stopped
-    (value: ids done, seconds). "collected": its tallies are in `Workers.tallies`. "lost": its block and its tallies are
-    gone, and another worker replaces it.
-    """
-
-    kind: Literal["progress", "traced", "collected", "lost"]
-    worker: Any
-    value: Any = None
 
 
 class Workers(Protocol):
@@ -55,7 +41,12 @@ class Workers(Protocol):
         """Ends blocks early."""
 
     def wait(self) -> list[Event]:
-        """Events, after a fraction of a second at most. Raises the error of a worker."""
+        """Events, after a fraction of a second at most. Raises the error of a worker.
+
+        "progress": more photons of a worker's block are done (value: their number). "traced": its block is done, or was
+        stopped (value: ids done, seconds). "collected": its tallies are in `tallies`. "lost": its block and its tallies
+        are gone, and another worker replaces it.
+        """
 
     def truth(self) -> Truth:
         """Truth maps by one of the workers."""

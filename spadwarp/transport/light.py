@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import warp as wp
 
+import spadwarp_kernels as sk
 from spadwarp.device import pick_devices
 from spadwarp.result import Truth
 from spadwarp.result.photon_ids import photons_per_position
 from spadwarp.scene import Scene
-from spadwarp.transport.local_workers import LocalWorkers
-from spadwarp.transport.plan import make_plan
+from spadwarp.transport.plan import RunOptions, make_plan
+from spadwarp.transport.workers import LocalWorkers
 
 __all__ = ["ExpectedLight", "LightTracer"]
 
@@ -34,8 +36,8 @@ class LightTracer:
         seed: 64 bits.
         device: As in `simulate`; the first of several.
         derivatives: Names, as in `simulate`.
-        apart: Whether the light of the targets is wanted apart.
-        kept: As in `simulate`.
+        separate_targets: Whether the light of the targets alone is wanted, too.
+        mesh_cache: As in `simulate`.
         tally: That of another tracer of as many pixels and bins, to save memory: a call empties it.
 
     Raises what `simulate` raises.
@@ -49,24 +51,13 @@ class LightTracer:
         seed: int,
         device: str | None = None,
         derivatives: Sequence[str] = (),
-        apart: bool = False,
-        kept: dict[str, Any] | None = None,
+        separate_targets: bool = False,
+        mesh_cache: dict[str, Any] | None = None,
         tally: Any = None,
     ) -> None:
-        plan = make_plan(
-            scene,
-            photons=photons,
-            seed=seed,
-            first_photon=0,
-            shard=None,
-            batches=False,
-            relative_error=None,
-            resume=None,
-            launch_size=None,
-            derivatives=derivatives or None,
-        )
-        workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, kept=kept)
-        self._scene, self._apart, self._unit = scene, apart, 1.0 / plan.scale
+        plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=derivatives or None)
+        workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)
+        self._scene, self._separate_targets, self._unit = scene, separate_targets, 1.0 / plan.scale
         self._names, self._worker = plan.derivatives, workers.workers[0]
         self.truth: Truth = workers.truth()
 
@@ -89,11 +80,7 @@ class LightTracer:
         return self._light(data.tally, value * self._unit, 1, 0), slopes
 
     def _light(self, tally: Any, value: Any, parameters: int, parameter: int) -> ExpectedLight:
-        import warp as wp
-
-        from spadwarp_kernels import tally_rates
-
         scale: Any = wp.array(np.asarray(value, np.float64), dtype=wp.float64, device=tally.device)
         which: Any = {"bins": self._scene.gate.bins, "parameters": parameters, "parameter": parameter}
-        target = tally_rates(tally, scale, components=(0, 2), **which) if self._apart else None
-        return ExpectedLight(tally_rates(tally, scale, **which), target)
+        target = sk.tally_rates(tally, scale, components=(0, 2), **which) if self._separate_targets else None
+        return ExpectedLight(sk.tally_rates(tally, scale, **which), target)

@@ -1,15 +1,16 @@
-"""The plan of a run: scene, seed, photon ids, batches."""
+"""The plan of a run: scene, seed, photon ids, batches, and how its work is divided."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from spadwarp.errors import ConfigError
 from spadwarp.limits import SEED, check_integer, check_part, check_real
 from spadwarp.mesh import build_mesh
-from spadwarp.result import COMPONENTS, Result
+from spadwarp.result import COMPONENTS, Result, ResultLike
 from spadwarp.result.photon_ids import Range, count, shard_of
 from spadwarp.result.result import physics_of
 from spadwarp.scene import Scene, Transport
@@ -20,21 +21,60 @@ from spadwarp.transport.tally_unit import scale_and_capacity
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["LARGEST_LAUNCH", "LAUNCH_SIZE", "PHOTONS", "Plan", "make_plan"]
+__all__ = ["RunOptions"]
 
 # Photons in one launch: large enough to fill the device, small enough for progress and Ctrl-C.
 LAUNCH_SIZE = {"cpu": 1 << 16, "cuda": 1 << 26}
 # One CPU thread walks a whole launch, and counts its events in 32 bits.
 LARGEST_LAUNCH = {"cpu": 1 << 20, "cuda": 1 << 26}
 
-PHOTONS = field_range(Transport, "photons")
-"""Range of the photons of a run."""
+_PHOTONS = field_range(Transport, "photons")
+_RANGES = {"threads": "[1, 4096]", "launch_size": f"[1, {1 << 26}]", "first_photon": f"[0, {1 << 62}]"}
 
 # Voxels that are read at the end of a batch for each of its photons, at most: 2 % of a photon's time, on a GPU too.
 _VOXELS_PER_PHOTON = 16
 
 # Photons of a batch at most: some seconds of a GPU, so that several can share the work and little is lost.
 _LARGEST_BATCH = 1 << 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How the photons of a run are divided, and what of the run is on disk; no choice changes the bits of a photon.
+
+    Attributes:
+        threads: CPU threads; by default one a core. A GPU takes none.
+        launch_size: Photons in one launch, up to 2^26, on the CPU 2^20; by default what suits the device.
+        first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
+        shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
+        resume: A result of the same scene, or its path, to which photons are added until it has `photons`; the outcome
+            is that of one long run. Gaps in its ids are filled.
+        checkpoint: A file for the photons done so far, as a partial result that `resume` takes. It is not removed when
+            the run is done.
+        checkpoint_every: Seconds between checkpoints, at least; more where writing takes long, so that it costs 2 % of
+            the time at most.
+
+    Raises:
+        ArgumentError: A number out of range.
+    """
+
+    threads: int | None = None
+    launch_size: int | None = None
+    first_photon: int = 0
+    shard: tuple[int, int] | None = None
+    resume: ResultLike | None = None
+    checkpoint: str | Path | None = None
+    checkpoint_every: float = 60.0
+
+    def __post_init__(self) -> None:
+        checked: dict[str, Any] = {}
+        checked["checkpoint_every"] = check_real("checkpoint_every", self.checkpoint_every, "[0, inf]")
+        for name, within in _RANGES.items():
+            value = getattr(self, name)
+            checked[name] = None if value is None and name != "first_photon" else check_integer(name, value, within)
+        checked["shard"] = None if self.shard is None else check_part("shard", self.shard)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +85,8 @@ class Plan:
         scene, mesh: What to simulate; the mesh from `spadwarp.mesh.build_mesh`.
         seed: 64-bit.
         ids: Of the photons, [start, stop).
-        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
         scale: Tally units per emitted photon.
+        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
         launch_size: Photons in one launch; None: what suits the device.
         derivatives: Full names of the parameters by which the histogram is differentiated.
     """
@@ -63,45 +103,38 @@ class Plan:
 
 def make_plan(
     scene: Scene,
+    run: RunOptions,
     *,
     photons: int | None,
     seed: int | None,
-    first_photon: int,
-    shard: tuple[int, int] | None,
-    batches: bool,
-    relative_error: float | None,
-    resume: Result | None,
-    launch_size: int | None,
+    batches: bool = False,
+    relative_error: float | None = None,
+    resume: Result | None = None,
     derivatives: Iterable[str] | None = None,
     blocks: Sequence[int] | None = None,
 ) -> Plan:
-    """The plan for the arguments of `simulate`.
+    """The plan for the arguments of `simulate`; `resume` is that of the run, read.
 
-    Raises `ArgumentError` for those that are out of range, `ConfigError` for those that do not go together.
+    Raises `ArgumentError` for those that are out of range, `ConfigError` for those that cannot be combined.
     """
-    photons = None if photons is None else check_integer("photons", photons, PHOTONS)
+    photons = None if photons is None else check_integer("photons", photons, _PHOTONS)
     seed = None if seed is None else check_integer("seed", seed, SEED)
-    first_photon = check_integer("first_photon", first_photon, "[0, 4611686018427387904]")
-    shard = None if shard is None else check_part("shard", shard)
+    first_photon, shard = run.first_photon, run.shard
     if relative_error is not None:
         check_real("relative_error", relative_error, "(0, 1)")
-    if relative_error is not None and shard is not None:
-        raise ConfigError("relative_error goes without shard: no part knows the error of the whole")
+        if shard is not None:
+            raise ConfigError("relative_error cannot be combined with shard: no part knows the error of the whole")
     batches = batches or relative_error is not None
     if resume is not None:
-        _check_resumed(resume, scene, seed, first_photon, shard, batches)
+        _check_resumed(resume, run, scene, seed, batches)
         seed, first_photon = resume.seed, resume.requested[0]
         photons = count([resume.requested]) if photons is None else photons
         if photons <= resume.photons:
             raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
-    if derivatives is None:
-        names = () if resume is None else tuple(resume.derivatives)
-    else:
-        names = resolve_derivatives(scene, derivatives, blocks)
-    if resume is not None and names != tuple(resume.derivatives):
-        raise ConfigError(
-            f"derivatives: the run to resume has {', '.join(resume.derivatives) or 'none'}, not {', '.join(names)}"
-        )
+    resumed = () if resume is None else tuple(resume.derivatives)
+    names = resumed if derivatives is None else resolve_derivatives(scene, derivatives, blocks)
+    if resume is not None and names != resumed:
+        raise ConfigError(f"derivatives: the run to resume has {', '.join(resumed) or 'none'}, not {', '.join(names)}")
     photons = scene.transport.photons if photons is None else photons
     seed = scene.transport.seed if seed is None else seed
     batch_size = 0
@@ -117,20 +150,16 @@ def make_plan(
             )
     mesh = build_mesh(scene)
     scale, capacity = scale_and_capacity(scene, mesh)
-    _check_capacity(photons, capacity)
-    ids = first_photon, first_photon + photons
-    if shard is not None:
-        ids = shard_of(ids, shard, batch_size or 1)
-    return Plan(scene, mesh, seed, ids, scale, batch_size, launch_size, names)
-
-
-def _check_capacity(photons: int, capacity: int) -> None:
     if photons > capacity:
         raise ConfigError(
             f"photons = {photons} is outside [1, {capacity}]: the unit of this scene's histogram is fine enough for "
             "its furthest target, and more photons might overflow its brightest bin; average runs with other seeds "
             "instead, or start the gate later"
         )
+    ids = first_photon, first_photon + photons
+    if shard is not None:
+        ids = shard_of(ids, shard, batch_size or 1)
+    return Plan(scene, mesh, seed, ids, scale, batch_size, run.launch_size, names)
 
 
 def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
@@ -146,15 +175,15 @@ def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard:
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
 
 
-def _check_resumed(
-    resume: Result, scene: Scene, seed: int | None, first_photon: int, shard: tuple[int, int] | None, batches: bool
-) -> None:
-    for name, value in (("first_photon", first_photon), ("shard", shard)):
-        if value:
-            raise ConfigError(f"{name} = {value} goes without resume, which has the photon ids of its run")
+def _check_resumed(resume: Result, run: RunOptions, scene: Scene, seed: int | None, batches: bool) -> None:
+    for name in ("first_photon", "shard"):
+        if value := getattr(run, name):
+            raise ConfigError(f"{name} = {value} cannot be combined with resume, which has the photon ids of its run")
     if physics_of(scene) != physics_of(resume.scene):
         raise ConfigError("resume: the result is of another scene; only photons and output may differ")
     if seed not in (None, resume.seed):
         raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
     if batches and not resume.batch_size:
-        raise ConfigError("uncertainty: the run to resume kept no batches")
+        raise ConfigError("uncertainty: the run to resume has no batches")
+    if channel := resume.provenance.get("channel"):
+        raise ConfigError(f"resume: the result holds {channel}-polarised light alone; resume the run that it is of")

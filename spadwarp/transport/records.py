@@ -1,4 +1,4 @@
-"""Photon records: how each photon ended, traced and kept in HDF5."""
+"""Photon records: how each photon ended, and their HDF5 file."""
 
 from __future__ import annotations
 
@@ -6,28 +6,27 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import spadwarp_kernels as sk
 from spadwarp.device import pick_device
 from spadwarp.errors import ArgumentError
 from spadwarp.io.hdf5 import Coordinate, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.limits import SEED, check_integer
 from spadwarp.mesh import build_mesh
-from spadwarp.result.file import read_ledger
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.transport.block_derivatives import is_of_grid
-from spadwarp.transport.derivatives import resolve_derivatives
+from spadwarp.transport.derivatives import is_block_name, resolve_derivatives
+from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.transport.plan import LAUNCH_SIZE
+from spadwarp.transport.simulation import Progress
+from spadwarp.transport.workers import DeviceWorker
 
-if TYPE_CHECKING:
-    from spadwarp.transport.simulation import Progress
-
-__all__ = ["FORMAT", "PhotonRecords", "load_records", "save_records", "trace"]
+__all__ = ["PhotonRecords", "load_records", "save_records", "trace"]
 
 FORMAT = "spadwarp records"
 FORMAT_VERSION = 1
@@ -71,11 +70,12 @@ class PhotonRecords:
         path: float32 `[N]`, geometric path [m].
         collisions: int32 `[N]`, events, surfaces included.
         reason: int32 `[N]`, index into `reasons`.
-        reasons: Names of the ledger's entries: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low, ...
-        ledger: As in `Result`, with its unit.
+        reasons: Names of the entries of the energy balance: weight_cutoff, max_collisions, max_path, lateral_limit,
+            exit_x_low, ...
+        energy_balance: As in `Result`, with its unit.
         derivatives: Names of the P parameters that were asked for.
         log_derivatives: float32 `[N, P]`, ∂ ln f/∂parameter of the photon's flights and events f so far: the
-            derivative of the expectation of anything that the records tell is the mean of this times the score.
+            derivative of the expectation of anything that the records tell is the mean of this times this.
     """
 
     id: NDArray[np.uint64]
@@ -86,8 +86,8 @@ class PhotonRecords:
     collisions: NDArray[np.int32]
     reason: NDArray[np.int32]
     reasons: tuple[str, ...]
-    ledger: dict[str, int]
-    ledger_unit: float
+    energy_balance: dict[str, int]
+    energy_balance_unit: float
     derivatives: tuple[str, ...] = ()
     log_derivatives: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
@@ -112,16 +112,12 @@ def trace(
 
     Args and raises: as `simulate`.
     """
-    import spadwarp_kernels as sk
-    from spadwarp.transport.device_worker import DeviceWorker
-    from spadwarp.transport.model import build_model, transport_spec
-
     scene = as_scene(scene)
     photons = check_integer("photons", scene.transport.photons if photons is None else photons, "[1, 2147483647]")
     seed = check_integer("seed", scene.transport.seed if seed is None else seed, SEED)
     mesh = build_mesh(scene)
     names = resolve_derivatives(scene, derivatives)
-    if any(map(is_of_grid, names)):
+    if any(map(is_block_name, names)):
         raise ArgumentError(
             f"derivatives: photon records have no derivatives by block: {names[-1]}; a histogram has, `simulate`"
         )
@@ -140,7 +136,7 @@ def trace(
         parts.append({name: getattr(worker.data.records, name).numpy() for name in arrays})
         if progress is not None:
             progress("trace", stop, photons)
-    ledger, _ = sk.read_ledger(worker.data)
+    energy_balance, _ = sk.read_ledger(worker.data)
     camera = scene.camera
     if camera.is_posed:
         for part in parts:
@@ -150,8 +146,8 @@ def trace(
         id=np.arange(photons, dtype=np.uint64),
         **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
         reasons=sk.LEDGER_ENTRIES,
-        ledger=ledger,
-        ledger_unit=sk.LEDGER_UNIT,
+        energy_balance=energy_balance,
+        energy_balance_unit=sk.LEDGER_UNIT,
         derivatives=names,
     )
 
@@ -174,7 +170,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
                 "format_version": FORMAT_VERSION,
                 "read_me": _READ_ME,
                 "reasons": list(records.reasons),
-                "ledger_unit": records.ledger_unit,
+                "energy_balance_unit": records.energy_balance_unit,
             }
         )
         for name in _ARRAYS:
@@ -184,7 +180,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
             file.create_dataset(
                 "log_derivatives", data=records.log_derivatives, compression="gzip", compression_opts=1, shuffle=True
             )
-        file.create_dataset("ledger", data=json.dumps(records.ledger))  # integers without limit
+        file.create_dataset("energy_balance", data=json.dumps(records.energy_balance))  # integers without limit
         if scene is not None:
             file.create_dataset("config", data=scene.to_toml())
         parameters: Coordinate = (list(records.derivatives), "1", "of the scene")
@@ -215,6 +211,6 @@ def load_records(path: str | Path) -> PhotonRecords:
             **arrays,
             derivatives=tuple(names),
             reasons=tuple(reasons),
-            ledger=read_ledger(file),
-            ledger_unit=file.real("ledger_unit", "(0, inf)"),
+            energy_balance=file.integers("energy_balance"),
+            energy_balance_unit=file.real("energy_balance_unit", "(0, inf)"),
         )

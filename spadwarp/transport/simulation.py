@@ -19,20 +19,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import spadwarp_kernels as sk
 from spadwarp.device import pick_devices, processor_name
-from spadwarp.errors import ConfigError, DeviceError, SpadwarpWarning
+from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning
+from spadwarp.limits import shown
 from spadwarp.mesh import focus_distance
 from spadwarp.parallel import Ray, interruptible
-from spadwarp.result import COMPONENTS, Result, Tallies
-from spadwarp.result.batch_moments import largest_share
-from spadwarp.result.file import ResultLike, as_result
-from spadwarp.result.merging import add_timing, check_capacity, check_focus, check_targets, join_provenance
+from spadwarp.result import COMPONENTS, Result, as_result, save_result
+from spadwarp.result.merging import add_timing, check_focus, check_targets, join_provenance
 from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
+from spadwarp.result.result import largest_share
+from spadwarp.result.tallies import check_capacity, total_of
 from spadwarp.scene import SceneLike, as_scene
-from spadwarp.transport.checkpoint import Checkpoint
 from spadwarp.transport.executor import Executor, Workers
-from spadwarp.transport.plan import Plan, make_plan
-from spadwarp.transport.stopping import FIRST_LOOK, StoppingRule
+from spadwarp.transport.plan import Plan, RunOptions, make_plan
+from spadwarp.transport.workers import ClusterWorkers, LocalWorkers
 from spadwarp.units import percent
 
 __all__ = ["Progress", "provenance", "simulate"]
@@ -44,6 +45,20 @@ Progress = Callable[[str, int, int], None]
 _LARGEST_ROUNDING_ERROR = 0.05
 _MANY = 10
 
+# Checkpoints take at most this share of the time.
+_LARGEST_SHARE = 0.02
+
+FIRST_LOOK = 32
+"""Batches after which a run whose goal is a relative error first looks at it."""
+
+# Photons beyond the number that should reach the goal, since most looks would else come a little too early.
+_RESERVE = 1.05
+# Errors of few batches may be far too large: at the next look there are at most so many times as many.
+_MOST = 8
+# A run whose error first reaches the goal goes on by this times the share of the variance that one batch has, at most
+# by as many photons again.
+_GOING_ON = 4.0
+
 
 def simulate(
     scene: SceneLike,
@@ -52,24 +67,18 @@ def simulate(
     seed: int | None = None,
     device: str | None = None,
     engine: Ray | None = None,
-    threads: int | None = None,
-    launch_size: int | None = None,
     progress: Progress | None = None,
     uncertainty: bool = False,
     relative_error: float | None = None,
-    first_photon: int = 0,
-    shard: tuple[int, int] | None = None,
-    resume: ResultLike | None = None,
-    checkpoint: str | Path | None = None,
-    checkpoint_every: float = 60.0,
-    tallies: Any = None,
-    kept: dict[str, Any] | None = None,
     derivatives: Iterable[str] | None = None,
     blocks: Sequence[int] | None = None,
+    tallies: Any = None,
+    mesh_cache: dict[str, Any] | None = None,
+    run: RunOptions | None = None,
 ) -> Result:
     """Traces photons through a scene into expected histograms per pixel.
 
-    One seed gives the same bits on one kind of device, whatever their number, the engine, `threads` and `launch_size`.
+    One seed gives the same bits on one kind of device, whatever their number, the engine and the `RunOptions`.
 
     Args:
         scene: From `spadwarp.load_scene`, or the path of its file.
@@ -79,31 +88,15 @@ def simulate(
         device: "cpu", "cuda:0", "cuda:0,cuda:2", or "cuda:all" for the GPUs of this host; by default the first GPU,
             else the CPU.
         engine: `spadwarp.Ray(...)` to run on its workers; `device` is then "cpu" or "cuda".
-        threads: CPU threads; by default one a core. A GPU takes none.
-        launch_size: Photons in one launch, up to 2^26, on the CPU 2^20.
         progress: Called from the caller's thread with ("compile", 0, 0) before kernels are compiled or loaded, then
             with ("trace", photons done, photons asked for); any other first word is a remark for the user.
-        uncertainty: Keep batches of photons, for `Result.standard_error`. Photons are rounded up to whole batches, by
-            at most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
+        uncertainty: Count photons in batches, for `Result.standard_error`. They are rounded up to whole batches, by at
+            most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
         relative_error: Stop when `Result.relative_error` is about this; implies `uncertainty`, and `photons` is the
             most that are traced. The error is looked at after 32 batches of 1/128 to 1/1024 of the photons, and then
             where it says that the goal will be reached, whatever the device. There the run goes on by a part of its
-            photons that is then fixed, so that it does not end because bright photons have not come yet; if they come
-            then, the error is larger than asked for. See "Which estimator, how many photons".
-        first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
-        shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
-        resume: A result of the same scene, or its path, to which photons are added until it has `photons`; the outcome
-            is that of one long run. Gaps in its ids are filled.
-        checkpoint: A file for the photons done so far, as a partial result that `resume` takes. It is not removed when
-            the run is done.
-        checkpoint_every: Seconds between checkpoints, at least; more where writing takes long, so that it costs 2 % of
-            the time at most.
-        tallies: The caller's own torch tensor or Warp array for the tallies, contiguous int64 of 3·H·W·T elements on
-            the device; what it holds is overwritten. Its contents are the result's tallies, which on the CPU share its
-            memory; `spadwarp.result.to_torch(result, tallies=…)` makes histograms of it where it lies. For one
-            device, without `resume`.
-        kept: A dict, empty at first, for runs of a scene that moves: it keeps the mesh on its devices, and where only
-            vertices moved its tree is refitted and not built anew. Without `engine`.
+            photons that is then fixed, so that it does not end because rare heavy photons have not arrived yet; if they
+            do then, the error is larger than asked for. See "Which estimator, how many photons".
         derivatives: Parameters by which the histogram is differentiated, for `Result.derivatives`, 8 at most:
             "medium.absorption", "medium.scattering", "medium.anisotropy", "medium.layers[1].scattering",
             "targets[0].reflectance"; short, "absorption", where one parameter alone can be meant. By default none, or
@@ -112,6 +105,13 @@ def simulate(
             of all blocks of a grid's cells, 4096 at most; `Result.derivatives` has all of them by that name.
         blocks: Number of blocks along the three edges of `medium.grid`, each a divisor of the number of cells there;
             by default one block.
+        tallies: The caller's own torch tensor or Warp array for the tallies, contiguous int64 of 3·H·W·T elements on
+            the device; what it holds is overwritten. Its contents are the result's tallies, which on the CPU share its
+            memory; `spadwarp.result.to_torch(result, tallies=…)` makes histograms of it where it lies. For one
+            device, without `resume`.
+        mesh_cache: A dict, empty at first, for runs of a scene that moves: it keeps the mesh on its devices, and where
+            only vertices moved its tree is refitted and not built anew. Without `engine`.
+        run: Threads and launches, photon ids of a part of a run, resuming and checkpoints; see `RunOptions`.
 
     Returns:
         The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
@@ -122,20 +122,21 @@ def simulate(
         DeviceError: A device failed during the run; the text names the checkpoint, if there is one.
         KeyboardInterrupt: Ctrl-C before the first launch was done, or a second Ctrl-C.
     """
-    if tallies is not None and (resume is not None or engine is not None):
-        raise ConfigError("tallies go without resume and engine: they hold one run of one device")
-    writer = Checkpoint(checkpoint, checkpoint_every)
-    resume = None if resume is None else as_result(resume, "resume")
+    run = RunOptions() if run is None else run
+    if not isinstance(run, RunOptions):
+        raise ArgumentError(f"run = {shown(run)} is not a RunOptions")
+    if tallies is not None and (run.resume is not None or engine is not None):
+        raise ConfigError("tallies cannot be combined with resume and engine: they hold one run of one device")
+    writer = Checkpoint(run.checkpoint, run.checkpoint_every)
+    resume = None if run.resume is None else as_result(run.resume, "resume")
     plan = make_plan(
         as_scene(scene),
+        run,
         photons=photons,
         seed=seed,
-        first_photon=first_photon,
-        shard=shard,
         batches=uncertainty,
         relative_error=relative_error,
         resume=resume,
-        launch_size=launch_size,
         derivatives=derivatives,
         blocks=blocks,
     )
@@ -145,12 +146,9 @@ def simulate(
             progress("compile", 0, 0)
         workers: Workers
         if engine is None:
-            from spadwarp.transport.local_workers import LocalWorkers
-
-            workers = LocalWorkers(plan, pick_devices(device), threads=threads, tallies=tallies, kept=kept)
+            devices = pick_devices(device)
+            workers = LocalWorkers(plan, devices, threads=run.threads, tallies=tallies, mesh_cache=mesh_cache)
         else:
-            from spadwarp.transport.ray_workers import ClusterWorkers
-
             note = None if progress is None else lambda text: progress(text, 0, 0)
             workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))
         try:
@@ -175,7 +173,7 @@ def _warn_of_rounding(result: Result) -> None:
             continue
         total, error = _units(tally), result.rounding_error[name]
         if error > _LARGEST_ROUNDING_ERROR:
-            text = f"adds {percent(error)} % to the error of an average lit bin" if total else "left none of it"
+            text = f"adds {percent(error)} % to the error of an average illuminated bin" if total else "left none of it"
             warnings.warn(
                 f"{name}: rounding to the histogram's unit {text}: {small} contributions of less than one unit came to "
                 f"{total} units in all; more photons help, and a later gate.start or narrower bins make the unit finer",
@@ -197,9 +195,6 @@ class _Run:
         self._plan, self._workers, self._resumed, self._checkpoint = plan, workers, resumed, checkpoint
         self._report = (lambda stage, done, total: None) if progress is None else progress
         self._unit = 1.0 / plan.scale
-        if resumed is not None and "channel" in resumed.provenance:
-            channel = resumed.provenance["channel"]
-            raise ConfigError(f"resume: the result holds {channel}-polarised light alone; resume the run that it is of")
         if resumed is not None and resumed.unit != self._unit:
             raise ConfigError(f"resume: the tally unit is {self._unit}, that of the result {resumed.unit}")
         self._focus_distance = focus_distance(plan.scene, plan.mesh)
@@ -260,17 +255,13 @@ class _Run:
 
     def _collect(self, done: Ranges) -> Result:
         """The result of the ids done, whose tallies the workers and the earlier result hold."""
-        import spadwarp_kernels as sk
-
         total, timing, made = self._workers.tallies(), dict(self._workers.timing), provenance()
         timing = {"truth": self._truth_seconds, **timing, "trace": time.perf_counter() - self._began}
         made |= self._workers.metadata()
         if self._resumed is None:
             check_capacity(total.tallies)
         else:
-            check_capacity(total.tallies, self._resumed.tallies)
-            total = Tallies.of(total)
-            total.add(self._resumed)
+            total = total_of(total, self._resumed)
         result = Result(
             scene=self._plan.scene,
             **vars(total),
@@ -278,7 +269,7 @@ class _Run:
             focus_distance=self._focus_distance,
             photons=count(done),
             seed=self._plan.seed,
-            ledger_unit=sk.LEDGER_UNIT,
+            energy_balance_unit=sk.LEDGER_UNIT,
             truth=self._truth,
             timing=timing,
             provenance=made,
@@ -287,13 +278,79 @@ class _Run:
             requested=self._plan.ids,
             partial=bool(without(self._plan.ids, done)),
         )
-        if difference := result.ledger_report()["difference"]:
-            raise DeviceError(f"the energy ledger is off by {difference} units: a device has lost counts")
+        if difference := result.energy_report()["difference"]:
+            raise DeviceError(f"the energy balance is off by {difference} units: a device has lost counts")
         if self._resumed is None:
             return result
         own = tuple(span for ids in done for span in without(ids, self._earlier))
         parts = [(self._resumed.provenance, self._resumed.photon_ranges), *([(made, own)] if own else [])]
         return replace(result, timing=add_timing([timing, self._resumed.timing]), provenance=join_provenance(parts))
+
+
+class Checkpoint:
+    """A file that is written again and again.
+
+    Args:
+        path: The file; None: no checkpoints.
+        every: Seconds between two of them, at least.
+
+    Attributes:
+        photons: In the file; 0 before the first.
+    """
+
+    def __init__(self, path: str | Path | None, every: float) -> None:
+        self.path, self.photons, self._every = path, 0, every
+        self._written, self._cost = time.monotonic(), 0.0
+
+    def is_due(self) -> bool:
+        pause = max(self._every, self._cost / _LARGEST_SHARE)
+        return self.path is not None and time.monotonic() >= self._written + pause
+
+    def write(self, collect: Callable[[], Result]) -> None:
+        """Writes a result; where that fails the run continues, as the disk may have space again later."""
+        assert self.path is not None
+        began = time.monotonic()
+        try:
+            result = collect()
+            save_result(result, self.path)
+            self.photons = result.photons
+        except FileError as error:
+            warnings.warn(f"no checkpoint, the run continues: {error}", RuntimeWarning, stacklevel=2)
+        self._written = time.monotonic()
+        self._cost = self._written - began
+
+
+class StoppingRule:
+    """The rule of one run.
+
+    It looks for the number of photons at which the error reaches the goal. A run that ended there would end where rare
+    bright photons have not come yet: too dark, with an error that is too small. So it goes on by a part of these
+    photons that is fixed there and then, and ends whatever the last of them bring. The part is small where many photons
+    matter equally, 40 to 80 batches; where few decide it is as many photons again, so that half had no say in it.
+
+    Args:
+        goal: Relative error.
+    """
+
+    def __init__(self, goal: float) -> None:
+        self._goal, self._found = goal, False
+
+    def next_look(self, batches: int, error: float, share: Callable[[], float]) -> int | None:
+        """Batches at the next look; None if the run ends.
+
+        Args:
+            batches: So far.
+            error: Relative error after these, infinite if it is not known.
+            share: Gives the part of the variance between batches that one of them has, in [0, 1].
+        """
+        if self._found:
+            return None
+        if error <= self._goal:
+            self._found = True
+            return batches + math.ceil(batches * min(1.0, _GOING_ON * share()))
+        most, excess = _MOST * batches, error / self._goal
+        wanted = math.ceil(_RESERVE * batches * excess**2) if excess < math.inf else most
+        return min(max(wanted, batches + max(1, batches // 16)), most)
 
 
 def provenance(device: Any = None) -> dict[str, Any]:

@@ -91,8 +91,8 @@ def _ledger(run: Run) -> list[Quantity]:
             rules: dict[str, Any] = {"estimator": estimator, "termination": termination, "weight_cutoff": cutoff}
             missing, gains = 0, []
             for result in run.results(scene(water, laser, **common, **rules)):
-                emitted = result.photons / result.ledger_unit
-                entries = {name: value for name, value in result.ledger.items() if name != "emitted"}
+                emitted = result.photons / result.energy_balance_unit
+                entries = {name: value for name, value in result.energy_balance.items() if name != "emitted"}
                 missing += abs(round(emitted) - sum(entries.values()))
                 gains.append(
                     [entries.get(entry, 0) / emitted for entry in ("roulette", "importance_sampling_residual")]

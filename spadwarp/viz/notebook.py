@@ -182,7 +182,7 @@ def _scene_figure(scene: Scene, device: Any, width: float) -> Figure:
 
 def _result_rows(result: Result) -> dict[str, str]:
     numbers = result.summary()
-    gate, depth = numbers["gate"], numbers["truth"]["depth_m"]
+    gate, depth, energy = numbers["gate"], numbers["truth"]["depth_m"], numbers["energy_balance"]
     fractions = ", ".join(
         f"{name.replace('_', '-')} {part:.3g}" for name, part in numbers["collected_fraction"].items()
     )
@@ -193,7 +193,7 @@ def _result_rows(result: Result) -> dict[str, str]:
         "truth": "no target" if depth is None else f"{depth[0]:.4g} to {depth[1]:.4g} m",
         "collected": f"{fractions} of the emitted light",
         "detections": f"{numbers['detections_per_pulse']:.4g} a pulse, all pixels",
-        "energy balance": "exact" if numbers["ledger"]["exact"] else f"off by {numbers['ledger']['difference']} units",
+        "energy balance": "exact" if energy["exact"] else f"off by {energy['difference']} units",
     }
 
 

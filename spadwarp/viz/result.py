@@ -22,8 +22,7 @@ from spadwarp.frames import METHODS, Frames, FramesFile, Method, Recording, firs
 from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
 from spadwarp.result import COMPONENTS, Result, degree_of_polarisation
-from spadwarp.result.batch_moments import pixel_standard_error
-from spadwarp.result.received import received_by_pixel
+from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.units import rounded
@@ -226,7 +225,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     # a dotted one above them, hide neither each other nor them.
     channel_styles = ((PURPLE, "-", 3.0, 1.5), ("black", (0, (1, 1.5)), 1.1, 4)) if result.channels else ()
     for (channel, label), (colour, line, linewidth, zorder) in zip(CHANNEL_NAMES.items(), channel_styles, strict=False):
-        seen = received_by_pixel(result, channel, row, column).sum(axis=0) * per_pulse
+        seen = pixel_channel(result, channel, row, column).sum(axis=0) * per_pulse
         axis.stairs(
             np.maximum(merged_means(seen, edges), 0.01 * bottom), time[edges], baseline=None,
             label=label, color=colour, linewidth=linewidth, linestyle=line, zorder=zorder,

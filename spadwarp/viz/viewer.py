@@ -27,7 +27,7 @@ from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.spad import noise_caption
 from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.limits import check_choice, check_integer, check_real
-from spadwarp.result import Channel, Result, received
+from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.viz import style
@@ -97,7 +97,7 @@ def view(
         path: The file to write.
         method: Estimator of depth; default: "centroid" for a result, the last of the file for frames.
         frame: Number of the frame, from 0, where the source holds frames.
-        channel: Of a result: which light counts, see `spadwarp.result.received`.
+        channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
         device: Warp device for the depth frame.
 
     Raises:
@@ -113,7 +113,7 @@ def view(
     if isinstance(held, SequenceFile):
         raise ArgumentError(f"{held.path} holds a scene that moves: `spadwarp video` shows it, frame by frame")
     if isinstance(held, Result):
-        page = _of_result(received(held, channel), method, device)
+        page = _of_result(analyser_channel(held, channel), method, device)
     elif channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels")
     else:

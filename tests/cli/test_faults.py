@@ -64,7 +64,7 @@ def test_a_run_whose_directory_is_removed_is_written_all_the_same(scene, tmp_pat
     _, complaints = process.communicate(timeout=120)
     assert process.returncode == 130, complaints
     result = spadwarp.load_result(out / "result.h5")
-    assert result.partial and result.ledger_report()["exact"]
+    assert result.partial and result.energy_report()["exact"]
     again = spadwarp.simulate(spadwarp.load_scene(scene), photons=min(result.photons, 50_000), device="cpu")
     assert again.tallies.sum() <= result.tallies.sum()
 

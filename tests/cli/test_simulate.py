@@ -26,7 +26,7 @@ def test_simulate_writes_what_python_computes(scene, tmp_path):
     twin = spadwarp.simulate(spadwarp.load_scene(scene, ["medium.extinction=0.5", "output.png=true"]), device="cpu")
     result = spadwarp.load_result(out / "result.h5")
     assert np.array_equal(result.tallies, twin.tallies)
-    assert result.ledger == twin.ledger
+    assert result.energy_balance == twin.energy_balance
     assert result.scene == twin.scene == spadwarp.load_scene(out / "scene.toml")
     assert {path.name for path in out.iterdir()} == FILES | PICTURES
     assert np.array_equal(read_exr(out / "depth.exr")[0]["Z"], twin.depth().astype(np.float32), equal_nan=True)
@@ -103,7 +103,7 @@ def test_records_are_those_of_trace(scene, tmp_path):
     twin = spadwarp.transport.trace(spadwarp.load_scene(scene), photons=1000, device="cpu")
     for name in ("id", "position", "direction", "weight", "path", "collisions", "reason"):
         assert np.array_equal(getattr(records, name), getattr(twin, name)), name
-    assert (records.reasons, records.ledger) == (twin.reasons, twin.ledger)
+    assert (records.reasons, records.energy_balance) == (twin.reasons, twin.energy_balance)
 
 
 def test_mesh_takes_the_place_of_the_first_target(scene, tmp_path):

@@ -128,8 +128,6 @@ def test_a_dataset_that_is_not_as_it_should_be_is_refused_by_name(name, way, val
     path = copy / name
     # Optional ones may be missing.
     optional = {
-        "requested",
-        "batch_moments",
         "expected",
         "background",
         "counts",

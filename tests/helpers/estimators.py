@@ -18,10 +18,19 @@ def cells(one, device, photons, seeds=32, pixels=False):
     for seed in range(seeds):
         result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
         assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
-        assert result.ledger_report()["exact"]
+        assert result.energy_report()["exact"]
         parts = [result.tallies.sum(axis=(1, 2)), result.tallies.sum(axis=(0, 3))][: 2 if pixels else 1]
         rows.append(np.concatenate([part.ravel() for part in parts]) * (result.unit / photons))
     return np.array(rows)
+
+
+def means(one, device, photons, seeds):
+    """Fractions of emitted photons in all pixels: mean and standard error by bin, then of all bins together."""
+    runs = [spadwarp.simulate(one, photons=photons, seed=seed, device=device) for seed in range(seeds)]
+    rows = np.array([run.tallies.sum(axis=(0, 1, 2)) * (run.unit / photons) for run in runs])
+    totals = rows.sum(axis=1)
+    error, total_error = (part.std(axis=0, ddof=1) / math.sqrt(seeds) for part in (rows, totals))
+    return rows.mean(axis=0), error, totals.mean(), total_error
 
 
 def clear_at_the_lens(one):

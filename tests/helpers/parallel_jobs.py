@@ -34,4 +34,6 @@ def shots(job, worker):
     import spadwarp
     from helpers.scenes import scene
 
-    return spadwarp.simulate(scene(), photons=2000, seed=job, device=worker.device, threads=1).tallies
+    return spadwarp.simulate(
+        scene(), photons=2000, seed=job, device=worker.device, run=spadwarp.RunOptions(threads=1)
+    ).tallies

@@ -8,7 +8,7 @@ RUN = {"photons": PHOTONS, "seed": 5}
 
 def same(a, b):
     assert a.tallies.tobytes() == b.tallies.tobytes()
-    assert a.ledger == b.ledger and a.counters == b.counters
+    assert a.energy_balance == b.energy_balance and a.counters == b.counters
     assert tuple(a.photon_ranges) == tuple(b.photon_ranges) and a.requested == b.requested and a.partial == b.partial
     assert (a.second_moment is None) == (b.second_moment is None)
     if a.second_moment is not None:

@@ -13,6 +13,45 @@ PLATE = {"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2],
 # Of so many faces that a GPU walks down a tree to them.
 TREE = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 
+# Water that differs from place to place: in layers, and in cells.
+LAYERS = [
+    {"start": 1.2, "extinction": 1.5, "albedo": 0.6, "anisotropy": 0.5},
+    {"start": 1.7, "extinction": 0.2, "albedo": 0.9},
+]
+PLUME = {
+    "shape": "plume",
+    "size": [1.4, 1.4, 1.2],
+    "cells": 24,
+    "extinction": 6.0,
+    "albedo": 0.7,
+    "anisotropy": 0.6,
+    "turbulence": 0.5,
+    "seed": 5,
+    "translation": [0.0, 0.0, 1.2],
+}
+PENCIL = {"profile": "collimated", "position": [0.0, 0.0, 0.0]}
+
+
+def scattered_once(medium, edges, estimator="guided"):
+    """Light of a pencil beam at x = -0.1 m that scatters once, by bins of path [m]."""
+    gate = {"start_ns": edges[0] / 0.299792458, "bin_width_ps": 1e3 * (edges[1] - edges[0]) / 0.299792458}
+    return scene(
+        medium=medium,
+        laser={**PENCIL, "position": [-0.1, 0.0, 0.0]},
+        camera={"aperture_diameter": 0.01},
+        gate={**gate, "bins": len(edges) - 1},
+        targets=[],
+        transport={"estimator": estimator, "max_collisions": 1},
+    )
+
+
+def half_spaces(folder, step=1.25):
+    """Two cells, a step from c = 0.3 to 1.2 at z = `step` m: c and b of both, and the grid."""
+    c, b = np.array([0.3, 1.2]), np.array([0.24, 0.6])
+    path = folder / "halves.npz"
+    np.savez(path, extinction=c.reshape(1, 1, 2), scattering=b.reshape(1, 1, 2), size=[80.0, 80.0, 40.0])
+    return c, b, {"file": str(path), "translation": [0.0, 0.0, step]}
+
 
 def scene(**sections):
     """A 4 x 4 pixel scene in which even `analog` converges: a wide lens and a near plate; sections change it."""

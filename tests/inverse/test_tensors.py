@@ -64,7 +64,9 @@ def test_blocks_of_a_grid(tmp_path):
     torch.testing.assert_close(light, torch.tensor(spadwarp.simulate(one, **choices).detections), rtol=1e-3, atol=0)
     light.sum().backward()
     names = ["medium.grid.extinction", "reflectance"]
-    other = spadwarp.simulate(one, first_photon=20_000, derivatives=names, blocks=(2, 1, 2), **choices)
+    other = spadwarp.simulate(
+        one, derivatives=names, blocks=(2, 1, 2), **choices, run=spadwarp.RunOptions(first_photon=20_000)
+    )
     scale = one.laser.photons_per_pulse * one.detections_per_photon
     expected = scale * other.derivatives[names[0]].sum(axis=(3, 4, 5, 6))
     np.testing.assert_allclose(means.grad, expected, rtol=1e-3)

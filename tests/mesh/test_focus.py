@@ -91,4 +91,9 @@ def test_a_result_knows_its_focus_and_is_added_to_its_like_alone(tmp_path):
     with pytest.raises(ConfigError, match=r"merge: the lenses of the results differ: focus_distance is 2\.2"):
         spadwarp.merge([far, other])
     with pytest.raises(ConfigError, match="resume: the lenses of the results differ: focus_distance is None and 2"):
-        spadwarp.simulate(far.scene, photons=2000, resume=dataclasses.replace(far, focus_distance=None), device="cpu")
+        spadwarp.simulate(
+            far.scene,
+            photons=2000,
+            device="cpu",
+            run=spadwarp.RunOptions(resume=dataclasses.replace(far, focus_distance=None)),
+        )

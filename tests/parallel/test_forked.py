@@ -58,7 +58,7 @@ def test_an_interrupt_while_results_are_awaited_is_raised_as_it_is(tmp_path, mon
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("spadwarp.parallel.forked.select.select", interrupted)
+    monkeypatch.setattr("multiprocessing.connection.Connection.poll", interrupted)
     with pytest.raises(KeyboardInterrupt), Forked([slow, slow]) as forked:
         forked.results()
     time.sleep(1.2)

@@ -14,6 +14,7 @@ from helpers import parallel_jobs
 from helpers.datasets import checksums, recipe
 from helpers.runs import PHOTONS, RUN, same
 from helpers.scenes import scene
+from spadwarp import RunOptions, simulate
 from spadwarp.parallel import Ray, interruptible, run_jobs
 
 ENGINES = {"here": {"device": "cpu"}, "processes": {"device": "cpu,cpu"}, "ray": {"engine": Ray(workers=2)}}
@@ -76,7 +77,7 @@ def test_after_an_interrupt_no_job_is_begun_and_those_begun_are_finished(options
 @pytest.mark.slow
 def test_simulations_do_not_depend_on_who_runs_them():
     for seed, tallies in run_jobs(parallel_jobs.shots, [3, 4], **ENGINES["processes"]):
-        alone = spadwarp.simulate(scene(), photons=2000, seed=seed, device="cpu")
+        alone = simulate(scene(), photons=2000, seed=seed, device="cpu")
         np.testing.assert_array_equal(tallies, alone.tallies)
 
 
@@ -103,30 +104,28 @@ class Killer:
 @pytest.mark.parametrize(("uncertainty", "kills"), [(False, 3), (True, 1)])
 def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, uncertainty, kills, whole, tmp_path):
     killer = Killer(kills, seed=kills)
-    options = {"uncertainty": uncertainty, "checkpoint": tmp_path / "checkpoint.h5", "checkpoint_every": 0.0}
-    run = spadwarp.simulate(scene(), **RUN, engine=Ray(workers=2), progress=killer, **options)
+    run = RunOptions(checkpoint=tmp_path / "checkpoint.h5", checkpoint_every=0.0)
+    options = {"uncertainty": uncertainty, "run": run}
+    run = simulate(scene(), **RUN, engine=Ray(workers=2), progress=killer, **options)
     same(run, whole[uncertainty])
     assert killer.left == 0 and sum(remark.startswith("lost the worker") for remark in killer.remarks) == kills
     assert kills + 1 <= len(run.provenance["workers"]) <= kills + 2 and run.provenance["device"] == "2 Ray workers"
     # The checkpoint is consistent, whatever was lost, and can be resumed.
     kept = spadwarp.load_result(tmp_path / "checkpoint.h5")
-    assert kept.partial and 0 < kept.photons < PHOTONS and kept.ledger_report()["exact"]
-    same(spadwarp.simulate(scene(), device="cpu", resume=kept), whole[uncertainty])
+    assert kept.partial and 0 < kept.photons < PHOTONS and kept.energy_report()["exact"]
+    same(simulate(scene(), device="cpu", run=RunOptions(resume=kept)), whole[uncertainty])
 
 
 def test_a_run_can_be_resumed_over_ray(cluster, whole):
-    parts = [spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=True, shard=(n, 5)) for n in (5, 1)]
+    parts = [simulate(scene(), **RUN, device="cpu", uncertainty=True, run=RunOptions(shard=(n, 5))) for n in (5, 1)]
     gaps = spadwarp.merge(parts)
-    same(spadwarp.simulate(scene(), engine=Ray(workers=1), resume=gaps), whole[True])
+    same(simulate(scene(), engine=Ray(workers=1), run=RunOptions(resume=gaps)), whole[True])
     assert gaps.photons < PHOTONS / 2  # untouched
 
 
 def test_the_stopping_rule_is_the_same_over_ray(cluster):
     options = {"photons": 2**20, "seed": 1, "relative_error": 0.1}
-    same(
-        spadwarp.simulate(scene(), **options, engine=Ray(workers=1)),
-        spadwarp.simulate(scene(), **options, device="cpu"),
-    )
+    same(simulate(scene(), **options, engine=Ray(workers=1)), simulate(scene(), **options, device="cpu"))
 
 
 def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
@@ -136,11 +135,11 @@ def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
             signal.raise_signal(signal.SIGINT)
 
     fired = []
-    part = spadwarp.simulate(scene(), photons=10**8, seed=5, engine=Ray(workers=2), progress=interrupt)
-    assert part.partial and 10_000 <= part.photons < 10**8 and part.ledger_report()["exact"]
+    part = simulate(scene(), photons=10**8, seed=5, engine=Ray(workers=2), progress=interrupt)
+    assert part.partial and 10_000 <= part.photons < 10**8 and part.energy_report()["exact"]
     # The photons it has, whichever they are, are those of a local run.
     parts = [
-        spadwarp.simulate(scene(), photons=stop - start, first_photon=start, seed=5, device="cpu")
+        simulate(scene(), photons=stop - start, seed=5, device="cpu", run=RunOptions(first_photon=start))
         for start, stop in part.photon_ranges
     ]
     assert spadwarp.merge(parts).tallies.tobytes() == part.tallies.tobytes()
@@ -148,9 +147,9 @@ def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
 
 def test_what_ray_cannot_do_is_refused(cluster):
     with pytest.raises(spadwarp.ConfigError, match="cuda:1"):
-        spadwarp.simulate(scene(), **RUN, device="cuda:1", engine=Ray())
+        simulate(scene(), **RUN, device="cuda:1", engine=Ray())
     with pytest.raises(spadwarp.DeviceError, match="no GPU"):
-        spadwarp.simulate(scene(), **RUN, device="cuda", engine=Ray())
+        simulate(scene(), **RUN, device="cuda", engine=Ray())
     with pytest.raises(spadwarp.ArgumentError, match="workers = 0 is outside"):
         Ray(workers=0)
     with pytest.raises(spadwarp.ArgumentError, match="address = 5 is not text"):

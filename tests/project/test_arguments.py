@@ -55,7 +55,9 @@ RESULT_FUNCTIONS = {
     "detect": lambda one: spadwarp.detect(one, pulses=10, seed=1, device="cpu").counts,
     "crlb": lambda one: spadwarp.crlb(one, device="cpu"),
     "merge": lambda one: spadwarp.merge([one]).tallies,
-    "resume": lambda one: spadwarp.simulate(scene(**ROOM), photons=1500, resume=one, device="cpu").tallies,
+    "resume": lambda one: (
+        spadwarp.simulate(scene(**ROOM), photons=1500, device="cpu", run=spadwarp.RunOptions(resume=one)).tallies
+    ),
 }
 
 
@@ -82,7 +84,9 @@ def test_merge_takes_a_list(wrong):
 
 
 def test_integral_floats_are_integers():
-    one = spadwarp.simulate(scene(), photons=1e3, seed=3.0, threads=1.0, launch_size=2.0**9, device="cpu")
+    one = spadwarp.simulate(
+        scene(), photons=1e3, seed=3.0, device="cpu", run=spadwarp.RunOptions(threads=1.0, launch_size=2.0**9)
+    )
     other = spadwarp.simulate(scene(), photons=1000, seed=np.uint64(3), device="cpu")
     assert one.photons == 1000 and one.tallies.tobytes() == other.tallies.tobytes()
     light = np.full((2, 2, 5), 0.1)
@@ -97,10 +101,13 @@ NUMBERS = {
     "simulate": (lambda **one: spadwarp.simulate(scene(), device="cpu", **one), {
         "photons": [0, 1.5, 1e13, math.nan, "1e5", True, [5]],
         "seed": [-1, 2**64, 0.5, math.inf],
-        "first_photon": [-1, 1e300],
+        "relative_error": [0, 1, math.nan, "2 %"],
+        "run": [{"threads": 2}, 5],
+    }),
+    "RunOptions": (spadwarp.RunOptions, {
+        "first_photon": [-1, 1e300, None],
         "threads": [0, 1e9, "all"],
         "launch_size": [0, 2**40, 1.5],
-        "relative_error": [0, 1, math.nan, "2 %"],
         "checkpoint_every": [-1, math.nan, None],
     }),
     "detect": (lambda **one: spadwarp.detect(CUBE, device="cpu", **{**AXIS, **FREE, **one}), {

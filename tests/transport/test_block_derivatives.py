@@ -9,10 +9,9 @@ from scipy import stats
 from scipy.integrate import quad
 
 import spadwarp
-from helpers.cli import run
-from helpers.scenes import scene
+from helpers.scenes import PENCIL, half_spaces, scattered_once, scene
+from spadwarp import simulate
 from spadwarp.transport import derivative_names, resolve_derivatives, trace
-from spadwarp.units import SPEED_OF_LIGHT
 
 pytestmark = pytest.mark.physics
 
@@ -31,7 +30,7 @@ def everywhere(tmp_path_factory):
 
 
 def simulated(one, device, derivatives=NAMES, blocks=(1, 1, 1), photons=60_000, **choices):
-    return spadwarp.simulate(one, photons=photons, device=device, derivatives=derivatives, blocks=blocks, **choices)
+    return simulate(one, photons=photons, device=device, derivatives=derivatives, blocks=blocks, **choices)
 
 
 @pytest.mark.parametrize(
@@ -40,13 +39,13 @@ def simulated(one, device, derivatives=NAMES, blocks=(1, 1, 1), photons=60_000, 
 def test_blocks_share_the_derivatives_of_one_water(estimator, tracking, everywhere, device):
     """The same photons; with the derivatives of a target beside them."""
     transport = {"estimator": estimator}
-    whole = spadwarp.simulate(scene(transport=transport), photons=60_000, device=device, derivatives=WATER)
+    whole = simulate(scene(transport=transport), photons=60_000, device=device, derivatives=WATER)
     one = scene(medium={"grid": {**everywhere, "tracking": tracking}}, transport=transport)
-    plain = spadwarp.simulate(one, photons=60_000, device=device)
+    plain = simulate(one, photons=60_000, device=device)
     result = simulated(one, device, WITH_TARGET, (4, 3, 5))
     # On a GPU products are rounded with sums (FMA), in kernels of two texts not the same ones.
     np.testing.assert_allclose(result.tallies, plain.tallies, rtol=0 if device == "cpu" else 1e-6, atol=device != "cpu")
-    assert (result.ledger, result.counters) == (plain.ledger, plain.counters)
+    assert (result.energy_balance, result.counters) == (plain.energy_balance, plain.counters)
     assert list(result.derivatives)[:2] == [WATER[3], "medium.grid.absorption[0,0,0]"]
     assert len(result.derivatives) == 1 + 3 * 60
     rtol = 1e-5 if device == "cpu" else 2e-2  # on a GPU some histories differ
@@ -65,7 +64,7 @@ def test_ballistic_light_in_closed_form(everywhere, device):
     grid = {"shape": "plume", "size": 1.2, "cells": 24, "extinction": 3.0, "turbulence": 0.5, "seed": 5}
     one = scene(
         medium={"grid": {**grid, "translation": [0.0, 0.1, 1.2], "tracking": "regular"}},
-        laser={"profile": "collimated", "position": [0.0, 0.0, 0.0]},
+        laser=PENCIL,
         camera={"aperture_diameter": 0.02},
         transport={"estimator": "guided"},
     )
@@ -78,28 +77,12 @@ def test_ballistic_light_in_closed_form(everywhere, device):
         np.testing.assert_allclose(lengths, expected, atol=0.004)
 
 
-def _pencil(grid, edges):
-    """Light that scatters once, of a pencil beam at x = -0.1 m."""
-    speed = SPEED_OF_LIGHT
-    gate = {"start_ns": 1e9 * edges[0] / speed, "bin_width_ps": 1e12 * (edges[1] - edges[0]) / speed}
-    return scene(
-        medium={"grid": grid},
-        laser={"profile": "collimated", "position": [-0.1, 0.0, 0.0]},
-        camera={"aperture_diameter": 0.01},
-        gate={**gate, "bins": len(edges) - 1},
-        targets=[],
-        transport={"estimator": "guided", "max_collisions": 1},
-    )
-
-
 @pytest.mark.parametrize("tracking", ["regular", "delta"])
 def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp_path, device):
     """Two blocks, a step from c 0.3 to 1.2 at z = 1.25 m; 0.3 % of the largest bin, and 4 standard errors."""
-    c, b, step = np.array([0.3, 1.2]), np.array([0.24, 0.6]), 1.25
-    path = tmp_path / "halves.npz"
-    np.savez(path, extinction=c.reshape(1, 1, 2), scattering=b.reshape(1, 1, 2), size=[80.0, 80.0, 40.0])
-    edges = np.arange(1.5, 4.01, 0.25)
-    one = _pencil({"file": str(path), "translation": [0.0, 0.0, step], "tracking": tracking}, edges)
+    step, edges = 1.25, np.arange(1.5, 4.01, 0.25)
+    c, b, grid = half_spaces(tmp_path, step)
+    one = scattered_once({"grid": {**grid, "tracking": tracking}}, edges)
     g, area = one.medium.anisotropy, one.camera.aperture_area
 
     def slope(z, kind, block):
@@ -148,28 +131,13 @@ def test_central_differences_in_a_plume(tmp_path, device):
             changed, first = one(**{kind: sign * step}), 1000 * (2 * number + 3 + sign)
             both.append(
                 [
-                    spadwarp.simulate(changed, photons=photons, seed=first + k, device=device).histogram.sum(
-                        axis=(0, 1)
-                    )
+                    simulate(changed, photons=photons, seed=first + k, device=device).histogram.sum(axis=(0, 1))
                     for k in range(seeds)
                 ]
             )
         differences = (np.array(both[0]) - both[1])[:, bins] / (2.0 * step)
         p_values += list(stats.ttest_ind(slopes, differences, equal_var=False).pvalue)
     assert min(p_values) * len(p_values) > 1e-3, p_values
-
-
-def test_files_merge_and_resume(everywhere, tmp_path):
-    one = scene(medium={"grid": {**everywhere, "tracking": "delta"}}, transport={"estimator": "next_event"})
-    asked = one, "cpu", WITH_TARGET, (2, 1, 5)
-    whole = simulated(*asked, 4096, uncertainty=True)
-    halves = [simulated(*asked, 4096, uncertainty=True, shard=(k, 2)) for k in (1, 2)]
-    resumed = spadwarp.simulate(one, photons=4096, device="cpu", resume=simulated(*asked, 2048))
-    loaded = spadwarp.load_result(whole.save(tmp_path / "result.h5"))
-    for other in (loaded, spadwarp.merge(halves), resumed):
-        np.testing.assert_array_equal(other.derivatives[NAMES[1]], whole.derivatives[NAMES[1]])
-    assert loaded.derivative_errors[NAMES[0]].shape == (2, 1, 5, 4, 4, 8)
-    assert "medium.grid.scattering of 2 x 1 x 5 blocks" in run("info", tmp_path / "result.h5").stdout
 
 
 def test_names_and_what_is_refused(everywhere, tmp_path):
@@ -187,10 +155,10 @@ def test_names_and_what_is_refused(everywhere, tmp_path):
         (one, NAMES[0], (4, 3, 4), "possible are 1, 2, 5, 10"),
         (one, NAMES[0], (4, 3), "list of 3 whole numbers"),
         (one, "medium.grid.anisotropy", None, "is not one of medium.grid.absorption"),
-        (one, names[1], (1, 2, 1), "blocks go with names of all blocks"),
+        (one, names[1], (1, 2, 1), "blocks need names of all blocks"),
         (one, "medium.grid.absorption[0,1,0]", None, "are not all blocks in their order"),
         (one, "absorption", None, "medium.grid.absorption and others go by block"),
-        (one, "reflectance", (1, 1, 1), "blocks go with derivatives by"),
+        (one, "reflectance", (1, 1, 1), "blocks need derivatives by"),
         (scene(), NAMES[0], None, "has no medium.grid"),
         (clear, NAMES[1], None, "is 0 in 8 of 8 cells"),
         (scene(medium={"grid": everywhere}, domain=walls), NAMES[0], None, "leave out domain.outside_index"),
@@ -203,6 +171,4 @@ def test_names_and_what_is_refused(everywhere, tmp_path):
         trace(one, photons=100, device="cpu", derivatives=NAMES[:1])
     large = {"width": 2000, "height": 2000}
     with pytest.raises(spadwarp.ConfigError, match="fewer pixels, bins or blocks"):
-        spadwarp.simulate(
-            scene(medium={"grid": everywhere}, camera=large), derivatives=NAMES, blocks=(8, 6, 10), photons=10
-        )
+        simulate(scene(medium={"grid": everywhere}, camera=large), derivatives=NAMES, blocks=(8, 6, 10), photons=10)

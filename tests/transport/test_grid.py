@@ -10,18 +10,13 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 import spadwarp
-from helpers.estimators import agreeing_cells, cells
-from helpers.scenes import scene
+from helpers.estimators import agreeing_cells, cells, means
+from helpers.scenes import LAYERS, PLUME, half_spaces, scattered_once, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene.medium import grid_cells
-from spadwarp.units import SPEED_OF_LIGHT
 
 pytestmark = pytest.mark.physics
 
-LAYERS = [
-    {"start": 1.2, "extinction": 1.5, "albedo": 0.6, "anisotropy": 0.5},
-    {"start": 1.7, "extinction": 0.2, "albedo": 0.9},
-]
 TRACKING = ("regular", "delta")
 
 
@@ -64,7 +59,7 @@ def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, devic
         )
         for medium in ({}, {"grid": {**one_water, "tracking": tracking}})
     )
-    assert cellular.tallies.any() and cellular.ledger_report()["exact"] and cellular.counters["invalid"] == 0
+    assert cellular.tallies.any() and cellular.energy_report()["exact"] and cellular.counters["invalid"] == 0
     rtol = 0.05 if (estimator, tracking) == ("guided", "delta") else 2e-3 if device == "cpu" else 2e-2
     np.testing.assert_allclose(
         cellular.histogram.sum(axis=(0, 1)), plain.histogram.sum(axis=(0, 1)), rtol=rtol, atol=1e-6
@@ -102,19 +97,6 @@ def test_cells_that_repeat_layers_have_their_expectation(estimator, layered_cell
     assert equal_means_p(found, layered, 0.2) > 1e-3
 
 
-PLUME = {
-    "shape": "plume",
-    "size": [1.4, 1.4, 1.2],
-    "cells": 24,
-    "extinction": 6.0,
-    "albedo": 0.7,
-    "anisotropy": 0.6,
-    "turbulence": 0.5,
-    "seed": 5,
-    "translation": [0.0, 0.0, 1.2],
-}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("tracking", TRACKING)
 def test_estimators_agree_through_a_plume(tracking, device):
@@ -124,23 +106,6 @@ def test_estimators_agree_through_a_plume(tracking, device):
     few = {"analog": 30_000, "next_event": 12_000, "guided": 12_000}
     found = agreeing_cells(one, device, photons=few if tracking == "delta" else {"guided": 12_000, "analog": 30_000})
     assert (found["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
-
-
-@pytest.mark.parametrize("tracking", TRACKING)
-@pytest.mark.parametrize("estimator", ["next_event", "guided"])
-def test_ballistic_light_is_weakened_by_the_cells_on_its_way(estimator, tracking, device):
-    """Pencil beam onto a plate: R/pi exp(-2 tau) A/d^2 to 1 %."""
-    one = scene(
-        medium={"grid": {**PLUME, "tracking": tracking}},
-        laser={"profile": "collimated", "position": [0.0, 0.0, 0.0]},
-        camera={"aperture_diameter": 0.02},
-        transport={"estimator": estimator},
-    )
-    depth = one.medium.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, 2.2))
-    assert depth > 1.2
-    result = spadwarp.simulate(one, photons=400_000, seed=3, device=device)
-    expected = 0.7 / math.pi * math.exp(-2.0 * depth) * math.pi * 0.01**2 / 2.2**2
-    assert result.component("ballistic").sum() == pytest.approx(expected, rel=0.02)
 
 
 # Single scatter of a pencil beam at x = -0.1 m, in cells, against the integral along it
@@ -179,30 +144,6 @@ def _in_bins(one, edges):
     return np.histogram(z + np.hypot(0.1, z), edges, weights=value)[0]
 
 
-def _measured(one, photons, seeds, device):
-    rows = [
-        spadwarp.simulate(one, photons=photons, seed=seed, device=device).component("backscatter").sum(axis=(0, 1))
-        for seed in range(seeds)
-    ]
-    return np.mean(rows, axis=0), np.std(rows, axis=0, ddof=1) / math.sqrt(seeds)
-
-
-def _pencil(medium, edges, estimator):
-    gate = {
-        "start_ns": 1e9 * edges[0] / SPEED_OF_LIGHT,
-        "bin_width_ps": 1e12 * (edges[1] - edges[0]) / SPEED_OF_LIGHT,
-        "bins": len(edges) - 1,
-    }
-    return scene(
-        medium=medium,
-        laser={"profile": "collimated", "position": [-0.1, 0.0, 0.0]},
-        camera={"aperture_diameter": 0.01},
-        gate=gate,
-        targets=[],
-        transport={"estimator": estimator, "max_collisions": 1},
-    )
-
-
 @pytest.mark.parametrize("tracking", TRACKING)
 def test_single_scatter_of_a_gaussian_cloud_is_that_of_the_integral(tracking, device):
     """Optical depth 2 on the axis. By bins that of the cells, in sum that of the cloud: 0.3 %, 4 standard errors."""
@@ -210,11 +151,11 @@ def test_single_scatter_of_a_gaussian_cloud_is_that_of_the_integral(tracking, de
     sigma, centre, peak = 1.8 / 6.0, np.array([0.0, 0.0, 1.4]), 2.0 / (0.3 * math.sqrt(2.0 * math.pi))
     cloud = {"shape": "cloud", "size": 1.8, "cells": 60, "extinction": peak, "albedo": 0.7, "tracking": tracking}
     medium = {"extinction": 0.05, "albedo": 0.0, "grid": {**cloud, "translation": centre.tolist()}}
-    one = _pencil(medium, edges, "guided")
+    one = scattered_once(medium, edges)
     assert one.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, 4.0)) == pytest.approx(2.0 + 0.2, rel=0.01)
 
     expected = _in_bins(one, edges)
-    mean, error = _measured(one, 150_000, 8, device)
+    mean, error, *_ = means(one, device, 150_000, 8)
     assert (np.abs(mean - expected) < 4.0 * error + 0.003 * expected).all(), (mean - expected) / error
     assert (error < 0.01 * expected).all()
 
@@ -233,12 +174,9 @@ def test_single_scatter_of_a_gaussian_cloud_is_that_of_the_integral(tracking, de
 @pytest.mark.parametrize("tracking", TRACKING)
 def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp_path, device):
     """Two cells, a step from c 0.3 to 1.2 at z = 1.25 m; 0.3 % of each bin, and 4 standard errors."""
-    c, b = np.array([0.3, 1.2]), np.array([0.24, 0.6])
-    path = tmp_path / "halves.npz"
-    np.savez(path, extinction=c.reshape(1, 1, 2), scattering=b.reshape(1, 1, 2), size=[80.0, 80.0, 40.0])
+    c, b, grid = half_spaces(tmp_path)
     edges = np.arange(1.5, 4.01, 0.25)
-    grid = {"file": str(path), "translation": [0.0, 0.0, 1.25], "tracking": tracking}
-    one = _pencil({"grid": grid}, edges, "guided")
+    one = scattered_once({"grid": {**grid, "tracking": tracking}}, edges)
 
     def brought(z):
         """Both ways cross the step at the same part of their length."""
@@ -250,6 +188,6 @@ def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp
     expected = np.array(
         [quad(brought, low, high, points=[1.25], epsabs=1e-15)[0] for low, high in itertools.pairwise(ends)]
     )
-    mean, error = _measured(one, 100_000, 8, device)
+    mean, error, *_ = means(one, device, 100_000, 8)
     assert (np.abs(mean - expected) < 4.0 * error + 0.003 * expected).all(), (mean - expected) / error
     assert (error < 0.01 * expected).all()

@@ -9,6 +9,7 @@ import spadwarp
 from helpers.estimators import agreeing_cells
 from helpers.opencv import project_points
 from helpers.scenes import PLATE, scene
+from spadwarp import simulate
 from spadwarp.errors import ConfigError
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_angles, rotation_matrix
@@ -43,9 +44,9 @@ def test_a_thin_lens_stopped_down_is_a_pinhole(estimator, device):
     sections = {"transport": {"estimator": estimator}, "camera": {"width": 16, "height": 16, "aperture_diameter": 2e-5}}
     camera = sections["camera"]
     sections["camera"] = {**camera, "pinhole": True}
-    pinhole = spadwarp.simulate(scene(**sections), photons=100_000, seed=1, device=device)
+    pinhole = simulate(scene(**sections), photons=100_000, seed=1, device=device)
     sections["camera"] = {**camera, "focus_distance": 1.2}
-    thin = spadwarp.simulate(scene(**sections), photons=100_000, seed=1, device=device)
+    thin = simulate(scene(**sections), photons=100_000, seed=1, device=device)
     wrong = np.abs(thin.intensity - pinhole.intensity).sum() / pinhole.intensity.sum()
     assert wrong < 0.01
     np.testing.assert_allclose(thin.histogram.sum(axis=(0, 1)), pinhole.histogram.sum(axis=(0, 1)), rtol=0.01)
@@ -62,7 +63,7 @@ def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
         camera={**camera, "aperture_diameter": 2 * radius, "focus_distance": focus},
         targets=[{"builtin": "plane", "size": 4e-3, "translation": [0.0, 0.0, z], "reflectance": 1.0}],
     )
-    image = spadwarp.simulate(one, photons=200_000, seed=4, device=device).intensity
+    image = simulate(one, photons=200_000, seed=4, device=device).intensity
     disc = radius * abs(1 / z - (0 if math.isinf(focus) else 1 / focus)) / pixel  # [pixels]
     place = np.arange(64) + 0.5 - 32
     r2 = place[:, None] ** 2 + place**2
@@ -88,7 +89,7 @@ def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
             laser={"half_angle_deg": 3.0, "position": [0.0, 0.0, 0.0], "direction": seen.tolist()},
             targets=[{"builtin": "sphere", "size": 0.12, "translation": place.tolist()}],
         )
-        result = spadwarp.simulate(one, photons=200_000, seed=2, device=device)
+        result = simulate(one, photons=200_000, seed=2, device=device)
         row, column = np.indices(result.intensity.shape)
         mean = [np.average(axis, weights=result.intensity) for axis in (column, row)]
         (expected,) = project_points([place], rvec, tvec, 70.0, 66.0, 30.3, 22.2, coefficients)
@@ -101,13 +102,13 @@ def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
 def test_moving_everything_together_changes_nothing(device):
     """Camera, laser and target under one rigid motion: the same histories to float32, so the same histogram."""
     turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
-    here = spadwarp.simulate(scene(), photons=100_000, seed=3, device=device)
+    here = simulate(scene(), photons=100_000, seed=3, device=device)
     target = {**PLATE, "translation": (turn @ [0, 0, 2.2] + shift).tolist(), "rotation_deg": [25.0, -40.0, 70.0]}
     camera = {"position": shift.tolist(), "rotation_deg": rotation_angles(turn)}
     standing = {"position": (turn @ [-0.1, 0, 0] + shift).tolist(), "direction": turn[:, 2].tolist(), "frame": "world"}
     for laser in ({}, standing):  # it rides on the camera, or stands in the world
         moved = scene(camera=camera, targets=[target], laser=laser)
-        there = spadwarp.simulate(moved, photons=100_000, seed=3, device=device)
+        there = simulate(moved, photons=100_000, seed=3, device=device)
         np.testing.assert_allclose(there.truth.range, here.truth.range, rtol=1e-5)
         np.testing.assert_allclose(there.truth.normal, here.truth.normal, atol=1e-5)
         np.testing.assert_allclose(there.true_path(), here.true_path(), rtol=1e-5)
@@ -138,9 +139,9 @@ def test_the_domain_stands_in_the_world(device):
 def test_a_camera_outside_the_water_is_refused():
     outside = scene(domain={"shape": "slab", "lower": 0.5, "upper": 9.0}, laser={"position": [0, 0, 1.0]})
     with pytest.raises(ConfigError, match=r"camera\.position: z = 0\.0 is outside \[0\.5, 9\.0\], the domain"):
-        spadwarp.simulate(outside, photons=10, device="cpu")
+        simulate(outside, photons=10, device="cpu")
     with pytest.raises(ConfigError, match=r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\], the domain"):
-        spadwarp.simulate(scene(domain={"shape": "box", "lower": 1.0, "upper": 9.0}), photons=10, device="cpu")
+        simulate(scene(domain={"shape": "box", "lower": 1.0, "upper": 9.0}), photons=10, device="cpu")
 
 
 def test_layers_of_water_stand_in_the_world(device):

@@ -9,7 +9,7 @@ import warp as wp
 
 import spadwarp
 import spadwarp_kernels as sk
-from helpers.scenes import scene
+from helpers.scenes import TREE, scene
 from helpers.statistics_of_samples import DEVICES
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
@@ -17,7 +17,6 @@ from spadwarp.transport.model import build_model, transport_spec
 from spadwarp_kernels.tally.tally import add_to_words, fold_accumulators
 from spadwarp_kernels.transport.launch import splits_accumulators
 
-MANY_FACES = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 PENCIL = {
     "laser": {"profile": "collimated", "position": [0.0, 0.0, 0.0]},
     "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 50.0},
@@ -27,9 +26,9 @@ CASES = {
     "water": {"targets": [], "transport": {"estimator": "next_event"}},
     "plate": {"transport": {"estimator": "guided"}},
     "analog": {"transport": {"estimator": "analog"}},
-    "tree": {"targets": [MANY_FACES], "transport": {"estimator": "next_event"}},
-    "guided tree": {"targets": [MANY_FACES], "transport": {"estimator": "guided"}},
-    "points": {"targets": [MANY_FACES], "transport": {"estimator": "guided", "points_per_flight": 3}},
+    "tree": {"targets": [TREE], "transport": {"estimator": "next_event"}},
+    "guided tree": {"targets": [TREE], "transport": {"estimator": "guided"}},
+    "points": {"targets": [TREE], "transport": {"estimator": "guided", "points_per_flight": 3}},
     "pencil": PENCIL,
 }
 

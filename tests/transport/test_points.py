@@ -8,6 +8,7 @@ import spadwarp_kernels as sk
 from helpers.estimators import cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
+from spadwarp import RunOptions, simulate
 from spadwarp.errors import ConfigError
 from spadwarp.transport import trace
 from spadwarp_kernels.transport.launch import check_spec
@@ -47,7 +48,7 @@ def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
 
     def variance(points):
         one = with_points(scene(**sections), points)
-        light = [spadwarp.simulate(one, photons=20_000, seed=seed, device=device).histogram for seed in range(24)]
+        light = [simulate(one, photons=20_000, seed=seed, device=device).histogram for seed in range(24)]
         return np.var(light, axis=0).sum(axis=(0, 1))[2:8]
 
     single, double, triple = (variance(points) for points in (1, 2, 3))
@@ -73,7 +74,7 @@ def test_three_points_where_a_warp_has_a_short_queue(kind, device, tmp_path):
         one = with_points(scene(**sections), points)
         rows = []
         for seed in range(12):
-            result = spadwarp.simulate(one, photons=20_000, seed=seed, device=device, derivatives=names)
+            result = simulate(one, photons=20_000, seed=seed, device=device, derivatives=names)
             assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
             rows.append(result.derivatives[names[0]].sum() if names else result.histogram.sum())
         return np.array(rows)
@@ -89,7 +90,7 @@ def test_records_of_photons_have_no_points(device):
 
 def test_results_of_other_points_are_not_added(device):
     one, two = (
-        spadwarp.simulate(with_points(scene(), points), photons=100, first_photon=first, seed=1, device=device)
+        simulate(with_points(scene(), points), photons=100, seed=1, device=device, run=RunOptions(first_photon=first))
         for points, first in ((1, 0), (2, 100))
     )
     with pytest.raises(ConfigError, match="scene of the results differs in transport"):
@@ -111,8 +112,10 @@ def test_results_of_other_points_are_not_added(device):
 )
 def test_what_goes_with_one_point_alone_is_refused(changes, named, device):
     one = scene().with_overrides({"transport.points_per_flight": 2, **changes})
-    for refuse in (lambda: spadwarp.simulate(one, photons=100, device=device), lambda: spadwarp.check(one)):
-        with pytest.raises(ConfigError, match=f"transport.points_per_flight = 2 does not go with {named}; take 1"):
+    for refuse in (lambda: simulate(one, photons=100, device=device), lambda: spadwarp.check(one)):
+        with pytest.raises(
+            ConfigError, match=f"transport.points_per_flight = 2 cannot be combined with {named}; take 1"
+        ):
             refuse()
     with pytest.raises(ConfigError, match="points_per_flight"):
         scene(transport={"points_per_flight": 4})

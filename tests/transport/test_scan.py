@@ -10,6 +10,7 @@ import spadwarp
 import spadwarp_kernels as sk
 from helpers.estimators import agreeing_cells
 from helpers.scenes import scene
+from spadwarp import RunOptions, simulate
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Camera
@@ -36,7 +37,7 @@ def test_a_scan_is_one_run_a_pixel_bit_for_bit(camera, estimator, device):
     """The photons of each position, walked one by one through a scene of that pixel alone, leave the same integers."""
     one = scene(**CONFOCAL, camera=camera, transport={"estimator": estimator})
     rounds, pixels = 40, 16
-    result = spadwarp.simulate(one, photons=rounds * pixels, seed=9, device=device)
+    result = simulate(one, photons=rounds * pixels, seed=9, device=device)
     target, mesh = pick_device(device), build_mesh(one)
     scale = build_model(one, target, mesh).scale
     for row, column in np.ndindex(4, 4):
@@ -72,7 +73,7 @@ def test_pixels_of_a_scan_see_their_own_light_alone(device):
         camera={"aperture_diameter": 0.02, "width": 6, "height": 4},
         scan={"mode": "confocal"},
     )
-    result = spadwarp.simulate(one, photons=6 * 4 * 20_000, seed=2, device=device)
+    result = simulate(one, photons=6 * 4 * 20_000, seed=2, device=device)
     distance = result.truth.range.astype(float)
     cosine = 2.2 / distance
     expected = 0.7 / math.pi * np.exp(-2 * 0.5 * distance) * math.pi * 0.01**2 * cosine**2 / distance**2
@@ -85,9 +86,9 @@ def test_pixels_of_a_scan_see_their_own_light_alone(device):
 def test_counts_of_photons_a_position_hold_for_any_range_of_ids():
     """Runs that stop within a round of the raster: each pixel is divided by its own photons."""
     one = scene(**CONFOCAL)
-    whole = spadwarp.simulate(one, photons=1000, seed=5, device="cpu")
+    whole = simulate(one, photons=1000, seed=5, device="cpu")
     parts = [
-        spadwarp.simulate(one, photons=count, first_photon=first, seed=5, device="cpu")
+        simulate(one, photons=count, seed=5, device="cpu", run=RunOptions(first_photon=first))
         for first, count in ((0, 333), (333, 667))
     ]
     for result in (whole, *parts):
@@ -97,15 +98,14 @@ def test_counts_of_photons_a_position_hold_for_any_range_of_ids():
         np.testing.assert_array_equal(result.unit / result.tally_value, expected)
     joined = spadwarp.merge(parts)
     np.testing.assert_array_equal(joined.histogram, whole.histogram)
-    resumed = spadwarp.simulate(one, photons=1000, resume=parts[0], device="cpu")
+    resumed = simulate(one, photons=1000, device="cpu", run=RunOptions(resume=parts[0]))
     np.testing.assert_array_equal(resumed.tallies, whole.tallies)
 
 
 @pytest.mark.filterwarnings("ignore:.*few heavy photons decide it")
 def test_the_standard_error_of_a_scan_is_the_spread_between_seeds():
     runs = [
-        spadwarp.simulate(scene(**CONFOCAL), photons=16 * 640, seed=seed, uncertainty=True, device="cpu")
-        for seed in range(48)
+        simulate(scene(**CONFOCAL), photons=16 * 640, seed=seed, uncertainty=True, device="cpu") for seed in range(48)
     ]
     assert runs[0].batch_size % 16 == 0 and runs[0].photons % runs[0].batch_size == 0
     totals = np.array([run.histogram.sum(axis=2) for run in runs])
@@ -116,7 +116,7 @@ def test_the_standard_error_of_a_scan_is_the_spread_between_seeds():
 
 def test_a_scan_survives_its_file_and_gives_depth(tmp_path):
     one = scene(**CONFOCAL, gate={"bin_width_ps": 100.0, "bins": 200})
-    result = spadwarp.simulate(one, photons=16 * 4000, seed=1, device="cpu")
+    result = simulate(one, photons=16 * 4000, seed=1, device="cpu")
     loaded = spadwarp.load_result(result.save(tmp_path / "scan.h5"))
     assert loaded.scene == one
     np.testing.assert_array_equal(loaded.histogram, result.histogram)

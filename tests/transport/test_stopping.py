@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from spadwarp.transport.stopping import FIRST_LOOK, StoppingRule
+from spadwarp.transport.simulation import FIRST_LOOK, StoppingRule
 
 RUNS, BATCHES = 1000, 1024
 

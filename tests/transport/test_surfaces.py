@@ -15,6 +15,7 @@ from PIL import Image
 import spadwarp
 from helpers.estimators import agreeing_cells
 from helpers.scenes import scene
+from spadwarp import simulate
 from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import build_mesh
 from spadwarp.mesh.files import srgb_to_linear
@@ -285,7 +286,7 @@ def test_ballistic_return_of_a_shiny_plate_meets_the_closed_form(device):
             | {"reflectance": reflectance, "specular": s, "roughness": alpha, "subdivisions": 0}
         ],
     )
-    result = spadwarp.simulate(one, photons=400_000, seed=3, device=device)
+    result = simulate(one, photons=400_000, seed=3, device=device)
     a, b = np.radians(5.0), np.radians(12.0)
     normal = -np.array([np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)])  # -Rx Ry z, towards the lens
     w, v = (laser - point) / np.linalg.norm(laser - point), -point / 2.0
@@ -310,7 +311,7 @@ def test_a_glossy_plate_shines_where_it_mirrors_the_laser(device):
         targets=[{"builtin": "plane", "size": 4.0, "translation": [0.0, 0.0, 2.2], "reflectance": 0.05}
                  | {"specular": 0.8, "roughness": 0.05}],
     )  # fmt: skip
-    image = spadwarp.simulate(one, photons=400_000, seed=5, device=device).component("ballistic").sum(axis=2)
+    image = simulate(one, photons=400_000, seed=5, device=device).component("ballistic").sum(axis=2)
     x = (np.arange(48) + 0.5 - 24) * one.camera.pixel_tangent * 2.2
     share = image / image.sum()
     bright = share > 0.5 * share.max()
@@ -329,7 +330,7 @@ def test_an_image_shows_in_the_picture(tmp_path):
         camera={"width": 24, "height": 24, "aperture_diameter": 0.02},
         targets=[target(path)],
     )
-    result = spadwarp.simulate(one, photons=400_000, seed=1, device="cpu")
+    result = simulate(one, photons=400_000, seed=1, device="cpu")
     x = (np.arange(24) + 0.5 - 12) * one.camera.pixel_tangent
     cosine = 1 / np.sqrt(1 + x**2 + x[:, None] ** 2)
     # An even cone on a plate: cos^3 of the lighting, cos^4 of the view (lens, square of the distance, plate).

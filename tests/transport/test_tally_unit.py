@@ -13,6 +13,7 @@ import spadwarp
 import spadwarp_kernels as sk
 from helpers.launch import Floats, launched
 from helpers.scenes import scene
+from spadwarp import RunOptions, simulate
 from spadwarp.device import pick_device
 from spadwarp.errors import ConfigError, SpadwarpError
 from spadwarp.mesh import build_mesh
@@ -57,7 +58,7 @@ def test_a_far_target_is_seen_behind_a_bright_bin_at_the_lens(estimator, device)
     within the rounding of the photons that have reached the plate."""
     one = plate_at(8.0, 1.2, estimator=estimator)
     photons = 8_000_000
-    result = spadwarp.simulate(one, photons=photons, seed=1, device=device)
+    result = simulate(one, photons=photons, seed=1, device=device)
     reached = result.counters["surface_events"]
     value = result.component("ballistic").sum() * photons
     assert value == pytest.approx(reached * one_return(one, 8.0), rel=0.005)
@@ -94,7 +95,7 @@ def test_the_ballistic_return_meets_the_closed_form_in_any_scene(distance, depth
         },
         gate={"start_ns": start, "bin_width_ps": drawn["bin_width"], "bins": bins},
     )
-    result = spadwarp.simulate(one, photons=100_000, seed=seed, device="cpu")
+    result = simulate(one, photons=100_000, seed=seed, device="cpu")
     reached, value = result.counters["surface_events"], one_return(one, distance) / result.unit
     assert reached > 100
     units = int(result.tallies[0].sum())
@@ -133,7 +134,7 @@ def test_the_brightest_bin_follows_the_phase_function(water, device):
         targets=[],
         transport={"estimator": "guided"},
     )
-    result = spadwarp.simulate(one, photons=100_000, seed=2, device=device)
+    result = simulate(one, photons=100_000, seed=2, device=device)
     fill = result.tallies.sum(axis=0).max() / result.photons * photon_capacity(one, None) / 2.0**62
     assert 1e-5 < fill < 0.5
 
@@ -142,21 +143,21 @@ def test_more_photons_than_the_tally_holds_are_refused():
     one = plate_at(8.0, 1.2)
     capacity = photon_capacity(one, build_mesh(one))
     with pytest.raises(ConfigError, match=rf"photons = {10**12} is outside \[1, {capacity}\]"):
-        spadwarp.simulate(one, photons=10**12, device="cpu")
+        simulate(one, photons=10**12, device="cpu")
 
 
 def test_an_overflow_is_an_error_and_not_a_histogram(monkeypatch):
     one = scene(transport={"estimator": "analog"})
     monkeypatch.setattr("spadwarp.transport.plan.scale_and_capacity", lambda *_: (2.0**57, PHOTON_CAPACITY))
     with pytest.raises(SpadwarpError, match="a histogram bin overflowed"):
-        spadwarp.simulate(one, photons=200_000, device="cpu")
+        simulate(one, photons=200_000, device="cpu")
     for values, expected in [([0, 2**62 - 1], False), ([5, 2**62], True), ([-1, 0], True)]:
         assert sk.has_overflowed(wp.array(values, dtype=wp.int64, device="cpu")) == expected
 
 
 def test_a_merge_beyond_the_tally_is_refused():
     one = scene()
-    parts = [spadwarp.simulate(one, photons=1000, seed=1, first_photon=1000 * k, device="cpu") for k in range(2)]
+    parts = [simulate(one, photons=1000, seed=1, device="cpu", run=RunOptions(first_photon=1000 * k)) for k in range(2)]
     full = [dataclasses.replace(part, tallies=np.where(part.tallies > 0, 2**61, 0)) for part in parts]
     with pytest.raises(SpadwarpError, match="a histogram bin overflowed"):
         spadwarp.merge(full)
@@ -211,6 +212,6 @@ def test_rounding_that_decides_the_error_is_a_warning():
         transport={"estimator": "next_event", "max_collisions": 60, "weight_cutoff": 0.0},
     )
     with pytest.warns(RuntimeWarning, match=r"rounding to the histogram's unit .* contributions of less than one unit"):
-        result = spadwarp.simulate(one, photons=100_000, device="cpu")
+        result = simulate(one, photons=100_000, device="cpu")
     assert max(result.rounding_error.values()) > 0.05
-    assert max(spadwarp.simulate(scene(), photons=20_000, device="cpu").rounding_error.values()) < 1e-3
+    assert max(simulate(scene(), photons=20_000, device="cpu").rounding_error.values()) < 1e-3

@@ -1,14 +1,22 @@
-"""Closed bright vessels, in which light meets many surfaces: `guided` keeps its weights and its error."""
+"""Closed bright vessels, in which light meets many surfaces, and wide lenses, next to which it scatters: all of it
+arrives, and `guided` keeps its weights and its error."""
+
+import math
 
 import numpy as np
 import pytest
 
+import spadwarp
 import spadwarp_kernels as sk
 from helpers.estimators import agreeing_cells, cells
 from helpers.scenes import scene
+from reference.aperture import Rig, count
+from reference.walk import Medium
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
+from spadwarp.scene import Scene
 from spadwarp.transport.model import build_model, transport_spec
+from spadwarp.validate.camera import vessel_reading, white_vessel
 from spadwarp_kernels.estimators.guided import LARGEST_WEIGHT_RATIO
 
 
@@ -23,10 +31,7 @@ def vessel(reflectance, *, extinction=0.05, albedo=0.8, max_collisions=200, gate
     )
 
 
-VESSELS = {
-    "reflectance 0.95": vessel(0.95),
-    "reflectance 1, capped": vessel(1.0, albedo=1.0, max_collisions=40),
-}
+VESSELS = {"reflectance 0.95": vessel(0.95), "reflectance 1, capped": vessel(1.0, albedo=1.0, max_collisions=40)}
 
 
 @pytest.mark.slow
@@ -76,3 +81,42 @@ def test_weights_of_guided_photons_are_bounded(extinction, reflectance, bound, d
     assert weight.max() <= bound * 1.0001
     # And the mean is that of the analog walk.
     assert weight.mean() == pytest.approx(1.0, abs=4 * weight.std() / np.sqrt(weight.size))
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+@pytest.mark.parametrize(("estimator", "photons"), [("analog", 40_000), ("next_event", 50_000), ("guided", 60_000)])
+def test_a_closed_white_vessel_is_as_bright_as_its_volume_says(estimator, photons, device):
+    """Imaging through the lens centre, with the lens point on a disc, loses 29 % of this light."""
+    one = Scene.from_dict(white_vessel(estimator))
+    read = [spadwarp.simulate(one, photons=photons, seed=seed, device=device).histogram.sum() for seed in range(16)]
+    error = np.std(read, ddof=1) / math.sqrt(16)
+    assert error < 0.02 * np.mean(read)
+    assert np.mean(read) == pytest.approx(vessel_reading(), abs=3 * error)
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+def test_a_wide_lens_collects_what_a_plain_count_of_photons_does(device):
+    """Total of each component: 0.4 m of lens before a plate at 2.2 m, in focus; water that scatters on the way."""
+    exact = {"max_collisions": 1000, "weight_cutoff": 0.0}
+    half = math.tan(math.radians(25.0))
+    rig = Rig(
+        medium=Medium(0.5, 0.8, 0.8),
+        laser=(-0.1, 0.0),
+        half_angle=math.radians(20.0),
+        aperture_radius=0.2,
+        field=(half, half),
+        focus=2.2,
+        plate_depth=2.2,
+        plate_size=(3.0, 3.0),
+        reflectance=0.7,
+    )
+    expected, error = count(rig, 600_000, np.arange(9.0), np.random.default_rng(1))
+    expected, error = expected.sum(axis=1), np.sqrt((error**2).sum(axis=1))
+    assert (error < 0.05 * expected).all()
+    for estimator, photons in (("analog", 40_000), ("guided", 20_000)):
+        found = cells(scene(transport={"estimator": estimator, **exact}), device, photons, seeds=8)
+        parts = found.reshape(8, 3, 8).sum(axis=2)
+        apart = parts.mean(axis=0) - expected
+        assert (np.abs(apart) < 3.5 * np.hypot(error, parts.std(axis=0, ddof=1) / math.sqrt(8))).all(), estimator

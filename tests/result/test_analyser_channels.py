@@ -12,7 +12,7 @@ from helpers.datasets import make, recipe
 from helpers.minimal_scene import CAMERA, scene
 from spadwarp.dataset import export_dataset, iterate_dataset
 from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.result import COMPONENTS, degree_of_polarisation, received
+from spadwarp.result import COMPONENTS, analyser_channel, degree_of_polarisation
 
 pytestmark = pytest.mark.filterwarnings("ignore:Monte Carlo noise")  # few photons
 
@@ -39,19 +39,19 @@ def analysed():
 
 def test_a_channel_is_a_result_of_its_own(analysed):
     for name in ("co", "cross"):
-        seen = received(analysed, name)
+        seen = analyser_channel(analysed, name)
         assert np.array_equal([seen.component(part) for part in COMPONENTS], analysed.channels[name])
         assert np.array_equal(seen.standard_error, analysed.channel_errors[name])
         assert seen.provenance["channel"] == name and not seen.channels
         # ambient light is unpolarised: (1 + 1/E)/2 of it passes
         assert seen.scene.detector.ambient_rate == pytest.approx(0.505e5)
-    assert received(analysed, "I") is analysed
-    both = received(analysed, "co").histogram + received(analysed, "cross").histogram
+    assert analyser_channel(analysed, "I") is analysed
+    both = analyser_channel(analysed, "co").histogram + analyser_channel(analysed, "cross").histogram
     np.testing.assert_allclose(both, 1.01 * analysed.histogram, rtol=1e-4, atol=1e-6 * analysed.histogram.max())
 
 
 def test_the_wall_is_depolarised_and_the_water_is_not(analysed):
-    co, cross = (received(analysed, name) for name in ("co", "cross"))
+    co, cross = (analyser_channel(analysed, name) for name in ("co", "cross"))
     for part in ("ballistic", "forward_scattered"):
         assert cross.component(part).sum() == pytest.approx(co.component(part).sum(), rel=0.01)
     # Voss & Fry's 0.117 of light scattered once straight back, the analyser's leak and a little multiple scattering.
@@ -67,13 +67,13 @@ def test_stokes_cubes_hold_what_an_analyser_passes(analysed, tmp_path):
     stokes = spadwarp.simulate(polarised("stokes"), photons=analysed.photons, seed=5, device="cpu")
     assert np.array_equal(stokes.tallies, analysed.tallies)
     for name in ("co", "cross"):
-        seen, expected = received(stokes, name).histogram, received(analysed, name).histogram
+        seen, expected = analyser_channel(stokes, name).histogram, analyser_channel(analysed, name).histogram
         np.testing.assert_allclose(seen, expected, atol=1e-6 * expected.max())
     turned = spadwarp.load_result(stokes.save(tmp_path / "result.h5"))
     across = turned.scene.with_overrides({"camera.analyser_angle_deg": -60.0})
-    turned = received(dataclasses.replace(turned, scene=across), "co")
+    turned = analyser_channel(dataclasses.replace(turned, scene=across), "co")
     np.testing.assert_allclose(
-        turned.histogram, received(stokes, "cross").histogram, atol=1e-6 * stokes.histogram.max()
+        turned.histogram, analyser_channel(stokes, "cross").histogram, atol=1e-6 * stokes.histogram.max()
     )
     again = spadwarp.load_result(turned.save(tmp_path / "co.h5"))
     assert np.array_equal(again.tallies, turned.tallies) and again.provenance["channel"] == "co"
@@ -83,7 +83,7 @@ def test_stokes_cubes_hold_what_an_analyser_passes(analysed, tmp_path):
 
 def test_counts_depth_and_bounds_of_a_channel(analysed):
     counts = {
-        name: spadwarp.detect(received(analysed, name), pulses=1000, frames=2, seed=3, device="cpu")
+        name: spadwarp.detect(analyser_channel(analysed, name), pulses=1000, frames=2, seed=3, device="cpu")
         for name in ("I", "co", "cross")
     }
     expected = {name: frames.expected.sum() for name, frames in counts.items()}
@@ -93,7 +93,7 @@ def test_counts_depth_and_bounds_of_a_channel(analysed):
     assert signal["cross"] / signal["I"] == pytest.approx(0.505, rel=0.01)
     background = {name: frames.background.sum() for name, frames in counts.items()}
     assert background["cross"] / background["I"] < 0.3
-    assert np.isfinite(spadwarp.crlb(received(analysed, "cross"), pulses=1000, device="cpu")).any()
+    assert np.isfinite(spadwarp.crlb(analyser_channel(analysed, "cross"), pulses=1000, device="cpu")).any()
 
 
 @pytest.mark.slow
@@ -107,9 +107,9 @@ def test_channels_on_the_command_line(analysed, tmp_path):
     assert frames.channel == "cross" and "cross" in run("info", frames.path).stdout
     run("depth", place, "--out", tmp_path / "depth", *chosen)
     found = np.load(tmp_path / "depth" / "depth.npy")
-    np.testing.assert_allclose(found, received(analysed, "cross").depth(), atol=1e-3)
+    np.testing.assert_allclose(found, analyser_channel(analysed, "cross").depth(), atol=1e-3)
     run("export", place, "--format", "npy", "--out", tmp_path / "npy", *chosen[:2])
-    assert np.array_equal(np.load(tmp_path / "npy" / "result.npy"), received(analysed, "cross").histogram)
+    assert np.array_equal(np.load(tmp_path / "npy" / "result.npy"), analyser_channel(analysed, "cross").histogram)
     assert "channel" in run("depth", frames.path, "--out", tmp_path / "no", *chosen, code=2).stderr
     spadwarp.viz.draw_result(analysed, tmp_path / "pictures")
 
@@ -142,10 +142,10 @@ def test_plan_compares_the_channels(tmp_path):
 
 def test_channels_that_are_not_there_are_refused(analysed):
     with pytest.raises(ArgumentError, match=r"'crossed'.*did you mean 'cross'"):
-        received(analysed, "crossed")
+        analyser_channel(analysed, "crossed")
     plain = spadwarp.simulate(scene(targets=[PLANE]), photons=100, seed=1, device="cpu")
     with pytest.raises(ConfigError, match=r"channel = 'co': .*camera\.polarisation = 'analyser'"):
-        received(plain, "co")
+        analyser_channel(plain, "co")
     with pytest.raises(ConfigError, match="degree of polarisation"):
         degree_of_polarisation(plain)
     with pytest.raises(ConfigError, match=r"needs camera\.polarisation"):
@@ -153,11 +153,11 @@ def test_channels_that_are_not_there_are_refused(analysed):
 
 
 def test_a_channel_is_not_added_to_other_light(analysed):
-    cross = received(analysed, "cross")
+    cross = analyser_channel(analysed, "cross")
     with pytest.raises(ConfigError, match="resume: the result holds cross-polarised light alone"):
-        spadwarp.simulate(cross.scene, photons=2 * cross.photons, resume=cross, device="cpu")
+        spadwarp.simulate(cross.scene, photons=2 * cross.photons, device="cpu", run=spadwarp.RunOptions(resume=cross))
     with pytest.raises(ConfigError, match="merge: the channel of the results differs"):
-        spadwarp.merge([cross, received(analysed, "co")])
+        spadwarp.merge([cross, analyser_channel(analysed, "co")])
 
 
 def test_recipes_take_a_channel_of_traced_scenes_only():
@@ -176,7 +176,7 @@ def test_data_sets_and_denoisers_take_a_channel(analysed, tmp_path):
     seen = {name: spadwarp.denoise.read_depth(place, channel=name, device="cpu") for name in (None, "I", "cross")}
     np.testing.assert_array_equal(seen[None].depth, seen["I"].depth)
     assert not np.array_equal(seen["cross"].depth, seen["I"].depth)
-    np.testing.assert_allclose(seen["cross"].depth[0], received(analysed, "cross").depth(), atol=0.05)
+    np.testing.assert_allclose(seen["cross"].depth[0], analyser_channel(analysed, "cross").depth(), atol=0.05)
     changes = {
         "targets.builtin": ["staircase"],
         "targets.validation": [],

@@ -1,4 +1,4 @@
-"""Results and frames as torch tensors that share their memory; see `spadwarp.arrays` for streams and devices."""
+"""Results for other libraries: torch tensors that share their memory (see `spadwarp.arrays`), and xarray."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 
+import numpy as np
+
 from spadwarp.arrays import is_torch
 from spadwarp.errors import ArgumentError
+from spadwarp.interop import Variable, labelled
+from spadwarp.limits import check_choice
 from spadwarp.result.result import COMPONENTS, Component, Result, Truth
 
 if TYPE_CHECKING:
     import torch
+    import xarray
 
     from spadwarp.scene import Scene
 
-__all__ = ["TorchResult", "TorchTruth", "to_torch"]
+__all__ = ["TorchResult", "TorchTruth", "to_torch", "to_xarray"]
 
 Frames = TypeVar("Frames")
 
@@ -54,9 +59,7 @@ class TorchResult:
 
     def component(self, name: Component) -> torch.Tensor:
         """One part of the histogram, float64 `[H, W, T]`; see `Result.component`."""
-        if name not in COMPONENTS:
-            raise ArgumentError(f"component {name!r} is not one of {', '.join(map(repr, COMPONENTS))}")
-        return self._fraction(self.tallies[COMPONENTS.index(name)])
+        return self._fraction(self.tallies[COMPONENTS.index(check_choice("component", name, COMPONENTS))])
 
     @property
     def detections(self) -> torch.Tensor:
@@ -119,3 +122,55 @@ def _shared(array: Any) -> torch.Tensor:
     if is_torch(array):
         return array
     return torch.from_numpy(array if array.flags.writeable else array.copy())
+
+
+def to_xarray(result: Result) -> xarray.Dataset:
+    """Histograms by component, and truth, as an xarray data set with coordinates and units.
+
+    `histogram` has the dimensions (component, y, x, time); `.sum("component")` is all light, `.sel(component=
+    "backscatter")` a part of it. Coordinates: time of flight [s] at the bins' centres, `path` [m] along it, pixels.
+    `derivative`, of results that have some, has the dimension parameter before these, and `polarisation` the dimension
+    channel. Attributes: photons, seed, partial and the scene as TOML.
+
+    Raises:
+        FileError: xarray is not installed.
+    """
+    image, cube = ("y", "x"), ("component", "y", "x", "time")
+    height, width = result.truth.depth.shape
+    values = np.stack([result.component(name) for name in COMPONENTS])
+    truth = result.truth
+    variables: dict[str, Variable] = {
+        "histogram": (cube, values, "1", "expected fraction of the emitted photons per pixel and bin"),
+        "detections_per_photon": ((), result.scene.detections_per_photon, "1", "detection efficiency with the filter"),
+        "depth": (image, truth.depth, "m", "true planar depth"),
+        "range": (image, truth.range, "m", "true distance along the line of sight"),
+        "normal": ((*image, "axis"), truth.normal, "1", "unit normals towards the camera"),
+        "reflectance": (image, truth.reflectance, "1", "Lambertian reflectance"),
+    }
+    if result.second_moment is not None and result.photons >= 2 * result.batch_size:
+        variables["standard_error"] = ((*image, "time"), result.standard_error, "1", "of the histogram of all light")
+    coordinates: dict[str, Variable] = {}
+    if result.derivatives:
+        slopes = np.stack([*result.derivatives.values()])
+        variables["derivative"] = (("parameter", *cube), slopes, "1", "of the histogram, per unit of the parameter")
+        coordinates["parameter"] = (("parameter",), list(result.derivatives), "1", "by which it is differentiated")
+    if result.channels:
+        channels = np.stack([*result.channels.values()])
+        variables["polarisation"] = (("channel", *cube), channels, "1", "fraction of the emitted photons in a channel")
+        coordinates["channel"] = (("channel",), list(result.channels), "1", "of the receiver of polarised light")
+    coordinates |= {
+        "component": (("component",), list(COMPONENTS), "1", "history of the light"),
+        "time": (("time",), result.bin_centres, "s", "time of flight at the centre of the bin"),
+        "path": (("time",), result.bin_centres * result.pulse_speed, "m", "geometric path, laser to target to lens"),
+        "y": (("y",), np.arange(height), "1", "row of pixels, downwards"),
+        "x": (("x",), np.arange(width), "1", "column of pixels, to the right"),
+        "axis": (("axis",), ["x", "y", "z"], "1", "of the camera frame: right, down, away"),
+    }
+    attributes = {
+        "photons": result.photons,
+        "photons_per_pulse": result.scene.laser.photons_per_pulse,
+        "seed": str(result.seed),
+        "partial": int(result.partial),
+        "scene": result.scene.to_toml(),
+    }
+    return labelled(variables, coordinates, attributes)

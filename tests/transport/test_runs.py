@@ -1,0 +1,524 @@
+"""Runs cut into launches, batches, devices and shards, in spite of failures: all end with the bits of one run."""
+
+import dataclasses
+import signal
+import threading
+import warnings
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy import stats
+
+import spadwarp
+import spadwarp_kernels as sk
+from helpers.cli import run
+from helpers.inverse import plate
+from helpers.runs import PHOTONS, RUN, same
+from helpers.scenes import PLATE, TREE, scene
+from helpers.statistics_of_samples import DEVICES
+from spadwarp import ConfigError, DeviceError, RunOptions, merge, simulate
+from spadwarp.result import component_errors
+from spadwarp.result.photon_ids import IdQueue, count, joined, shard_of, without
+from spadwarp.transport import LightTracer
+from spadwarp_kernels.tally import tally as tally_module
+
+# Few threads: many would have walked all photons before the first of them is reported.
+SMALL_LAUNCHES = {"threads": 2, "launch_size": 1000}
+
+
+def here(**options):
+    return simulate(scene(), device="cpu", **options)
+
+
+@pytest.mark.parametrize("targets", [[PLATE], [TREE]], ids=["plate", "tree"])
+@pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
+def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, targets, device):
+    one = scene(transport={"estimator": estimator}, targets=targets)
+
+    def cut(threads, launch_size, seed=2**63 + 5):
+        return simulate(
+            one, photons=20_000, seed=seed, device=device, run=RunOptions(threads=threads, launch_size=launch_size)
+        )
+
+    whole = cut(1, 20_000)
+    assert whole.tallies.any()
+    for threads, launch_size in [(1, 777), (2, 1000), (3, 4096)]:
+        same(cut(threads, launch_size), whole)
+    assert cut(1, 20_000, seed=2**63 + 6).tallies.tobytes() != whole.tallies.tobytes()
+
+
+# Photon ids
+
+
+def test_ids_are_handed_out_once():
+    waiting = IdQueue([(100, 130), (0, 50)])
+    first = waiting.take(40)
+    assert first == (0, 40) and waiting.take(40) == (40, 50) and waiting.left == 30
+    waiting.put_back([first])
+    taken = []
+    while ids := waiting.take(7):
+        taken.append(ids)
+    assert joined(taken) == ((0, 40), (100, 130)) and waiting.left == 0
+    assert without((0, 200), joined(taken)) == ((40, 100), (130, 200))
+    assert without((10, 30), ((0, 40),)) == ()
+
+
+@pytest.mark.parametrize(("parts", "unit"), [(1, 1), (3, 1), (7, 64), (32, 1024)])
+def test_shards_are_whole_units_and_together_the_run(parts, unit):
+    span = 2048, 2048 + 32 * 1024
+    shards = [shard_of(span, (number, parts), unit) for number in range(1, parts + 1)]
+    assert joined(shards) == (span,)
+    assert all(start % unit == 0 for start, _ in shards)
+    assert max(map(count, [[s] for s in shards])) - min(map(count, [[s] for s in shards])) <= unit
+
+
+# Several devices
+
+SEVERAL = ["cpu", "cpu,cpu", "cpu,cpu,cpu", *(["cuda:0,cuda:0", "cuda:all"] if "cuda:0" in DEVICES else [])]
+
+
+@pytest.mark.parametrize("uncertainty", [False, True])
+@pytest.mark.parametrize("device", SEVERAL)
+def test_devices_with_tallies_of_their_own_add_up_to_one(device, uncertainty, whole):
+    one = whole[uncertainty]
+    if device.startswith("cuda"):
+        one = simulate(scene(), **RUN, device="cuda:0", uncertainty=uncertainty)
+    seen = []
+    options = {**RUN, "device": device, "uncertainty": uncertainty, "progress": lambda *report: seen.append(report)}
+    cut = simulate(scene(), **options, run=RunOptions(threads=4, launch_size=3000))
+    same(cut, one)
+    assert cut.provenance["device"] == device or device == "cuda:all"
+    traced = [done for stage, done, _ in seen if stage == "trace"]
+    assert seen[0][0] == "compile" and traced == sorted(traced) and traced[-1] == cut.photons
+
+
+@pytest.mark.parametrize("other", sorted({"cpu", *DEVICES}))
+def test_tallies_of_two_devices_are_added(other, device, monkeypatch):
+    monkeypatch.setattr(tally_module, "_PIECE", 7)
+    a, b = np.random.default_rng(0).integers(-(2**62), 2**62, size=(2, 30))
+    total, more = wp.array(a, dtype=wp.int64, device=device), wp.array(b, dtype=wp.int64, device=other)
+    sk.add_tallies(total, more)
+    assert np.array_equal(total.numpy(), a + b) and np.array_equal(more.numpy(), b)
+    with pytest.raises(sk.ArgumentError, match="shape \\(30,\\)"):
+        sk.add_tallies(total, wp.zeros(29, dtype=wp.int64, device=other))
+
+
+# Parts
+
+
+@pytest.mark.parametrize("uncertainty", [False, True])
+def test_shards_add_up_to_the_run_and_gaps_can_be_filled(uncertainty, whole):
+    def shard(number):
+        return here(**RUN, uncertainty=uncertainty, run=RunOptions(shard=(number, 5)))
+
+    parts = [shard(number) for number in (4, 1, 5, 2)]
+    assert [part.requested[0] for part in parts] != sorted(part.requested[0] for part in parts)
+    gap, third = merge(parts), shard(3)
+    assert len(gap.photon_ranges) == 2 and gap.requested == whole[uncertainty].requested
+    assert len(gap.provenance["parts"]) == 4
+    same(merge([gap, third]), whole[uncertainty])
+    filled = here(run=RunOptions(resume=gap))
+    same(filled, whole[uncertainty])
+    assert [part["photon_ranges"] for part in filled.provenance["parts"]][-1] == [list(third.requested)]
+
+
+@pytest.mark.parametrize("uncertainty", [False, True])
+def test_an_interrupted_shard_knows_where_it_ends(uncertainty, whole, tmp_path):
+    """Ctrl-C returns the photons that were traced, from a file they are resumed; batches are those of the long run."""
+
+    def interrupt(stage, done, total):
+        if stage == "trace" and done > 2 * batch and not fired:
+            fired.append(total)
+            signal.raise_signal(signal.SIGTERM)
+
+    fired, batch = [], whole[uncertainty].batch_size
+    half = {**RUN, "uncertainty": uncertainty}
+    part = here(**half, progress=interrupt, run=RunOptions(**SMALL_LAUNCHES, shard=(2, 2)))
+    start, stop = shard_of(whole[uncertainty].requested, (2, 2), batch or 1)
+    assert part.partial and part.requested == (start, stop) and fired == [stop - start]
+    assert part.photon_ranges == ((start, start + part.photons),) and part.energy_report()["exact"]
+    part.save(tmp_path / "part.h5")
+    rest = here(run=RunOptions(resume=tmp_path / "part.h5"))
+    assert not rest.partial
+    same(merge([rest, here(**half, run=RunOptions(shard=(1, 2)))]), whole[uncertainty])
+
+
+CELLS = {
+    "shape": "plume",
+    "size": 1.2,
+    "cells": 10,
+    "extinction": 2.0,
+    "translation": [0.0, 0.0, 1.1],
+    "tracking": "delta",
+}
+BLOCKS = tuple(f"medium.grid.{kind}" for kind in ("absorption", "scattering", "extinction"))
+SIGNED = {
+    "derivatives": (
+        {"transport": {"estimator": "guided"}},
+        {"derivatives": ("absorption", "scattering", "anisotropy", "reflectance")},
+        "derivatives  by medium.absorption, medium.scattering",
+    ),
+    "blocks": (
+        {"medium": {"grid": CELLS}, "transport": {"estimator": "next_event"}},
+        {"derivatives": (*BLOCKS, "reflectance"), "blocks": (2, 1, 5)},
+        "medium.grid.scattering of 2 x 1 x 5 blocks",
+    ),
+    "channels": (
+        {
+            "medium": {"scattering_matrix": "voss_fry"},
+            "laser": {"polarisation": "linear"},
+            "camera": {"polarisation": "analyser", "analyser_angle_deg": 30.0, "analyser_extinction_ratio": 50.0},
+            "transport": {"estimator": "guided"},
+        },
+        {},
+        "degree of polarisation",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*few heavy photons decide it")
+@pytest.mark.parametrize("kind", SIGNED)
+def test_derivatives_and_channels_survive_files_merging_and_resuming(kind, tmp_path):
+    sections, asked, shown = SIGNED[kind]
+    one, options = scene(**sections), {"device": "cpu", "photons": 8192, "uncertainty": True, **asked}
+    whole = simulate(one, **options)
+    halves = [simulate(one, **options, run=RunOptions(shard=(k, 2))) for k in (1, 2)]
+    short = simulate(one, **{**options, "photons": 4096, "uncertainty": False})
+    resumed = [simulate(one, photons=8192, device="cpu", run=RunOptions(resume=part)) for part in (halves[0], short)]
+    loaded = spadwarp.load_result(whole.save(tmp_path / "result.h5"))
+    signed = "channel_tallies" if kind == "channels" else "derivative_tallies"
+    for other in (loaded, merge(halves), *resumed):
+        found, expected = getattr(other, signed), getattr(whole, signed)
+        assert (found.names, found.units) == (expected.names, expected.units)
+        np.testing.assert_array_equal(found.tallies, expected.tallies)
+    for name in ("derivatives", "channels", "derivative_errors", "channel_errors"):
+        for key, values in getattr(whole, name).items():
+            np.testing.assert_array_equal(getattr(loaded, name)[key], values)
+    assert shown in run("info", tmp_path / "result.h5").stdout
+    with pytest.raises(ConfigError, match="holds no batches"):
+        [*resumed[1].derivative_errors.values(), *resumed[1].channel_errors.values()]
+    pytest.importorskip("xarray")
+    labelled = loaded.to_xarray()["polarisation" if kind == "channels" else "derivative"].sel(component="backscatter")
+    parts = whole.channels if kind == "channels" else whole.derivatives
+    np.testing.assert_array_equal(labelled, np.stack(list(parts.values()))[:, 2])
+
+
+def test_what_cannot_be_merged_is_refused():
+    one, options = scene(), {"photons": 1000, "device": "cpu"}
+    a = simulate(one, **options, seed=5)
+    later = {**options, "run": RunOptions(first_photon=1000)}
+    for other, text in (
+        (a, "ids 0 to 999 are in more than one"),
+        (simulate(one, **later, seed=6), "seed of the results differs"),
+        (
+            simulate(one.with_overrides({"medium.extinction": 0.6}), **later, seed=5),
+            "scene of the results differs in medium: only photons",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            merge([a, other])
+    same(merge([simulate(one, **later, seed=5), a]), simulate(one, **{**options, "photons": 2000}, seed=5))
+    with pytest.raises(ConfigError, match="photons = 1000 is outside"):
+        simulate(one, **options, run=RunOptions(resume=a))
+    with pytest.raises(ConfigError, match="no batches"):
+        _ = a.standard_error
+
+
+HUGE = {"camera": {"width": 4096, "height": 4096}, "gate": {"bins": 1000}}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"photons": 0}, r"photons = 0 is outside \[1, 1000000000000\]"),
+        ({"seed": -1}, "seed = -1 is outside"),
+        ({"device": "cuda:99"}, "device = 'cuda:99' is not one of cpu"),
+        ({"device": "cpu,cuda:99"}, "not one of cpu"),
+        *([] if "cuda:0" in DEVICES else [({"device": "cuda:all"}, "cuda:0")]),
+        ({"run": {"launch_size": 2**21}}, r"launch_size = 2097152 is outside \[1, 1048576\]"),
+        *(({"run": {"shard": shard}}, "^shard") for shard in (3, (0, 4), (5, 4), (1, 2, 3), (1.5, 2), ("1", 2))),
+        ({"run": {"shard": (1, 10**6)}}, "too few"),
+        ({"run": {"shard": (1, 2)}, "relative_error": 0.1}, "relative_error cannot be combined with shard"),
+        ({"run": {"shard": (1, 2), "resume": "whole"}}, "shard = .* cannot be combined with resume"),
+        ({"scene": HUGE}, "outside"),
+    ],
+)
+def test_wrong_use_is_named(arguments, text, whole):
+    options = {"photons": 1000, "device": "cpu", **arguments}
+    one = scene(**options.pop("scene", {}))
+    choices = options.pop("run", {})
+    choices = {**choices, "resume": whole[False] if "resume" in choices else None}
+    with pytest.raises(spadwarp.SpadwarpError, match=text):
+        simulate(one, **options, run=RunOptions(**choices))
+
+
+# Checkpoints and failures
+
+
+def failing_after(calls, monkeypatch, error):
+    """Lets the launches after so many fail as a device does."""
+    launch, left = sk.launch_transport, [calls]
+    lock = threading.Lock()
+
+    def fail(*arguments, **options):
+        with lock:
+            left[0] -= 1
+        if left[0] < 0:
+            raise RuntimeError(error)
+        launch(*arguments, **options)
+
+    monkeypatch.setattr(sk, "launch_transport", fail)
+
+
+@pytest.mark.parametrize("device", ["cpu", "cpu,cpu"])
+@pytest.mark.parametrize("uncertainty", [False, True])
+def test_a_device_that_disappears_costs_what_was_not_in_a_checkpoint(device, uncertainty, whole, tmp_path, monkeypatch):
+    place = tmp_path / "checkpoint.h5"
+    failing_after(120, monkeypatch, "CUDA error 719: unspecified launch failure")
+    often = RunOptions(**SMALL_LAUNCHES, checkpoint=place, checkpoint_every=0.0)
+    with pytest.raises(DeviceError) as caught:
+        simulate(scene(), **RUN, device=device, uncertainty=uncertainty, run=often)
+    monkeypatch.undo()
+    saved = spadwarp.load_result(place)
+    assert saved.partial and 0 < saved.photons <= 120_000 and saved.energy_report()["exact"]
+    assert "cpu failed: CUDA error 719" in str(caught.value)
+    assert f"{place}: the {saved.photons} photons that were done" in str(caught.value)
+    same(here(run=RunOptions(resume=saved)), whole[uncertainty])
+
+
+def test_a_device_without_memory_is_named(monkeypatch):
+    def full(*arguments, **options):
+        raise RuntimeError("Failed to allocate 1207959552 bytes on device 'cuda:0'")
+
+    monkeypatch.setattr(sk, "make_data", full)
+    with pytest.raises(DeviceError, match="cpu has too little memory left: Failed to allocate 1207959552"):
+        here(**RUN)
+
+
+def test_a_full_disk_costs_no_photons(whole, tmp_path):
+    """The checkpoint meets a limit on the size of files: the one before it stays, the run continues to its end."""
+    resource = pytest.importorskip("resource")
+    place = tmp_path / "checkpoint.h5"
+    here(**{**RUN, "photons": 1000}).save(place)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(stage, done, total):
+        if stage == "trace":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (5000, limits[1]))
+
+    often = RunOptions(threads=2, launch_size=2000, checkpoint=place, checkpoint_every=0.0)
+    try:
+        with pytest.warns(RuntimeWarning, match=r"the run continues: .*checkpoint\.h5: cannot be written"):
+            result = here(**RUN, progress=fill, run=often)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    same(result, whole[False])
+    saved = spadwarp.load_result(place)
+    assert saved.photons == 1000 and [path.name for path in tmp_path.iterdir()] == ["checkpoint.h5"]
+    same(here(photons=PHOTONS, run=RunOptions(resume=saved)), whole[False])
+
+
+# Errors from batches
+
+
+def test_batches_leave_the_tallies_as_they_are(whole):
+    known = whole[True]
+    assert known.photons >= PHOTONS and known.photons % known.batch_size == 0
+    plain = here(**{**RUN, "photons": known.photons})
+    assert plain.tallies.tobytes() == known.tallies.tobytes() and plain.energy_balance == known.energy_balance
+
+
+def test_squares_are_exact_to_128_bits(device):
+    rng = np.random.default_rng(0)
+    rows = [rng.integers(0, 2**61, size=(3, 50), dtype=np.int64) // [[1], [2**20], [2**40]] for _ in range(300)]
+    rows[0][:] = 0
+    tally = wp.zeros(150, dtype=wp.int64, device=device)
+    batches = sk.Batches(tally, 3)
+    for row in rows:
+        tally.assign(row.ravel() // 3)
+        batches.close(tally)
+        assert not tally.numpy().any()
+    sums = [[int(v) // 3 for v in row.ravel()] for row in rows]
+    expected = [sum((row[i] + row[50 + i] + row[100 + i]) ** 2 for row in sums) for i in range(50)]
+    low, high = (half.numpy() for half in batches.second_moment)
+    assert [int(h) << 64 | int(l) for l, h in zip(low, high, strict=True)] == expected
+    assert batches.count == 300
+
+
+def test_batches_of_two_tallies_are_those_of_one(device, monkeypatch):
+    monkeypatch.setattr(tally_module, "_PIECE", 7)
+    rng = np.random.default_rng(1)
+    rows = rng.integers(-(2**59), 2**59, size=(40, 100), dtype=np.int64) >> rng.integers(0, 59, size=(40, 1))
+
+    def closed(rows):
+        tally = wp.zeros(100, dtype=wp.int64, device=device)
+        batches = sk.Batches(tally, 2, signed=True)
+        for row in rows:
+            tally.assign(row)
+            batches.close(tally)
+        return batches
+
+    one, part, rest = closed(rows), closed(rows[:13]), closed(rows[13:])
+    part.add(rest)
+    assert part.count == one.count and not part.has_overflowed()
+    for mine, expected in zip((part.total, *part.second_moment), (one.total, *one.second_moment), strict=True):
+        assert np.array_equal(mine.numpy(), expected.numpy())
+    # Carries from the lower halves are rare by chance.
+    for batches in (part, rest):
+        batches.second_moment[0].fill_(2**63 + 5)
+        batches.second_moment[1].fill_(7)
+    part.add(rest)
+    assert set(part.second_moment[0].numpy()) == {10} and set(part.second_moment[1].numpy()) == {15}
+    rest.total.fill_(2**62 - 1)
+    part.total.fill_(1)
+    part.add(rest)
+    assert part.has_overflowed()
+    empty = wp.zeros(50, dtype=wp.int64, device=device)
+    for other in (closed(np.zeros((1, 100), np.int64)).total, sk.Batches(empty, 1)):
+        with pytest.raises(sk.ArgumentError):
+            part.add(other)
+
+
+@pytest.mark.slow
+def test_standard_error_is_the_spread_between_seeds(device):
+    """The error from the batches of one run against the spread of 64 runs, both pooled over bins: equal within 10 %."""
+    # A lens of 0.4 m, as in the other tests, sees much light from next to it, whose sums are skewed.
+    one = scene(transport={"estimator": "guided"}, camera={"aperture_diameter": 0.05})
+    runs = [simulate(one, photons=2**15, seed=seed, device=device, uncertainty=True) for seed in range(64)]
+    values = np.array([run.histogram for run in runs])
+    bright = values.mean(axis=0) > 0.05 * values.mean(axis=0).max()
+    spread = values.var(axis=0, ddof=1)[bright]
+    claimed = np.mean([run.standard_error**2 for run in runs], axis=0)[bright]
+    assert bright.sum() > 20
+    assert np.sqrt(claimed / spread).mean() == pytest.approx(1.0, abs=0.1)
+    z = (values - values.mean(axis=0))[:, bright] / np.array([run.standard_error for run in runs])[:, bright]
+    # Coverage, both sides together: a bin's sum is skewed, and its error rises and falls with it.
+    beyond = 2 * stats.norm.sf(2)
+    assert beyond / 2 < (np.abs(z) > 2).mean() < 2 * beyond
+
+
+def test_moments_of_the_components_are_those_of_the_batches(device):
+    """A run of 32 batches against a run of each; merged runs have the same."""
+    size, options = 1024, {"seed": 5, "device": device}
+    whole = simulate(scene(), photons=32 * size, **options, uncertainty=True)
+    assert whole.batch_size == size
+    each = [simulate(scene(), photons=size, **options, run=RunOptions(first_photon=k * size)) for k in range(32)]
+    totals = np.array([run.tallies.sum(axis=(1, 2, 3)) for run in each])
+    for name, total in zip(("ballistic", "forward_scattered", "backscatter"), totals.T.tolist(), strict=True):
+        assert whole.batch_moments[f"{name}_squares"] == sum(x * x for x in total)
+        assert whole.batch_moments[f"{name}_smallest"] == min(total)
+        assert whole.batch_moments[f"{name}_largest"] == max(total)
+        error = component_errors(whole)[name]
+        assert error.relative_error == pytest.approx(np.std(total, ddof=1) / np.mean(total) / np.sqrt(32))
+        squares = (np.array(total, float) - np.mean(total)) ** 2
+        assert error.largest_share == pytest.approx(32 / 31 * squares.max() / squares.sum())
+    parts = [
+        simulate(scene(), photons=32 * size, **options, uncertainty=True, run=RunOptions(shard=(k, 2))) for k in (1, 2)
+    ]
+    assert merge(parts).batch_moments == whole.batch_moments
+
+
+def test_a_heavy_batch_is_named(tmp_path):
+    """Nothing is said of many equal photons; a batch with thirty times the light is, and files keep it."""
+    plain = here(photons=2**15, seed=5, uncertainty=True)
+    assert plain.warnings == () and plain.summary()["warnings"] == []
+    heavy = dict(plain.batch_moments)
+    spike = 30 * int(plain.tallies[2].sum()) // 32
+    largest = heavy["backscatter_largest"]
+    heavy["backscatter_largest"] = largest + spike
+    heavy["backscatter_squares"] += (largest + spike) ** 2 - largest**2
+    tallies = plain.tallies.copy()
+    tallies[2, 0, 0, 0] += spike
+    spiked = dataclasses.replace(plain, tallies=tallies, batch_moments=heavy)
+    for one in (spiked, spadwarp.load_result(spiked.save(tmp_path / "heavy.h5"))):
+        (text,) = one.warnings
+        assert text.startswith("backscatter: one of 32 batches has 100 %") and "more photons" in text
+        assert one.summary()["warnings"] == [text]
+
+
+@pytest.mark.slow
+def test_guided_warns_of_no_heavy_photons_where_next_event_does():
+    """Narrow lens, forward-peaked water: next events close to the lens are rare and large."""
+
+    def warned(estimator, seed):
+        one = spadwarp.load_scene("plane_5m", {"transport.estimator": estimator})
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result = simulate(one, photons=100_000, seed=seed, device="cpu", uncertainty=True)
+        texts = [str(warning.message) for warning in caught if "of the variance" in str(warning.message)]
+        assert texts == list(result.warnings)
+        return bool(texts)
+
+    counts = {name: sum(warned(name, seed) for seed in range(12)) for name in ("guided", "next_event")}
+    assert counts["guided"] == 0 and counts["next_event"] >= 2
+
+
+# Runs with an error as their goal
+
+
+def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
+    one = scene(transport={"estimator": "guided"})
+    found = simulate(one, photons=2**22, seed=1, device=device, relative_error=0.05)
+    assert found.relative_error <= 0.05 and not found.partial
+    assert found.photons < 2**22
+    # Where the error so far said that the goal would be reached, not at the next power of two, and a part on.
+    assert found.relative_error > 0.6 * 0.05
+    never = simulate(one, photons=2**14, seed=1, device=device, relative_error=1e-6)
+    assert never.photons == 2**14 and not never.partial and never.relative_error > 1e-6
+
+
+def test_the_stopping_rule_does_not_see_how_many_devices_there_are():
+    options, seen = {"photons": 2**20, "seed": 1, "relative_error": 0.1}, []
+    one = here(**options, progress=lambda *report: seen.append(report[0]))
+    same(simulate(scene(), **options, device="cpu,cpu"), one)
+    errors = [remark for remark in seen if remark.startswith("error")]
+    assert "after 32 batches; about " in errors[0] and errors[0].endswith(" photons are needed")
+    batches = one.photons // one.batch_size
+    assert errors[-1] == f"error {100 * one.relative_error:.3g} % after {batches} batches"
+
+
+def test_a_resumed_run_counts_all_batches_for_its_stopping_rule(whole):
+    photons, seen = 64 * whole[True].batch_size, []
+    resumed = here(
+        photons=photons,
+        relative_error=1e-6,
+        progress=lambda *report: seen.append(report[0]),
+        run=RunOptions(resume=whole[True]),
+    )
+    assert resumed.photons == photons
+    assert [remark for remark in seen if remark.startswith("error")][-1].split(" after ")[1].startswith("64 batches; ")
+
+
+# Light that stays on its device
+
+
+def test_light_and_derivatives_are_those_of_simulate():
+    one = plate()
+    names = ["medium.absorption", "medium.scattering", "targets[0].reflectance"]
+    options = {"photons": 20_000, "seed": 5, "device": "cpu", "derivatives": names}
+    tracer = LightTracer(one, **options, separate_targets=True)
+    tracer(0, 20_000)  # what was traced before does not stay
+    light, slopes = tracer(20_000, 20_000)
+    result = simulate(one, **options, run=RunOptions(first_photon=20_000))
+    scale = one.laser.photons_per_pulse * one.detections_per_photon
+    np.testing.assert_allclose(light.total.numpy(), result.detections.reshape(64, -1), rtol=1e-6)
+    target = result.component("ballistic") + result.component("forward_scattered")
+    np.testing.assert_allclose(light.target.numpy(), scale * target.reshape(64, -1), rtol=1e-6)
+    for name in names:
+        parts = scale * result.derivatives[name].reshape(3, 64, -1)
+        size = np.abs(parts).max()
+        np.testing.assert_allclose(slopes[name].total.numpy(), parts.sum(axis=0), rtol=1e-6, atol=1e-9 * size)
+        np.testing.assert_allclose(slopes[name].target.numpy(), parts[:2].sum(axis=0), rtol=1e-6, atol=1e-9 * size)
+    assert tracer.truth.depth.shape == (8, 8)
+
+
+def test_rates_of_a_tally_need_arrays_that_fit():
+    tally = wp.array(np.arange(24), dtype=wp.int64, device="cpu")
+    scale = wp.array([1.0, 2.0], dtype=wp.float64, device="cpu")
+    rates = sk.tally_rates(tally, scale, bins=2, components=(1, 3), parameters=2, parameter=1).numpy()
+    cube = np.arange(24).reshape(3, 2, 2, 2)[1:, ..., 1].sum(axis=0)
+    np.testing.assert_array_equal(rates, cube * np.array([[1.0], [2.0]]))
+    for wrong in ({"bins": 3}, {"bins": 2, "parameters": 2, "parameter": 2}, {"bins": 4, "components": (2, 2)}):
+        with pytest.raises(sk.ArgumentError):
+            sk.tally_rates(tally, scale, **wrong)
