@@ -13,7 +13,7 @@ import spadwarp
 from helpers.cli import DEVICE, ROOT, run, tables
 from helpers.scenes import scene as make_scene
 from spadwarp.cli import app
-from spadwarp.cli._app import STAGES
+from spadwarp.cli.app import STAGES
 from spadwarp.dataset import load_recipe
 from spadwarp.denoise import load_training_recipe
 from spadwarp.run import SCHEMAS, json_schema
@@ -53,12 +53,12 @@ def test_every_choice_in_the_template_is_valid():
 
 
 def test_examples_go_by_name(tmp_path):
-    printed = run("examples", "--json", tmp_path / "printed.json").stdout
+    printed = run("list", "--json", tmp_path / "printed.json").stdout
     known = tables(tmp_path / "printed.json")
     assert {path.stem for path in (ROOT / "configs" / "scenes").glob("*.toml")} == set(known["scenes"])
     assert all(name in printed for names in known.values() for name in names)
-    assert run("examples", "plane_5m").stdout.startswith("# A grey wall")
-    assert "'nothing'" in run("examples", "nothing", code=2).stderr
+    assert run("list", "scenes", "plane_5m").stdout.startswith("# A grey wall")
+    assert "'nothing'" in run("list", "scenes", "nothing", code=2).stderr
     assert spadwarp.load_scene("plane_5m") == spadwarp.load_scene(ROOT / "configs" / "scenes" / "plane_5m.toml")
     assert load_recipe("small").name == "spadwarp small" and load_training_recipe("usdn").model == "usdn"
     small = ("--set", "camera.width=4", "--set", "camera.height=4", "--set", "output.png=false", "--photons", 1000)
@@ -136,7 +136,7 @@ def test_every_field_is_described():
 
 def test_schema_tells_editors_where_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    printed = run("schema", "scene").stdout
+    printed = run("init", "--schema", "scene").stdout
     assert "#:schema ./scene.schema.json" in printed and "even-better-toml" in printed
     assert tables("scene.schema.json") == json.loads(json.dumps(json_schema("scene")))
     with pytest.raises(spadwarp.ArgumentError, match="'film' is not one of 'scene'"):

@@ -239,7 +239,7 @@ def test_commands_write_page_and_video(result, tmp_path):
         out = tmp_path / name
         outcome = run(command[0], tmp_path, "--out", out, *command[1:])
         assert outcome.stdout.startswith(f"written: {out} (") and out.is_file()
-    assert "two numbers" in run("video", tmp_path, "--window", "a", code=2).output
+    assert "two numbers" in run("view", tmp_path, "--out", "a.gif", "--window", "a", code=2).output
 
 
 def test_a_page_is_never_written_over_its_source(tmp_path):

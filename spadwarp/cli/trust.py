@@ -1,0 +1,285 @@
+"""Commands about trust and speed: `validate`, `bench`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from spadwarp.cli.app import complain, fail, running, say
+from spadwarp.cli.options import command
+from spadwarp.cli.outputs import check_outputs, write_json
+from spadwarp.cli.text import in_bytes, new_table, short, show_table
+from spadwarp.errors import FileError
+from spadwarp.units import percent
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from spadwarp.benchmark import BenchResult, Comparison
+    from spadwarp.validate import CaseResult
+
+
+@command()
+def validate(
+    cases: list[str] | None = None,
+    *,
+    photons: int = 1_000_000,
+    seed: int = 0,
+    device: str | None = None,
+    tabulated: bool = False,
+    plots: Path | None = None,
+) -> None:
+    """Compare the simulator with known results of physics.
+
+    A correct simulator fails in one run of a thousand. Exit code 1 if a value does not agree with its reference.
+
+    Args:
+        cases (CASE): Names of `spadwarp list validation`; all if left out.
+        photons: Photons for each scene of a case.
+        seed: Key of the random numbers.
+        tabulated: Use Henyey–Greenstein as tables of angle and value.
+        plots (DIR): Also draw a picture of each case.
+
+    \b
+    Examples:
+      spadwarp validate
+      spadwarp validate slab cube60 --photons 1e7 --seed 1 --json report.json --plots plots/
+    """
+    from spadwarp.validate import CASES, draw_results, report, run
+
+    check_outputs(plots, [f"{name}.png" for name in CASES], option="--plots")
+    announce = None if running.quiet else lambda case: complain(f"{case.name}: {case.summary}")
+    options: dict[str, Any] = {"photons": photons, "seed": seed}
+    results = run(cases or None, device=device, tabulated=tabulated, progress=announce, **options)
+    failed = [result for result in results if not result.passed]
+    write_json(report(results, **options))
+    drawn = [] if plots is None else draw_results(results, plots)
+    show_table(_case_table(results))
+    say(f"{len(results) - len(failed)} of {len(results)} agree" + (f"; plots in {plots}" if drawn else ""))
+    if failed:
+        fail("\n".join(f"{one.name}: {one.quantity}: z = {one.z:.2f}" for one in failed))
+
+
+def _case_table(results: Sequence[CaseResult]) -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("case", no_wrap=True)
+    table.add_column("quantity", overflow="fold")
+    for title in ("value", "reference", "error", "z", ""):
+        table.add_column(title, justify="right", no_wrap=True)
+    before = None
+    for one in results:
+        table.add_row(
+            one.name if one.name != before else "",
+            one.quantity,
+            f"{one.value:.6g}",
+            f"{one.reference:.6g}",
+            f"{one.standard_error:.2g}",
+            f"{one.z:+.2f}",
+            Text("ok", "green") if one.passed else Text("FAILED", "bold red"),
+        )
+        before = one.name
+    return table
+
+
+@command()
+def bench(
+    cases: list[str] | None = None,
+    *,
+    device: str | None = None,
+    photons: int | None = None,
+    repeats: int = 3,
+    compare: Path | None = None,
+) -> None:
+    """Measure the speed of named cases.
+
+    Compile time is apart from run time. "error" is the relative standard error of the brightest bins after one second
+    of transport.
+
+    With --compare, a case is faster or slower where the 99 % confidence interval of the ratio of its speeds (the t-test
+    of Welch on the logarithms of the timed runs) lies more than 3 % from 1; the same where it stays within 10 %; else
+    unclear, for which more --repeats help. Ends with code 1 where a case is slower, or a mean that is known from
+    elsewhere is missed.
+
+    Args:
+        cases (CASE): Names of `spadwarp list benchmarks`, or "scaling"; all if left out. A FILE.json that --json wrote
+            stands for its results, and nothing is measured.
+        photons: Photons of a timed run. By default chosen for the device.
+        repeats: Timed runs; the fastest is reported.
+        compare: Also say which cases are faster, slower or the same as in FILE, written by --json; for a directory, as
+            in its newest file from such a device.
+
+    \b
+    Examples:
+      spadwarp bench water staircase_5m --json before.json
+      spadwarp bench water staircase_5m --compare before.json
+      spadwarp bench --compare before.json after.json
+      spadwarp bench scaling --device cpu
+    """
+    from spadwarp.benchmark import history, load_report
+
+    stored = _stored_results(cases)
+    before = None
+    if compare is not None and compare.is_dir():
+        history(compare)  # one without reports is known before cases are measured
+    elif compare is not None:
+        before = load_report(compare)
+    check_outputs(inputs=(compare, stored))
+    if stored is not None:
+        summary = load_report(stored)
+        _say_stored(summary)
+    else:
+        summary = _measure(cases, device=device, photons=photons, repeats=repeats)
+    slower = []
+    if compare is not None:
+        try:
+            slower = _compare(summary, compare, before)
+        except FileError:  # no report of such a device: what was measured is kept
+            write_json(summary)
+            raise
+    write_json(summary)
+    checks = {row["case"]: row["check"] for row in summary["results"]}
+    missed = [case for case, check in checks.items() if check is not None and not check["passed"]]
+    problems = [f"{', '.join(missed)}: a mean is not what it should be"] if missed else []
+    problems += [f"{', '.join(slower)}: slower than in {compare}"] if slower else []
+    if problems:
+        fail("\n".join(problems))
+
+
+def _stored_results(cases: Sequence[str] | None) -> Path | None:
+    """The file that stands for results, instead of names of cases."""
+    files = [case for case in cases or () if case.endswith(".json")]
+    if files and len(cases or ()) > 1:
+        raise typer.BadParameter(f"{files[0]} cannot be combined with other cases and files", param_hint="CASE")
+    return Path(files[0]) if files else None
+
+
+def _measure(cases: list[str] | None, **options: Any) -> dict[str, Any]:
+    """Runs the cases."""
+    from spadwarp.benchmark import report, run
+
+    results: list[BenchResult] = []
+
+    announce = None if running.quiet else lambda case: complain(f"{case.name}: {case.summary}")
+    try:
+        run(cases or None, progress=announce, found=results.append, **options)
+    except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
+        if results:
+            write_json(report(results))
+        raise
+    summary = report(results)
+    _say_summary(results, summary["provenance"])
+    return summary
+
+
+def _say_stored(stored: dict[str, Any]) -> None:
+    from spadwarp.benchmark import BenchResult
+
+    names = [field.name for field in fields(BenchResult)]
+    results = [BenchResult(**{name: row[name] for name in names}) for row in stored["results"]]
+    _say_summary(results, stored["provenance"])
+
+
+def _compare(summary: dict[str, Any], place: Path, before: dict[str, Any] | None) -> list[str]:
+    """Adds the comparison to the summary; returns the cases that are slower."""
+    from spadwarp.benchmark import compare, load_report, newest_report
+
+    if before is None:
+        cases = [row["case"] for row in summary["results"]]
+        place = newest_report(place, like=summary["provenance"], cases=cases)
+        before = load_report(place)
+    found = compare(summary, before)
+    summary["comparison"] = [asdict(one) for one in found]
+    made = before["provenance"]
+    say(f"against {place}: {made['device_name']}, spadwarp {made['spadwarp']}, {made['date']}")
+    if found:
+        show_table(_comparison_table(found))
+    else:
+        say("no case is in both")
+    return [one.case for one in found if one.verdict == "slower"]
+
+
+def _bench_table(results: Sequence[BenchResult]) -> Table:
+    titles = (
+        "faces",
+        "setup [s]",
+        "compile [s]",
+        "run [s]",
+        "per second",
+        "collisions/s",
+        "queries/s",
+        "memory",
+        "error",
+    )
+    table = new_table("case", *titles)
+    for result in results:
+        unit, rate = next(iter(result.rates.items()))
+        memory = result.tally_bytes if result.memory is None else result.memory
+        error = result.error_per_root_second
+        table.add_row(
+            result.case,
+            str(result.faces or "-"),
+            *(short(value) for value in (result.setup, result.compile, min(result.seconds))),
+            f"{rate:.3g} {unit}",
+            *(short(result.rates.get(unit, math.nan)) for unit in ("collisions", "queries")),
+            "-" if memory is None else in_bytes(memory) + ("" if result.memory is not None else "*"),
+            "-" if error is None else f"{100 * error:.3g} %",
+        )
+    return table
+
+
+def _growth(results: Sequence[BenchResult]) -> list[str]:
+    """The result of "scaling": time and memory of the largest case over those of a smaller one."""
+    lines = []
+    for kind, base in (("photons_", -2), ("faces_", 0), ("bins_", 0)):
+        cases = [result for result in results if result.case.startswith(kind)]
+        if len(cases) < 2:
+            continue
+        small, large = cases[base], cases[-1]
+        time = large.rates["photons"] and small.rates["photons"] / large.rates["photons"]
+        line = f"{small.case} -> {large.case}: {time:.3g} times the time of a photon"
+        if small.memory and large.memory:
+            line += f", {large.memory / small.memory:.3g} times the memory"
+        lines.append(line)
+    return lines
+
+
+def _comparison_table(found: Sequence[Comparison]) -> Table:
+    table = new_table("case", "", "before", "now", "ratio", "99 % interval")
+    for one in found:
+        interval = "-" if one.interval is None else f"{one.interval[0]:.3f} to {one.interval[1]:.3f}"
+        rates = (_with_spread(one.before, one.spread_before), _with_spread(one.now, one.spread_now))
+        table.add_row(f"{one.case} [{one.unit}/s]", one.verdict, *rates, f"{one.ratio:.3f}", interval)
+    return table
+
+
+def _with_spread(rate: float, spread: float | None) -> str:
+    return f"{rate:.3g} ± ?" if spread is None else f"{rate:.3g} ± {percent(spread)} %"
+
+
+def _say_summary(results: Sequence[BenchResult], made: Mapping[str, Any]) -> None:
+    show_table(_bench_table(results))
+    if any(result.memory is None and result.tally_bytes for result in results):
+        say("* histograms alone; Warp does not count memory on the CPU")
+    say(f"{made['device_name']} ({made['device']}), {made['date']}")
+    for line in _growth(results):
+        say(line)
+    for result in results:
+        if result.check is not None:
+            say(_checked(result.case, result.check))
+
+
+def _checked(case: str, check: Mapping[str, Any]) -> str:
+    verdict = "agrees with" if check["passed"] else "MISSES"
+    return (
+        f"{case}: {check['name']} {100 * check['value']:.3f} ± {100 * check['standard_error']:.3f} %, "
+        f"{verdict} {100 * check['reference']:.2f} %"
+    )
