@@ -49,7 +49,8 @@ def info(path: Path, *, verify: bool = False) -> None:
     elif (path / "recipe.toml").is_file():
         manifest = spadwarp.dataset.read_manifest(path)
         size = sum(one["bytes"] for one in manifest["files"].values())
-        answer({"kind": "dataset", "bytes": size, **manifest}, hide=("files", "checksums"))
+        say(readable({"kind": "dataset", "bytes": size, **{**manifest, "files": len(manifest["files"])}}))
+        write_json({"kind": "dataset", **manifest})
     else:
         held = spadwarp.load(path)
         summary = spadwarp.files.summary(held)

@@ -173,6 +173,7 @@ def _measure(cases: list[str] | None, **options: Any) -> dict[str, Any]:
         run(cases or None, progress=announce, found=results.append, **options)
     except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
         if results:
+            show_table(_bench_table(results))
             write_json(report(results))
         raise
     summary = report(results)

@@ -62,7 +62,7 @@ def card(plan: Plan, manifest: dict[str, Any]) -> str:
             f" (here {plan.depth_offset:.6g} m and {plan.depth_step:.6g} m); code 0 is no return; "
             "`np.unpackbits(label, axis=-1)[..., :width]` are the labels.",
             "",
-            "`spadwarp dataset export <this folder> --format parquet --out <folder>` writes float depth, clean depth, "
+            "`spadwarp export <this folder> --format parquet --out <folder>` writes float depth, clean depth, "
             "labels and numbers for `datasets.load_dataset(<folder>)`; `webdataset` and `zarr` likewise.",
             "",
             *tables,

@@ -29,7 +29,7 @@ def to_frames(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], str
     said = None
     if axes is None:
         axes = _inferred(values.shape, letters)
-        said = f"axes: {_in_words(values.shape, axes)} (--axes {axes})"
+        said = f"axes: {_in_words(values.shape, axes)} (axes = {axes})"
     elif sorted(axes) != sorted(letters):
         raise ArgumentError(f"axes = {axes!r} are not the letters of {letters} in any order, for shape {values.shape}")
     return np.transpose(values, [axes.index(letter) for letter in letters]), said
@@ -47,7 +47,7 @@ def _inferred(shape: tuple[int, ...], letters: str) -> str:
     if len(best) == 1 or (best and plausible[best[0]] * _CLEARLY <= plausible[best[1]]):
         return best[0]
     raise ArgumentError(
-        f"the order of the axes is missing (--axes): shape {shape} may be "
+        f"the order of the axes is missing (axes): shape {shape} may be "
         + " or ".join(f"{order} ({_in_words(shape, order)})" for order in orders)
     )
 
@@ -69,6 +69,6 @@ def image_shape(pixels: int, given: tuple[int, int] | None, shapes: list[tuple[i
         return given
     found = {shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and shape[0] * shape[1] == pixels}
     if len(found) != 1:
-        raise ArgumentError(f"the image's size is missing (--image-size): {pixels} pixels, one after the other")
+        raise ArgumentError(f"the image's size is missing (image_size): {pixels} pixels, one after the other")
     (height, width), *_ = found
     return height, width

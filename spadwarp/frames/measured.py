@@ -164,7 +164,7 @@ def read_histograms(
         values = values.sum(axis=0, dtype=np.int64 if values.dtype.kind in "iu" else np.float64)
     if gate_start is None and raw.gate_start is None:
         origin = "tag 0" if raw.first else "bin 0"
-        text = f"{path.name}: gate start is not given (--gate-start-ns): {origin} is taken for the time of the pulse"
+        text = f"{path.name}: gate start is not given (gate_start): {origin} is taken for the time of the pulse"
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
     return Histograms(
         values=np.ascontiguousarray(values),
@@ -237,7 +237,7 @@ def listed_arrays(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -
 
 def unnamed_dataset(path: Path, listed: str) -> ArgumentError:
     """The error for a file of several arrays of which none was named."""
-    return ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
+    return ArgumentError(f"{path}: the dataset is missing (dataset); the file holds {listed}")
 
 
 def _read_hdf5(path: Path, asked: _Asked) -> _Raw:
@@ -283,7 +283,7 @@ def _read_mat(path: Path, asked: _Asked) -> _Raw:
     width = width if width is not None and 1e-15 < width < 1e-3 else None
     if entry.kind == "cell":
         if asked.tag_unit is None:
-            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (--tag-unit-ps)")
+            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
         counts, step, first = histogram_of_tags(np.asarray(value), unit=asked.tag_unit, bin_width=asked.bin_width)
         notes.append(
             f"time tags of {counts.shape[1]} x {counts.shape[0]} pixels, bins of {step * 1e12:g} ps from tag {first}"
@@ -326,7 +326,7 @@ def _read_ptu(path: Path, asked: _Asked) -> _Raw:
     counts, width, start, text = read_ptu(path, image_size=asked.image_size, sum_frames=asked.sum_frames)
     notes = [text]
     if counts.ndim == 4:
-        notes.append(f"{len(counts)} frames; --sum-frames adds them up")
+        notes.append(f"{len(counts)} frames; sum_frames adds them up")
     return _Raw(values=counts, bin_width=width, gate_start=start, ordered=True, notes=tuple(notes))
 
 

@@ -69,7 +69,7 @@ def _check_tags(file: Any, path: Path) -> None:
 
 def _image(file: Any, sum_frames: bool) -> NDArray[np.int32]:
     frames, height, width, _, bins = file.shape
-    most_values((1 if sum_frames else frames, height, width, bins), "adding up the frames (--sum-frames)")
+    most_values((1 if sum_frames else frames, height, width, bins), "adding up the frames (sum_frames)")
     options: dict[str, Any] = {"channel": -1, "dtype": np.uint32, "keepdims": False}
     counts = file.decode_image(frame=-1 if sum_frames or frames == 1 else None, **options)
     return np.ascontiguousarray(counts).view(np.int32)
@@ -84,7 +84,7 @@ def _scan(file: Any, image_size: tuple[int, int] | None) -> tuple[NDArray[np.int
     bins = int(dtime.max(initial=0)) + 1
     if image_size is None:
         if marks.size:
-            raise ArgumentError(f"the image's size is missing (--image-size): a scan of {marks.size} markers")
+            raise ArgumentError(f"the image's size is missing (image_size): a scan of {marks.size} markers")
         return np.bincount(dtime, minlength=bins).astype(np.int32)[None, None], "one point"
     height, width = image_size
     most_values((height, width, bins), "a smaller image")

@@ -52,7 +52,7 @@ def histogram_of_tags(
     tags = tags.astype(np.int64)
     first = int(tags.min()) // step * step
     bins = (int(tags.max()) - first) // step + 1
-    wider = f"a wider bin than {step * unit * 1e12:g} ps (--bin-width-ps)"
+    wider = f"a wider bin than {step * unit * 1e12:g} ps (bin_width)"
     if bins > _MOST_BINS:
         raise ArgumentError(
             f"time tags from {tags.min()} to {tags.max()} are {bins} bins, more than {_MOST_BINS}; {wider} would help,"

@@ -18,7 +18,7 @@ class Water(Section):
 
     section: ClassVar[str] = "medium"
     preset: str | None = None
-    """a named water, see `spadwarp presets medium`"""
+    """a named water, see `spadwarp list presets medium`"""
     absorption: float = Field(0.0, ge=0, le=1e6)
     """absorption coefficient a [1/m]"""
     scattering: float = Field(0.0, ge=0, le=1e6)

@@ -68,7 +68,7 @@ class Medium(Water):
     scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
     """what scattering does to the polarisation of light, over any phase function; "none": light is not polarised"""
     matrix_table: str | None = None
-    """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp particles` writes one
+    """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp water` writes one
     """
     depolarisation_ratio: float = Field(0.039, ge=0, le=0.5)
     """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""

@@ -261,11 +261,6 @@ def test_runs_are_repeated_until_enough():
     assert result.error_per_root_second is None
 
 
-def test_cases_are_listed():
-    listed = run("bench", "--list").output
-    assert all(name in listed for name in [*CASES, "scaling"])
-
-
 @pytest.mark.parametrize("script", ["run_pmcx", "run_pmcxcl", "run_pmmc", "run_mitransient"])
 def test_a_missing_peer_is_reported_and_is_no_failure(script, tmp_path):
     for module in ("pmcx", "pmcxcl", "pmmc", "mitsuba"):

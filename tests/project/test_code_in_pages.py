@@ -42,7 +42,7 @@ SMALLER = {
 LEFT_OUT = {
     r"pip install|python3 -m venv|^\.venv/bin": "installs; .ci/run runs the README's two blocks",
     r"^spadwarp doctor": "reports on this machine; tests/doctor",
-    r"--ray-address|out/cluster/": "needs a Ray cluster; tests/parallel runs Ray on this machine",
+    r"--ray |out/cluster/": "needs a Ray cluster; tests/parallel runs Ray on this machine",
     r"^sbatch|part\$id|out/part": "needs Slurm; tests/transport runs and merges shards",
     r"^torchrun": "needs several GPUs",
     r"train configs/|\bruns/": "recipes for a GPU; tests/denoise trains the networks for a few steps",

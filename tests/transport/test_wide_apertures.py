@@ -11,7 +11,7 @@ from helpers.scenes import scene
 from reference.aperture import Rig, count
 from reference.walk import Medium
 from spadwarp.scene import Scene
-from spadwarp.validate.camera import vessel_reading, white_vessel
+from spadwarp.validate.cases import vessel_reading, white_vessel
 
 pytestmark = pytest.mark.physics
 
