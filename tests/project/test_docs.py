@@ -110,7 +110,7 @@ def commands(text):
                     yield shlex.split(line, comments=True)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=by_name)
 def test_commands_in_the_text_name_what_there_is(page):
     """Commands, options, configurations and scripts."""
     printed = {}

@@ -36,6 +36,3 @@ def test_python_blocks_run(readme, roots, printed, tmp_path):
     process = subprocess.run([sys.executable, program], cwd=folder, env=environment, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr
     assert printed in process.stdout
-
-
-PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
