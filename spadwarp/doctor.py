@@ -21,7 +21,7 @@ from spadwarp.transport import simulate, trace
 __all__ = ["Diagnosis", "SelfTest", "diagnose"]
 
 NEEDED = (
-    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "rich", "h5py",
+    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py",
     "matplotlib", "tomli-w", "PyYAML", "jinja2",
 )  # fmt: skip
 

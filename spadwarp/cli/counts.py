@@ -14,7 +14,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, write_json
-from spadwarp.cli.text import count, new_table, progress, rows, short, show_table
+from spadwarp.cli.text import count, progress, rows, show_table
 from spadwarp.cli.text import written as names_of
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.limits import parse_number
@@ -23,7 +23,6 @@ from spadwarp.units import percent, range_from_time, rounded
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-    from rich.table import Table
 
     from spadwarp import Result, Scene
     from spadwarp.frames import Recording
@@ -331,38 +330,36 @@ def _bounds(path: Path, scene: Scene, options: dict[str, Any]) -> None:
     write_json(found.to_dict())
 
 
-def _bounds_table(found: Bounds) -> Table:
-    columns = [f"with\n{name}" for name in found.names[:-1]]
-    table = new_table("unknown", "value", "bound", "bound [%]", "others\nknown", "ratio", *columns)
+def _bounds_table(found: Bounds) -> list[dict[str, Any]]:
+    table = []
     for name, one in found.bounds.items():
-        row = found.names.index(name) if name in found.names else -1
-        correlations = [f"{x:+.3f}" for x in found.correlation[row, :row]] if row > 0 else []
+        row = found.names.index(name) if name in found.names else 0
         label = f"{name} [{one.unit}]" if one.unit else name
-        table.add_row(
-            f"{label}, median pixel" if one.per_pixel else label,
-            "" if name == "depth" else f"{one.value:.4g}",
-            short(one.standard_error),
-            "" if one.relative != one.relative else f"{100 * one.relative:.3g}",
-            short(one.alone),
-            f"{one.standard_error / one.alone:.3g}",
-            *correlations,
-            *[""] * (len(columns) - len(correlations)),
-        )
+        cells = {
+            "unknown": f"{label}, median pixel" if one.per_pixel else label,
+            "value": "" if name == "depth" else f"{one.value:.4g}",
+            "bound": one.standard_error,
+            "bound [%]": "" if one.relative != one.relative else f"{100 * one.relative:.3g}",
+            "others known": one.alone,
+            "ratio": one.standard_error / one.alone,
+        }
+        others = enumerate(found.names[:row])
+        table.append(cells | {f"with {other}": f"{found.correlation[row, k]:+.3f}" for k, other in others})
     return table
 
 
-def _estimates(found: Fit) -> Table:
-    table = new_table("estimate", "value", "±", "95 % interval", "start", "noise of\nsimulation")
-    for one in found.estimates.values():
-        table.add_row(
-            f"{one.name} [{one.unit}]" if one.unit else one.name,
-            rounded(one.value, one.standard_error),
-            f"{one.standard_error:.2g}",
-            " to ".join(rounded(end, one.standard_error) for end in one.interval),
-            rounded(one.start, one.standard_error),
-            f"{percent(one.simulation)} %",
-        )
-    return table
+def _estimates(found: Fit) -> list[dict[str, Any]]:
+    return [
+        {
+            "estimate": f"{one.name} [{one.unit}]" if one.unit else one.name,
+            "value": rounded(one.value, one.standard_error),
+            "±": f"{one.standard_error:.2g}",
+            "95 % interval": " to ".join(rounded(end, one.standard_error) for end in one.interval),
+            "start": rounded(one.start, one.standard_error),
+            "noise of simulation": f"{percent(one.simulation)} %",
+        }
+        for one in found.estimates.values()
+    ]
 
 
 def _of_pixels(one: EstimateMap) -> str:

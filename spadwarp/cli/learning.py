@@ -12,7 +12,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, write_json
-from spadwarp.cli.text import count, progress, readable, rows, show_table
+from spadwarp.cli.text import count, progress, readable, show_table
 from spadwarp.limits import environment_integer
 
 if TYPE_CHECKING:
@@ -181,31 +181,25 @@ def evaluate(
 
 
 def _say_gains(found: Evaluation) -> None:
-    from rich.table import Table
-
     from spadwarp.denoise import TITLES
 
-    table = Table("method", *found.levels, "mean")
+    table = []
     for method in found.ranking():
-        gains = []
+        row = {"method": TITLES[method]}
         for level in (*found.levels, None):
             after, before = found.mean(method, level=level), found.mean("input", level=level)
-            gains.append(f"{after.psnr:.2f}" if method == "input" else f"{after.psnr - before.psnr:+.2f}")
-        table.add_row(TITLES[method], *gains)
+            gain = f"{after.psnr:.2f}" if method == "input" else f"{after.psnr - before.psnr:+.2f}"
+            row["mean" if level is None else level] = gain
+        table.append(row)
     say(f"PSNR of the input, and gain over it [dB], by backscatter fraction or photons; {found.summary}")
     show_table(table)
-    lines = {}
-    for method in found.methods:
+    for method in found.methods if found.steps else ():
         steps = [item for (name, _), item in found.steps.items() if name == method]
-        lines[TITLES[method]] = f"{sum(s.resolved for s in steps)} of {sum(s.total for s in steps)} steps"
-    if found.steps:
-        say(rows(lines))
+        say(f"{TITLES[method]}: {sum(s.resolved for s in steps)} of {sum(s.total for s in steps)} steps")
 
 
 def _scenes(models: list[str], report: Path | None, **options: Any) -> None:
     """Scenes that no training saw, by scene type."""
-    from rich.table import Table
-
     from spadwarp.denoise import evaluate_scenes, scene_table, write_scene_report
 
     with progress("frames") as shown:
@@ -214,10 +208,7 @@ def _scenes(models: list[str], report: Path | None, **options: Any) -> None:
     for setting, water in found.types():
         names, lines = scene_table(found, setting, water)
         say(f"{setting}, backscatter {water}: PSNR of the input and gains over it [dB] by backscatter fraction")
-        table = Table(*names)
-        for row in lines:
-            table.add_row(*row)
-        show_table(table)
+        show_table([dict(zip(names, line, strict=True)) for line in lines])
     if written:
         say(f"written: {written[0]}")
     write_json({**found.to_dict(), "files": written})
@@ -226,17 +217,17 @@ def _scenes(models: list[str], report: Path | None, **options: Any) -> None:
 def _points(**options: Any) -> None:
     """Histograms: ours and the best tuned classical estimate of each point."""
     import numpy as np
-    from rich.table import Table
 
     from spadwarp.denoise import TITLES, evaluate_histograms
 
     with progress("points") as shown:
         found = evaluate_histograms(progress=shown, **options)
-    table = Table("photons", "SBR", "background", "returns", "RMSE [mm]", "best classical [mm]", "which")
+    table = []
     for point, values in found.rmse.items():
         name, best = found.best(point)
-        numbers = f"{1e3 * values['histograms']:.1f}", f"{1e3 * best:.1f}"
-        table.add_row(*map(str, point), *numbers, TITLES[name])
+        row = dict(zip(("photons", "SBR", "background", "returns"), map(str, point), strict=True))
+        row |= {"RMSE [mm]": f"{1e3 * values['histograms']:.1f}", "best classical [mm]": f"{1e3 * best:.1f}"}
+        table.append({**row, "which": TITLES[name]})
     show_table(table)
     ratios = found.ratios()
     say(f"RMSE over that of the best classical estimate: median {np.median(ratios):.2f}, highest {ratios.max():.2f}")
@@ -245,8 +236,6 @@ def _points(**options: Any) -> None:
 
 def _photons(data: Path, models: list[str], report: Path | None, **options: Any) -> None:
     """Frames of few photons from a result."""
-    from rich.table import Table
-
     from spadwarp.denoise import TITLES, draw_photon_sweep, photon_sweep
 
     result = opt.load_run(data)
@@ -254,13 +243,12 @@ def _photons(data: Path, models: list[str], report: Path | None, **options: Any)
         found = photon_sweep(result, models=[one for one in models if one != "bm3d"], progress=shown, **options)
     written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
     say(f"RMSE [mm]; {found.summary}")
+    titles = {"input": "likelihood of each pixel", **TITLES, "bound": "Cramér–Rao bound"}
     for row, ratio in enumerate(found.sbr):
-        table = Table(f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons))
-        for name, values in found.rmse.items():
-            title = "likelihood of each pixel" if name == "input" else TITLES[name]
-            table.add_row(title, *(f"{1e3 * one:.3g}" for one in values[row]))
-        table.add_row("Cramér–Rao bound", *(f"{1e3 * one:.3g}" for one in found.bound[row]))
-        show_table(table)
+        methods = {name: values[row] for name, values in found.rmse.items()} | {"bound": found.bound[row]}
+        columns = [f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons)]
+        lines = [[titles[name], *(1e3 * float(one) for one in values)] for name, values in methods.items()]
+        show_table([dict(zip(columns, line, strict=True)) for line in lines])
     if written:
         say(f"written: {written[0]}")
     write_json({**found.to_dict(), "files": written})

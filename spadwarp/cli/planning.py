@@ -19,10 +19,10 @@ from spadwarp.cli.text import (
     bracketed,
     count,
     counted,
-    new_table,
     percent,
     progress,
     readable,
+    rows,
     short,
     show_table,
 )
@@ -32,8 +32,6 @@ from spadwarp.limits import shown
 from spadwarp.units import with_prefix
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from spadwarp import Scene
     from spadwarp.analytic import BudgetRow, DepthErrorRow, Proposal
     from spadwarp.water import ParticleOptics
@@ -157,7 +155,7 @@ def plan(
     say(readable({name: value for name, value in found.to_dict().items() if name not in hidden}))
     if found.largest_range == found.largest_range:
         say(f"largest range, for a plane square to the optical axis: {found.largest_range:.3g} m; {found.range_limit}")
-    show_table(_terms(found))
+    say(rows(_terms(found)))
     for name in ("co", "cross") if found.channels else ():
         say(_reception(found, name))
     say(_verdict(found))
@@ -210,34 +208,23 @@ def _reception(found: Proposal, name: str) -> str:
     return f"{text}; the same Cramér–Rao bound takes {ratio**2:.2g} times the pulses."
 
 
-def _terms(found: Proposal) -> Table:
+def _terms(found: Proposal) -> dict[str, str]:
     """The parts of the depth error at the proposed pulses."""
     pilot = found.pilot
     floors = ", ".join(f"{name} {1000 * value:.3g}" for name, value in pilot.floor.items() if name != found.method)
+    alone = pilot.unscattered_floor[found.method]
+    unscattered = f"unscattered light alone: {1000 * alone:.3g}" if alone < math.inf else "all light is scattered"
     about = {
         "shot noise": "falls with the root of the pulses",
         "background": "backscatter, dark counts, ambient light; falls likewise",
         "Cramér–Rao bound": "both together: the least error of an unbiased estimator",
-        "forward scattering": f"{found.method}; does not fall with the pulses; {floors}",
+        "forward scattering": f"{found.method}; does not fall with the pulses; {floors}; from {count(pilot.photons)} "
+        f"traced photons, ±{1000 * pilot.run_noise:.2g} a pixel; {unscattered}",
         "pile-up": "change of the median depth",
         "total": "root of the sum of squares",
     }
-    table = new_table(f"depth error, {count(found.pulses)} pulses", "mm", "")
-    table.columns[-1].justify = "left"
-    table.columns[-1].no_wrap = False
-    for name, value in found.terms.items():
-        table.add_row(name, short(1000 * value), about[name])
-        if name == "forward scattering":
-            alone = pilot.unscattered_floor[found.method]
-            unscattered = (
-                f"unscattered light alone: {1000 * alone:.3g}" if alone < math.inf else "all light is scattered"
-            )
-            table.add_row(
-                "",
-                "",
-                f"from {count(pilot.photons)} traced photons, ±{1000 * pilot.run_noise:.2g} a pixel; " + unscattered,
-            )
-    return table
+    title = f"depth error, {count(found.pulses)} pulses"
+    return {title: "mm"} | {name: f"{short(1000 * value):<6}  {about[name]}" for name, value in found.terms.items()}
 
 
 @command()
@@ -284,11 +271,12 @@ def sweep(
         raise typer.BadParameter("needs --vary with a field of the scene", param_hint="--of")
     stem = "budget" if of_range else "sweep"
     check_outputs(out, (f"{stem}.png", f"{stem}.csv"), inputs=(scene, *read.files))
-    notes, table, summary = [], None, {}
+    notes: list[str] = []
+    summary: dict[str, Any] = {}
     if of_range:
         budget = spadwarp.budget(read, _ranges(values), medium or None, reflectance=reflectance, device=device)
         found = [dataclasses.asdict(row) for row in budget]
-        table = _budget_table([row.medium for row in budget], "water", budget)
+        table = _budget_table("water", [row.medium for row in budget], budget)
         written = _write_curves(out, stem, spadwarp.viz.draw_budget, budget, found)
         notes = _budget_notes(budget, read)
     else:
@@ -298,7 +286,7 @@ def sweep(
         written = _write_curves(out, stem, spadwarp.viz.draw_sweep, curves, plain)
         names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in curves.values]
         draw: Any = _budget_table if of == "budget" else _error_table
-        table = draw(names, curves.field, curves.rows)
+        table = draw(curves.field, names, curves.rows)
         notes = _budget_notes(list[Any](curves.rows), read) if of == "budget" else []
         summary = {"field": curves.field, "values": list(curves.values), "of": of}
     show_table(table, keys=2 if of == "budget" else 1)
@@ -335,43 +323,28 @@ def _write_curves(
 _SCATTERS = 0.2  # optical depth: from here on scattered light adds more than a quarter to a target's
 
 
-def _budget_table(names: Sequence[str], title: str, found: Sequence[BudgetRow]) -> Table:
-    from spadwarp.analytic import OUTLIERS
-
-    table = new_table(
-        title,
-        "range\n[m]",
-        "c·r",
-        "gate [ns]",
-        "pulses",
-        "signal",
-        "background",
-        "α",
-        "signal/\nbackscatter",
-        "σ* [ps]",
-        "σ* [mm]",
-        "outliers",
-        "pulses\nfor 1 cm",
-    )
-    before = None
+def _budget_table(title: str, names: Sequence[str], found: Sequence[BudgetRow]) -> list[dict[str, Any]]:
+    table = []
     for name, row in zip(names, found, strict=True):
-        reached = row.outlier_probability <= OUTLIERS
-        table.add_row(
-            name if name != before else "",
-            f"{row.range:.4g}",
-            f"{row.optical_depth:.3g}",
-            f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
-            counted(row.pulses),
-            f"{row.signal:.3g}",
-            f"{row.background:.3g}",
-            f"{row.alpha:.3g}",
-            short(row.signal_to_backscatter),
-            bracketed(1e12 * row.sigma_time, reached),
-            bracketed(1e3 * row.sigma_depth, reached),
-            percent(row.outlier_probability),
-            "never" if math.isinf(row.pulses_for_1cm) else counted(row.pulses_for_1cm),
+        reached = row.outlier_probability <= spadwarp.analytic.OUTLIERS
+        gate = f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}"
+        table.append(
+            {
+                title: name,
+                "range [m]": f"{row.range:.4g}",
+                "c·r": row.optical_depth,
+                "gate [ns]": f"{gate}{'*' if row.gate_moved else ' '}",
+                "pulses": counted(row.pulses),
+                "signal": row.signal,
+                "background": row.background,
+                "α": row.alpha,
+                "signal/backscatter": row.signal_to_backscatter,
+                "σ* [ps]": bracketed(1e12 * row.sigma_time, reached),
+                "σ* [mm]": bracketed(1e3 * row.sigma_depth, reached),
+                "outliers": percent(row.outlier_probability),
+                "pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else counted(row.pulses_for_1cm),
+            }
         )
-        before = name
     return table
 
 
@@ -399,20 +372,18 @@ def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
     return notes
 
 
-def _error_table(names: Sequence[str], title: str, found: Sequence[DepthErrorRow]) -> Table:
-    table = new_table(
-        title, "σ* median [mm]", "σ* 90 % below [mm]", "outliers", "pixels with an estimate", "signal/backscatter"
-    )
-    for name, row in zip(names, found, strict=True):
-        table.add_row(
-            name,
-            short(1e3 * row.sigma_depth),
-            short(1e3 * row.sigma_depth_p90),
-            percent(row.outlier_probability),
-            percent(row.estimate_fraction),
-            short(row.signal_to_backscatter),
-        )
-    return table
+def _error_table(title: str, names: Sequence[str], found: Sequence[DepthErrorRow]) -> list[dict[str, Any]]:
+    return [
+        {
+            title: name,
+            "σ* median [mm]": 1e3 * row.sigma_depth,
+            "σ* 90 % below [mm]": 1e3 * row.sigma_depth_p90,
+            "outliers": percent(row.outlier_probability),
+            "pixels with an estimate": percent(row.estimate_fraction),
+            "signal/backscatter": row.signal_to_backscatter,
+        }
+        for name, row in zip(names, found, strict=True)
+    ]
 
 
 # Values of --particles, by theory.

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import math
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
-from spadwarp.cli.app import complain, running
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Column, Table
+from spadwarp.cli.app import complain, running, say
 
 __all__ = [
     "Report",
@@ -26,7 +21,6 @@ __all__ = [
     "count",
     "counted",
     "in_bytes",
-    "new_table",
     "percent",
     "progress",
     "readable",
@@ -133,58 +127,30 @@ def _plain(value: Any) -> str:
     return count(value) if isinstance(value, int) else str(value)
 
 
-def new_table(first: str, *titles: str) -> Table:
-    """A table of numbers, whose first column is text."""
-    from rich import box
-    from rich.table import Table
+def show_table(table: Sequence[Mapping[str, Any]], *, keys: int = 1) -> None:
+    """Rows of values by title on stdout, numbers to three digits, as wide as the terminal; 160 columns elsewhere.
 
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column(first, no_wrap=True)
-    for title in titles:
-        table.add_column(title, justify="right", no_wrap=True)
-    return table
-
-
-def show_table(table: Table, *, keys: int = 1) -> None:
-    """A table on stdout, as wide as the terminal; 160 columns elsewhere.
-
-    One that is wider is printed in several parts, each with the first `keys` columns, so that no number is cut off.
+    A table that is wider is printed in several parts, each with the first `keys` columns, so that no number is cut off.
     """
-    if running.quiet:
-        return
-    from rich.console import Console
-
-    console = Console(highlight=False, markup=False)  # "[m]" is a unit
-    if not console.is_terminal:
-        console = Console(highlight=False, markup=False, width=160)
-    for part in _parts(table, console, keys):
-        console.print(part)
-
-
-def _parts(table: Table, console: Console, keys: int) -> list[Table]:
-    """The table if it is not wider than the console or can break its lines, else parts of it that are not.
-
-    Each part begins with the first `keys` columns.
-    """
-    widest = console.options.update(width=10_000)
-
-    def part(columns: Sequence[Column]) -> Table:
-        chosen = copy.copy(table)
-        chosen.columns = [dataclasses.replace(column, _index=i) for i, column in enumerate(columns)]
-        return chosen
-
-    def fits(columns: Sequence[Column]) -> bool:
-        return console.measure(part(columns), options=widest).maximum <= console.width
-
-    if not all(column.no_wrap for column in table.columns) or fits(table.columns):
-        return [table]
-    first, groups = table.columns[:keys], [table.columns[keys : keys + 1]]
-    for column in table.columns[keys + 1 :]:
-        if fits([*first, *groups[-1], column]):
-            groups[-1].append(column)
+    titles = list(dict.fromkeys(title for row in table for title in row))
+    cells = {title: [title, *(_cell(row.get(title, "")) for row in table)] for title in titles}
+    widths = {title: max(map(len, column)) for title, column in cells.items()}
+    width = shutil.get_terminal_size().columns if sys.stdout is not None and sys.stdout.isatty() else 160
+    first, groups = titles[:keys], [titles[keys : keys + 1]]
+    for title in titles[keys + 1 :]:
+        if sum(widths[one] + 2 for one in (*first, *groups[-1], title)) - 2 <= width:
+            groups[-1].append(title)
         else:
-            groups.append([column])
-    return [part([*first, *group]) for group in groups]
+            groups.append([title])
+    for group in groups:
+        for line in range(len(table) + 1):
+            parts = [cells[title][line].ljust(widths[title]) for title in first]
+            parts += [cells[title][line].rjust(widths[title]) for title in group]
+            say("  ".join(parts).rstrip())
+
+
+def _cell(value: Any) -> str:
+    return short(value) if isinstance(value, float) else str(value)
 
 
 # Progress

@@ -13,13 +13,11 @@ import typer
 from spadwarp.cli.app import complain, fail, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import check_outputs, write_json
-from spadwarp.cli.text import in_bytes, new_table, short, show_table
+from spadwarp.cli.text import in_bytes, show_table
 from spadwarp.errors import FileError
 from spadwarp.units import percent
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from spadwarp.benchmark import BenchResult, Comparison
     from spadwarp.validate import CaseResult
 
@@ -59,35 +57,25 @@ def validate(
     failed = [result for result in results if not result.passed]
     write_json(report(results, **options))
     drawn = [] if plots is None else draw_results(results, plots)
-    show_table(_case_table(results))
+    show_table(_case_table(results), keys=2)
     say(f"{len(results) - len(failed)} of {len(results)} agree" + (f"; plots in {plots}" if drawn else ""))
     if failed:
         fail("\n".join(f"{one.name}: {one.quantity}: z = {one.z:.2f}" for one in failed))
 
 
-def _case_table(results: Sequence[CaseResult]) -> Table:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("case", no_wrap=True)
-    table.add_column("quantity", overflow="fold")
-    for title in ("value", "reference", "error", "z", ""):
-        table.add_column(title, justify="right", no_wrap=True)
-    before = None
-    for one in results:
-        table.add_row(
-            one.name if one.name != before else "",
-            one.quantity,
-            f"{one.value:.6g}",
-            f"{one.reference:.6g}",
-            f"{one.standard_error:.2g}",
-            f"{one.z:+.2f}",
-            Text("ok", "green") if one.passed else Text("FAILED", "bold red"),
-        )
-        before = one.name
-    return table
+def _case_table(results: Sequence[CaseResult]) -> list[dict[str, Any]]:
+    return [
+        {
+            "case": one.name,
+            "quantity": one.quantity,
+            "value": f"{one.value:.6g}",
+            "reference": f"{one.reference:.6g}",
+            "error": f"{one.standard_error:.2g}",
+            "z": f"{one.z:+.2f}",
+            "": "ok" if one.passed else "FAILED",
+        }
+        for one in results
+    ]
 
 
 @command()
@@ -208,31 +196,25 @@ def _compare(summary: dict[str, Any], place: Path, before: dict[str, Any] | None
     return [one.case for one in found if one.verdict == "slower"]
 
 
-def _bench_table(results: Sequence[BenchResult]) -> Table:
-    titles = (
-        "faces",
-        "setup [s]",
-        "compile [s]",
-        "run [s]",
-        "per second",
-        "collisions/s",
-        "queries/s",
-        "memory",
-        "error",
-    )
-    table = new_table("case", *titles)
+def _bench_table(results: Sequence[BenchResult]) -> list[dict[str, Any]]:
+    table = []
     for result in results:
         unit, rate = next(iter(result.rates.items()))
         memory = result.tally_bytes if result.memory is None else result.memory
         error = result.error_per_root_second
-        table.add_row(
-            result.case,
-            str(result.faces or "-"),
-            *(short(value) for value in (result.setup, result.compile, min(result.seconds))),
-            f"{rate:.3g} {unit}",
-            *(short(result.rates.get(unit, math.nan)) for unit in ("collisions", "queries")),
-            "-" if memory is None else in_bytes(memory) + ("" if result.memory is not None else "*"),
-            "-" if error is None else f"{100 * error:.3g} %",
+        table.append(
+            {
+                "case": result.case,
+                "faces": result.faces or "-",
+                "setup [s]": result.setup,
+                "compile [s]": result.compile,
+                "run [s]": min(result.seconds),
+                "per second": f"{rate:.3g} {unit}",
+                "collisions/s": result.rates.get("collisions", math.nan),
+                "queries/s": result.rates.get("queries", math.nan),
+                "memory": "-" if memory is None else in_bytes(memory) + ("" if result.memory is not None else "*"),
+                "error": "-" if error is None else f"{100 * error:.3g} %",
+            }
         )
     return table
 
@@ -253,13 +235,18 @@ def _growth(results: Sequence[BenchResult]) -> list[str]:
     return lines
 
 
-def _comparison_table(found: Sequence[Comparison]) -> Table:
-    table = new_table("case", "", "before", "now", "ratio", "99 % interval")
-    for one in found:
-        interval = "-" if one.interval is None else f"{one.interval[0]:.3f} to {one.interval[1]:.3f}"
-        rates = (_with_spread(one.before, one.spread_before), _with_spread(one.now, one.spread_now))
-        table.add_row(f"{one.case} [{one.unit}/s]", one.verdict, *rates, f"{one.ratio:.3f}", interval)
-    return table
+def _comparison_table(found: Sequence[Comparison]) -> list[dict[str, str]]:
+    return [
+        {
+            "case": f"{one.case} [{one.unit}/s]",
+            "": one.verdict,
+            "before": _with_spread(one.before, one.spread_before),
+            "now": _with_spread(one.now, one.spread_now),
+            "ratio": f"{one.ratio:.3f}",
+            "99 % interval": "-" if one.interval is None else f"{one.interval[0]:.3f} to {one.interval[1]:.3f}",
+        }
+        for one in found
+    ]
 
 
 def _with_spread(rate: float, spread: float | None) -> str:
