@@ -29,11 +29,19 @@ FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 
 @dataclass
 class Running:
-    """What every command is told: to print only warnings and errors, to replace files, to write a JSON file, too."""
+    """The command that runs.
+
+    Attributes:
+        quiet: Whether only warnings and errors are printed.
+        overwrite: Whether existing files are replaced.
+        json: File for the summary.
+        given: Options and arguments that have another value than by default.
+    """
 
     quiet: bool = False
     overwrite: bool = False
     json: Path | None = None
+    given: frozenset[str] = frozenset()
 
 
 running = Running()

@@ -291,9 +291,7 @@ def fit(
     options: dict[str, Any] = {"unknown": unknown, "pulses": pulses, "photons": photons, "seed": seed, "device": device}
     options["prior"] = opt.named_values(prior, 2, "--prior")
     if bounds:
-        for option, value in {"SCENE": scene, "--out": out, "--start": start, "--input": inputs}.items():
-            if value:
-                raise typer.BadParameter("cannot be combined with --bounds, which takes SCENE alone", param_hint=option)
+        opt.refuse("cannot be combined with --bounds, which takes SCENE alone", "SCENE", "--out", "--start", "--input")
         _bounds(path, opt.read_scene(path, overrides), options)
         return
     if scene is None or out is None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from spadwarp import Ray, Result, Scene
 
 __all__ = ["Channel", "Length", "Method", "Seconds", "command", "from_to", "from_unit", "given", "items", "load_run"]
-__all__ += ["measured", "named_values", "one_device", "read_engine", "read_part", "read_scene", "real_number"]
+__all__ += ["measured", "named_values", "one_device", "read_engine", "read_part", "read_scene", "real_number", "refuse"]
 __all__ += ["whole_number"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
@@ -86,20 +86,25 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
     def register(function: Callable[..., None]) -> Callable[..., None]:
         text, described = _documentation(function)
         hints = get_type_hints(function, include_extras=True)
-        made = [
-            _parameter(one, hints[one.name], *described.get(one.name, SHARED.get(one.name, ("", ""))))
-            for one in inspect.signature(function).parameters.values()
-        ]
+        made, names = [], {}
+        for one in inspect.signature(function).parameters.values():
+            shared = SHARED.get(one.name, ("", ""))
+            (metavar, about), option = described.get(one.name, shared[:2]), shared[2:]
+            is_option = one.kind is inspect.Parameter.KEYWORD_ONLY
+            names[one.name] = _option_name(one.name, *option) if is_option else metavar.strip("[]")
+            made.append(_parameter(one, hints[one.name], metavar, about, names[one.name]))
         for common, kind in _COMMON.items():
             if common not in without:
                 default = False if kind is bool else None
-                option = inspect.Parameter(common, inspect.Parameter.KEYWORD_ONLY, default=default)
-                made.append(_parameter(option, kind, *SHARED[common]))
+                parameter = inspect.Parameter(common, inspect.Parameter.KEYWORD_ONLY, default=default)
+                made.append(_parameter(parameter, kind, *SHARED[common][:2], f"--{common}"))
+        defaults = {one.name: one.default for one in made}
 
         @functools.wraps(function)
         def run(**values: Any) -> None:
             for common in _COMMON:
                 setattr(running, common, values.pop(common, None))
+            running.given = frozenset(names[one] for one, value in values.items() if value != defaults[one])
             function(**{one: _plain(value) for one, value in values.items()})
 
         run.__doc__ = text
@@ -120,9 +125,11 @@ def _documentation(function: Callable[..., None]) -> tuple[str, dict[str, tuple[
     return f"{before}\n{after}", {name: (metavar, " ".join(text.split())) for name, metavar, text in found}
 
 
-def _parameter(
-    one: inspect.Parameter, kind: Any, metavar: str, text: str, option: str | None = None
-) -> inspect.Parameter:
+def _option_name(parameter: str, option: str | None = None) -> str:
+    return option or "--" + parameter.rstrip("_").replace("_", "-")
+
+
+def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name: str) -> inspect.Parameter:
     """The parameter as typer takes it."""
     optional = get_origin(kind) in (Union, UnionType)
     inner = next(part for part in get_args(kind) if part is not NoneType) if optional else kind
@@ -141,7 +148,6 @@ def _parameter(
     if one.kind is not inspect.Parameter.KEYWORD_ONLY:
         about: Any = typer.Argument(**extra)
     else:
-        name = option or "--" + one.name.rstrip("_").replace("_", "-")
         names = [f"{name}/--no-{name[2:]}"] if one.default is True else [name]
         about = typer.Option(*names, *(["-q"] if one.name == "quiet" else []), **extra)
     return one.replace(
@@ -263,6 +269,12 @@ def named_values(texts: list[str] | None, numbers: int, option: str) -> dict[str
             raise
         found[name.strip()] = read if numbers > 1 else read[0]
     return found
+
+
+def refuse(text: str, *options: str) -> None:
+    """Refuses those of the options that are given."""
+    if wrong := [option for option in options if option in running.given]:
+        raise typer.BadParameter(text, param_hint=", ".join(wrong))
 
 
 def given(**values: Any) -> dict[str, Any]:

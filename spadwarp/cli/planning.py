@@ -264,11 +264,10 @@ def sweep(
     read = opt.read_scene(scene, overrides)
     field, _, values = (vary or "range=").partition("=")
     of_range = field.strip() == "range"
-    for option, value in {"--medium": medium, "--reflectance": reflectance}.items():
-        if value and not of_range:
-            raise typer.BadParameter("is for --vary range=FROM:TO:N", param_hint=option)
-    if of_range and of != "budget":
-        raise typer.BadParameter("needs --vary with a field of the scene", param_hint="--of")
+    if of_range:
+        opt.refuse("needs --vary with a field of the scene", "--of")
+    else:
+        opt.refuse("is for --vary range=FROM:TO:N", "--medium", "--reflectance")
     stem = "budget" if of_range else "sweep"
     check_outputs(out, (f"{stem}.png", f"{stem}.csv"), inputs=(scene, *read.files))
     notes: list[str] = []
@@ -437,14 +436,11 @@ def water(
     """
     check_outputs(files={"--out": out, "--matrix": matrix})
     if particles is None:
-        for option, value in {"--out": out, "--matrix": matrix, "--no-water": not water or None}.items():
-            if value is not None:
-                raise typer.BadParameter("needs --particles", param_hint=option)
+        opt.refuse("needs --particles", "--out", "--matrix", "--water")
         asked = {"chlorophyll": chlorophyll, "temperature": temperature, "salinity": salinity}
         _water(wavelength_nm, asked)
         return
-    if chlorophyll:
-        raise typer.BadParameter("cannot be combined with --particles", param_hint="--chlorophyll")
+    opt.refuse("cannot be combined with --particles", "--chlorophyll")
     for option, field, file in (("--out", "phase_table", out), ("--matrix", "matrix_table", matrix)):
         if file is not None and file.suffix.lower() != ".csv":
             raise typer.BadParameter(f"{file} does not end in .csv, as medium.{field} must", param_hint=option)

@@ -122,10 +122,8 @@ def view(
         "video": ("--frame", "--window", "--pictures", "--fps", "--linear"),
         "picture": () if is_mesh else ("--pictures", "--split"),
     }[kind]
-    options: dict[str, Any] = {"--method": method, "--frame": frame, "--channel": None if channel == "I" else channel}
-    options |= {"--window": window, "--pictures": pictures, "--fps": fps, "--linear": linear or None, "--split": split}
-    if wrong := [option for option, value in options.items() if value is not None and option not in used]:
-        raise typer.BadParameter(f"is not for a {kind} ({target})", param_hint=", ".join(wrong))
+    options = ("--method", "--frame", "--channel", "--window", "--pictures", "--fps", "--linear", "--split")
+    opt.refuse(f"is not for a {kind} ({target})", *(one for one in options if one not in used))
     times = None if window is None else opt.from_to(window, "ns", "--window")
     if kind == "picture" and not is_mesh:
         spadwarp.dataset.read_manifest(path)  # before a folder is made for the picture
@@ -208,8 +206,7 @@ def export(
             raise typer.BadParameter(f"{whole[0]} cannot be combined with other formats", param_hint="--format")
         _export_dataset(path, whole[0], out, field, frames_per_file)
         return
-    if field:
-        raise typer.BadParameter("is for parquet, webdataset and zarr", param_hint="--field")
+    opt.refuse("is for parquet, webdataset and zarr", "--field", "--frames-per-file")
     source = spadwarp.files.locate(path)
     chosen = _frames(frames)
     stem = source.resolve().stem

@@ -104,30 +104,20 @@ def simulate(
       spadwarp simulate staircase_5m --trajectory poses.csv --frame-rate 10 --out moving/
     """
     if trajectory is not None:
-        clash: dict[str, Any] = {
-            "--resume": resume,
-            "--ray": ray,
-            "--workers": workers,
-            "--threads": threads,
-            "--shard": shard,
-        }
-        clash |= {"--records": records, "--uncertainty": uncertainty, "--relative-error": relative_error}
-        _refuse(
-            clash | {"--derivatives": derivatives, "--first-photon": first_photon, "--shard": shard}, "--trajectory"
-        )
+        text = "cannot be combined with --trajectory"
+        opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
+        opt.refuse(text, "--records", "--uncertainty", "--relative-error", "--derivatives")
         if scene is None or out is None:
             raise _missing(scene)
         drawn = {"frame_rate": frame_rate, "photons": photons, "seed": seed, "methods": (method,), "tags": tags}
         _simulate_moving(scene, trajectory, out, opt.read_scene(scene, overrides, mesh=mesh), device=devices, **drawn)
         return
-    for option, value in {"--frame-rate": frame_rate, "--tags": tags or None}.items():
-        if value is not None:
-            raise typer.BadParameter("needs --trajectory", param_hint=option)
+    opt.refuse("needs --trajectory", "--frame-rate", "--method", "--tags")
     earlier = None
     if resume is not None:
-        clash = {"SCENE": scene, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
-        clash |= {"--first-photon": first_photon, "--shard": shard, "--records": records, "--derivatives": derivatives}
-        _refuse(clash, "--resume")
+        text = "cannot be combined with --resume: the run has it"
+        opt.refuse(text, "SCENE", "--out", "--mesh", "--seed", "--set", "--records", "--derivatives")
+        opt.refuse(text, "--first-photon", "--shard")
         out = resume if resume.is_dir() else resume.parent
         earlier = _earlier(resume, photons)
         photons, read = None if photons is None else earlier.scene.transport.photons, earlier.scene
@@ -175,16 +165,9 @@ def simulate(
         _fail_as_interrupted(result, records)
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
-        why = (
-            "after all photons" if result.photons >= read.transport.photons else "since rare heavy photons arrived late"
-        )
+        late = result.photons < read.transport.photons
+        why = "since rare heavy photons arrived late" if late else "after all photons"
         complain(f"warning: the error {reached} {why}, not {100 * relative_error:.3g} %; --resume {out} adds photons")
-
-
-def _refuse(options: dict[str, Any], option: str) -> None:
-    """Refuses options that have a value beside another one."""
-    if clash := [name for name, value in options.items() if value]:
-        raise typer.BadParameter(f"cannot be combined with {', '.join(clash)}", param_hint=option)
 
 
 def _missing(scene_path: Path | None) -> typer.BadParameter:

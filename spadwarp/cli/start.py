@@ -10,6 +10,7 @@ from typing import Any, Literal
 import typer
 
 import spadwarp
+from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, fail, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import check_outputs, write_json
@@ -40,8 +41,7 @@ def init(
       spadwarp init --schema scene
     """
     if schema is not None:
-        if example is not None:
-            raise typer.BadParameter("cannot be combined with --schema", param_hint="--example")
+        opt.refuse("cannot be combined with --schema", "--example")
         path = Path(name or f"{schema}.schema.json")
         check_outputs(files={"NAME": path})
         spadwarp.io.write_json(spadwarp.run.json_schema(schema), path)
@@ -91,7 +91,7 @@ def listed(
 
     Args:
         kind (KIND): One of these; without it, scenes and recipes.
-        name: A scene or a recipe to print; a section of presets.
+        name ([NAME]): A scene or a recipe to print; a section of presets.
         out (DIR): Directory for targets.png, a picture of the built-in targets.
 
     \b
@@ -101,10 +101,10 @@ def listed(
       spadwarp list presets medium
       spadwarp list targets --out pictures/
     """
-    if out is not None and kind != "targets":
-        raise typer.BadParameter("is for `spadwarp list targets`", param_hint="--out")
-    if name is not None and kind in ("targets", "validation", "benchmarks"):
-        raise typer.BadParameter(f"{name!r}: `spadwarp list {kind}` has no parts", param_hint="NAME")
+    if kind != "targets":
+        opt.refuse("is for `spadwarp list targets`", "--out", "--device")
+    if kind in ("targets", "validation", "benchmarks"):
+        opt.refuse(f"{name!r}: `spadwarp list {kind}` has no parts", "NAME")
     check_outputs(out, ["targets.png"])
     if kind == "presets":
         _list_presets(name)
