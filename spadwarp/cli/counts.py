@@ -66,7 +66,6 @@ def detect(
         run (RUN): A result, or its directory.
         pulses: Pulses per frame; by default detector.pulses_per_frame.
         frames: Frames to record.
-        seed: Key of the random numbers.
         method: Estimator of depth; may be repeated. By default all four; the last is drawn.
         coates: Correct pile-up (Coates) before depth is estimated.
         tags: Also keep the time tag of every detection.
@@ -279,7 +278,6 @@ def fit(
         prior (NAME=MEAN,SD): A value known from elsewhere: mean and standard deviation; may be repeated.
         pulses: Pulses of a frame, if COUNTS does not hold them; with --bounds by default detector.pulses_per_frame.
         photons: Photons of an iteration at most. By default 2e7 on the CPU, 4e8 on a GPU.
-        seed: Key of the random numbers.
 
     \b
     Examples:

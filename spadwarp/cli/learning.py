@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -175,6 +176,10 @@ def evaluate(
         found = run(data, models=chosen, progress=shown, **options, **common)
     written = write_report(found, report) if report is not None else []
     _say_gains(found)
+    _finish(found, written)
+
+
+def _finish(found: Any, written: Sequence[Path]) -> None:
     if written:
         say(f"written: {written[0]}")
     write_json({**found.to_dict(), "files": written})
@@ -209,9 +214,7 @@ def _scenes(models: list[str], report: Path | None, **options: Any) -> None:
         names, lines = scene_table(found, setting, water)
         say(f"{setting}, backscatter {water}: PSNR of the input and gains over it [dB] by backscatter fraction")
         show_table([dict(zip(names, line, strict=True)) for line in lines])
-    if written:
-        say(f"written: {written[0]}")
-    write_json({**found.to_dict(), "files": written})
+    _finish(found, written)
 
 
 def _points(**options: Any) -> None:
@@ -249,6 +252,4 @@ def _photons(data: Path, models: list[str], report: Path | None, **options: Any)
         columns = [f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons)]
         lines = [[titles[name], *(1e3 * float(one) for one in values)] for name, values in methods.items()]
         show_table([dict(zip(columns, line, strict=True)) for line in lines])
-    if written:
-        say(f"written: {written[0]}")
-    write_json({**found.to_dict(), "files": written})
+    _finish(found, written)

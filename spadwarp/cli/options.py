@@ -43,7 +43,7 @@ SHARED: dict[str, tuple[str, str] | tuple[str, str, str]] = {
     ),
     "overrides": ("SECTION.FIELD=VALUE", "Overrides a field of SCENE or RECIPE; may be repeated.", "--set"),
     "photons": ("N", "Photons to emit, such as 2e9. By default the scene's."),
-    "seed": ("N", "Key of the random numbers. By default the scene's."),
+    "seed": ("N", "Key of the random numbers."),
     "device": ("NAME", '"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
     "devices": (
         "NAME",

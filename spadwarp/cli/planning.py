@@ -117,7 +117,6 @@ def plan(
         eye_distance (LENGTH): Also keep the pulse energy safe for an eye at this distance from the laser [m].
         eye_exposure (TIME): How long the eye looks into the beam [s].
         photons: Photons of the Monte Carlo run.
-        seed: Key of the random numbers.
         no_range: Do not look for the largest range.
         write: Scene file to write with the proposed values.
 

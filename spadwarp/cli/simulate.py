@@ -67,6 +67,7 @@ def simulate(
 
     Args:
         scene (SCENE): Scene file (TOML), or the name of a scene of `spadwarp list scenes`; none with --resume.
+        seed: Key of the random numbers. By default the scene's.
         threads: CPU threads; by default one for each core.
         records: Also write the terminal state of every photon: records.h5.
         uncertainty: Keep batches for the standard error of every bin; twice the memory. --photons is rounded up to
@@ -368,7 +369,6 @@ def analytic(
 
     Args:
         frames: Depth frames to draw.
-        seed: Key of the random numbers.
         rendered (NAME=VALUE,...): Images in place of the scene's targets: depth=EXR, depth_channel=NAME, depth_scale=M
             (metres per unit of depth), radial (depth is the distance from the camera, not planar), normal=EXR (world
             normals; else surfaces face the camera), albedo=EXR or a number (diffuse reflectance, 0.5), albedo_channel=

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +39,6 @@ def validate(
     Args:
         cases (CASE): Names of `spadwarp list validation`; all if left out.
         photons: Photons for each scene of a case.
-        seed: Key of the random numbers.
         tabulated: Use Henyey–Greenstein as tables of angle and value.
         plots (DIR): Also draw a picture of each case.
 
@@ -123,9 +122,9 @@ def bench(
     check_outputs(inputs=(compare, stored))
     if stored is not None:
         summary = load_report(stored)
-        _say_stored(summary)
     else:
         summary = _measure(cases, device=device, photons=photons, repeats=repeats)
+    _say_report(summary)
     slower = []
     if compare is not None:
         try:
@@ -155,26 +154,15 @@ def _measure(cases: list[str] | None, **options: Any) -> dict[str, Any]:
     from spadwarp.benchmark import report, run
 
     results: list[BenchResult] = []
-
     announce = None if running.quiet else lambda case: complain(f"{case.name}: {case.summary}")
     try:
         run(cases or None, progress=announce, found=results.append, **options)
     except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
         if results:
-            show_table(_bench_table(results))
+            _say_report(report(results))
             write_json(report(results))
         raise
-    summary = report(results)
-    _say_summary(results, summary["provenance"])
-    return summary
-
-
-def _say_stored(stored: dict[str, Any]) -> None:
-    from spadwarp.benchmark import BenchResult
-
-    names = [field.name for field in fields(BenchResult)]
-    results = [BenchResult(**{name: row[name] for name in names}) for row in stored["results"]]
-    _say_summary(results, stored["provenance"])
+    return report(results)
 
 
 def _compare(summary: dict[str, Any], place: Path, before: dict[str, Any] | None) -> list[str]:
@@ -196,41 +184,47 @@ def _compare(summary: dict[str, Any], place: Path, before: dict[str, Any] | None
     return [one.case for one in found if one.verdict == "slower"]
 
 
-def _bench_table(results: Sequence[BenchResult]) -> list[dict[str, Any]]:
-    table = []
-    for result in results:
-        unit, rate = next(iter(result.rates.items()))
-        memory = result.tally_bytes if result.memory is None else result.memory
-        error = result.error_per_root_second
-        table.append(
-            {
-                "case": result.case,
-                "faces": result.faces or "-",
-                "setup [s]": result.setup,
-                "compile [s]": result.compile,
-                "run [s]": min(result.seconds),
-                "per second": f"{rate:.3g} {unit}",
-                "collisions/s": result.rates.get("collisions", math.nan),
-                "queries/s": result.rates.get("queries", math.nan),
-                "memory": "-" if memory is None else in_bytes(memory) + ("" if result.memory is not None else "*"),
-                "error": "-" if error is None else f"{100 * error:.3g} %",
-            }
-        )
-    return table
+def _say_report(report: Mapping[str, Any]) -> None:
+    """A report as a table, and what follows from it."""
+    table, made = [], report["provenance"]
+    for result in report["results"]:
+        unit, rate = next(iter(result["rates"].items()))
+        memory = result["tally_bytes"] if result["memory"] is None else result["memory"]
+        error = result["error_per_root_second"]
+        cells = {"case": result["case"], "faces": result["faces"] or "-", "setup [s]": result["setup"]}
+        cells |= {
+            "compile [s]": result["compile"],
+            "run [s]": min(result["seconds"]),
+            "per second": f"{rate:.3g} {unit}",
+        }
+        cells |= {f"{unit}/s": result["rates"].get(unit, math.nan) for unit in ("collisions", "queries")}
+        cells["memory"] = "-" if memory is None else in_bytes(memory) + ("*" if result["memory"] is None else "")
+        table.append({**cells, "error": "-" if error is None else f"{100 * error:.3g} %"})
+    show_table(table)
+    if any(result["memory"] is None and result["tally_bytes"] for result in report["results"]):
+        say("* histograms alone; Warp does not count memory on the CPU")
+    say(f"{made['device_name']} ({made['device']}), {made['date']}")
+    for line in _growth(report["results"]):
+        say(line)
+    for result in report["results"]:
+        if (check := result["check"]) is not None:
+            verdict = "agrees with" if check["passed"] else "MISSES"
+            value, error, known = (100 * check[name] for name in ("value", "standard_error", "reference"))
+            say(f"{result['case']}: {check['name']} {value:.3f} ± {error:.3f} %, {verdict} {known:.2f} %")
 
 
-def _growth(results: Sequence[BenchResult]) -> list[str]:
+def _growth(results: Sequence[Mapping[str, Any]]) -> list[str]:
     """The result of "scaling": time and memory of the largest case over those of a smaller one."""
     lines = []
     for kind, base in (("photons_", -2), ("faces_", 0), ("bins_", 0)):
-        cases = [result for result in results if result.case.startswith(kind)]
+        cases = [result for result in results if result["case"].startswith(kind)]
         if len(cases) < 2:
             continue
         small, large = cases[base], cases[-1]
-        time = large.rates["photons"] and small.rates["photons"] / large.rates["photons"]
-        line = f"{small.case} -> {large.case}: {time:.3g} times the time of a photon"
-        if small.memory and large.memory:
-            line += f", {large.memory / small.memory:.3g} times the memory"
+        time = large["rates"]["photons"] and small["rates"]["photons"] / large["rates"]["photons"]
+        line = f"{small['case']} -> {large['case']}: {time:.3g} times the time of a photon"
+        if small["memory"] and large["memory"]:
+            line += f", {large['memory'] / small['memory']:.3g} times the memory"
         lines.append(line)
     return lines
 
@@ -251,23 +245,3 @@ def _comparison_table(found: Sequence[Comparison]) -> list[dict[str, str]]:
 
 def _with_spread(rate: float, spread: float | None) -> str:
     return f"{rate:.3g} ± ?" if spread is None else f"{rate:.3g} ± {percent(spread)} %"
-
-
-def _say_summary(results: Sequence[BenchResult], made: Mapping[str, Any]) -> None:
-    show_table(_bench_table(results))
-    if any(result.memory is None and result.tally_bytes for result in results):
-        say("* histograms alone; Warp does not count memory on the CPU")
-    say(f"{made['device_name']} ({made['device']}), {made['date']}")
-    for line in _growth(results):
-        say(line)
-    for result in results:
-        if result.check is not None:
-            say(_checked(result.case, result.check))
-
-
-def _checked(case: str, check: Mapping[str, Any]) -> str:
-    verdict = "agrees with" if check["passed"] else "MISSES"
-    return (
-        f"{case}: {check['name']} {100 * check['value']:.3f} ± {100 * check['standard_error']:.3f} %, "
-        f"{verdict} {100 * check['reference']:.2f} %"
-    )

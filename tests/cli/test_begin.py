@@ -94,36 +94,26 @@ def test_all_configurations_fit_their_schema(kind):
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "fits"),
     [
-        'laser.pulse_energy = "150 nJ"',
-        'targets = [{builtin = "staircase", translation = [0, "20 cm", 5], scale = 0.5}]',
-        'medium = {preset = "uwoc-clear", group_index = "fresh"}',
-        'medium = {extinction = 1.0, albedo = "lu2024"}',
-        "domain = {shape = 'slab', lower = -1.0}",
-        "camera.focus_distance = inf",
-        "medium.layers = [{start = 1.0, preset = 'uwoc-clear'}]",
+        ('laser.pulse_energy = "150 nJ"', True),
+        ('targets = [{builtin = "staircase", translation = [0, "20 cm", 5], scale = 0.5}]', True),
+        ('medium = {preset = "uwoc-clear", group_index = "fresh"}', True),
+        ('medium = {extinction = 1.0, albedo = "lu2024"}', True),
+        ("domain = {shape = 'slab', lower = -1.0}", True),
+        ("camera.focus_distance = inf", True),
+        ("medium.layers = [{start = 1.0, preset = 'uwoc-clear'}]", True),
+        ("laser.pulse_energy = -1.0", False),
+        ("laser.puls_energy = 1.0", False),
+        ('laser.pulse_energy = "many"', False),
+        ('medium.preset = "uwoc-cleer"', False),
+        ('targets = [{builtin = "stairs"}]', False),
+        ('transport.estimator = "guess"', False),
+        ("gate.bins = 1.5", False),
     ],
 )
-def test_what_a_scene_takes_fits(text):
-    validator("scene").validate(tomllib.loads(text))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "laser.pulse_energy = -1.0",
-        "laser.puls_energy = 1.0",
-        'laser.pulse_energy = "many"',
-        'medium.preset = "uwoc-cleer"',
-        'targets = [{builtin = "stairs"}]',
-        'transport.estimator = "guess"',
-        "gate.bins = 1.5",
-    ],
-)
-def test_what_a_scene_refuses_does_not_fit(text):
-    with pytest.raises(jsonschema.ValidationError):
-        validator("scene").validate(tomllib.loads(text))
+def test_a_schema_takes_what_a_scene_takes(text, fits):
+    assert validator("scene").is_valid(tomllib.loads(text)) is fits
 
 
 def test_every_field_is_described():

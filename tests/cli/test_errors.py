@@ -79,8 +79,8 @@ def process(*arguments, **options):
 
 
 def test_a_terminal_may_lack_letters(scene):
-    ascii_only = ENVIRONMENT | {"PYTHONIOENCODING": "ascii"}
-    done = process("sweep", scene, "--vary", "range=2:3:2", "--device", "cpu", env=ascii_only, stdout=subprocess.PIPE)
+    options = {"env": ENVIRONMENT | {"PYTHONIOENCODING": "latin-1"}, "encoding": "latin-1", "stdout": subprocess.PIPE}
+    done = process("sweep", scene, "--vary", "range=2:3:2", "--device", "cpu", **options)
     assert done.returncode == 0 and "?* [mm]" in done.stdout
 
 
