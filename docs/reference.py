@@ -97,7 +97,7 @@ def recipe() -> str:
     top = {name: field for name, field in Recipe.model_fields.items() if _model(field) in (None, Distribution)}
     parts = [
         MADE + "# Dataset recipe\n\n"
-        "What `spadwarp dataset make RECIPE` draws from. A *distribution* is a number (always that), a list (one of "
+        "What `spadwarp dataset RECIPE` draws from. A *distribution* is a number (always that), a list (one of "
         "these) or a table `{low = …, high = …}`, with `log = true` even in the logarithm. Recipes that run as they "
         "are: [configs/datasets](../../configs/datasets).\n",
         "## Top level\n\n" + _table(top),

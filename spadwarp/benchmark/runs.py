@@ -1,4 +1,4 @@
-"""Running the benchmark cases.
+"""Running the benchmark cases, the file of their results, and whether cases became faster.
 
 Kernels are loaded, and one run is discarded, before the clock starts; a launch ends when the device has finished it,
 and later copies to the host are not counted.
@@ -6,24 +6,28 @@ and later copies to the host are not counted.
 
 from __future__ import annotations
 
+import json
 import math
+import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spadwarp.analytic import simulate_analytic
 from spadwarp.benchmark.cases import CASES, GROUPS, Case
-from spadwarp.benchmark.results import BenchResult
-from spadwarp.device import core_count, pick_device
+from spadwarp.device import core_count, nvidia_driver, pick_device, processor_name
+from spadwarp.errors import FileError
 from spadwarp.frames import detect
 from spadwarp.limits import check_choice, check_integer
 from spadwarp.mesh import build_mesh
-from spadwarp.scene import Detector, Laser, Scene, Transport
-from spadwarp.scene.sections import field_range
-from spadwarp.transport import simulate, trace, truth_maps
+from spadwarp.scene import Detector, Laser, Scene
+from spadwarp.transport import provenance, simulate, trace, truth_maps
 from spadwarp.transport.model import build_model, transport_spec
 
 if TYPE_CHECKING:
@@ -31,7 +35,97 @@ if TYPE_CHECKING:
 
     from spadwarp_kernels import Data, Model
 
-__all__ = ["CPU_PHOTONS_PER_CORE", "CUDA_PHOTONS", "TransportRun", "run"]
+__all__ = ["MARGIN", "BenchResult", "Comparison", "TransportRun", "compare", "history", "load_report", "newest_report"]
+__all__ += ["report", "run"]
+
+FORMAT, FORMAT_VERSION = "spadwarp bench", 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchResult:
+    """What was measured in a case.
+
+    Attributes:
+        case: Its name.
+        device: "cpu", "cuda:0", ...
+        threads: CPU threads; None on a GPU.
+        faces: Triangles of the target.
+        size: Work of one run by unit: photons; or frames, bins, pulses.
+        setup: Seconds for meshes, BVH and arrays.
+        compile: Seconds to compile the kernel or, if it was compiled before, to load it.
+        seconds: Of each timed run.
+        rates: Per second, from the fastest run: photons, collisions, queries (of surfaces, with shadow rays); or
+            frames, bins.
+        memory: Highest memory of the device that the case used [bytes]; None on the CPU, where Warp does not count it.
+        tally_bytes: Size of the histograms; None without a camera.
+        error_per_root_second: Relative standard error of the bins that decide the depth (`Result.relative_error`) after
+            one second of transport; it falls with the root of the time. None without a camera or where it was not asked
+            for, infinite where nothing returned.
+        check: Where a mean is known: `name`, `value`, `standard_error`, `reference`, `passed`.
+    """
+
+    case: str
+    device: str
+    threads: int | None
+    faces: int = 0
+    size: dict[str, int]
+    setup: float
+    compile: float
+    seconds: tuple[float, ...]
+    rates: dict[str, float]
+    memory: int | None = None
+    tally_bytes: int | None = None
+    error_per_root_second: float | None = None
+    check: dict[str, Any] | None = None
+
+
+def report(results: Sequence[BenchResult]) -> dict[str, Any]:
+    """Results as plain values, with device, processor, driver, versions, commit and date."""
+    device = pick_device(results[0].device if results else None)
+    made = {**provenance(device), "driver": nvidia_driver() if device.is_cuda else None, "commit": _commit()}
+    made["processor"] = processor_name(pick_device("cpu"))
+    return {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "provenance": {**made, "threads": None if device.is_cuda else core_count()},
+        "results": [asdict(result) for result in results],
+    }
+
+
+def load_report(path: str | Path) -> dict[str, Any]:
+    """Reads what `spadwarp bench --json` wrote. Raises `FileError`."""
+    try:
+        stored = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise FileError(f"{path}: not JSON: {error}") from error
+    if not isinstance(stored, dict) or stored.get("format") != FORMAT or not isinstance(stored.get("results"), list):
+        raise FileError(f"{path}: not a file that `spadwarp bench --json` wrote")
+    if stored.get("format_version") != FORMAT_VERSION:
+        raise FileError(f"{path}: format_version = {stored.get('format_version')} is not {FORMAT_VERSION}")
+    needed = {field.name for field in fields(BenchResult)}
+    if any(not isinstance(row, dict) or not needed <= row.keys() for row in stored["results"]):
+        raise FileError(f"{path}: a result lacks one of {', '.join(sorted(needed))}")
+    return stored
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that this package lies in, "-dirty" where it was changed; None outside one."""
+    root = Path(__file__).resolve().parents[2]
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
+            return None
+        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+# Runs
 
 # Photons of one timed run.
 CUDA_PHOTONS = 1 << 26
@@ -70,7 +164,7 @@ def run(
     names = list(CASES) if cases is None else list(cases)
     for name in names:
         check_choice("cases: an item", name, [*CASES, *GROUPS])
-    photons = None if photons is None else check_integer("photons", photons, field_range(Transport, "photons"))
+    photons = None if photons is None else check_integer("photons", photons, "[1, 1000000000000]")
     repeats = check_integer("repeats", repeats, "[1, 1000]")
     wp_device = pick_device(device)
     chosen = [case for name in names for case in (GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]])]
@@ -301,3 +395,129 @@ def _stage(case: Case, clock: _Clock, memory: _Memory, *, rates: Mapping[str, in
 
 
 _KINDS = {"transport": measure_transport, "analytic": _analytic, "detect": _detect}
+
+
+# Comparison
+
+MARGIN = 0.03
+"""Change of speed that a comparison ignores: processes differ by this much where the runs of one agree better."""
+
+_CONFIDENCE = 0.99
+_RESOLUTION = 0.1  # "same" is not said where the interval reaches beyond this change of speed
+_TIMER = 1e-3  # the least relative scatter of a timed run: clocks are not better
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One case now and before.
+
+    Attributes:
+        case: Its name.
+        unit: What is counted: photons, frames or bins a second.
+        before, now: Rate [1/s], geometric mean of the timed runs.
+        spread_before, spread_now: Relative standard deviation of a timed run; None from one run.
+        ratio: now / before; above 1 is faster.
+        interval: Confidence interval of the ratio at 99 %; None where one side has a single run.
+        verdict: "faster" or "slower" where the whole interval lies more than `MARGIN` from 1; else "same", or
+            "unclear" where it reaches further than 10 % from 1.
+    """
+
+    case: str
+    unit: str
+    before: float
+    now: float
+    spread_before: float | None
+    spread_now: float | None
+    ratio: float
+    interval: tuple[float, float] | None
+    verdict: Literal["faster", "slower", "same", "unclear"]
+
+
+def compare(now: Mapping[str, Any], before: Mapping[str, Any]) -> list[Comparison]:
+    """Compares two reports case by case, those that both have.
+
+    Logarithms of rates are compared, so that a ratio is a difference, by the t-test of Welch (1947), which takes the
+    scatter of either side as it is. It knows the noise between runs of one process alone; `MARGIN` stands for the rest.
+
+    Args:
+        now, before: From `report` or `load_report`.
+    """
+    earlier = {row["case"]: row for row in before["results"]}
+    return [_compared(row, earlier[row["case"]]) for row in now["results"] if row["case"] in earlier]
+
+
+def _compared(now: Mapping[str, Any], before: Mapping[str, Any]) -> Comparison:
+    unit = next(iter(now["rates"]))
+    new, old = _log_rates(now, unit), _log_rates(before, unit)
+    interval = _interval(new, old)
+    return Comparison(
+        case=now["case"],
+        unit=unit,
+        before=math.exp(old.mean()),
+        now=math.exp(new.mean()),
+        spread_before=_spread(old),
+        spread_now=_spread(new),
+        ratio=math.exp(new.mean() - old.mean()),
+        interval=interval,
+        verdict=_verdict(interval),
+    )
+
+
+def _verdict(interval: tuple[float, float] | None) -> Literal["faster", "slower", "same", "unclear"]:
+    if interval is None:
+        return "unclear"
+    low, high = interval
+    if low > 1.0 + MARGIN:
+        return "faster"
+    if high < 1.0 / (1.0 + MARGIN):
+        return "slower"
+    return "same" if max(high, 1.0 / low) <= 1.0 + _RESOLUTION else "unclear"
+
+
+def _log_rates(row: Mapping[str, Any], unit: str) -> NDArray[np.float64]:
+    return np.asarray(np.log(row["size"][unit] / np.asarray(row["seconds"], dtype=np.float64)))
+
+
+def _spread(log_rates: NDArray[np.float64]) -> float | None:
+    return float(log_rates.std(ddof=1)) if log_rates.size > 1 else None
+
+
+def _interval(new: NDArray[np.float64], old: NDArray[np.float64]) -> tuple[float, float] | None:
+    """Of the ratio, from logarithms of rates; degrees of freedom by Welch and Satterthwaite."""
+    from scipy.special import stdtrit
+
+    if min(new.size, old.size) < 2:
+        return None
+    parts = [max(float(side.var(ddof=1)), _TIMER**2) / side.size for side in (new, old)]
+    freedom = sum(parts) ** 2 / (parts[0] ** 2 / (new.size - 1) + parts[1] ** 2 / (old.size - 1))
+    half = float(stdtrit(freedom, 0.5 + 0.5 * _CONFIDENCE)) * math.sqrt(sum(parts))
+    difference = float(new.mean() - old.mean())
+    return math.exp(difference - half), math.exp(difference + half)
+
+
+def history(directory: str | Path) -> list[tuple[Path, dict[str, Any]]]:
+    """The reports (*.json) of a directory and their paths, oldest first. Raises `FileError`."""
+    paths = sorted(Path(directory).glob("*.json"))
+    if not paths:
+        raise FileError(f"{directory}: holds no report (*.json) that `spadwarp bench --json` wrote")
+    return sorted(((path, load_report(path)) for path in paths), key=lambda entry: str(entry[1]["provenance"]["date"]))
+
+
+def newest_report(directory: str | Path, *, like: Mapping[str, Any], cases: Sequence[str]) -> Path:
+    """The newest report of a directory with one of these cases, from the same kind of device.
+
+    Args:
+        directory: Of reports.
+        like: Provenance of a report: `device_name` and `threads` count.
+        cases: Names of cases.
+
+    Raises:
+        FileError: There is none.
+    """
+    for path, stored in reversed(history(directory)):
+        made = stored["provenance"]
+        same = all(made.get(name) == like[name] for name in ("device_name", "threads"))
+        if same and any(row["case"] in cases for row in stored["results"]):
+            return path
+    threads = "" if like["threads"] is None else f" with {like['threads']} threads"
+    raise FileError(f"{directory}: no report of {', '.join(cases)} from {like['device_name']}{threads}")

@@ -1,125 +1,95 @@
-"""`spadwarp simulate`: a scene in, a directory of results out."""
+"""Commands that trace light: `simulate`, `merge`; and `analytic`, by the analytic model."""
 
 from __future__ import annotations
 
 import importlib
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 import spadwarp
-from spadwarp.cli import _options as opt
-from spadwarp.cli._app import INTERRUPTED, app, complain, fail, say
-from spadwarp.cli._progress import progress
-from spadwarp.errors import ConfigError, address_space
+from spadwarp.cli import options as opt
+from spadwarp.cli.app import INTERRUPTED, complain, fail, running, say
+from spadwarp.cli.options import command
+from spadwarp.cli.outputs import answer, check_outputs, write_json
+from spadwarp.cli.text import count, progress, readable, rows, written
+from spadwarp.errors import ArgumentError, ConfigError, address_space
+from spadwarp.limits import parse_number
 
 if TYPE_CHECKING:
     from types import ModuleType
 
     from spadwarp import Ray, Result, Scene
-    from spadwarp.cli._progress import Report
+    from spadwarp.analytic import AnalyticResult
+    from spadwarp.cli.text import Report
     from spadwarp.files import RunFiles
 
 
-@app.command()
+@command()
 def simulate(
-    scene_path: Annotated[
-        Path | None,
-        typer.Argument(metavar="SCENE", help="Scene file (TOML); none with --resume.", show_default=False),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Directory for the output files.", show_default=False)
-    ] = None,
-    mesh: opt.Mesh = None,
-    device: opt.Devices = None,
-    engine_name: opt.EngineName = "local",
-    ray_address: opt.RayAddress = None,
-    workers: opt.Workers = None,
-    photons: opt.Photons = None,
-    seed: opt.Seed = None,
-    overrides: opt.Overrides = None,
-    threads: opt.Threads = None,
-    records: Annotated[
-        bool, typer.Option("--records", help="Also write the terminal state of every photon: records.h5.")
-    ] = False,
-    uncertainty: Annotated[
-        bool,
-        typer.Option(
-            "--uncertainty",
-            help="Keep batches for the standard error of every bin; twice the memory. --photons is rounded up to whole "
-            "batches.",
-        ),
-    ] = False,
-    relative_error: Annotated[
-        float | None,
-        typer.Option(
-            parser=opt.real_number,
-            metavar="X",
-            help="Stop at this relative error of the bins that decide the depth (0.02: 2 %); --photons is then the "
-            "largest number of photons, rounded up to whole batches.",
-        ),
-    ] = None,
-    derivatives: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME,...",
-            help="Also the derivatives of the histogram by these parameters, 8 at most: medium.absorption, "
-            "medium.scattering, medium.anisotropy, medium.layers[0].scattering, targets[0].reflectance, ...; short, "
-            "absorption, where one alone can be meant. medium.grid.absorption, .scattering, .extinction: by block.",
-            show_default=False,
-        ),
-    ] = None,
-    blocks: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NX,NY,NZ",
-            help="Blocks of cells along the edges of medium.grid, for the derivatives by its coefficients; divisors of "
-            "the numbers of cells. Memory grows with their product. By default one block.",
-            show_default=False,
-        ),
-    ] = None,
-    resume: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Resume the finished, interrupted or killed run in DIR until it has --photons in total (by default "
-            "those it was started with), and write the result there.",
-        ),
-    ] = None,
-    checkpoint: Annotated[
-        float,
-        typer.Option(
-            parser=opt.real_number,
-            metavar="SECONDS",
-            help="Time between checkpoints in --out, for --resume after a crash; longer where writing takes long. "
-            "0: none.",
-        ),
-    ] = 60.0,
-    first_photon: Annotated[
-        int,
-        typer.Option(
-            parser=opt.whole_number, metavar="ID", help="Id of the first photon; `spadwarp merge` adds the runs."
-        ),
-    ] = 0,
-    shard_text: Annotated[
-        str | None,
-        typer.Option(
-            "--shard", metavar="I/N", help="Only part I of N equal parts of the photons; `spadwarp merge` adds them."
-        ),
-    ] = None,
-    overwrite: opt.Overwrite = False,
-    quiet: opt.Quiet = False,
-    json_path: opt.Json = None,
+    scene: Path | None = None,
+    *,
+    out: Path | None = None,
+    mesh: Path | None = None,
+    devices: str | None = None,
+    ray: str | None = None,
+    workers: int | None = None,
+    photons: int | None = None,
+    seed: int | None = None,
+    overrides: list[str] | None = None,
+    threads: int | None = None,
+    records: bool = False,
+    uncertainty: bool = False,
+    relative_error: float | None = None,
+    derivatives: str | None = None,
+    resume: Path | None = None,
+    checkpoint: float = 60.0,
+    first_photon: int = 0,
+    shard: str | None = None,
+    trajectory: Path | None = None,
+    frame_rate: float | None = None,
+    method: opt.Method = "matched",
+    tags: bool = False,
 ) -> None:
-    """Trace photons through a scene into histograms.
+    """Trace photons through a scene into histograms, or through each frame of a scene that moves.
 
     Writes to the output directory: result.h5 (the complete result, for `spadwarp info` and `spadwarp.load_result`),
     scene.toml (the complete scene of the run), depth.exr, truth.exr and pictures. Ctrl-C or SIGTERM ends the run and
     writes the photons traced so far; after a crash, --resume continues from the last checkpoint.
+
+    With --trajectory: sequence.h5 with counts, depth, truth and, with --tags, detections of all frames, and
+    sequence.gif, which shows them.
+
+    Args:
+        scene (SCENE): Scene file (TOML), or the name of a scene of `spadwarp list scenes`; none with --resume.
+        seed: Key of the random numbers. By default the scene's.
+        threads: CPU threads; by default one for each core.
+        records: Also write the terminal state of every photon: records.h5.
+        uncertainty: Keep batches for the standard error of every bin; twice the memory. --photons is rounded up to
+            whole batches.
+        relative_error (X): Stop at this relative error of the bins that decide the depth (0.02: 2 %); --photons is then
+            the largest number of photons, rounded up to whole batches.
+        derivatives (NAME,...): Also the derivatives of the histogram by these parameters, 8 at most:
+            medium.absorption, medium.scattering, medium.anisotropy, medium.layers[0].scattering,
+            targets[0].reflectance, ...; short, absorption, where one alone can be meant. medium.grid.absorption,
+            .scattering, .extinction: by block of cells; with :NX:NY:NZ by so many blocks along its edges,
+            divisors of the numbers of cells, else by one. Memory grows with their product.
+        resume (DIR): Resume the finished, interrupted or killed run in DIR until it has --photons in total (by default
+            those it was started with), and write the result there.
+        checkpoint (SECONDS): Time between checkpoints in --out, for --resume after a crash; longer where writing takes
+            long. 0: none.
+        first_photon (ID): Id of the first photon; `spadwarp merge` adds the runs.
+        shard (I/N): Only part I of N equal parts of the photons; `spadwarp merge` adds them.
+        trajectory (CSV): Simulate a scene that moves: columns time [s] and fields of the scene, such as
+            camera.position[0], targets[0].translation[2]; a frame for each row.
+        frame_rate (HZ): Frames a second between the rows of --trajectory.
+        method: Estimator of the depth of a scene that moves.
+        tags: Also keep every detection of a scene that moves.
 
     \b
     Examples:
@@ -130,43 +100,49 @@ def simulate(
       spadwarp simulate configs/scenes/plane_5m.toml --derivatives absorption,scattering --out run5/
       spadwarp simulate --resume run1/ --photons 4e9
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e10 --device cuda:all --out run3/
-      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --engine ray --ray-address auto --out run4/
+      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --ray auto --out run4/
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --shard 3/64 --out part3/
+      spadwarp simulate staircase_5m --trajectory poses.csv --frame-rate 10 --out moving/
     """
+    if trajectory is not None:
+        text = "cannot be combined with --trajectory"
+        opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
+        opt.refuse(text, "--records", "--uncertainty", "--relative-error", "--derivatives")
+        if scene is None or out is None:
+            raise _missing(scene)
+        drawn = {"frame_rate": frame_rate, "photons": photons, "seed": seed, "methods": (method,), "tags": tags}
+        _simulate_moving(scene, trajectory, out, opt.read_scene(scene, overrides, mesh=mesh), device=devices, **drawn)
+        return
+    opt.refuse("needs --trajectory", "--frame-rate", "--method", "--tags")
     earlier = None
     if resume is not None:
-        given = {"SCENE": scene_path, "--out": out, "--mesh": mesh, "--seed": seed, "--set": overrides}
-        more = {"--first-photon": first_photon, "--shard": shard_text, "--records": records}
-        more |= {"--derivatives": derivatives, "--blocks": blocks}
-        if clash := [name for name, value in (given | more).items() if value]:
-            raise typer.BadParameter(f"goes without {', '.join(clash)}: the run has them", param_hint="--resume")
+        text = "cannot be combined with --resume: the run has it"
+        opt.refuse(text, "SCENE", "--out", "--mesh", "--seed", "--set", "--records", "--derivatives")
+        opt.refuse(text, "--first-photon", "--shard")
         out = resume if resume.is_dir() else resume.parent
         earlier = _earlier(resume, photons)
-        photons, scene = None if photons is None else earlier.scene.transport.photons, earlier.scene
+        photons, read = None if photons is None else earlier.scene.transport.photons, earlier.scene
     else:
-        if scene_path is None or out is None:
-            raise _missing(scene_path)
-        scene = opt.read_scene(scene_path, mesh=mesh, overrides=overrides, photons=photons, seed=seed)
+        if scene is None or out is None:
+            raise _missing(scene)
+        read = opt.read_scene(scene, overrides, mesh=mesh, photons=photons, seed=seed)
         photons = None
     if records:
-        _check_records(scene, whole=not (first_photon or shard_text))
-    shard = opt.read_part(shard_text, "--shard")
-    engine = opt.read_engine(engine_name, ray_address, workers)
-    run = _prepared(device, engine)
-    _warn(scene, device)
+        _check_records(read, whole=not (first_photon or shard))
+    part, engine = opt.read_part(shard, "--shard"), opt.read_engine(ray, workers)
+    run = _prepared(devices, engine)
+    _warn(read, devices)
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
-    names = _parameters(scene, derivatives, blocks, earlier)
+    names = _parameters(read, derivatives, earlier)
     sizes: dict[str, Any] = {"batches": batches, "records": records, "checkpoint": checkpoint > 0}
-    needed = run.bytes_needed(scene, derivatives=len(names), **sizes)
-    inputs = (scene_path, *scene.files)
-    options: dict[str, Any] = {"json": json_path, "inputs": inputs, "overwrite": overwrite, "needed": needed}
-    outputs = _outputs(out, resume=earlier is not None, **options)
-    pictures = _load_pictures(scene)
-    with progress(quiet=quiet) as report:
+    needed = run.bytes_needed(read, derivatives=len(names), **sizes)
+    _check_run(out, resume=earlier is not None, inputs=(scene, *read.files), needed=needed)
+    pictures = _load_pictures(read)
+    with progress() as report:
         result = spadwarp.simulate(
-            scene,
+            read,
             photons=photons,
-            device=device,
+            device=devices,
             engine=engine,
             progress=_joined_at_the_end(report, pictures),
             uncertainty=uncertainty,
@@ -175,25 +151,25 @@ def simulate(
             run=spadwarp.RunOptions(
                 threads=threads,
                 first_photon=first_photon,
-                shard=shard,
+                shard=part,
                 resume=earlier,
                 checkpoint=out / run.CHECKPOINT if checkpoint > 0 else None,
                 checkpoint_every=checkpoint,
             ),
         )
-    device = opt.one_device(device, engine)
+    device = opt.one_device(devices, engine)
     files = run.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
     if records and not result.partial:
-        files.written.append(_write_records(scene, result.photons, out, device=device, quiet=quiet))
-    if not quiet:
-        say(described(result, files))
+        files.written.append(_write_records(read, result.photons, out, device=device))
+    say(readable(_brief(result, files)) + f"\nwritten: {written(files.written)}")
     error = result.relative_error if _has_errors(result) else None
-    outputs.write_json({**result.summary(), "relative_error": error, "files": files.written})
+    write_json({**result.summary(), "relative_error": error, "files": files.written})
     if result.partial:
         _fail_as_interrupted(result, records)
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
-        why = "after all photons" if result.photons >= scene.transport.photons else "since bright photons came late"
+        late = result.photons < read.transport.photons
+        why = "since rare heavy photons arrived late" if late else "after all photons"
         complain(f"warning: the error {reached} {why}, not {100 * relative_error:.3g} %; --resume {out} adds photons")
 
 
@@ -202,21 +178,19 @@ def _missing(scene_path: Path | None) -> typer.BadParameter:
     return typer.BadParameter(f"is missing; give {text}", param_hint=hint)
 
 
-def _parameters(scene: Scene, names: str | None, blocks: str | None, earlier: Result | None) -> tuple[str, ...]:
+def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tuple[str, ...]:
     """By which the histogram is differentiated."""
-    counts = None if blocks is None else [_count(text) for text in blocks.split(",")]
     if names is None:
-        if counts is not None:
-            raise typer.BadParameter("goes with --derivatives medium.grid.absorption", param_hint="--blocks")
         return () if earlier is None else tuple(earlier.derivatives)
-    return spadwarp.transport.resolve_derivatives(scene, [name.strip() for name in names.split(",")], counts)
-
-
-def _count(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is not a whole number; for example 4,4,2", param_hint="--blocks") from None
+    plain, blocks = [], None
+    for text in names.split(","):
+        name, *counts = (part.strip() for part in text.split(":"))
+        plain.append(name)
+        if counts:
+            if not all(count.isdecimal() for count in counts):
+                raise typer.BadParameter(f"{text!r} is not of the form NAME:NX:NY:NZ", param_hint="--derivatives")
+            blocks = [int(count) for count in counts]
+    return spadwarp.transport.resolve_derivatives(scene, plain, blocks)
 
 
 def _warn(scene: Scene, device: str | None) -> None:
@@ -250,17 +224,16 @@ def _check_records(scene: Scene, *, whole: bool) -> None:
         raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
 
 
-def _outputs(out: Path, *, resume: bool, overwrite: bool, **options: Any) -> opt.Outputs:
+def _check_run(out: Path, *, resume: bool, **options: Any) -> None:
     """Makes the directory; refuses one that holds another run, or a part of one."""
     from spadwarp.files import CHECKPOINT, RUN_FILES, remove_checkpoint
 
-    if (out / CHECKPOINT).exists() and not (resume or overwrite):
+    if (out / CHECKPOINT).exists() and not (resume or running.overwrite):
         problem = f"{out} has a run that was not finished; --resume {out} resumes it, --overwrite replaces it"
         raise typer.BadParameter(problem, param_hint="--out")
-    outputs = opt.check_outputs(out, RUN_FILES, resume=resume, overwrite=overwrite, **options)
+    check_outputs(out, RUN_FILES, resume=resume, **options)
     if not resume:
         remove_checkpoint(out)
-    return outputs
 
 
 def _prepared(device: str | None, engine: Ray | None) -> ModuleType:
@@ -299,12 +272,12 @@ def _has_errors(result: Result) -> bool:
     return result.second_moment is not None and result.photons >= 2 * result.batch_size
 
 
-def _write_records(scene: Scene, photons: int, out: Path, *, device: str | None, quiet: bool) -> Path:
+def _write_records(scene: Scene, photons: int, out: Path, *, device: str | None) -> Path:
     from spadwarp.transport import save_records
 
-    if not quiet:
+    if not running.quiet:
         complain("the photons are traced again for their records")
-    with progress(quiet=quiet) as report:
+    with progress() as report:
         records = spadwarp.transport.trace(scene, photons=photons, device=device, progress=report)
     return save_records(records, out / "records.h5", scene=scene)
 
@@ -313,48 +286,171 @@ def _fail_as_interrupted(result: Result, records: bool) -> None:
     start, stop = result.requested
     left_out = "; no records were written" if records else ""
     fail(
-        f"interrupted after {opt.count(result.photons)} of {opt.count(stop - start)} photons, "
+        f"interrupted after {count(result.photons)} of {count(stop - start)} photons, "
         f"which are written and marked partial{left_out}",
         INTERRUPTED,
     )
 
 
-def described(result: Result, files: RunFiles) -> str:
-    """A run in a few lines."""
+def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
+    """A run in a few numbers."""
     import numpy as np
 
-    summary, truth, frame, written = result.summary(), result.truth.depth, files.depth, files.written
-    seconds = result.timing.get("trace", 0.0)
-    speed = f" ({result.photons / seconds:.3g}/s)" if seconds > 0 else ""
-    collected = summary["collected_fraction"]
-    ledger = summary["energy_balance"]
-    returned = np.isfinite(frame)
-    lines = {
-        "photons": f"{opt.count(result.photons)}, seed {result.seed}, on {result.provenance.get('device', 'unknown')} "
-        f"in {seconds:.3g} s{speed}",
-        "collected": f"{sum(collected.values()):.3g} of the emitted light: "
-        + ", ".join(f"{name.replace('_', '-')} {part:.3g}" for name, part in collected.items()),
-        "detections": f"{summary['detections_per_pulse']:.3g} a pulse, all pixels together",
-        "depth": f"{returned.sum()} of {frame.size} pixels"
-        + (f", {np.nanmin(frame):.2f} to {np.nanmax(frame):.2f} m" if returned.any() else ""),
+    summary, truth, frame = result.summary(), result.truth.depth, files.depth
+    seconds, balance = result.timing.get("trace", 0.0), summary["energy_balance"]
+    error = np.abs(frame - truth)[np.isfinite(frame) & np.isfinite(truth)]
+    returned = frame[np.isfinite(frame)]
+    return {
+        "photons": result.photons,
+        "seed": result.seed,
+        "device": f"{result.provenance.get('device', 'unknown')}, {seconds:.3g} s"
+        + (f", {result.photons / seconds:.3g} photons/s" if seconds > 0 else ""),
+        "collected_fraction": summary["collected_fraction"],
+        "detections_per_pulse": summary["detections_per_pulse"],
+        "depth_m": [float(returned.min()), float(returned.max())] if returned.size else None,
+        "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
+        **({"derivatives": summary["derivatives"]} if result.derivatives else {}),
+        **({"relative_error": result.relative_error} if _has_errors(result) else {}),
+        "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS",
     }
-    both = returned & np.isfinite(truth)
-    if both.any():
-        error = np.median(np.abs(frame - truth)[both])
-        lines["truth"] = (
-            f"{np.isfinite(truth).sum()} of {frame.size} pixels, {np.nanmin(truth):.2f} to {np.nanmax(truth):.2f} m; "
-            f"median error of the depth {1000 * error:.3g} mm"
+
+
+def _simulate_moving(path: Path, trajectory: Path, out: Path, scene: Scene, **options: Any) -> None:
+    """Simulates the frames of a scene that moves, and shows them."""
+    names = ("sequence.h5", "sequence.gif")
+    check_outputs(out, names, inputs=(path, trajectory, *scene.files))
+    with progress("frames") as report:
+        file = spadwarp.frames.simulate_sequence(scene, trajectory, out / names[0], progress=report, **options)
+    picture = spadwarp.viz.video(file, out / names[1])
+    answer({**spadwarp.files.summary(file), "files": [file.path, picture]})
+
+
+@command()
+def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
+    """Add runs of one scene and seed that traced different photons.
+
+    The sum has the same bits as one run of all photons. Writes the same files as `spadwarp simulate`.
+
+    Args:
+        runs (RUN...): Results, or their directories.
+
+    \b
+    Example:
+      spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --out a/
+      spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --first-photon 1e8 --out b/
+      spadwarp merge a/ b/ --out ab/
+    """
+    from spadwarp.files import RUN_FILES, bytes_needed, write_run
+
+    result = spadwarp.merge(opt.load_run(place) for place in runs)
+    needed = bytes_needed(result.scene, batches=result.batch_size > 0, derivatives=len(result.derivatives))
+    check_outputs(out, RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
+    files = write_run(result, out, device=device)
+    ids = ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges)
+    say(rows({"photon ids": ids}))
+    say(readable(_brief(result, files)) + f"\nwritten: {written(files.written)}")
+    write_json({**result.summary(), "photon_ranges": result.photon_ranges, "files": files.written})
+
+
+@command()
+def analytic(
+    scene: Path,
+    *,
+    out: Path,
+    frames: int = 1,
+    seed: int = 0,
+    overrides: list[str] | None = None,
+    rendered: list[str] | None = None,
+    profile: Path | None = None,
+    device: str | None = None,
+) -> None:
+    """Depth frames by the analytic model.
+
+    From the scene's targets, or from images that a game engine or Blender rendered with the scene's camera. Writes
+    analytic.h5 (maps, frames, and labels of the pixels that report background) and analytic.png.
+
+    Args:
+        frames: Depth frames to draw.
+        rendered (NAME=VALUE,...): Images in place of the scene's targets: depth=EXR, depth_channel=NAME, depth_scale=M
+            (metres per unit of depth), radial (depth is the distance from the camera, not planar), normal=EXR (world
+            normals; else surfaces face the camera), albedo=EXR or a number (diffuse reflectance, 0.5), albedo_channel=
+            NAME, preset=unreal or blender (the program whose channels, units and axes hold; unreal: 0.01 m).
+        profile (RUN): Result of the same scene whose backscatter is taken; analytic.backscatter = monte_carlo.
+
+    \b
+    Examples:
+      spadwarp analytic configs/scenes/staircase_15m.toml --frames 1000 --out frames/
+      spadwarp analytic scene.toml --out cat/ \\
+          --rendered depth=cat_RGBD.EXR,depth_channel=A,normal=cat_Surf_Norm.EXR,albedo=cat_Base_Col.EXR
+    """
+    read = opt.read_scene(scene, overrides)
+    maps = opt.items(rendered, _RENDERED, "--rendered")
+    if maps and "depth" not in maps:
+        raise typer.BadParameter(f"{', '.join(maps)} needs depth=EXR", param_hint="--rendered")
+    if profile is not None and read.analytic.backscatter != "monte_carlo":
+        raise typer.BadParameter(
+            f"needs --set analytic.backscatter=monte_carlo; the scene's is {read.analytic.backscatter!r}",
+            param_hint="--profile",
         )
-    if result.derivatives:
-        lines["derivatives"] = "by " + ", ".join(summary["derivatives"])
-    if _has_errors(result) and math.isfinite(result.relative_error):
-        lines["error"] = (
-            f"standard error {100 * result.relative_error:.3g} % or less in the brightest bin of 95 % of the pixels "
-            "that see a target"
-        )
-    parts = sorted(ledger["fractions"].items(), key=lambda entry: -abs(entry[1]))
-    lines["ledger"] = (
-        "energy balance is exact: " if ledger["exact"] else f"OFF BY {ledger['difference']} UNITS: "
-    ) + ", ".join(f"{name} {100 * part:.3g} %" for name, part in parts if part)
-    lines["written"] = ", ".join(path.name for path in written) + f" in {written[0].parent}"
-    return opt.rows(lines)
+    check_outputs(
+        out,
+        ("analytic.h5", "analytic.png"),
+        inputs=(scene, *read.files, *(value for value in maps.values() if isinstance(value, Path)), profile),
+        needed=(5 * max(frames, 0) + 200) * read.camera.width * read.camera.height + (16 << 20),
+    )
+    if frames < 0:
+        raise ArgumentError(f"frames = {frames} is outside [0, inf)")
+    result = spadwarp.simulate_analytic(
+        read,
+        truth=spadwarp.result.load_truth_exr(camera=read.camera, **maps) if maps else None,
+        frames=min(frames, 1),
+        seed=seed,
+        device=device,
+        backscatter_profile=None if profile is None else opt.load_run(profile),
+    )
+    files = [result.save(out / "analytic.h5", frames=frames, device=device)]
+    files.append(spadwarp.viz.draw_analytic(result, out / "analytic.png"))
+    notes = spadwarp.analytic.model_notes(read)
+    answer({"frames": frames, "seed": seed, **_medians(result), "notes": notes, "files": files})
+
+
+def _number_or_path(text: str) -> Path | float:
+    try:
+        return parse_number(text)
+    except ValueError:
+        return Path(text)
+
+
+# Arguments of `spadwarp.result.load_truth_exr`.
+_RENDERED: dict[str, Callable[[str], Any]] = {
+    "depth": Path,
+    "depth_channel": str,
+    "depth_scale": opt.real_number,
+    "radial": bool,
+    "normal": Path,
+    "albedo": _number_or_path,
+    "albedo_channel": str,
+    "preset": str,
+}
+
+
+def _medians(result: AnalyticResult) -> dict[str, Any]:
+    import numpy as np
+
+    def median(values: Any) -> float:
+        return float(np.median(values[there])) if there.any() else math.nan
+
+    there = result.fisher > 0
+    return {
+        "pixels": int(there.size),
+        "pixels_with_target": int(np.isfinite(result.truth.depth).sum()),
+        "pixels_with_estimate": int(there.sum()),
+        "signal": median(result.signal),
+        "backscatter": median(result.backscatter),
+        "alpha": median(result.alpha),
+        "signal_to_backscatter": median(result.signal_to_backscatter),
+        "sigma_time": median(result.sigma_time),
+        "sigma_depth": median(result.sigma_depth),
+        "outlier_probability": float(result.outlier_probability[there].mean()) if there.any() else math.nan,
+        "background_probability": float(result.background_probability[there].mean()) if there.any() else math.nan,
+    }

@@ -68,7 +68,7 @@ def card(manifest: Mapping[str, Any]) -> str:
         f" (here {manifest['depth_offset']:.6g} m and {manifest['depth_step']:.6g} m); code 0 is no return; "
         "`np.unpackbits(label, axis=-1)[..., :width]` are the labels.",
         "",
-        "`spadwarp dataset export <this folder> --format parquet --out <folder>` writes float depth, clean depth, "
+        "`spadwarp export <this folder> --format parquet --out <folder>` writes float depth, clean depth, "
         "labels and numbers for `datasets.load_dataset(<folder>)`; `webdataset` and `zarr` likewise.",
         "",
     ]

@@ -88,7 +88,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
     path = Path(folder) / "manifest.json"
     if file_problem(path) == "no such file":
         if file_problem(path.parent / "recipe.toml") is None:
-            raise FileError(f"{folder}: not finished; `spadwarp dataset make` makes the missing shards")
+            raise FileError(f"{folder}: not finished; `spadwarp dataset` makes the missing shards")
         raise FileError(f"{folder}: no dataset there (no manifest.json)")
     try:
         manifest = parse_json(read_text(path, largest=_LARGEST_MANIFEST))

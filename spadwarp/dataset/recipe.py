@@ -182,7 +182,7 @@ class Targets(Table):
     """The targets, and which of them are for validation and test; all others are for training."""
 
     builtin: Names | Literal["all"] = Field(
-        "all", description='names from `spadwarp targets`; "all" objects, or none if meshes or exports are given'
+        "all", description='names from `spadwarp list targets`; "all" objects, or none if meshes or exports are given'
     )
     meshes: Names = Field((), description="mesh files, or folders of them, relative to the recipe")
     mesh_size: float | None = Field(
@@ -414,7 +414,7 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     tables = read_toml(path)
     if {"laser", "camera"} <= set(tables) and "scene" not in tables:
         raise ConfigError(
-            "a scene, not a recipe; a recipe has such tables in [scene], see `spadwarp examples`", source=str(path)
+            "a scene, not a recipe; a recipe has such tables in [scene], see `spadwarp list datasets`", source=str(path)
         )
     return Recipe.from_dict(tables, source=path)
 

@@ -635,5 +635,5 @@ def _within(numbers: NDArray[Any], allowed: range) -> bool:
 
 def _opened(path: Path, format: str) -> Hdf5File:
     if not os.path.exists(path):
-        raise FileError(f"{path}: no such file; `spadwarp dataset make` makes what is missing")
+        raise FileError(f"{path}: no such file; `spadwarp dataset` makes what is missing")
     return open_hdf5(path, format, version=FORMAT_VERSION)

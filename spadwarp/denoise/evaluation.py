@@ -118,7 +118,7 @@ def evaluate(
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Evaluation:
-    """Scores denoisers on a dataset of `spadwarp dataset make`.
+    """Scores denoisers on a dataset of `spadwarp dataset`.
 
     Args:
         data: The dataset's folder.

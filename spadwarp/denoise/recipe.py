@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -15,6 +15,7 @@ from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
 from spadwarp.scene.messages import describe
 from spadwarp.scene.sections import Whole
+from spadwarp.scene.tables import parse_override
 
 __all__ = ["LEAST_CROP", "MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
 
@@ -199,14 +200,16 @@ class TrainingRecipe(_Table):
         return recipe
 
 
-def load_training_recipe(path: str | os.PathLike[str], *, overrides: Mapping[str, Any] | None = None) -> TrainingRecipe:
-    """Reads a recipe, or by a bare name one of the package's; `overrides` are tables that replace the file's values.
+def load_training_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> TrainingRecipe:
+    """Reads a recipe, or by a bare name one of the package's; `overrides` are texts such as "optimiser.steps=2000".
 
     Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
     """
     path = example_or_path(path, "training")
-    tables = read_toml(path)
-    for name, value in (overrides or {}).items():
-        inner = tables.get(name)
-        tables[name] = {**inner, **value} if isinstance(inner, dict) and isinstance(value, Mapping) else value
+    tables: dict[Any, Any] = read_toml(path)
+    for (*sections, field), value in map(parse_override, overrides):
+        inner = tables
+        for section in sections:
+            inner = inner.setdefault(section, {})
+        inner[field] = value
     return TrainingRecipe.from_dict(tables, source=path)

@@ -147,9 +147,9 @@ def _advice(workers: Workers) -> str:
         return ""
     return (
         " on this CPU; a data-centre GPU trains in minutes. The package has trained weights, which `spadwarp denoise` "
-        "uses; fewer steps (--steps, in a new folder), or start from these weights (start in the recipe), take less, "
-        "and fewer samples (optimiser.pool) are drawn sooner. Ctrl-C keeps a checkpoint of the steps, from which the "
-        "same command resumes; samples are drawn anew"
+        "uses; fewer steps (optimiser.steps, in a new folder), or start from these weights (start in the recipe), take "
+        "less, and fewer samples (optimiser.pool) are drawn sooner. Ctrl-C keeps a checkpoint of the steps, from which "
+        "the same command resumes; samples are drawn anew"
     )
 
 

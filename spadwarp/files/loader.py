@@ -46,7 +46,7 @@ def load(path: str | os.PathLike[str]) -> Held:
     - `analytic.h5`: an `AnalyticFile`, likewise.
     - A dataset's folder or one of its shards: a `FrameReader` of all its frames.
     - `records.h5`: `PhotonRecords`.
-    - `sequence.h5` of `video --trajectory`: a `SequenceFile`, which reads the frames of a scene that moves when asked.
+    - `sequence.h5` of `simulate --trajectory`: a `SequenceFile`, which reads frames of a scene that moves when asked.
     - A directory with one of these files, such as that of a run: the same. A checkpoint counts if there is no result.
 
     Raises:

@@ -276,14 +276,14 @@ def depth_of(
         ArgumentError: Something that is needed is missing, given twice or out of range.
     """
     if histograms.bin_width is None:
-        raise ArgumentError("bin width is missing (--bin-width-ps): the file does not hold it")
+        raise ArgumentError("bin width is missing (bin_width): the file does not hold it")
     index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
     values = histograms.values
     height, width = values.shape[-3:-1]
     filtered = method in ("matched", "likelihood")
     response = histograms.response if filtered else histograms.irf
     if filtered and response is None:
-        raise ArgumentError(f"method = {method!r} needs an instrument response (--irf-fwhm-ps, --irf)")
+        raise ArgumentError(f"method = {method!r} needs an instrument response (irf)")
     known: Any = histograms.background if background is None else background
     if background == "median" or (known is None and method == "likelihood"):
         known = _median_background(values)
@@ -315,9 +315,7 @@ def _geometry(
     """Group index, and lines of sight where they are known."""
     scene = histograms.scene
     if scene is None and group_index is None:
-        raise ArgumentError(
-            "group index is missing (--group-index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater"
-        )
+        raise ArgumentError("group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
     if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
         raise ArgumentError("group index and field of view are those of the file's scene")
     index = check_real(

@@ -170,7 +170,7 @@ def read_histograms(
         values = values.sum(axis=0, dtype=np.int64 if values.dtype.kind in "iu" else np.float64)
     if gate_start is None and raw.gate_start is None:
         origin = "tag 0" if raw.first else "bin 0"
-        text = f"{path.name}: gate start is not given (--gate-start-ns): {origin} is taken for the time of the pulse"
+        text = f"{path.name}: gate start is not given (gate_start): {origin} is taken for the time of the pulse"
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
     return Histograms(
         values=np.ascontiguousarray(values),
@@ -262,7 +262,7 @@ def _ordered(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], list
     letters, notes = "yxt" if values.ndim == 3 else "nyxt", []
     if axes is None:
         axes = _inferred(values.shape, letters)
-        notes = [f"axes: {_in_words(values.shape, axes)} (--axes {axes})"]
+        notes = [f"axes: {_in_words(values.shape, axes)} (axes = {axes})"]
     elif sorted(axes) != sorted(letters):
         raise ArgumentError(f"axes = {axes!r} are not the letters of {letters} in any order, for shape {values.shape}")
     return np.transpose(values, [axes.index(letter) for letter in letters]), notes
@@ -280,7 +280,7 @@ def _inferred(shape: tuple[int, ...], letters: str) -> str:
     if len(best) == 1 or (best and plausible[best[0]] * _CLEARLY <= plausible[best[1]]):
         return best[0]
     raise ArgumentError(
-        f"the order of the axes is missing (--axes): shape {shape} may be "
+        f"the order of the axes is missing (axes): shape {shape} may be "
         + " or ".join(f"{order} ({_in_words(shape, order)})" for order in orders)
     )
 
@@ -307,7 +307,7 @@ def _named(path: Path, dataset: str | None, names: Sequence[str], candidates: Se
 
 def _unnamed(path: Path, listed: str) -> ArgumentError:
     """The error for a file of several arrays of which none was named."""
-    return ArgumentError(f"{path}: the dataset is missing (--dataset); the file holds {listed}")
+    return ArgumentError(f"{path}: the dataset is missing (dataset); the file holds {listed}")
 
 
 def _listed(shapes: Mapping[str, tuple[int, ...]]) -> str:
@@ -353,7 +353,7 @@ def _read_mat(path: Path, request: _Request) -> _Raw:
     notes = [] if request.dataset or len(candidates) == 1 else [f"reads {name}, not {', '.join(candidates[1:])}"]
     if chosen.kind == "cell":
         if request.tag_unit is None:
-            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (--tag-unit-ps)")
+            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
         return _of_tags(value, request.tag_unit, request.bin_width, notes)
     width = facts.get("bin_size")
     width = width if width is not None and 1e-15 < width < 1e-3 else None
@@ -390,7 +390,7 @@ def _image_shape(pixels: int, image_size: tuple[int, int] | None, shapes: list[t
         return image_size
     fitting = {shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and shape[0] * shape[1] == pixels}
     if len(fitting) != 1:
-        raise ArgumentError(f"the image's size is missing (--image-size): {pixels} pixels, one after the other")
+        raise ArgumentError(f"the image's size is missing (image_size): {pixels} pixels, one after the other")
     (height, width), *_ = fitting
     return height, width
 
@@ -426,7 +426,7 @@ def _of_tags(cells: NDArray[Any], unit: float, bin_width: float | None, notes: l
     tags = tags.astype(np.int64)
     first = int(tags.min()) // step * step
     bins = (int(tags.max()) - first) // step + 1
-    wider = f"a wider bin than {step * unit * 1e12:g} ps (--bin-width-ps)"
+    wider = f"a wider bin than {step * unit * 1e12:g} ps (bin_width)"
     if bins > _MOST_BINS:
         raise ArgumentError(
             f"time tags from {tags.min()} to {tags.max()} are {bins} bins, more than {_MOST_BINS}; {wider} would help,"
@@ -456,7 +456,7 @@ def _read_ptu(path: Path, request: _Request) -> _Raw:
             counts, text = _ptu_scan(file, request.image_size)
         if (channels := file.number_channels) > 1:
             text += f"; {channels} channels, added up"
-        notes = [text, f"{len(counts)} frames; --sum-frames adds them up"][: counts.ndim - 2]
+        notes = [text, f"{len(counts)} frames; sum_frames adds them up"][: counts.ndim - 2]
         # Time of flight at the start of bin 0, which `spadwarp export` writes in the comment.
         is_ours = file.tags.get("CreatorSW_Name") == "spadwarp"
         gate = re.search(r"Bin 0 begins at (\S+) ns of flight", file.comment or "") if is_ours else None
@@ -483,7 +483,7 @@ def _check_ptu(file: Any, path: Path) -> None:
 
 def _ptu_image(file: Any, sum_frames: bool) -> NDArray[np.int32]:
     frames, height, width, _, bins = file.shape
-    _check_size((1 if sum_frames else frames, height, width, bins), "adding up the frames (--sum-frames)")
+    _check_size((1 if sum_frames else frames, height, width, bins), "adding up the frames (sum_frames)")
     options: dict[str, Any] = {"channel": -1, "dtype": np.uint32, "keepdims": False}
     counts = file.decode_image(frame=-1 if sum_frames or frames == 1 else None, **options)
     return np.ascontiguousarray(counts).view(np.int32)
@@ -498,7 +498,7 @@ def _ptu_scan(file: Any, image_size: tuple[int, int] | None) -> tuple[NDArray[np
     bins = int(dtime.max(initial=0)) + 1
     if image_size is None:
         if marks.size:
-            raise ArgumentError(f"the image's size is missing (--image-size): a scan of {marks.size} markers")
+            raise ArgumentError(f"the image's size is missing (image_size): a scan of {marks.size} markers")
         return np.bincount(dtime, minlength=bins).astype(np.int32)[None, None], "one point"
     height, width = image_size
     _check_size((height, width, bins), "a smaller image")

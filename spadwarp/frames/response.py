@@ -309,7 +309,7 @@ def read_response(path: str | Path, *, bin_width: float | None = None) -> Instru
     if values.ndim != 1 or values.size < 2 or not (np.isfinite(values).all() and values.min() >= 0 and values.any()):
         raise ArgumentError(f"{path}: {values.shape} is not a response: two values or more, not negative, not all 0")
     if bin_width is None:
-        raise ArgumentError(f"bin width is missing (--bin-width-ps): {path} has a value for each bin")
+        raise ArgumentError(f"bin width is missing (bin_width): {path} has a value for each bin")
     values = np.concatenate([[0.0], _near_1(values), [0.0]])  # between its bins linear, to 0 on either side
     centres = np.arange(values.size) - float(values @ np.arange(values.size)) / float(values.sum())
     return InstrumentResponse(times=centres * bin_width, values=values)

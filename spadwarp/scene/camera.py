@@ -41,7 +41,7 @@ class Camera(Section):
 
     section: ClassVar[str] = "camera"
     preset: str | None = None
-    """a named camera, see `spadwarp presets camera`"""
+    """a named camera, see `spadwarp list presets camera`"""
     width: Whole = Field(..., ge=1, le=16384)
     """pixels in a row"""
     height: Whole = Field(..., ge=1, le=16384)

@@ -16,7 +16,7 @@ class Detector(Section):
 
     section: ClassVar[str] = "detector"
     preset: str | None = None
-    """a named detector, see `spadwarp presets detector`"""
+    """a named detector, see `spadwarp list presets detector`"""
     pdp: float = Field(0.247, ge=0, le=1)
     """photon detection probability of the active area"""
     fill_factor: float = Field(0.2, gt=0, le=1)

@@ -33,7 +33,7 @@ class Laser(Section):
     section: ClassVar[str] = "laser"
     alternatives: ClassVar[tuple[str, ...]] = ENERGIES
     preset: str | None = None
-    """a named laser, see `spadwarp presets laser`"""
+    """a named laser, see `spadwarp list presets laser`"""
     position: Vector = (0.0, 0.0, 0.0)
     """where the beam begins [m]"""
     direction: Direction = (0.0, 0.0, 1.0)

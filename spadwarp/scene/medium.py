@@ -45,7 +45,7 @@ class Water(Section):
     section: ClassVar[str] = "medium"
     alternatives: ClassVar[tuple[str, ...]] = COEFFICIENTS
     preset: str | None = None
-    """a named water, see `spadwarp presets medium`"""
+    """a named water, see `spadwarp list presets medium`"""
     absorption: float = Field(0.0, ge=0, le=1e6)
     """absorption coefficient a [1/m]"""
     scattering: float = Field(0.0, ge=0, le=1e6)
@@ -138,7 +138,7 @@ class Medium(Water):
     scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
     """what scattering does to the polarisation of light, over any phase function; "none": light is not polarised"""
     matrix_table: CsvFile = None
-    """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp particles` writes one
+    """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp water` writes one
     """
     depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
     """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""

@@ -95,7 +95,7 @@ class Port(Section):
 
     section: ClassVar[str] = "port"
     preset: str | None = None
-    """a named port, see `spadwarp presets port`"""
+    """a named port, see `spadwarp list presets port`"""
     shape: Literal["flat", "dome"] = "flat"
     """a plane window, or a spherical one"""
     distance: float | None = Field(None, ge=1e-6, le=1e6)

@@ -284,7 +284,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
         raise FileError(f"{path}: not a scene{used(path)}")
     tables = read_toml(path)
     if "scene" in tables and "laser" not in tables:
-        raise ConfigError("a recipe of a dataset, for `spadwarp dataset make`, not a scene", source=str(path))
+        raise ConfigError("a recipe of a dataset, for `spadwarp dataset`, not a scene", source=str(path))
     return _build(tables, overrides=overrides, source=path)
 
 

@@ -18,7 +18,7 @@ class Gate(Section):
 
     section: ClassVar[str] = "gate"
     preset: str | None = None
-    """named electronics, see `spadwarp presets gate`"""
+    """named electronics, see `spadwarp list presets gate`"""
     start_ns: float = Field(0.0, ge=0, le=1e12)
     """begin of the first bin [ns]"""
     bin_width_ps: float = Field(..., ge=1e-12, le=1e15)

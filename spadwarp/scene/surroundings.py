@@ -22,7 +22,7 @@ class Target(Section):
 
     section: ClassVar[str] = "targets"
     builtin: str | None = Field(None, min_length=1)
-    """a built-in mesh, such as "staircase"; see `spadwarp targets`"""
+    """a built-in mesh, such as "staircase"; see `spadwarp list targets`"""
     mesh: AnyFile = None
     """path of a mesh file, relative to the scene file"""
     size: Size | None = None

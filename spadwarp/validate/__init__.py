@@ -6,7 +6,7 @@
 True
 """
 
-from spadwarp.validate.case import Case
-from spadwarp.validate.runs import CASES, FAMILY_LEVEL, CaseResult, draw_results, report, run
+from spadwarp.validate.cases import CASES, FAMILY_LEVEL, CaseResult, draw_results, report, run
+from spadwarp.validate.measure import Case
 
 __all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run"]

@@ -10,22 +10,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-__all__ = ["AFTER_COLLISIONS", "AFTER_PATH", "CUBE60", "CUBE60_ROUNDING", "CUTOFF", "EXIT_COSINES", "EXIT_COSINE_EDGES"]
-__all__ += ["FLUENCE", "FOURNIER_FORAND", "FOURNIER_FORAND_ANGLE", "FOURNIER_FORAND_SINGLE_SCATTER", "LAMBERTIAN"]
-__all__ += [
-    "NEAR_AXIS",
-    "SINGLE_SCATTER",
-    "SLABS",
-    "SLAB_DERIVATIVES",
-    "STACKS",
-    "TIME_RESOLVED",
-    "Fluence",
-    "Pulse",
-    "Slab",
-    "SlabDerivatives",
-    "Stack",
-]
-
 
 class Slab(NamedTuple):
     """An index-matched slab, normal incidence; fractions that leave it, `transmitted` with the direct beam."""

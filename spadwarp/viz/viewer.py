@@ -111,7 +111,9 @@ def view(
     check_apart(path, source)
     held = source if isinstance(source, Held) else load(source)
     if isinstance(held, SequenceFile):
-        raise ArgumentError(f"{held.path} holds a scene that moves: `spadwarp video` shows it, frame by frame")
+        raise ArgumentError(
+            f"{held.path} holds a scene that moves: `spadwarp view --out NAME.gif` shows it, frame by frame"
+        )
     if isinstance(held, Result):
         page = _of_result(analyser_channel(held, channel), method, device)
     elif channel != "I":

@@ -13,7 +13,7 @@ import spadwarp
 from helpers.cli import DEVICE, ROOT, run, tables
 from helpers.scenes import scene as make_scene
 from spadwarp.cli import app
-from spadwarp.cli._app import STAGES
+from spadwarp.cli.app import STAGES
 from spadwarp.dataset import load_recipe
 from spadwarp.denoise import load_training_recipe
 from spadwarp.files import json_schema
@@ -53,12 +53,12 @@ def test_every_choice_in_the_template_is_valid():
 
 
 def test_examples_go_by_name(tmp_path):
-    printed = run("examples", "--json", tmp_path / "printed.json").stdout
+    printed = run("list", "--json", tmp_path / "printed.json").stdout
     known = tables(tmp_path / "printed.json")
     assert {path.stem for path in (ROOT / "configs" / "scenes").glob("*.toml")} == set(known["scenes"])
     assert all(name in printed for names in known.values() for name in names)
-    assert run("examples", "plane_5m").stdout.startswith("# A grey wall")
-    assert "'nothing'" in run("examples", "nothing", code=2).stderr
+    assert run("list", "scenes", "plane_5m").stdout.startswith("# A grey wall")
+    assert "'nothing'" in run("list", "scenes", "nothing", code=2).stderr
     assert spadwarp.load_scene("plane_5m") == spadwarp.load_scene(ROOT / "configs" / "scenes" / "plane_5m.toml")
     assert load_recipe("small").name == "spadwarp small" and load_training_recipe("usdn").model == "usdn"
     small = ("--set", "camera.width=4", "--set", "camera.height=4", "--set", "output.png=false", "--photons", 1000)
@@ -101,36 +101,26 @@ def test_all_configurations_fit_their_schema(kind):
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "fits"),
     [
-        'laser.pulse_energy = "150 nJ"',
-        'targets = [{builtin = "staircase", translation = [0, "20 cm", 5], scale = 0.5}]',
-        'medium = {preset = "uwoc-clear", group_index = "fresh"}',
-        'medium = {extinction = 1.0, albedo = "lu2024"}',
-        "domain = {shape = 'slab', lower = -1.0}",
-        "camera.focus_distance = inf",
-        "medium.layers = [{start = 1.0, preset = 'uwoc-clear'}]",
+        ('laser.pulse_energy = "150 nJ"', True),
+        ('targets = [{builtin = "staircase", translation = [0, "20 cm", 5], scale = 0.5}]', True),
+        ('medium = {preset = "uwoc-clear", group_index = "fresh"}', True),
+        ('medium = {extinction = 1.0, albedo = "lu2024"}', True),
+        ("domain = {shape = 'slab', lower = -1.0}", True),
+        ("camera.focus_distance = inf", True),
+        ("medium.layers = [{start = 1.0, preset = 'uwoc-clear'}]", True),
+        ("laser.pulse_energy = -1.0", False),
+        ("laser.puls_energy = 1.0", False),
+        ('laser.pulse_energy = "many"', False),
+        ('medium.preset = "uwoc-cleer"', False),
+        ('targets = [{builtin = "stairs"}]', False),
+        ('transport.estimator = "guess"', False),
+        ("gate.bins = 1.5", False),
     ],
 )
-def test_what_a_scene_takes_fits(text):
-    validator("scene").validate(tomllib.loads(text))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "laser.pulse_energy = -1.0",
-        "laser.puls_energy = 1.0",
-        'laser.pulse_energy = "many"',
-        'medium.preset = "uwoc-cleer"',
-        'targets = [{builtin = "stairs"}]',
-        'transport.estimator = "guess"',
-        "gate.bins = 1.5",
-    ],
-)
-def test_what_a_scene_refuses_does_not_fit(text):
-    with pytest.raises(jsonschema.ValidationError):
-        validator("scene").validate(tomllib.loads(text))
+def test_a_schema_takes_what_a_scene_takes(text, fits):
+    assert validator("scene").is_valid(tomllib.loads(text)) is fits
 
 
 def test_every_field_is_described():
@@ -143,7 +133,7 @@ def test_every_field_is_described():
 
 def test_schema_tells_editors_where_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    printed = run("schema", "scene").stdout
+    printed = run("init", "--schema", "scene").stdout
     assert "#:schema ./scene.schema.json" in printed and "even-better-toml" in printed
     assert tables("scene.schema.json") == json.loads(json.dumps(json_schema(spadwarp.Scene)))
 

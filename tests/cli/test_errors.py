@@ -44,7 +44,7 @@ def test_what_can_be_foreseen_is_a_sentence(error, code, text, monkeypatch):
         raise error
 
     monkeypatch.setattr("spadwarp.scene.presets", fails)
-    outcome = run("presets", code=code)
+    outcome = run("list", "presets", code=code)
     assert text in outcome.stderr and outcome.stdout == ""
     assert "Traceback" not in outcome.stderr and "bug" not in outcome.stderr
 
@@ -57,20 +57,20 @@ def test_what_caused_an_error_counts(monkeypatch):
             raise RuntimeError("Failed to load the shared library") from error
 
     monkeypatch.setattr("spadwarp.scene.presets", fails)
-    assert "not enough memory" in run("presets", code=1).stderr
+    assert "not enough memory" in run("list", "presets", code=1).stderr
 
 
 def test_a_bug_keeps_its_traceback_in_a_file(monkeypatch, tmp_path):
     monkeypatch.setattr("spadwarp.scene.presets", lambda: {}["missing"])
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    complaint = run("presets", code=70).stderr
+    complaint = run("list", "presets", code=70).stderr
     (kept,) = tmp_path.glob("spadwarp-bug-*.txt")
     assert "error: spadwarp has a bug: KeyError: 'missing'" in complaint and str(kept) in complaint
     assert "Traceback" not in complaint
     assert "Traceback" in kept.read_text() and spadwarp.__version__ in kept.read_text()
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
-    assert "Traceback" in run("presets", code=70).stderr  # there is no other place for it
+    assert "Traceback" in run("list", "presets", code=70).stderr  # there is no other place for it
 
 
 def process(*arguments, **options):
@@ -79,21 +79,24 @@ def process(*arguments, **options):
 
 
 def test_a_terminal_may_lack_letters(scene):
-    ascii_only = ENVIRONMENT | {"PYTHONIOENCODING": "ascii"}
-    done = process("budget", scene, "--range", "2:3:2", "--device", "cpu", env=ascii_only, stdout=subprocess.PIPE)
+    options = {"env": ENVIRONMENT | {"PYTHONIOENCODING": "latin-1"}, "encoding": "latin-1", "stdout": subprocess.PIPE}
+    done = process("sweep", scene, "--vary", "range=2:3:2", "--device", "cpu", **options)
     assert done.returncode == 0 and "?* [mm]" in done.stdout
 
 
 def test_an_answer_that_cannot_be_written_is_an_error():
     with open("/dev/full", "w") as full:
-        done = process("presets", stdout=full)
+        done = process("list", "presets", stdout=full)
     assert (done.returncode, done.stderr) == (1, "error: No space left on device\n")
 
 
 def test_streams_may_be_closed():
-    done = process("presets", stdout=None, preexec_fn=lambda: os.close(1))
+    done = process("list", "presets", stdout=None, preexec_fn=lambda: os.close(1))
     assert (done.returncode, done.stderr) == (0, "")
-    assert process("presets", stderr=None, stdout=subprocess.DEVNULL, preexec_fn=lambda: os.close(2)).returncode == 0
+    assert (
+        process("list", "presets", stderr=None, stdout=subprocess.DEVNULL, preexec_fn=lambda: os.close(2)).returncode
+        == 0
+    )
 
 
 def test_an_interrupt_while_commands_are_loaded():
@@ -101,7 +104,7 @@ def test_an_interrupt_while_commands_are_loaded():
         import sys
         class Interrupting:
             def find_spec(self, name, path=None, target=None):
-                if name == "spadwarp.cli.merge":
+                if name == "spadwarp.cli.results":
                     raise KeyboardInterrupt
         sys.meta_path.insert(0, Interrupting())
         from spadwarp.__main__ import main
@@ -134,9 +137,9 @@ def _limited(mebibytes, *arguments):
 @pytest.mark.parametrize(
     ("mebibytes", "needed", "arguments"),
     [
-        (250, "spadwarp needs 0.5 GiB", ("presets",)),
+        (250, "spadwarp needs 0.5 GiB", ("list", "presets")),
         (600, "Warp needs 1 GiB", ("simulate", "plane_5m", "--out", "out")),
-        (720, "Warp needs 1 GiB", ("budget", "plane_5m")),
+        (720, "Warp needs 1 GiB", ("sweep", "plane_5m")),
         (560, "denoising needs 1 GiB", ("denoise", "depth.npy", "--model", "usdn", "--out", "out")),
         (700, "denoising needs 1 GiB", ("denoise", "depth.npy", "--model", "usdn", "--out", "out")),
     ],
@@ -151,7 +154,7 @@ def test_less_memory_than_the_libraries_need(mebibytes, needed, arguments, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mebibytes", [1030, 1100])
-@pytest.mark.parametrize("command", ["simulate", "budget"])
+@pytest.mark.parametrize("command", ["simulate", "sweep"])
 def test_short_memory_is_named(command, mebibytes, scene, tmp_path):
     out = tmp_path / "out"
     done = _limited(mebibytes, command, scene, "--device", "cpu", "--out", out)

@@ -98,6 +98,6 @@ def test_arrays_that_are_not_what_their_name_says(tmp_path):
     (tmp_path / "deep.npy").write_bytes(content.replace(b"(2, 2, 8)", b"(((((((((")[: len(content)])
     words = {"zip": ".npz archive", "pickle": "object", "text": "<U1", "cut": "cut", "bomb": "", "deep": ""}
     for name, expected in words.items():
-        options = ("--bin-width-ps", 100, "--gate-start-ns", 0, "--group-index", 1, "--out", tmp_path / "out")
+        options = ("--input", "bin_width=100ps,gate_start=0,group_index=1", "--out", tmp_path / "out")
         complaint = run("depth", tmp_path / f"{name}.npy", *options, code=1).stderr
         assert f"{name}.npy" in complaint and expected in complaint, complaint

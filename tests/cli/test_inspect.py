@@ -1,7 +1,8 @@
-"""Commands that look: check, info, presets, water, devices, validate, targets; help, version, processes."""
+"""Commands that look: check, info, list, water, validate; help, version, processes."""
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 import warnings
@@ -28,16 +29,16 @@ def test_validation_says_what_failed(tmp_path, monkeypatch):
     assert "0 of 1 agree" in failed.stdout and "its sum: z = -10.00" in failed.stderr
     monkeypatch.undo()
     assert "nope" in run("validate", "nope", code=2).stderr
-    assert "cube60" in run("validate", "--list").stdout
+    assert "cube60" in run("list", "validation").stdout and "scaling" in run("list", "benchmarks").stdout
 
 
 def test_targets_are_listed_and_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr("spadwarp.viz.scenes.builtin_names", lambda: ("plane", "staircase"))
-    printed = run("targets", "--out", tmp_path / "out", "--json", tmp_path / "printed.json", *DEVICE)
+    printed = run("list", "targets", "--out", tmp_path / "out", "--json", tmp_path / "printed.json", *DEVICE)
     assert "staircase" in printed.stdout and "4.00 x 4.00 x 0.70 m" in printed.stdout
     assert (tmp_path / "out" / "targets.png").read_bytes().startswith(b"\x89PNG")
     assert tables(tmp_path / "printed.json")["targets"][0] == {"name": "plane", "faces": 2, "extent": [1.0, 1.0, 0.0]}
-    assert "not empty" in run("targets", "--out", tmp_path / "out", code=2).stderr
+    assert "not empty" in run("list", "targets", "--out", tmp_path / "out", code=2).stderr
 
 
 def test_check_warns_with_numbers(scene, tmp_path):
@@ -56,8 +57,8 @@ def test_check_accepts_every_scene_that_comes_along():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             printed = run("check", path).stdout
-        lengths = printed.partition("attenuation length")[2].partition("\n")[0].split("; ")
-        assert len(lengths) == len(spadwarp.load_scene(path).medium.waters) and all("albedo" in one for one in lengths)
+        waters = spadwarp.load_scene(path).medium.waters
+        assert printed.count("attenuation length") == printed.count("albedo") == len(waters), path
 
 
 def test_info_tells_what_the_result_holds(scene, tmp_path):
@@ -66,36 +67,33 @@ def test_info_tells_what_the_result_holds(scene, tmp_path):
     summary = tmp_path / "summary.json"
     printed = run("info", tmp_path / "result.h5", "--json", summary).stdout
     assert run("info", tmp_path).stdout == printed  # the directory stands for the result in it
-    assert "20 000, seed 3" in printed and "Energy balance, exact" in printed and "100.000000 %" in printed
+    assert "20 000" in printed and "100.000000 %" in printed
+    assert re.search(r"energy balance\n +verdict +exact", printed)
     assert tables(summary) == json.loads(json.dumps({"kind": "result", **result.summary()}))
 
 
 def test_a_result_that_says_little_about_its_origin_is_shown(done, tmp_path):
     result = dataclasses.replace(spadwarp.load_result(done / "result.h5"), provenance={}, timing={}, counters={})
     result.save(tmp_path / "result.h5")
-    assert "unknown" in run("info", tmp_path / "result.h5").stdout
+    run("info", tmp_path / "result.h5")
     run("merge", tmp_path / "result.h5", "--out", tmp_path / "out", *DEVICE)
     run("view", tmp_path, "--out", tmp_path / "view.html")
 
 
-def test_presets_water_and_devices_are_those_of_python(tmp_path):
+def test_presets_and_water_are_those_of_python(tmp_path):
     summary = tmp_path / "summary.json"
-    printed = run("presets", "medium", "--json", summary).stdout
+    printed = run("list", "presets", "medium", "--json", summary).stdout
     names = [preset["name"] for preset in tables(summary)["presets"]]
     assert names == list(spadwarp.scene.presets("medium"))
     assert all(name in printed for name in names) and "picoquant" not in printed
-    assert "picoquant-visuv-532" in run("presets").stdout
+    assert "picoquant-visuv-532" in run("list", "presets").stdout
 
     printed = run(
         "water", 532, "--chlorophyll", 0.5, "--temperature", 10, "--salinity", 35, "--json", tmp_path / "water.json"
     ).stdout
     optics = spadwarp.water.water_optics(532.0, chlorophyll=0.5, temperature=10.0, salinity=35.0)
-    assert f"{optics.extinction:.4g} 1/m" in printed and f"{optics.group_index:.5f}" in printed
+    assert f"{optics.extinction:.4g} 1/m" in printed and f"{optics.group_index:.4g}" in printed
     assert tables(tmp_path / "water.json")["absorption"] == optics.absorption
-
-    assert "cpu" in run("devices", "--json", summary, "--overwrite").stdout
-    assert tables(summary)["devices"] == spadwarp.device.devices()
-    assert sum(device["default"] for device in spadwarp.device.devices()) == 1
 
 
 def test_every_help_shows_an_example():
@@ -119,11 +117,11 @@ def test_importing_the_command_line_loads_nothing_heavy():
 
 def test_a_process_keeps_stdout_for_the_answer(scene):
     """Also on a machine without a GPU, of which Warp's native code would complain."""
-    process = start("devices")
+    process = start("doctor", "--no-self-test")
     printed, complaints = process.communicate(timeout=120)
     assert process.returncode == 0
-    assert "Warp" not in printed + complaints
-    assert printed.startswith("cpu")
+    assert complaints == ""
+    assert "\n  cpu" in printed
 
 
 def test_exit_code_of_a_process_that_was_used_wrongly(scene):
@@ -133,17 +131,16 @@ def test_exit_code_of_a_process_that_was_used_wrongly(scene):
     assert "Traceback" not in complaints
 
 
-def test_targets_looks_at_mesh_files(tmp_path):
+def test_info_and_view_take_mesh_files(tmp_path):
     import trimesh
 
     trimesh.creation.box((400, 300, 200)).export(tmp_path / "box.stl")
     summary = tmp_path / "printed.json"
-    printed = run("targets", tmp_path / "box.stl", "--out", tmp_path / "pictures", "--json", summary, *DEVICE).stdout
-    assert "probably mm" in printed and "12 faces, closed" in printed and "400 x 300 x 200" in printed
-    (found,) = tables(summary)["meshes"]
+    printed = run("info", tmp_path / "box.stl", "--json", summary).stdout
+    assert re.search(r"unit +mm", printed) and re.search(r"faces +12\n", printed) and "400, 300, 200 m" in printed
+    found = tables(summary)
     assert found["scale"] == 0.001 and found["hints"]
+    run("view", tmp_path / "box.stl", "--out", tmp_path / "pictures" / "box.png", *DEVICE)
     assert (tmp_path / "pictures" / "box.png").stat().st_size > 5000
-    assert "no such file" in run("targets", tmp_path / "nothing.stl", code=1).stderr
-    (tmp_path / "figure.py").write_text("")
-    complaint = run("targets", tmp_path / "figure.py", code=1).stderr
-    assert complaint.startswith(f"error: {tmp_path / 'figure.py'}: '.py' is no ending of a mesh file; .stl, .obj")
+    assert "is a mesh" in run("view", tmp_path / "box.stl", "--out", tmp_path / "page.html", code=2).stderr
+    assert "no such file" in run("info", tmp_path / "nothing.stl", code=1).stderr

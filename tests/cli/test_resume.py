@@ -10,7 +10,7 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, FILES, PICTURES, run, start, tables
-from spadwarp.files import load_resumable
+from spadwarp.files.run import load_resumable
 
 
 def test_a_resumed_run_is_the_long_run(spad_scene, tmp_path):
@@ -28,7 +28,7 @@ def test_a_resumed_run_is_the_long_run(spad_scene, tmp_path):
     long = spadwarp.simulate(spadwarp.load_scene(spad_scene), photons=total, device="cpu")
     assert np.array_equal(result.tallies, long.tallies) and result.energy_balance == long.energy_balance
     assert result.photons == total == spadwarp.load_scene(out / "scene.toml").transport.photons
-    assert f"{100 * result.relative_error:.3g} % or less in the brightest bin" in printed.stdout
+    assert f"relative error {result.relative_error:.4g}" in " ".join(printed.stdout.split())
 
 
 def test_merged_runs_are_one_run(spad_scene, done, tmp_path):
@@ -43,7 +43,7 @@ def test_merged_runs_are_one_run(spad_scene, done, tmp_path):
     long = spadwarp.simulate(spadwarp.load_scene(spad_scene), photons=first + second, device="cpu")
     assert np.array_equal(merged.tallies, long.tallies) and merged.energy_balance == long.energy_balance
     assert tables(tmp_path / "both.json")["photon_ranges"] == [[0, first + second]]
-    assert "energy balance is exact" in printed.stdout and (both / "depth.exr").is_file()
+    assert "energy balance exact" in " ".join(printed.stdout.split()) and (both / "depth.exr").is_file()
     assert "photon ids 0 to" in run("merge", one, one, "--out", tmp_path / "twice", code=2).stderr
 
 
@@ -114,7 +114,7 @@ def test_interrupt_writes_what_is_done(scene, tmp_path, number, pictures):
     assert result.partial and 0 < result.photons < 10**11
     assert result.energy_report()["exact"]
     assert {path.name for path in out.iterdir()} == FILES | pictures
-    assert "interrupted" in run("info", out).stdout
+    assert "partial yes" in " ".join(run("info", out).stdout.split())
 
 
 @pytest.mark.slow
@@ -136,7 +136,7 @@ def test_a_killed_run_resumes_from_its_checkpoint(scene, tmp_path):
     result = spadwarp.load_result(out / "result.h5")
     long = spadwarp.simulate(spadwarp.load_scene(scene), photons=total, device="cpu")
     assert np.array_equal(result.tallies, long.tallies) and result.energy_balance == long.energy_balance
-    assert not result.partial and "the first of 3 parts" in run("info", out).stdout
+    assert not result.partial and run("info", out).stdout.count("photons") > 2
     assert {path.name for path in out.iterdir()} == FILES
 
 
@@ -165,10 +165,9 @@ def test_shards_are_merged(scene, tmp_path):
     [
         (("--shard", "4/3"), "shard = 4/3 is outside [1/3, 3/3]"),
         (("--shard", "half"), "such as 3/64"),
-        (("--engine", "slurm"), "is not local or ray"),
-        (("--workers", "2"), "needs --engine ray"),
+        (("--workers", "2"), "needs --ray"),
         (("--shard", "1/2", "--records"), "photon 0"),
-        (("--device", "cuda:1", "--engine", "ray"), "cuda:1"),
+        (("--device", "cuda:1", "--ray", "start"), "cuda:1"),
     ],
 )
 def test_wrong_parts_and_engines_are_named(scene, tmp_path, arguments, words):

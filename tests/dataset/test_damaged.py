@@ -78,11 +78,8 @@ def test_a_manifest_that_is_no_table_is_refused(text, folder):
     (folder / "manifest.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(FileError, match=r"manifest\.json: "):
         read_manifest(folder)
-    for command in ("info", "verify", "preview"):
-        outcome = run(
-            "dataset", command, folder, *(("--out", folder / "x.png") if command == "preview" else ()), code=1
-        )
-        assert "manifest.json" in outcome.stderr
+    for words in (("info", folder), ("info", folder, "--verify"), ("view", folder, "--out", folder / "x.png")):
+        assert "manifest.json" in run(*words, code=1).stderr
 
 
 def test_a_target_that_is_in_no_split_is_refused(folder):

@@ -505,22 +505,18 @@ def test_recipes_in_configs(path):
 def test_commands(tmp_path):
     path, out = written(recipe(), tmp_path), tmp_path / "data"
 
-    def dataset(*words, code=0):
-        return run("dataset", *words, code=code).output
-
-    make = ["make", path, "--out", out, *DEVICE, "--set", "frames.per_scene=1"]
-    printed = dataset(*make, "--part", "1/2")
-    assert "3 shards with 3 frames" in printed and "3 shards, left to other machines" in printed
-    assert "frames-00001.h5: missing" in dataset("verify", out, code=1)
-    assert "3 shards that were complete" in dataset(*make, "--json", tmp_path / "report.json")
-    assert tables(tmp_path / "report.json")["frames"] == 3
-    assert "complete" in dataset("verify", out)
-    printed = dataset("info", out)
-    assert "staircase" in printed and "36 x 24 pixels" in printed
-    dataset("preview", out, "--frames", "4", "--out", tmp_path / "sheet.png")
+    make = ["dataset", path, "--out", out, *DEVICE, "--set", "frames.per_scene=1"]
+    run(*make, "--part", "1/2", "--json", tmp_path / "part.json")
+    assert tables(tmp_path / "part.json")["missing"] == tables(tmp_path / "part.json")["frames"] == 3
+    assert "frames-00001.h5: missing" in run("info", out, "--verify", code=1).output
+    run(*make, "--json", tmp_path / "report.json")
+    assert tables(tmp_path / "report.json")["frames"] == tables(tmp_path / "report.json")["kept"] == 3
+    assert "complete" in run("info", out, "--verify").output
+    assert "staircase" in run("info", out).output
+    run("view", out, "--pictures", "4", "--out", tmp_path / "sheet.png")
     assert (tmp_path / "sheet.png").read_bytes()[:4] == b"\x89PNG"
-    for wrong in (["--part", "3/2"], ["--part", "x"], ["--engine", "cloud"]):
-        dataset(*make, *wrong, code=2)
+    for wrong in (["--part", "3/2"], ["--part", "x"], ["--workers", "2"]):
+        run(*make, *wrong, code=2)
 
 
 def test_hugging_face_reads_the_frames(folder, tmp_path):

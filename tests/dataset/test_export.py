@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
 def parquet(folder, tmp_path_factory):
     pytest.importorskip("pyarrow")
     out = tmp_path_factory.mktemp("exported") / "parquet"
-    run("dataset", "export", folder, "--out", out, "--frames-per-file", 3)
+    run("export", folder, "--format", "parquet", "--out", out, "--frames-per-file", 3)
     return out
 
 
@@ -171,8 +171,11 @@ def test_what_cannot_be_exported_is_named(folder, tmp_path):
     (tmp_path / "b" / "mine").write_text("")
     with pytest.raises(FileError, match="exists"):
         export_dataset(folder, tmp_path / "b", "webdataset")
-    assert "exists" in run("dataset", "export", folder, "--out", tmp_path / "b", code=2).output
-    assert "holds the dataset" in run("dataset", "export", folder, "--out", folder, "--overwrite", code=2).output
+    assert "exists" in run("export", folder, "--format", "parquet", "--out", tmp_path / "b", code=2).output
+    assert (
+        "holds the dataset"
+        in run("export", folder, "--format", "parquet", "--out", folder, "--overwrite", code=2).output
+    )
     make(recipe(**{"frames.per_scene": 1}), tmp_path / "analytic")
     with pytest.raises(ArgumentError, match="it has no histograms"):
         export_dataset(tmp_path / "analytic", tmp_path / "a", fields=("counts",))

@@ -132,7 +132,7 @@ def test_files_of_every_kind(tmp_path):
     write_exr(folder / "engine.exr", {"A": np.ascontiguousarray(100.0 * noisy)})
     savemat(folder / "matlab.mat", {"depth": noisy, "name": "a text", "scalar": 3.0})
     common = ["--model", "median", "--gate", "13.5:16", "--out", out]
-    invoke("denoise", folder / "engine.exr", "--scale", 0.01, *common)
+    invoke("denoise", folder / "engine.exr", "--input", "scale=0.01", *common)
     invoke("denoise", folder / "matlab.mat", *common, "--overwrite")
     invoke("denoise", folder / "one.npy", "--json", tmp_path / "one.json", *common, "--overwrite")
     found = np.load(out / "one.npy")

@@ -9,7 +9,6 @@ import warp as wp
 
 import spadwarp
 from helpers.cli import DEVICE, ENVIRONMENT, run, tables
-from spadwarp.doctor import diagnosis, self_test
 
 
 def test_self_test_measures_what_is_known(tmp_path):
@@ -25,7 +24,7 @@ def test_self_test_measures_what_is_known(tmp_path):
 
 
 def test_a_wrong_simulator_is_found_out(monkeypatch):
-    monkeypatch.setattr(self_test, "_TRANSMITTED", 0.67)
+    monkeypatch.setattr(spadwarp.doctor, "_TRANSMITTED", 0.67)
     outcome = run("doctor", *DEVICE, "--quiet", code=1)
     assert "self-test: transmitted by the slab" in outcome.stderr and "FAILED" in outcome.stderr
     assert outcome.stdout == ""
@@ -72,8 +71,8 @@ def test_a_cache_that_cannot_be_used_is_named(tmp_path):
 )
 def test_what_is_missing_for_a_gpu(version, words, monkeypatch):
     monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
-    monkeypatch.setattr(diagnosis, "_driver_cuda", lambda: version)
-    monkeypatch.setattr(diagnosis.Path, "exists", lambda self: False)
+    monkeypatch.setattr(spadwarp.doctor, "_driver_cuda", lambda: version)
+    monkeypatch.setattr(spadwarp.doctor.Path, "exists", lambda self: False)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    [reason] = diagnosis._gpu_reasons()
+    [reason] = spadwarp.doctor._gpu_reasons()
     assert re.search(words, reason)

@@ -157,8 +157,8 @@ def test_the_gate_of_an_exported_ptu_is_known(frames, detection, tmp_path):
         assert read_histograms(tmp_path / "b.ptu").gate_start == 0
 
     ranges = {}
-    for name, options in {"own": (), "given": ("--gate-start-ns", 0)}.items():
-        arguments = ("depth", path, "--group-index", 1.3638, *options, "--device", "cpu", "--out", tmp_path / name)
+    for name, facts in {"own": "group_index=1.3638", "given": "group_index=1.3638,gate_start=0"}.items():
+        arguments = ("depth", path, "--input", facts, "--device", "cpu", "--out", tmp_path / name)
         run(*arguments)
         ranges[name] = np.load(tmp_path / name / "range.npy")
     later = 0.5 * SPEED_OF_LIGHT / 1.3638 * detection.gate_start

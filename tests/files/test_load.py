@@ -97,7 +97,7 @@ def test_denoise_takes_every_file_with_an_image(files, name, tmp_path):
 
 @pytest.mark.parametrize("name", ["analytic", "shard"])
 def test_video_shows_reported_depths(files, name, tmp_path):
-    run("video", files[name], "--pictures", 5, "--out", tmp_path / "light.gif")
+    run("view", files[name], "--pictures", 5, "--out", tmp_path / "light.gif")
     assert (tmp_path / "light.gif").stat().st_size > 1000
 
 

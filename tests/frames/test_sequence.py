@@ -127,12 +127,21 @@ def test_what_is_no_trajectory_is_named_before_the_first_photon(base, text, word
 
 def test_command_and_exports(base, poses, tmp_path):
     (tmp_path / "scene.toml").write_text(base.to_toml())
-    options = ("--photons", 2000, "--pulses", 500, "--device", "cpu", "--out", tmp_path / "moving")
-    printed = run("video", tmp_path / "scene.toml", "--trajectory", poses, "--frame-rate", 10, *options).output
-    assert "4, from 0 to 0.3 s" in printed and "camera.position[2]" in printed
+    options = (
+        "--photons",
+        2000,
+        "--set",
+        "detector.pulses_per_frame=500",
+        "--device",
+        "cpu",
+        "--out",
+        tmp_path / "moving",
+    )
+    printed = run("simulate", tmp_path / "scene.toml", "--trajectory", poses, "--frame-rate", 10, *options).output
+    assert "0, 0.3 s" in printed and "camera.position[2]" in printed
     with Image.open(tmp_path / "moving" / "sequence.gif") as picture:
         assert picture.n_frames == 4
-    assert "is not empty" in run("video", tmp_path / "scene.toml", "--trajectory", poses, *options, code=2).output
+    assert "is not empty" in run("simulate", tmp_path / "scene.toml", "--trajectory", poses, *options, code=2).output
     run("export", tmp_path / "moving", "--format", "npy", "--out", tmp_path / "exported")
     held = spadwarp.load(tmp_path / "moving")
     exported = np.load(tmp_path / "exported" / "sequence.npy")
@@ -141,5 +150,5 @@ def test_command_and_exports(base, poses, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "depth" / "depth.npy")[2], held.depth("matched", 2))
     if importlib.util.find_spec("plotly"):
         assert "scene that moves" in run("view", tmp_path / "moving", "--out", tmp_path / "a.html", code=2).output
-    assert "needs --trajectory" in run("video", tmp_path / "moving", "--photons", 10, code=2).output
+    assert "needs --trajectory" in run("simulate", tmp_path / "scene.toml", "--tags", code=2).output
     assert "moving" in run("info", tmp_path / "moving").output

@@ -39,7 +39,7 @@ def _scene(r: random.Random, corpus: Corpus) -> Case:
             ("check", name),
             ("check", name, "--json", "out.json"),
             ("simulate", name, "--photons", "200", "--out", "out", "--quiet", *CPU),
-            ("budget", name, "--range", "1,2", "--out", "out", *CPU),
+            ("sweep", name, "--vary", "range=1,2", "--out", "out", *CPU),
             ("load_scene", name),
         )
     )
@@ -91,15 +91,16 @@ def _mesh(r: random.Random, corpus: Corpus) -> Case:
     is_text = name in ("box.ascii.stl", "box.off", "target.obj")
     damaged = (mutations.in_text if is_text or r.random() < 0.3 else mutations.in_bytes)(r, corpus[name])
     run = ("simulate", "scene.toml", "--mesh", name, "--photons", "100", "--out", "out", "--quiet", *CPU)
-    command = r.choice((("check", "scene.toml", "--mesh", name), ("targets", name), run))
+    command = r.choice((("check", "scene.toml", "--mesh", name), ("info", name), run))
     return Case(command, {name: damaged, "scene.toml": None, "target.mtl": None, "target.png": None}, ("out",))
 
 
 def _exr(r: random.Random, corpus: Corpus) -> Case:
-    analytic = ("analytic", "scene.toml", "--depth", "depth.exr", "--depth-channel", "Z", "--depth-scale", "1")
+    albedo = r.choice(("0.5", "depth.exr"))
+    rendered = f"depth=depth.exr,depth_channel=Z,depth_scale=1,albedo={albedo}"
     command = r.choice(
         (
-            (*analytic, "--albedo", r.choice(("0.5", "depth.exr")), "--out", "out", "--quiet", *CPU),
+            ("analytic", "scene.toml", "--rendered", rendered, "--out", "out", "--quiet", *CPU),
             ("denoise", "depth.exr", "--model", "median", "--out", "out", *CPU),
         )
     )
@@ -121,7 +122,7 @@ def _hdf5(r: random.Random, corpus: Corpus) -> Case:
             ("detect", name, "--pulses", "50", "--method", "peak", "--out", "out", *CPU),
             ("merge", name, "other.h5", "--out", "out", *CPU),
             ("simulate", "scene.toml", "--photons", "2000", "--resume", "result.h5", "--out", "out", *CPU),
-            ("video", name, "--out", "out.gif", "--pictures", "3"),
+            ("view", name, "--out", "out.gif", "--pictures", "3"),
         ]
     files = {name: mutations.in_hdf5(r, corpus[name]), "scene.toml": None}
     if name == "result.h5":
@@ -134,10 +135,9 @@ def _dataset(r: random.Random, corpus: Corpus) -> Case:
     damage = mutations.in_hdf5 if name.endswith(".h5") else mutations.in_text
     command = r.choice(
         (
-            ("dataset", "info", "data"),
-            ("dataset", "verify", "data"),
-            ("dataset", "preview", "data", "--out", "out.png"),
             ("info", "data"),
+            ("info", "data", "--verify"),
+            ("view", "data", "--out", "out.png"),
             ("export", "data", "--format", "npy", "--out", "out"),
             ("load", "data"),
         )
@@ -145,14 +145,14 @@ def _dataset(r: random.Random, corpus: Corpus) -> Case:
     return Case(command, {"data": None, f"data/{name}": damage(r, corpus[f"data/{name}"])}, ("out", "out.png"))
 
 
-_KNOWN = ("--bin-width-ps", "200", "--gate-start-ns", "10", "--group-index", "1.3")
+_KNOWN = ("--input", "bin_width=200ps,gate_start=10ns,group_index=1.3")
 
 
 def _measured(*names: str) -> Callable[[random.Random, Corpus], Case]:
     def case(r: random.Random, corpus: Corpus) -> Case:
         name = r.choice(names)
-        method = ("--irf-fwhm-ps", "300", "--method", r.choice(("peak", "centroid", "likelihood")))
-        tags = ("--tag-unit-ps", "200") if name == "tags.mat" else ()
+        method = ("--input", "irf=300ps", "--method", r.choice(("peak", "centroid", "likelihood")))
+        tags = ("--input", "tag_unit=200ps") if name == "tags.mat" else ()
         command = r.choice(
             (
                 ("depth", name, "--out", "out", *_KNOWN, *tags, *method, *CPU),
@@ -162,7 +162,18 @@ def _measured(*names: str) -> Callable[[random.Random, Corpus], Case]:
         if name == "depth.npy":
             command = ("denoise", name, "--model", "median", "--out", "out", *CPU)
         if name in ("response.npy", "irf.csv"):
-            command = ("depth", "counts.npy", "--out", "out", *_KNOWN, "--irf", name, "--method", "matched", *CPU)
+            command = (
+                "depth",
+                "counts.npy",
+                "--out",
+                "out",
+                *_KNOWN,
+                "--input",
+                f"irf={name}",
+                "--method",
+                "matched",
+                *CPU,
+            )
         damage = mutations.in_text if name.endswith(".csv") else mutations.in_bytes
         return Case(command, {"counts.npy": None, name: damage(r, corpus[name])}, ("out",))
 

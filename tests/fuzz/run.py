@@ -31,7 +31,7 @@ FINE = ("done", "refused")
 def warm_up(corpus: Path) -> None:
     """Loads what the commands load, and compiles or loads the kernels."""
     files = ("scene.toml", "calibrated.toml", "result.h5", "frames.h5", "counts.npy", "counts.ptu", "depth.exr")
-    options = ("--bin-width-ps", "200", "--gate-start-ns", "1", "--group-index", "1", "--irf-fwhm-ps", "300")
+    options = ("--input", "bin_width=200ps,gate_start=1ns,group_index=1,irf=300ps")
     sys.stderr.flush()
     import contextlib
     import io
@@ -51,12 +51,11 @@ def warm_up(corpus: Path) -> None:
                 ("depth", place["counts.ptu"], *options, "--method", "peak"),
                 ("denoise", str(corpus / "depth.npy"), "--model", "usdn"),
                 ("export", place["frames.h5"], "--format", "mat"),
-                ("video", place["result.h5"], "--pictures", "2"),
                 ("view", place["result.h5"]),
             )
         ):
-            where = {"video": f"{out}/v.gif", "view": f"{out}/v.html"}.get(arguments[0], f"{out}/{number}")
-            device = () if arguments[0] in ("video", "export") else ("--device", "cpu")
+            where = f"{out}/v.html" if arguments[0] == "view" else f"{out}/{number}"
+            device = () if arguments[0] == "export" else ("--device", "cpu")
             done = CliRunner().invoke(spadwarp.cli.app, [*arguments, "--out", where, *device])
             assert done.exit_code == 0, (arguments, done.output, done.exception)
 

@@ -163,7 +163,7 @@ def test_commands_say_what_python_says(light, tmp_path):
     assert np.load(tmp_path / "fit" / "depth.npy").shape == (8, 8)
     assert "NAME=VALUE" in run("fit", tmp_path, scene, *options, "--start", "a", "--out", tmp_path / "x", code=2).stderr
     options = ("--unknown", UNKNOWN, "--photons", "1e5", "--pulses", "1e4", *DEVICE)
-    printed = run("crlb", scene, *options, "--json", tmp_path / "crlb.json")
+    printed = run("fit", scene, "--bounds", *options, "--json", tmp_path / "crlb.json")
     assert "medium.scattering [1/m]" in printed.stdout and "counts expected in 10 000 pulses" in printed.stdout
     twin = spadwarp.inverse.bounds(scene, unknown=UNKNOWN, photons=100_000, pulses=10_000, device="cpu")
     one = tables(tmp_path / "crlb.json")["bounds"]["medium.scattering"]

@@ -28,12 +28,11 @@ SMALLER = {
     r"^(spadwarp fit .*)": r"\1 --set camera.width=16 --set camera.height=12",
     r"^(spadwarp plan .*)": r"\1 --photons 5e3 --no-range",
     r"--pulses 20000": "--pulses 500",
-    r"(--trajectory \S+)": r"\1 --photons 5e3 --set camera.width=16 --set camera.height=12",
     r"--steps 24": "--steps 9",
     r"--size 320 240": "--size 64 48",
-    r"dataset make \S+": "dataset make small --set scenes_per_target=1 --set frames.per_scene=2",
-    r"dataset make small --set": "dataset make small --set scenes_per_shard=1 --set",
-    r"train (out/\S+)": r"train \1 --steps 2",
+    r"spadwarp dataset \S+": "spadwarp dataset small --set scenes_per_target=1 --set frames.per_scene=2",
+    r"dataset small --set": "dataset small --set scenes_per_shard=1 --set",
+    r"train (out/\S+)": r"train \1 --set optimiser.steps=2",
     r"^spadwarp evaluate ": "spadwarp evaluate --frames 1 ",
     r"--device cuda:\w+": "--device cpu",
 }
@@ -42,13 +41,13 @@ SMALLER = {
 LEFT_OUT = {
     r"pip install|python3 -m venv|^\.venv/bin": "installs; .ci/run runs the README's two blocks",
     r"^spadwarp doctor": "reports on this machine; tests/doctor",
-    r"--ray-address|out/cluster/": "needs a Ray cluster; tests/parallel runs Ray on this machine",
+    r"--ray |out/cluster/": "needs a Ray cluster; tests/parallel runs Ray on this machine",
     r"^sbatch|part\$id|out/part": "needs Slurm; tests/transport runs and merges shards",
     r"^torchrun": "needs several GPUs",
     r"train configs/|\bruns/": "recipes for a GPU; tests/denoise trains the networks for a few steps",
     r"^python bench/peers": "needs networks of others",
     r"^python docs/figures/measured": "needs a published capture",
-    r"evaluate --(histograms|report)": "take minutes; tests/denoise has them at a small size",
+    r"evaluate --(models histograms|report)": "take minutes; tests/denoise has them at a small size",
     r"bm3d": "takes minutes; tests/denoise has it on a small frame",
 }
 

@@ -110,7 +110,7 @@ def commands(text):
                     yield shlex.split(line, comments=True)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=by_name)
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=by_name)
 def test_commands_in_the_text_name_what_there_is(page):
     """Commands, options, configurations and scripts."""
     printed = {}
@@ -119,7 +119,7 @@ def test_commands_in_the_text_name_what_there_is(page):
             known = (ROOT / words[1]).read_text()
         elif "spadwarp" in words[:1] or words[-2:-1] == ["spadwarp"]:
             words = words[words.index("spadwarp") + 1 :]
-            command = tuple(words[: 2 if words[0] == "dataset" else 1])
+            command = tuple(words[:1])
             if command not in printed:
                 printed[command] = CliRunner().invoke(app, [*command, "--help"]).stdout
             known = printed[command] + "--help"

@@ -36,26 +36,3 @@ def test_python_blocks_run(readme, roots, printed, tmp_path):
     process = subprocess.run([sys.executable, program], cwd=folder, env=environment, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr
     assert printed in process.stdout
-
-
-PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_shell_commands_name_what_there_is(page):
-    """The options and the scenes that a page shows are those of the command line."""
-    from typer.testing import CliRunner
-
-    from spadwarp.cli import app
-
-    text = "\n".join(re.findall(r"^```(?:sh|bash)\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE))
-    for path in re.findall(r"configs/\S+\.toml", text):
-        assert (ROOT / path).is_file(), path
-    for command, arguments in re.findall(r"spadwarp ([a-z]+)([^\n#]*(?:\\\n[^\n#]*)*)", text):
-        words = [command]
-        if "COMMAND [ARGS]" in CliRunner().invoke(app, [command, "--help"]).stdout:  # a group of commands
-            words.append(arguments.split()[0])
-        printed = CliRunner().invoke(app, [*words, "--help"])
-        assert printed.exit_code == 0, words
-        for option in re.findall(r"--[a-z-]+", arguments):
-            assert option in printed.stdout, f"{words} {option}"

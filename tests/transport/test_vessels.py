@@ -16,7 +16,7 @@ from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.validate.camera import vessel_reading, white_vessel
+from spadwarp.validate.cases import vessel_reading, white_vessel
 from spadwarp_kernels.estimators.guided import LARGEST_WEIGHT_RATIO
 
 

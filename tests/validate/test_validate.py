@@ -15,7 +15,7 @@ from reference.slab_derivatives import slab_derivatives
 from spadwarp.errors import ArgumentError
 from spadwarp.io import json_text
 from spadwarp.validate import CASES, draw_results, references, report, run
-from spadwarp.validate.statistics import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
+from spadwarp.validate.measure import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
 
 # The statistics
 

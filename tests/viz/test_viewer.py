@@ -235,11 +235,11 @@ def test_an_mp4_is_written_or_the_error_names_what_is_missing(result, tmp_path, 
 
 def test_commands_write_page_and_video(result, tmp_path):
     save_result(result, tmp_path / "result.h5")
-    for command, name in ((["view", "--device", "cpu"], "page.html"), (["video", "--pictures", "3"], "light.gif")):
+    for options, name in ((("--device", "cpu"), "page.html"), (("--pictures", "3"), "light.gif")):
         out = tmp_path / name
-        outcome = run(command[0], tmp_path, "--out", out, *command[1:])
+        outcome = run("view", tmp_path, "--out", out, *options)
         assert outcome.stdout.startswith(f"written: {out} (") and out.is_file()
-    assert "two numbers" in run("video", tmp_path, "--window", "a", code=2).output
+    assert "two numbers" in run("view", tmp_path, "--out", "a.gif", "--window", "a", code=2).output
 
 
 def test_a_page_is_never_written_over_its_source(tmp_path):

@@ -117,7 +117,7 @@ def test_concentration_is_volume():
 
 def test_command_makes_a_table_for_a_scene(tmp_path):
     path = tmp_path / "coast.csv"
-    outcome = run("particles", "532", "--small", 0.05, "--large", 0.2, "--out", path)
+    outcome = run("water", "532", "--particles", "small=0.05,large=0.2", "--out", path)
     assert "absorption = 0.04444" in outcome.output
     law = spadwarp.scene.phase_function(
         spadwarp.scene.Medium(extinction=0.3, albedo=0.8, phase_function="tabulated", phase_table=str(path))
@@ -130,14 +130,17 @@ def test_command_makes_a_table_for_a_scene(tmp_path):
 
 def test_refused():
     for arguments, words in (
-        (("532",), "--small"),
-        (("532", "--small", 1, "--index", 1.1), "--small"),
-        (("532", "--index", 1.1), "--concentration"),
-        (("532", "--index", 1.1, "--concentration", 1), "--slope, --median or --diameter"),
-        (("532", "--index", 1.1, "--concentration", 1, "--slope", 4), "--smallest"),
-        (("532", "--index", 1.1, "--concentration", 1, "--diameter", "3 s"), "is a time; a length is needed"),
+        ("concentration=1", "give small and large, or index"),
+        ("small=1,index=1.1", "give small and large, or index"),
+        ("small=1,slope=4", "slope belongs to index"),
+        ("index=1.1", "concentration is missing"),
+        ("index=1.1,concentration=1", "slope, median or diameter"),
+        ("index=1.1,concentration=1,slope=4", "smallest is missing"),
+        ("index=1.1,concentration=1,diameter=3 s", "is a time; a length is needed"),
+        ("indx=1.1", "did you mean 'index'?"),
     ):
-        assert words in " ".join(run("particles", *arguments, code=2).output.split())
+        assert words in " ".join(run("water", "532", "--particles", arguments, code=2).output.split())
+    assert "needs --particles" in run("water", "532", "--out", "a.csv", code=2).output
     with pytest.raises(ArgumentError, match=r"index.imag = -0.1"):
         mie_particles(single_size(1e-6), NM, index=1.1 - 0.1j, concentration=1.0)
     with pytest.raises(ArgumentError, match="no particles"):

@@ -118,8 +118,8 @@ def test_tables_that_no_matter_has_are_refused(tmp_path, rows, text):
 
 def test_matrix_of_particles_on_the_command_line(tmp_path):
     file = tmp_path / "matrix.csv"
-    mie = ["particles", "532", "--index", "1.1", "--concentration", "1", "--diameter", "0.5um"]
+    mie = ["water", "532", "--particles", "index=1.1,concentration=1,diameter=0.5um"]
     assert "matrix_table" in run(*mie, "--matrix", str(file)).stdout
     assert spadwarp.water.read_matrix_table(file)(np.array([0.0])).shape == (1, 5)
-    refused = run("particles", "532", "--small", "0.1", "--matrix", str(tmp_path / "new.csv"), code=2)
+    refused = run("water", "532", "--particles", "small=0.1", "--matrix", str(tmp_path / "new.csv"), code=2)
     assert "no matrix" in refused.output

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import io
-import math
 import os
 import platform
 import shlex
@@ -15,6 +14,8 @@ import tempfile
 import traceback
 import warnings
 from contextlib import AbstractContextManager, ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import typer
@@ -26,17 +27,35 @@ from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError, SpadwarpW
 FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 
 
+@dataclass
+class Running:
+    """The command that runs.
+
+    Attributes:
+        quiet: Whether only warnings and errors are printed.
+        overwrite: Whether existing files are replaced.
+        json: File for the summary.
+        given: Options and arguments that have another value than by default.
+    """
+
+    quiet: bool = False
+    overwrite: bool = False
+    json: Path | None = None
+    given: frozenset[str] = frozenset()
+
+
+running = Running()
 _resources = ExitStack()  # of the command that runs
 Value = TypeVar("Value")
 
 
 # Commands by stage of work, in the order of the help.
 STAGES = {
-    "Begin": ("init", "examples", "schema", "doctor", "devices"),
-    "Plan": ("check", "plan", "budget", "crlb", "sweep", "water", "particles", "presets", "targets"),
+    "Begin": ("init", "list", "doctor"),
+    "Plan": ("check", "plan", "sweep", "water"),
     "Simulate": ("simulate", "merge", "analytic"),
     "Counts and depth": ("detect", "depth", "fit", "denoise"),
-    "Look at results": ("info", "view", "video", "export"),
+    "Look at results": ("info", "view", "export"),
     "Datasets and training": ("dataset", "train", "evaluate"),
     "Trust and speed": ("validate", "bench"),
 }
@@ -125,8 +144,9 @@ def until_the_end(context: AbstractContextManager[Value]) -> Value:
 
 
 def say(text: str = "") -> None:
-    """Prints the answer of a command to stdout."""
-    typer.echo(text)
+    """Prints the answer of a command to stdout, but with --quiet."""
+    if not running.quiet:
+        typer.echo(text)
 
 
 def complain(text: str) -> None:
@@ -140,8 +160,8 @@ def fail(text: str, code: int = FAILED) -> NoReturn:
     raise typer.Exit(code)
 
 
-class _Command(TyperCommand):
-    """Refuses options that are not finite numbers, which `float` takes without a word."""
+class Command(TyperCommand):
+    """Complains of values in its own words."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:
@@ -150,24 +170,9 @@ class _Command(TyperCommand):
             error.message = error.message.removeprefix("Value error, ").removesuffix(".")  # of the parser's own making
             raise
 
-    def invoke(self, ctx: Any) -> Any:
-        for param in self.params:
-            value = ctx.params.get(param.name)
-            for one in value if isinstance(value, list | tuple) else [value]:
-                if isinstance(one, float) and not math.isfinite(one):
-                    raise typer.BadParameter(f"{one} is not a finite number", param_hint=param.opts[0])
-        return super().invoke(ctx)
-
-
-class Commands(typer.Typer):
-    """The application, or a group of its commands."""
-
-    def command(self, *args: Any, **options: Any) -> Any:
-        return super().command(*args, cls=_Command, **options)
-
 
 # Help in plain text: units in square brackets stay, and nothing is loaded to draw boxes.
-app = Commands(
+app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
     add_completion=True,
@@ -179,7 +184,7 @@ app = Commands(
 
 def _version(asked: bool) -> None:
     if asked:
-        say(f"spadwarp {spadwarp.__version__}")
+        typer.echo(f"spadwarp {spadwarp.__version__}")
         raise typer.Exit
 
 

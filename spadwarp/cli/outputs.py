@@ -11,46 +11,39 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 import spadwarp
-from spadwarp.cli._app import until_the_end
+from spadwarp.cli.app import running, say, until_the_end
+from spadwarp.cli.text import in_bytes, readable, written
 from spadwarp.errors import FileError
 
-__all__ = ["Json", "Out", "Outputs", "Overwrite", "check_outputs", "check_writable", "in_bytes"]
+__all__ = ["answer", "check_outputs", "write_json"]
 
-Out = Annotated[Path, typer.Option(metavar="DIR", help="Directory for the output files.", show_default=False)]
-Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace output files that exist; allow a directory that is not empty.")
-]
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the output as JSON.")]
-
-_READ_IN_DIRECTORIES = (
-    "result.h5",
-    "frames.h5",
-    "sequence.h5",
-    "analytic.h5",
-)  # where an input is the directory of one of them
+# Where an input is the directory of one of them.
+_READ_IN_DIRECTORIES = ("result.h5", "frames.h5", "sequence.h5", "analytic.h5")
 
 
-@dataclass(frozen=True)
-class Outputs:
-    """The outputs of a command that `check_outputs` allowed."""
+def answer(summary: Mapping[str, Any], hide: Iterable[str] = ()) -> None:
+    """Prints a summary without the names in `hide`, and the files in it; and writes all of it as JSON."""
+    hidden = {"files", "notes", "warnings", *hide}
+    say(readable({name: value for name, value in summary.items() if name not in hidden}))
+    if files := summary.get("files"):
+        say(f"written: {written(files)}")
+    write_json(summary)
 
-    json: Path | None
-    overwrite: bool
 
-    def write_json(self, summary: Mapping[str, Any]) -> None:
-        """The machine-readable twin of what a command prints; numbers that are not finite become null."""
-        if self.json is None:
-            return
-        if not self.overwrite and os.path.lexists(self.json) and not spadwarp.io.is_stream(self.json):
-            raise FileError(f"{self.json}: appeared while the command ran; it is not replaced")
-        spadwarp.io.write_json(summary, self.json)
+def write_json(summary: Mapping[str, Any]) -> None:
+    """The machine-readable twin of what a command prints, if --json asks for it; what is not finite becomes null."""
+    path = running.json
+    if path is None:
+        return
+    if not running.overwrite and os.path.lexists(path) and not spadwarp.io.is_stream(path):
+        raise FileError(f"{path}: appeared while the command ran; it is not replaced")
+    spadwarp.io.write_json(summary, path)
 
 
 def check_outputs(
@@ -58,15 +51,14 @@ def check_outputs(
     names: Iterable[str] = (),
     *,
     files: Mapping[str, Path | None] | None = None,
-    json: Path | None = None,
     inputs: Iterable[str | Path | None] = (),
-    overwrite: bool,
     resume: bool = False,
     beside: bool = False,
-    needed: int = 0,
+    needed: int = 16 << 20,
     option: str = "--out",
-) -> Outputs:
-    """Refuses outputs that would replace something else, and finds out now whether they can be written.
+) -> None:
+    """Refuses outputs, the file of --json too, that would replace something else without --overwrite, and finds out now
+    whether they can be written.
 
     The output directory is made, and locked until the command ends.
 
@@ -74,9 +66,7 @@ def check_outputs(
         out: Directory of `option`.
         names: Files that the command may write in it; patterns such as `frames-*.mat` where `beside` is given.
         files: Option → file that the command writes.
-        json: File of --json.
         inputs: Files that the command reads, or directories of a result or frames.
-        overwrite: Whether existing files are replaced.
         resume: Whether the command continues what is in the directory.
         beside: Whether the directory may hold other files than `names`.
         needed: Bytes that may be written to `out`.
@@ -86,6 +76,7 @@ def check_outputs(
         typer.BadParameter: An output exists, is an input, or is given twice.
         FileError: A directory cannot be written, is in use by another process, or has too little space.
     """
+    json, overwrite = running.json, running.overwrite
     names = list(names)
     named = {option: path for option, path in {**(files or {}), "--json": json}.items() if path is not None}
     named = {option: path for option, path in named.items() if not spadwarp.io.is_stream(path)}
@@ -102,8 +93,7 @@ def check_outputs(
                 raise typer.BadParameter(f"{path} exists; --overwrite replaces it", param_hint=option)
         _prepare_directory(out, option, may_hold_files=overwrite or resume or beside, needed=needed)
     for path in named.values():
-        check_writable(path.parent)
-    return Outputs(json, overwrite)
+        _check_writable(path.parent)
 
 
 def _check_apart(written: Iterable[tuple[str, Path]], inputs: Iterable[str | Path | None]) -> None:
@@ -133,7 +123,7 @@ def _place(path: Path) -> Path:
 def _prepare_directory(out: Path, option: str, *, may_hold_files: bool, needed: int) -> None:
     if out.exists() and not out.is_dir():
         raise typer.BadParameter(f"{out} is a file; a directory is needed", param_hint=option)
-    check_writable(out)
+    _check_writable(out)
     if not until_the_end(spadwarp.io.lock(out / ".lock")):
         raise FileError(f"{out}: another process is writing to this directory; wait for it, or name another one")
     if any(not path.name.startswith(".") for path in out.iterdir()) and not may_hold_files:
@@ -143,7 +133,7 @@ def _prepare_directory(out: Path, option: str, *, may_hold_files: bool, needed: 
         raise FileError(f"{out}: up to {in_bytes(needed)} will be written; {in_bytes(free)} are free there")
 
 
-def check_writable(directory: Path) -> None:
+def _check_writable(directory: Path) -> None:
     """Raises `FileError` where no file can be made in the directory, which is made if it is not there, and removed
     again if it is empty when the command ends."""
     until_the_end(_not_left_empty([place for place in (directory, *directory.parents) if not os.path.exists(place)]))
@@ -164,12 +154,3 @@ def _not_left_empty(folders: list[Path]) -> Iterator[None]:
         for folder in folders:
             with suppress(OSError):
                 folder.rmdir()
-
-
-def in_bytes(number: float) -> str:
-    """1.5 GiB"""
-    for unit in ("bytes", "KiB", "MiB", "GiB"):
-        if number < 1024:
-            return f"{number:.4g} {unit}"
-        number /= 1024
-    return f"{number:.3g} TiB"

@@ -1,0 +1,486 @@
+"""Commands from counts to depth: `detect`, `depth`, `fit`, `denoise`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import typer
+
+import spadwarp
+from spadwarp.cli import options as opt
+from spadwarp.cli.app import complain, running, say
+from spadwarp.cli.options import command
+from spadwarp.cli.outputs import answer, check_outputs, write_json
+from spadwarp.cli.text import count, progress, rows, show_table
+from spadwarp.cli.text import written as names_of
+from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.limits import parse_number
+from spadwarp.units import percent, range_from_time, rounded
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from spadwarp import Result, Scene
+    from spadwarp.frames import Recording
+    from spadwarp.inverse import Bounds, EstimateMap, Fit
+
+# What a detector sees of a scene; the rest has decided which photons came.
+_DETECTOR_FIELDS = (
+    "detector",
+    "daylight",
+    *(f"laser.{name}" for name in ("pulse_energy", "average_power", "peak_power", "repetition_rate", "pulse_fwhm_ps")),
+    *(f"laser.{name}" for name in ("linewidth_nm", "spectrum")),
+)
+
+_MEDIAN_PER_SIGMA = 0.6745  # of the absolute values of normal errors
+_NOISE = 0.1  # part of the bound's information that is noise of the simulation, from which on it is said
+
+
+@command()
+def detect(
+    run: Path,
+    *,
+    out: Path,
+    pulses: int | None = None,
+    frames: int = 1,
+    seed: int = 0,
+    method: list[opt.Method] | None = None,
+    coates: bool = False,
+    tags: bool = False,
+    window: tuple[str, str] | None = None,
+    channel: opt.Channel = "I",
+    overrides: list[str] | None = None,
+    device: str | None = None,
+) -> None:
+    """Frames of counts that the camera would record.
+
+    Writes frames.h5 (counts, depth frames of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set
+    takes fields of the detector and of daylight, and of the laser its energy or power, repetition_rate, pulse_fwhm_ps
+    and spectrum.
+
+    Args:
+        run (RUN): A result, or its directory.
+        pulses: Pulses per frame; by default detector.pulses_per_frame.
+        frames: Frames to record.
+        method: Estimator of depth; may be repeated. By default all four; the last is drawn.
+        coates: Correct pile-up (Coates) before depth is estimated.
+        tags: Also keep the time tag of every detection.
+        window (NS BINS): Start [ns] and bins of the detector's window, such as 10 512 or 10ns 512. By default the run's
+            gate.
+
+    \b
+    Example:
+      spadwarp detect run1/result.h5 --pulses 20000 --frames 100 --seed 3 --out frames/
+      spadwarp detect run1/ --pulses 1e6 --out frames/ --coates --set detector.dark_count_rate=1e3
+    """
+    recorded = _window(window)
+    result = _with_detector(opt.load_run(run, channel), overrides)
+    scene, methods = result.scene, list(dict.fromkeys(method or get_args(opt.Method)))
+    pixels = max(frames, 0) * scene.camera.width * scene.camera.height
+    bins = recorded[1] if recorded else scene.gate.bins
+    shots = scene.detector.pulses_per_frame if pulses is None else pulses
+    counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
+    needed = pixels * (4 * counted + 4 * len(methods) + 8) + (16 << 20)
+    check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed)
+    with progress("frames") as report:
+        recording = spadwarp.frames.record_frames(
+            result,
+            out / "frames.h5",
+            pulses=pulses,
+            frames=frames,
+            seed=seed,
+            methods=methods,
+            undo_pile_up=coates,
+            tags=tags,
+            window=recorded,
+            device=device,
+            progress=report,
+        )
+    for note in recording.notes:
+        complain(f"note: {note}")
+    if recording.bound_noise > _NOISE and not _refused(recording):
+        complain(f"note: {_bound_noise(recording, result.photons)}")
+    files = [recording.path, spadwarp.viz.draw_recording(recording, result, out / "frame.png")]
+    answer({**_recorded(recording, frames), "channel": channel, "files": files})
+
+
+def _window(window: tuple[str, str] | None) -> tuple[float, int] | None:
+    """Start [s] and bins."""
+    if window is None:
+        return None
+    try:
+        return 1e-9 * opt.from_unit("ns")(window[0]), opt.whole_number(window[1])
+    except typer.BadParameter as error:
+        error.param_hint = "--window"
+        raise
+
+
+def _with_detector(result: Result, overrides: list[str] | None) -> Result:
+    """The result with another detector; other fields would belong to another run."""
+    for one in overrides or []:
+        field = one.partition("=")[0].strip()
+        if not any(field == known or field.startswith(f"{known}.") for known in _DETECTOR_FIELDS):
+            raise ConfigError(f"--set: {field} is not a field of {', '.join(_DETECTOR_FIELDS)}; simulate again")
+    return dataclasses.replace(result, scene=result.scene.with_overrides(overrides or []))
+
+
+def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
+    import numpy as np
+
+    first, bound = recording.first, recording.bound_depth[~np.isnan(recording.bound_depth)]
+    median = float(np.median(bound)) if bound.size else math.inf
+    pixels = first.counts.shape[1] * first.counts.shape[2]
+    return {
+        "pulses": first.pulses,
+        "frames": frames,
+        "seed": first.seed,
+        "detections_per_frame_and_pixel": recording.detections / (frames * pixels),
+        "detections_per_pulse_and_pixel": recording.detections / (frames * pixels * first.pulses),
+        "bound": {
+            "pixels": int(bound.size),
+            "median_m": median if math.isfinite(median) else None,
+            "noise_fraction": recording.bound_noise if math.isfinite(recording.bound_noise) else None,
+        },
+        "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
+        "monte_carlo_noise": None if recording.monte_carlo is None else dataclasses.asdict(recording.monte_carlo),
+        "notes": list(recording.notes),
+    }
+
+
+def _refused(recording: Recording) -> bool:
+    """There is information, but no bound: too few photons were traced, as a note says."""
+    return math.isfinite(recording.bound_noise) and not (recording.bound_time == recording.bound_time).any()
+
+
+def _bound_noise(recording: Recording, photons: int) -> str:
+    """How much of the bound's information was noise, and the photons that would leave a tenth."""
+    return (
+        f"{percent(recording.bound_noise)} % of the information in the median pixel was noise of the simulation; the "
+        "Cramér–Rao bound is without it"
+        + (", and only roughly known" if recording.bound_noise > 0.3 else "")
+        + f"; about {recording.bound_photons:.1e} photons instead of {photons:.1e} would make that a tenth"
+    )
+
+
+@command()
+def depth(
+    path: Path,
+    *,
+    out: Path,
+    method: opt.Method = "centroid",
+    channel: opt.Channel = "I",
+    inputs: list[str] | None = None,
+    background: str | None = None,
+    ply: Path | None = None,
+    ply_frame: Literal["camera", "world"] = "camera",
+    device: str | None = None,
+) -> None:
+    """Depth from histograms, simulated or measured.
+
+    Writes depth.npy (all frames), depth.exr and depth.png (the first). Measured histograms are arrays of any order of
+    axes, sparse matrices, cells of time tags, or T3 records. Facts that the file lacks are asked for; what was inferred
+    is printed. Without a field of view, the output is the range along the line of sight, for a laser in the lens.
+
+    Args:
+        path (FILE): A result or frames (.h5, or their directory), or measured: .npy, .mat, .h5, .ptu. Of an analytic
+            file, a dataset or a shard its depth frames are written as they are.
+        method: Estimator of the arrival time.
+        background (COUNTS): Background per bin, or "median": each pixel's median bin. By default that of the file; for
+            measured histograms none, with likelihood the median.
+        ply: Also write the points of the first frame, with normals.
+        ply_frame: Frame of the points: the camera's, or the world for a simulation.
+
+    \b
+    Examples:
+      spadwarp depth out/result.h5 --method matched --ply points.ply --out depth/
+      spadwarp depth counts.npy --method likelihood --out depth/ \\
+          --input axes=tyx,bin_width=55ps,gate_start=20ns,group_index=1.3566,irf=200ps
+      spadwarp depth tags.mat --input tag_unit=8ps,bin_width=64ps,gate_start=0s,group_index=1 --out depth/
+    """
+    from spadwarp.frames import depth_of, read_histograms
+
+    facts, files = opt.measured(inputs, group_index=opt.real_number, horizontal_fov_deg=opt.from_unit("°"))
+    seen = {name: facts.pop(name, None) for name in ("group_index", "horizontal_fov_deg")}
+    place = spadwarp.files.locate(path)
+    reduced = spadwarp.files.stored_depth(spadwarp.load(place)) if spadwarp.files.is_own_file(place) else None
+    if reduced is None:
+        histograms = read_histograms(place, channel=channel, **facts)
+        for text in histograms.notes:
+            complain(f"note: {text}")
+    values = histograms.values[..., 0] if reduced is None else reduced.values
+    names = [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")]
+    check_outputs(out, names, files={"--ply": ply}, inputs=(path, *files), needed=32 * values.size)
+    if reduced is None:
+        reduced = depth_of(histograms, method=method, background=_background(background), device=device, **seen)
+    comment = f"{path.name}, {reduced.method}"
+    files = spadwarp.files.write_depth(reduced, out, ply=ply, ply_frame=ply_frame, comment=comment)
+    answer({**_distances(reduced.first), "quantity": reduced.quantity, "frames": reduced.frames, "files": files})
+
+
+def _background(text: str | None) -> Any:
+    if text is None or text == "median":
+        return text
+    try:
+        return parse_number(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is neither a number nor 'median'", param_hint="--background") from None
+
+
+def _distances(image: NDArray[np.float64]) -> dict[str, Any]:
+    import numpy as np
+
+    there = image[np.isfinite(image)]
+    metres = [float(there.min()), float(there.max()), float(np.median(there))] if there.size else None
+    return {"pixels_with_return": int(there.size), "metres": metres}
+
+
+@command()
+def fit(
+    path: Path,
+    scene: Path | None = None,
+    *,
+    unknown: str,
+    out: Path | None = None,
+    bounds: bool = False,
+    start: list[str] | None = None,
+    prior: list[str] | None = None,
+    pulses: int | None = None,
+    photons: int | None = None,
+    seed: int = 0,
+    inputs: list[str] | None = None,
+    overrides: list[str] | None = None,
+    device: str | None = None,
+) -> None:
+    """Water, reflectance, background and depth from counts, by maximum likelihood; or only how well they can be known.
+
+    The model is the whole chain: transport, instrument response, noise, pile-up or dead time. SCENE has the camera, the
+    laser and all that is known. Writes fit.png (counts, fit, residuals), scene.toml (with the estimates), and NAME.npy
+    and NAME_error.npy for each unknown of the pixels.
+
+    With --bounds, SCENE stands alone, without COUNTS, and nothing is written: Cramér–Rao bounds of all unknowns
+    together, from one exposure. The least standard deviation of any unbiased estimate, when everything that is named is
+    unknown, and when all others are known; what not knowing the water costs in depth is the ratio. Of values of the
+    pixels, the table shows the median of the pixels that see a target.
+
+    Args:
+        path (COUNTS): Frames (.h5, or their directory), or measured histograms: .npy, .mat, .h5, .ptu; none with
+            --bounds.
+        scene (SCENE): Scene file (TOML), or the name of a scene of `spadwarp list scenes`.
+        unknown (NAMES): Names of the unknowns, with commas between: absorption, scattering, anisotropy, reflectance (or
+            targets[0].reflectance), background, depth. ':pixel' behind one of the last three gives each pixel its own.
+        bounds: Only the Cramér–Rao bounds of SCENE.
+        start (NAME=VALUE): Where to start; may be repeated. By default absorption and scattering from the backscatter,
+            the others from the scene.
+        prior (NAME=MEAN,SD): A value known from elsewhere: mean and standard deviation; may be repeated.
+        pulses: Pulses of a frame, if COUNTS does not hold them; with --bounds by default detector.pulses_per_frame.
+        photons: Photons of an iteration at most. By default 2e7 on the CPU, 4e8 on a GPU.
+
+    \b
+    Examples:
+      spadwarp fit frames/ harbour_5m --unknown absorption,scattering,reflectance --out fit/
+      spadwarp fit counts.npy scene.toml --pulses 1e6 --unknown absorption,scattering,depth:pixel \\
+          --start medium.absorption=0.1 --out fit/
+      spadwarp fit harbour_5m --bounds --unknown depth,absorption,scattering
+    """
+    options: dict[str, Any] = {"unknown": unknown, "pulses": pulses, "photons": photons, "seed": seed, "device": device}
+    options["prior"] = opt.named_values(prior, 2, "--prior")
+    if bounds:
+        opt.refuse("cannot be combined with --bounds, which takes SCENE alone", "SCENE", "--out", "--start", "--input")
+        _bounds(path, opt.read_scene(path, overrides), options)
+        return
+    if scene is None or out is None:
+        hint, text = ("SCENE", "a scene file, or --bounds") if scene is None else ("--out", "a directory, --out fit/")
+        raise typer.BadParameter(f"is missing; give {text}", param_hint=hint)
+    read, (facts, files) = opt.read_scene(scene, overrides), opt.measured(inputs)
+    names = spadwarp.files.fit_files(spadwarp.inverse.read_unknowns(read, unknown))
+    check_outputs(out, names, inputs=(path, scene, *files, *read.files))
+    begin = opt.named_values(start, 1, "--start") or None
+    with progress() as report:
+        found = spadwarp.fit(
+            spadwarp.files.locate(path), read, initial_guess=begin, progress=report, **options, **facts
+        )
+    for text in found.warnings:
+        complain(f"warning: {text}")
+    written = spadwarp.files.write_fit(found, out)
+    if found.estimates:
+        show_table(_estimates(found))
+    lines = {f"{name} of each pixel": _of_pixels(one) for name, one in found.maps.items()}
+    lines["counts"] = f"{count(found.counts.sum())} of {count(found.pulses)} pulses"
+    lines["fit"] = (
+        f"{'converged' if found.converged else 'not converged'} after {len(found.iterations)} renderings of "
+        f"{found.photons:.2e} photons in all, {found.seconds:.3g} s"
+    )
+    say(rows({**lines, "written": names_of(written)}))
+    write_json({**found.to_dict(), "files": written})
+
+
+def _bounds(path: Path, scene: Scene, options: dict[str, Any]) -> None:
+    check_outputs(inputs=(path, *scene.files))
+    found = spadwarp.inverse.bounds(scene, **options)
+    for text in found.warnings:
+        complain(f"warning: {text}")
+    show_table(_bounds_table(found))
+    say(f"{count(found.counts)} counts expected in {count(found.pulses)} pulses")
+    write_json(found.to_dict())
+
+
+def _bounds_table(found: Bounds) -> list[dict[str, Any]]:
+    table = []
+    for name, one in found.bounds.items():
+        row = found.names.index(name) if name in found.names else 0
+        label = f"{name} [{one.unit}]" if one.unit else name
+        cells = {
+            "unknown": f"{label}, median pixel" if one.per_pixel else label,
+            "value": "" if name == "depth" else f"{one.value:.4g}",
+            "bound": one.standard_error,
+            "bound [%]": "" if one.relative != one.relative else f"{100 * one.relative:.3g}",
+            "others known": one.alone,
+            "ratio": one.standard_error / one.alone,
+        }
+        others = enumerate(found.names[:row])
+        table.append(cells | {f"with {other}": f"{found.correlation[row, k]:+.3f}" for k, other in others})
+    return table
+
+
+def _estimates(found: Fit) -> list[dict[str, Any]]:
+    return [
+        {
+            "estimate": f"{one.name} [{one.unit}]" if one.unit else one.name,
+            "value": rounded(one.value, one.standard_error),
+            "±": f"{one.standard_error:.2g}",
+            "95 % interval": " to ".join(rounded(end, one.standard_error) for end in one.interval),
+            "start": rounded(one.initial_guess, one.standard_error),
+            "noise of simulation": f"{percent(one.simulation)} %",
+        }
+        for one in found.estimates.values()
+    ]
+
+
+def _of_pixels(one: EstimateMap) -> str:
+    import numpy as np
+
+    known = np.isfinite(one.value)
+    if not known.any():
+        return "known in none"
+    median, error = (float(np.median(part[known])) for part in (one.value, one.standard_error))
+    text = f"known in {count(known.sum())} of {count(known.size)}; median {median:.5g}, standard error {error:.2g}"
+    return f"{text} {one.unit}".rstrip()
+
+
+_ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_second.npy", ".exr", ".png")
+
+
+@command()
+def denoise(
+    path: Path,
+    *,
+    out: Path,
+    model: str = "pyramid",
+    gate: str | None = None,
+    profile: Path | None = None,
+    weights: Path | None = None,
+    inputs: list[str] | None = None,
+    mask: float | None = None,
+    device: str | None = None,
+    precision: Literal["float32", "float16", "bfloat16"] | None = None,
+) -> None:
+    """Denoise depth frames.
+
+    Writes for each file: NAME.npy (depth of all frames), NAME_target.npy and NAME_confidence.npy (the probabilities
+    that a pixel sees a target, and that its depth is right), NAME.exr (all three of the first frame) and NAME.png.
+    Every pixel has a depth, also where there is only water; --mask leaves these out. Histograms become depth first:
+    counts by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then
+    denoised with their histograms, and NAME_second.npy has second surfaces in a pixel. Datasets do not keep the
+    background that this needs: their depth frames are denoised without their histograms, as one line of the output
+    says. Needs pip install "spadwarp[denoise]".
+
+    --input also takes of depth: channel=NAME (of an EXR; of a result co or cross), scale=0.01 (metres per unit) and
+    as_depth (three dimensions in .npy, .mat and .h5 are frames of depth, not a histogram).
+
+    Args:
+        path (IN): A result or frames (.h5, or their directory); an analytic file, a dataset or a shard, of which the
+            stored depth counts; depth (.exr, .npy, .mat, .h5), measured histograms (.npy, .mat, .h5, .ptu), or a folder
+            of them.
+        model: pyramid, histograms, dncnn, usdn; or median, gating, bm3d; for counts also likelihood, pooled,
+            semi-global, total-variation, belief-propagation.
+        gate (FROM:TO): Gate in depth, such as 13.5:16 [m]; also in time, such as 90ns:110ns, with --input group_index.
+            By default that of the file, or the range of its depths.
+        profile: .npy with the water's backscatter over the gate in equal bins.
+        weights: Weights of spadwarp train. By default the package's.
+        mask (P): Leave out pixels that see a target with less than this probability: 0.08 for PyramidNet of depth, 0.5
+            for histograms.
+        precision: Of the layers of pyramid: float32, float16 (default on a GPU), bfloat16 (default on a CPU with AMX).
+
+    \b
+    Examples:
+      spadwarp denoise out/result.h5 --out denoised/
+      spadwarp denoise depth.npy --gate 13.5:16 --model dncnn --out denoised/
+      spadwarp denoise engine/ --input channel=A,scale=0.01 --gate 13.5:16 --out denoised/
+    """
+    import numpy as np
+
+    from spadwarp.denoise import denoise_file, depth_files
+
+    facts, files = opt.measured(inputs, group_index=opt.real_number, channel=str, scale=opt.real_number, as_depth=bool)
+    depths = _gate(gate, facts.get("group_index"))
+    paths = depth_files(path)
+    stems = [one.stem for one in paths]
+    if twice := sorted({one for one in stems if stems.count(one) > 1}):
+        raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
+    needed = sum(one.stat().st_size for one in paths if one.is_file())
+    names = [stem + ending for stem in stems for ending in _ENDINGS]
+    check_outputs(out, names, inputs=(*paths, profile, weights, *files), needed=needed)
+    settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
+    settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
+    lines: dict[str, str] = {}
+    summary: list[dict[str, Any]] = []
+    failed = 0
+    for number, one in enumerate(paths, 1):
+        try:
+            done = denoise_file(one, out, precision=precision, **settings, **facts)
+        except (ConfigError, FileError, ArgumentError) as error:
+            text = str(error) if str(one) in str(error) else f"{one}: {error}"
+            if len(paths) == 1:
+                raise type(error)(text) from None
+            complain(f"error: {text}")
+            failed += 1
+            continue
+        filled = float(np.isfinite(done.depth).mean())
+        target = float((done.target_probability >= done.threshold).mean())
+        frames = "1 frame" if len(done.depth) == 1 else f"{count(len(done.depth))} frames"
+        lines[one.name] = (
+            f"{frames}, {100 * filled:.3g} % of the pixels have a depth, {100 * target:.3g} % show a target"
+        )
+        facts_of_file = {"file": one, "gate": done.gate, "filled": filled, "target": target}
+        summary.append({**facts_of_file, "files": done.files, "notes": done.notes})
+        if not running.quiet:
+            for note in done.notes:
+                complain(f"{one.name}: {note}")
+            if len(paths) > 1:
+                complain(f"{number} of {len(paths)}")
+    say(rows({**lines, "written": f"{sum(len(one['files']) for one in summary)} files in {out}"}))
+    write_json({"model": model, "files": summary})
+    if failed:
+        raise FileError(f"{path}: {failed} of {len(paths)} files could not be denoised")
+
+
+def _gate(text: str | None, group_index: float | None) -> tuple[float, float] | None:
+    """Depths [m] of a gate in depth, or in time of flight."""
+    if text is None:
+        return None
+    try:
+        return opt.from_to(text, "m", "--gate")
+    except typer.BadParameter as error:
+        if " is a time" not in error.message:
+            raise
+    if group_index is None:
+        raise typer.BadParameter(
+            f"{text!r} is in time of flight: --input group_index=N makes depth of it; or give two lengths",
+            param_hint="--gate",
+        )
+    start, stop = opt.from_to(text, "s", "--gate")
+    return range_from_time(start, group_index), range_from_time(stop, group_index)

@@ -1,0 +1,255 @@
+"""Commands about learning: `dataset`, `train`, `evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+import spadwarp
+from spadwarp.cli import options as opt
+from spadwarp.cli.app import complain, running, say
+from spadwarp.cli.options import command
+from spadwarp.cli.outputs import answer, check_outputs, write_json
+from spadwarp.cli.text import count, progress, readable, show_table
+from spadwarp.limits import environment_integer
+
+if TYPE_CHECKING:
+    from spadwarp.denoise import Evaluation
+
+
+@command()
+def dataset(
+    recipe: Path,
+    *,
+    out: Path,
+    part: str | None = None,
+    overrides: list[str] | None = None,
+    devices: str | None = None,
+    processes: int = 4,
+    ray: str | None = None,
+    workers: int | None = None,
+) -> None:
+    """Make a dataset of labelled depth frames, or its missing and damaged shards.
+
+    The same recipe gives the same files. An interrupted call can be repeated: complete shards are kept. `spadwarp
+    info`, `view` and `export` take its folder.
+
+    Args:
+        recipe (RECIPE): Recipe (TOML), or the name of one of `spadwarp list datasets`.
+        out (DIR): The dataset's folder.
+        part (K/N): Only part K of N of the dataset: every N-th shard from the K-th; for several machines.
+        processes: Largest number of processes per GPU; fewer for few shards or cores.
+
+    \b
+    Examples:
+      spadwarp dataset configs/datasets/small.toml --out data/small/
+      spadwarp dataset configs/datasets/lu2024.toml --out data/lu2024/ --device cuda:all
+      spadwarp dataset configs/datasets/lu2024.toml --out data/lu2024/ --part 3/64
+    """
+    read = spadwarp.dataset.load_recipe(recipe)
+    if overrides:
+        read = read.with_overrides(overrides)
+    engine = opt.read_engine(ray, workers)
+    if running.json is not None and out.resolve() in running.json.resolve().parents:
+        raise typer.BadParameter(f"{running.json} is in the dataset's folder", param_hint="--json")
+    check_outputs(inputs=(recipe,))
+    with progress("frames") as report:
+        found = spadwarp.dataset.make_dataset(
+            read,
+            out,
+            device=devices,
+            processes=processes,
+            engine=engine,
+            part=opt.read_part(part, "--part") or (1, 1),
+            progress=report,
+        )
+    summary = {"folder": found.folder, "frames": found.frames, "made": list(found.made), "kept": len(found.kept)}
+    summary |= {"broken": list(found.broken), "missing": len(found.missing)}
+    say(readable({**summary, "made": f"{count(len(found.made))} shards"}))
+    write_json(summary)
+
+
+@command()
+def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device: str | None = None) -> None:
+    """Train a denoiser on scenes that are drawn as it goes, or on the clean scenes of a dataset.
+
+    New noise is drawn for each step; with a pool, as in the recipe for histograms, a sample serves several steps (6
+    there, on average). After the first steps the command says how long it will take. Writes weights (safetensors),
+    log.jsonl, curves.png and a checkpoint; Ctrl-C or SIGTERM keep a checkpoint of the last step, and the same command
+    resumes the training. Another recipe or number of steps needs a new folder. On several GPUs: torchrun
+    --nproc-per-node N -m spadwarp train ...
+
+    Args:
+        recipe (RECIPE): Training recipe (TOML), or the name of one of `spadwarp list training`.
+        overrides (SECTION.FIELD=VALUE): Overrides a field of RECIPE, such as data=DIR, seed=3, optimiser.steps=2e4; may
+            be repeated.
+
+    \b
+    Example:
+      spadwarp train configs/training/pyramid.toml --out runs/pyramid/
+      spadwarp train usdn --set data=data/small/ --set optimiser.steps=2000 --out runs/usdn/
+    """
+    from spadwarp.denoise import load_training_recipe
+    from spadwarp.denoise import train as run
+
+    chosen = load_training_recipe(recipe, overrides or ())
+    first = environment_integer("RANK", 0) == 0
+    names = (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt")
+    check_outputs(out if first else None, names, inputs=(recipe,), resume=True)  # one process of torchrun writes
+    running.quiet |= not first
+    with progress("steps") as shown:
+        trained = run(chosen, out, device=device, progress=shown, notify=None if running.quiet else complain)
+    if first:
+        answer({"psnr": trained.psnr, "seconds": trained.seconds, "weights": trained.weights})
+
+
+_PICTURES = ("metrics", "samples", "rescaled", "detail", "ranking", "photons", "reliability")
+_REPORT = ("report.html", "scores.json", *(f"{name}.png" for name in _PICTURES))
+
+
+@command()
+def evaluate(
+    data: Path | None = None,
+    *,
+    models: str = "all",
+    split: str = "test",
+    frames: int = 20,
+    bm3d_frames: int = 0,
+    crop: tuple[int, int] | None = None,
+    report: Path | None = None,
+    weights: Path | None = None,
+    seed: int = 0,
+    device: str | None = None,
+) -> None:
+    """Compare denoisers by scene type, on a dataset, or on frames with few photons.
+
+    Without DATA: scenes before a wall, above a floor and in open water, with backscatter from in front, from the whole
+    gate and from near-range, at six backscatter fractions; gains, errors near rims and inside, targets missed and
+    invented. With --models histograms: the network for histograms against classical estimates, point by point.
+    On a dataset: PSNR, SSIM and entropy over the gate, errors in millimetres, steps resolved. On a Monte Carlo result:
+    frames of 1 to 100 signal photons a pixel at several signal-to-background ratios, RMSE beside the Cramér-Rao bound.
+
+    Args:
+        data ([DATA]): A dataset's folder; or a Monte Carlo result. Without it, scenes of the package that no training
+            saw.
+        models (NAMES): "all", or a list: median, gating, bm3d, usdn, dncnn, pyramid; for results also histograms.
+        split: test, validation, train or all.
+        frames: Frames of each target and level.
+        bm3d_frames: Frames of each level for BM3D, up to a minute each.
+        crop (WIDTH HEIGHT): Only the middle part of each frame [pixels]; 128 96 makes BM3D faster.
+        report (DIR): Also write report.html, its pictures and scores.json there; for a result only photons.png.
+        weights: Weights of spadwarp train for the network that they name. By default the package's.
+        seed: Seed of the noise, except that of a dataset.
+
+    \b
+    Examples:
+      spadwarp evaluate --report report/
+      spadwarp evaluate --models histograms
+      spadwarp dataset configs/datasets/lu2024.toml --out data/lu2024/
+      spadwarp evaluate data/lu2024/ --models all --report report/
+      spadwarp evaluate data/lu2024/ --weights runs/pyramid/pyramid.safetensors --report report/
+      spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
+      spadwarp evaluate out/result.h5 --report photons/
+    """
+    from spadwarp.denoise import evaluate as run
+    from spadwarp.denoise import write_report
+
+    named = {"all": ["median", "gating", "usdn", "dncnn", "pyramid"]}
+    chosen = [name.strip() for name in named.get(models, models.split(","))]
+    check_outputs(report, _REPORT, inputs=(data, weights), option="--report")
+    common: dict[str, Any] = {"weights": weights, "device": device}
+    if data is None:
+        if chosen == ["histograms"]:
+            _points(seed=seed, **common)
+        else:
+            _scenes(chosen, report, seed=seed, **common)
+        return
+    if data.is_file() or (data / "result.h5").is_file():
+        _photons(data, [*chosen, "histograms"] if models == "all" else chosen, report, seed=seed, **common)
+        return
+    bm3d_frames = bm3d_frames or (20 if "bm3d" in chosen else 0)
+    options: dict[str, Any] = {"split": split, "frames": frames, "bm3d_frames": bm3d_frames, "crop": crop}
+    with progress("frames") as shown:
+        found = run(data, models=chosen, progress=shown, **options, **common)
+    written = write_report(found, report) if report is not None else []
+    _say_gains(found)
+    _finish(found, written)
+
+
+def _finish(found: Any, written: Sequence[Path]) -> None:
+    if written:
+        say(f"written: {written[0]}")
+    write_json({**found.to_dict(), "files": written})
+
+
+def _say_gains(found: Evaluation) -> None:
+    from spadwarp.denoise import TITLES
+
+    table = []
+    for method in found.ranking():
+        row = {"method": TITLES[method]}
+        for level in (*found.levels, None):
+            after, before = found.mean(method, level=level), found.mean("input", level=level)
+            gain = f"{after.psnr:.2f}" if method == "input" else f"{after.psnr - before.psnr:+.2f}"
+            row["mean" if level is None else level] = gain
+        table.append(row)
+    say(f"PSNR of the input, and gain over it [dB], by backscatter fraction or photons; {found.summary}")
+    show_table(table)
+    for method in found.methods if found.steps else ():
+        steps = [item for (name, _), item in found.steps.items() if name == method]
+        say(f"{TITLES[method]}: {sum(s.resolved for s in steps)} of {sum(s.total for s in steps)} steps")
+
+
+def _scenes(models: list[str], report: Path | None, **options: Any) -> None:
+    """Scenes that no training saw, by scene type."""
+    from spadwarp.denoise import evaluate_scenes, scene_table, write_scene_report
+
+    with progress("frames") as shown:
+        found = evaluate_scenes(models=models, progress=shown, **options)
+    written = write_scene_report(found, report) if report is not None else []
+    for setting, water in found.types():
+        names, lines = scene_table(found, setting, water)
+        say(f"{setting}, backscatter {water}: PSNR of the input and gains over it [dB] by backscatter fraction")
+        show_table([dict(zip(names, line, strict=True)) for line in lines])
+    _finish(found, written)
+
+
+def _points(**options: Any) -> None:
+    """Histograms: ours and the best tuned classical estimate of each point."""
+    import numpy as np
+
+    from spadwarp.denoise import TITLES, evaluate_histograms
+
+    with progress("points") as shown:
+        found = evaluate_histograms(progress=shown, **options)
+    table = []
+    for point, values in found.rmse.items():
+        name, best = found.best(point)
+        row = dict(zip(("photons", "SBR", "background", "returns"), map(str, point), strict=True))
+        row |= {"RMSE [mm]": f"{1e3 * values['histograms']:.1f}", "best classical [mm]": f"{1e3 * best:.1f}"}
+        table.append({**row, "which": TITLES[name]})
+    show_table(table)
+    ratios = found.ratios()
+    say(f"RMSE over that of the best classical estimate: median {np.median(ratios):.2f}, highest {ratios.max():.2f}")
+    write_json(found.to_dict())
+
+
+def _photons(data: Path, models: list[str], report: Path | None, **options: Any) -> None:
+    """Frames of few photons from a result."""
+    from spadwarp.denoise import TITLES, draw_photon_sweep, photon_sweep
+
+    result = opt.load_run(data)
+    with progress("frames") as shown:
+        found = photon_sweep(result, models=[one for one in models if one != "bm3d"], progress=shown, **options)
+    written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
+    say(f"RMSE [mm]; {found.summary}")
+    titles = {"input": "likelihood of each pixel", **TITLES, "bound": "Cramér–Rao bound"}
+    for row, ratio in enumerate(found.sbr):
+        methods = {name: values[row] for name, values in found.rmse.items()} | {"bound": found.bound[row]}
+        columns = [f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons)]
+        lines = [[titles[name], *(1e3 * float(one) for one in values)] for name, values in methods.items()]
+        show_table([dict(zip(columns, line, strict=True)) for line in lines])
+    _finish(found, written)

@@ -1,0 +1,368 @@
+"""Commands from functions: options from a signature, their help from its docstring; and how values are read."""
+
+from __future__ import annotations
+
+import enum
+import functools
+import inspect
+import math
+import re
+from collections.abc import Callable, Mapping
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import typer
+
+import spadwarp
+from spadwarp.cli.app import Command, app, running
+from spadwarp.limits import parse_number, shown, suggestion
+from spadwarp.units import quantity
+
+if TYPE_CHECKING:
+    from spadwarp import Ray, Result, Scene
+
+__all__ = ["Channel", "Length", "Method", "Seconds", "command", "from_to", "from_unit", "given", "items", "load_run"]
+__all__ += ["measured", "named_values", "one_device", "read_engine", "read_part", "read_scene", "real_number", "refuse"]
+__all__ += ["whole_number"]
+
+Method = Literal["peak", "centroid", "matched", "likelihood"]
+"""`spadwarp.frames.METHODS`, known without loading it."""
+Channel = Literal["I", "co", "cross"]
+"""`spadwarp.result.CHANNELS`, known without loading it."""
+
+# Options that mean the same in every command: metavar, help, and a name unlike that of the parameter.
+SHARED: dict[str, tuple[str, str] | tuple[str, str, str]] = {
+    "scene": ("SCENE", "Scene file (TOML), or the name of a scene of `spadwarp list scenes`."),
+    "out": ("DIR", "Directory for the output files."),
+    "mesh": (
+        "FILE",
+        "A mesh (STL, OBJ, PLY, OFF, GLB, USD) that replaces the scene's first target, with the same position, "
+        "rotation and reflectance; in metres, or in millimetres with --set 'targets[0].scale=0.001'.",
+    ),
+    "overrides": ("SECTION.FIELD=VALUE", "Overrides a field of SCENE or RECIPE; may be repeated.", "--set"),
+    "photons": ("N", "Photons to emit, such as 2e9. By default the scene's."),
+    "seed": ("N", "Key of the random numbers."),
+    "device": ("NAME", '"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
+    "devices": (
+        "NAME",
+        '"cpu", "cuda:0", "cuda:0,cuda:2", "cuda:all" for every GPU of this host; by default the first GPU, else the '
+        "CPU.",
+        "--device",
+    ),
+    "ray": ("ADDRESS", 'Workers of Ray: a running cluster, HOST:PORT or "auto", or "start" to start it here.'),
+    "workers": ("N", "Workers of Ray; by default one for each GPU, or one for each machine without a GPU."),
+    "channel": (
+        "",
+        "Which light counts where the camera has an analyser: I (all of it, without the analyser), co or cross.",
+    ),
+    "inputs": (
+        "NAME=VALUE,...",
+        "What a measured file does not hold: bin_width=55ps, gate_start=20ns (time of flight at bin 0 or tag 0; by "
+        "default 0, with a warning), group_index=1.3566 (1 in air, 1.3566 in fresh water, 1.3638 in seawater), "
+        "irf=200ps (FWHM of a Gaussian instrument response) or irf=FILE (.csv of time_ps, value; .csv or .npy of one "
+        "value for each bin), axes=tyx (y rows, x columns, t bins, n frames), dataset=NAME (of the array in a .mat or "
+        ".h5 file), image_size=640x480 (where pixels stand one after the other), tag_unit=8ps (of cells of a .mat "
+        "file), sum_frames (adds frames up), horizontal_fov_deg=60 (for planar depth and points).",
+        "--input",
+    ),
+    "overwrite": ("", "Replace output files that exist; allow a directory that is not empty."),
+    "quiet": ("", "Print only warnings and errors."),
+    "json": ("FILE", "Also write the output as JSON."),
+}
+_COMMON = {"overwrite": bool, "quiet": bool, "json": Path | None}
+
+
+def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callable[[Callable[..., None]], Any]:
+    """Makes a command of a function: its parameters become arguments, those behind `*` options.
+
+    Kinds and defaults come from the signature; an annotated function reads the text. Metavar and help are those of the
+    docstring's section `Args`, `parameter (METAVAR): help`, else of `SHARED`. A trailing "_" is no part of an option's
+    name. Each command has --overwrite, --quiet and --json, which `running` holds, but those that are named in
+    `without`.
+    """
+
+    def register(function: Callable[..., None]) -> Callable[..., None]:
+        text, described = _documentation(function)
+        hints = get_type_hints(function, include_extras=True)
+        made, names = [], {}
+        for one in inspect.signature(function).parameters.values():
+            shared = SHARED.get(one.name, ("", ""))
+            (metavar, about), option = described.get(one.name, shared[:2]), shared[2:]
+            is_option = one.kind is inspect.Parameter.KEYWORD_ONLY
+            names[one.name] = _option_name(one.name, *option) if is_option else metavar.strip("[]")
+            made.append(_parameter(one, hints[one.name], metavar, about, names[one.name]))
+        for common, kind in _COMMON.items():
+            if common not in without:
+                default = False if kind is bool else None
+                parameter = inspect.Parameter(common, inspect.Parameter.KEYWORD_ONLY, default=default)
+                made.append(_parameter(parameter, kind, *SHARED[common][:2], f"--{common}"))
+        defaults = {one.name: one.default for one in made}
+
+        @functools.wraps(function)
+        def run(**values: Any) -> None:
+            for common in _COMMON:
+                setattr(running, common, values.pop(common, None))
+            running.given = frozenset(names[one] for one, value in values.items() if value != defaults[one])
+            function(**{one: _plain(value) for one, value in values.items()})
+
+        run.__doc__ = text
+        run.__dict__["__signature__"] = inspect.Signature(made)
+        del run.__dict__["__wrapped__"]
+        run.__annotations__ = {one.name: one.annotation for one in made}
+        app.command(name or function.__name__, cls=Command)(run)
+        return function
+
+    return register
+
+
+def _documentation(function: Callable[..., None]) -> tuple[str, dict[str, tuple[str, str]]]:
+    """The docstring without its section `Args`, and of each parameter there metavar and help."""
+    before, _, rest = inspect.cleandoc(function.__doc__ or "").partition("\nArgs:\n")
+    section, _, after = rest.partition("\n\n")
+    found = re.findall(r"^ {4}(\w+)(?: \((.+?)\))?: (.*(?:\n {8,}.*)*)", section, re.MULTILINE)
+    return f"{before}\n{after}", {name: (metavar, " ".join(text.split())) for name, metavar, text in found}
+
+
+def _option_name(parameter: str, option: str | None = None) -> str:
+    return option or "--" + parameter.rstrip("_").replace("_", "-")
+
+
+def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name: str) -> inspect.Parameter:
+    """The parameter as typer takes it."""
+    optional = get_origin(kind) in (Union, UnionType)
+    inner = next(part for part in get_args(kind) if part is not NoneType) if optional else kind
+    extra: dict[str, Any] = {}
+    if get_origin(inner) is Annotated:
+        inner, extra["parser"] = get_args(inner)
+    elif inner in (int, float):
+        extra["parser"] = whole_number if inner is int else real_number
+    elif get_origin(inner) is list:
+        inner = list[_choices(get_args(inner)[0])]  # type: ignore[misc]
+    inner = _choices(inner)
+    metavar = metavar or {int: "N", float: "X", Path: "FILE", str: "NAME"}.get(inner, "")
+    extra |= {"metavar": metavar or None, "help": text}
+    if one.default in (None, inspect.Parameter.empty):
+        extra["show_default"] = False
+    if one.kind is not inspect.Parameter.KEYWORD_ONLY:
+        about: Any = typer.Argument(**extra)
+    else:
+        names = [f"{name}/--no-{name[2:]}"] if one.default is True else [name]
+        about = typer.Option(*names, *(["-q"] if one.name == "quiet" else []), **extra)
+    return one.replace(
+        kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[inner | None if optional else inner, about]
+    )
+
+
+def _choices(kind: Any) -> Any:
+    """A literal type as the enumeration that typer takes."""
+    if get_origin(kind) is not Literal:
+        return kind
+    return enum.StrEnum("Choice", {word: word for word in get_args(kind)})  # type: ignore[misc]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return value.value if isinstance(value, enum.Enum) else value
+
+
+# Values
+
+
+def whole_number(text: str | int) -> int:
+    """An integer from `2000000`, `2_000_000`, `2e6` or `2.0e6`."""
+    try:
+        value = Decimal(text)
+    except InvalidOperation:
+        value = Decimal("nan")
+    if not value.is_finite() or value.adjusted() > 30 or value != value.to_integral_value():
+        raise typer.BadParameter(f"{text!r} is not a whole number, such as 2000000 or 2e6")
+    return int(value)
+
+
+def real_number(text: str | float) -> float:
+    """A finite number, such as `0.02` or `1e-3`."""
+    try:
+        number = parse_number(str(text))
+    except ValueError as error:
+        raise typer.BadParameter(f"{shown(text)} {error}") from None
+    if math.isinf(number):
+        raise typer.BadParameter(f"{text} is not a finite number")
+    return number
+
+
+def from_unit(unit: str) -> Callable[[str | float], float]:
+    """A parser for a number in the unit, bare or with a unit of its own: `0.01` or `1cm` for m."""
+
+    def parse(text: str | float) -> float:
+        word = str(text).strip()
+        try:
+            return real_number(word) if word[-1:] in "0123456789." else quantity(word, unit)
+        except ValueError as error:
+            raise typer.BadParameter(f"{shown(text)} {error}") from None
+
+    parse.__name__ = unit
+    return parse
+
+
+Length = Annotated[float, from_unit("m")]
+Seconds = Annotated[float, from_unit("s")]
+
+
+def from_to(text: str, unit: str, option: str) -> tuple[float, float]:
+    """Two numbers of the unit from `2:3`, `2,3` or `80cm:1.2m`; both have a unit of their own, or none of them."""
+    parts = [part.strip() for part in re.split("[:,]", text)]
+    try:
+        if len(parts) != 2 or "" in parts:
+            raise typer.BadParameter(f"{shown(text)} is not FROM:TO, two numbers such as 2:3 or 2{unit}:3{unit}")
+        first, second = map(from_unit(unit), parts)
+        bare = [part[-1] in "0123456789." for part in parts]
+        if bare[0] != bare[1]:
+            with_unit, without = parts[bare.index(False)], parts[bare.index(True)]
+            raise typer.BadParameter(
+                f"{shown(text)} is ambiguous: {with_unit} has a unit and {without} has none; write the unit of both"
+            )
+        if first > second:
+            raise typer.BadParameter(f"{shown(text)} is FROM:TO; {parts[0]} is more than {parts[1]}")
+    except typer.BadParameter as error:
+        error.param_hint = option
+        raise
+    return first, second
+
+
+def items(texts: list[str] | str | None, readers: Mapping[str, Callable[[str], Any]], option: str) -> dict[str, Any]:
+    """Values by name from `NAME=VALUE,NAME=VALUE`, each read by the reader of its name; a bare name is true."""
+    texts = [texts] if isinstance(texts, str) else texts or []
+    found: dict[str, Any] = {}
+    for one in (one for text in texts for one in re.split(r",(?=\s*[a-z_]+\s*(?:=|,|$))", text)):
+        name, equals, value = (part.strip() for part in one.partition("="))
+        if name not in readers:
+            raise typer.BadParameter(
+                f"{shown(name)} is not one of {', '.join(readers)}{suggestion(name, [*readers])}", param_hint=option
+            )
+        if bool(equals) == (readers[name] is bool):
+            shape = name if equals else f"{name}=VALUE"
+            raise typer.BadParameter(f"{shown(one)} is not of the form {shape}", param_hint=option)
+        try:
+            found[name] = readers[name](value) if equals else True
+        except typer.BadParameter as error:
+            error.message, error.param_hint = f"{name} = {error.message}", option
+            raise
+    return found
+
+
+def named_values(texts: list[str] | None, numbers: int, option: str) -> dict[str, Any]:
+    """Name and so many numbers from texts such as `medium.anisotropy=0.92,0.01`."""
+    found = {}
+    for text in texts or []:
+        name, _, values = text.partition("=")
+        parts = values.split(",")
+        if not values or len(parts) != numbers:
+            shape = "NAME=MEAN,SD" if numbers == 2 else "NAME=VALUE"
+            raise typer.BadParameter(f"{text!r} is not {shape}", param_hint=option)
+        try:
+            read = tuple(real_number(part.strip()) for part in parts)
+        except typer.BadParameter as error:
+            error.param_hint = option
+            raise
+        found[name.strip()] = read if numbers > 1 else read[0]
+    return found
+
+
+def refuse(text: str, *options: str) -> None:
+    """Refuses those of the options that are given."""
+    if wrong := [option for option in options if option in running.given]:
+        raise typer.BadParameter(text, param_hint=", ".join(wrong))
+
+
+def given(**values: Any) -> dict[str, Any]:
+    """The arguments that have a value."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+# What commands read
+
+
+def read_scene(
+    path: Path,
+    overrides: list[str] | None = None,
+    *,
+    mesh: Path | None = None,
+    photons: int | None = None,
+    seed: int | None = None,
+) -> Scene:
+    """The scene with the options applied: first `--mesh`, then `--set`, then the others."""
+    if mesh is None:
+        scene = spadwarp.load_scene(path, overrides)
+    else:
+        # What sized the old target says nothing about the new one.
+        replaced = {"targets[0]": {"mesh": str(mesh), "scale": None, "subdivisions": None}}
+        scene = spadwarp.load_scene(path, replaced).with_overrides(overrides or [])
+    return scene.with_overrides(transport=given(photons=photons, seed=seed))
+
+
+def load_run(place: Path, channel: Channel = "I") -> Result:
+    """The result in a file, or in the directory of a run; a checkpoint where there is no result."""
+    path = spadwarp.files.locate(place)
+    result = spadwarp.load_result(place / "result.h5" if path.is_dir() else path)
+    return spadwarp.result.analyser_channel(result, channel)
+
+
+def measured(texts: list[str] | None, **more: Callable[[str], Any]) -> tuple[dict[str, Any], list[Path]]:
+    """Arguments of `spadwarp.frames.read_histograms` from --input, and those of `more`; and files that they name."""
+    from spadwarp.frames import instrument_response, read_response
+
+    time = from_unit("s")
+
+    def response(text: str) -> Any:
+        if Path(text).suffix.lower() in (".csv", ".npy"):
+            return Path(text)
+        return instrument_response(pulse_fwhm=0.0, jitter_fwhm=time(text))
+
+    found = items(
+        texts,
+        {
+            "bin_width": time, "gate_start": time, "irf": response, "axes": str, "dataset": str, "image_size": _size,
+            "tag_unit": time, "sum_frames": bool, **more,
+        },
+        "--input",
+    )  # fmt: skip
+    if not isinstance(path := found.get("irf"), Path):
+        return found, []
+    return {**found, "irf": read_response(path, bin_width=found.get("bin_width"))}, [path]
+
+
+def _size(text: str) -> tuple[int, int]:
+    """(height, width) of "640x480"."""
+    found = re.fullmatch(r"([1-9][0-9]{0,4})[x×]([1-9][0-9]{0,4})", text.strip())
+    if found is None:
+        raise typer.BadParameter(f"{text!r} is not of the form WIDTHxHEIGHT")
+    return int(found[2]), int(found[1])
+
+
+def read_engine(address: str | None, workers: int | None) -> Ray | None:
+    """The argument `engine` from --ray and --workers."""
+    if address is not None:
+        return spadwarp.Ray(None if address == "start" else address, workers)
+    if workers is not None:
+        raise typer.BadParameter("needs --ray", param_hint="--workers")
+    return None
+
+
+def one_device(devices: str | None, engine: Ray | None) -> str | None:
+    """The device for the work after a run that needs one device."""
+    if devices is None or engine is not None:
+        return None
+    return "cuda:0" if devices == "cuda:all" else devices.split(",")[0]
+
+
+def read_part(text: str | None, option: str) -> tuple[int, int] | None:
+    """The numbers of `3/64`, which Python checks."""
+    if text is None:
+        return None
+    number, _, parts = text.partition("/")
+    if not (number.isdecimal() and parts.isdecimal()):
+        raise typer.BadParameter(f"{text!r} is not a part such as 3/64", param_hint=option)
+    return int(number), int(parts)

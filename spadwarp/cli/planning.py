@@ -1,0 +1,514 @@
+"""Commands that plan: `check`, `plan`, `sweep`, `water`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+
+import typer
+
+import spadwarp
+from spadwarp.cli import options as opt
+from spadwarp.cli.app import complain, say
+from spadwarp.cli.options import command
+from spadwarp.cli.outputs import answer, check_outputs, write_json
+from spadwarp.cli.text import (
+    bracketed,
+    count,
+    counted,
+    percent,
+    progress,
+    readable,
+    rows,
+    short,
+    show_table,
+)
+from spadwarp.cli.text import written as names_of
+from spadwarp.errors import ArgumentError
+from spadwarp.limits import shown
+from spadwarp.units import with_prefix
+
+if TYPE_CHECKING:
+    from spadwarp import Scene
+    from spadwarp.analytic import BudgetRow, DepthErrorRow, Proposal
+    from spadwarp.water import ParticleOptics
+
+
+@command()
+def check(
+    scene: Path, *, mesh: Path | None = None, picture: Path | None = None, overrides: list[str] | None = None
+) -> None:
+    """Validate a scene without running it; warn with numbers.
+
+    Exit code 0 with or without warnings, 2 for a scene that is not valid.
+
+    Args:
+        picture: Draw the water cut open, with laser, camera and targets.
+
+    \b
+    Examples:
+      spadwarp check configs/scenes/harbour_5m.toml --set medium.extinction=2.5
+      spadwarp check sediment_4m --picture water.png
+    """
+    from spadwarp.checks import summary
+    from spadwarp.mesh import build_mesh
+
+    read = opt.read_scene(scene, overrides, mesh=mesh)
+    check_outputs(files={"--picture": picture}, inputs=(scene, *read.files))
+    triangles = build_mesh(read)
+    messages, numbers = spadwarp.check(read, triangles), summary(read, triangles)
+    faces = 0 if triangles is None else triangles.face_count
+    say(readable({"faces": faces, **numbers}) + "\n")
+    for message in messages:
+        if message.level == "warning":
+            typer.echo(str(message))  # also with --quiet
+        else:
+            say(str(message))
+    if not any(message.level == "warning" for message in messages):
+        say(f"{scene}: valid, no warnings")
+    if picture is not None:
+        spadwarp.viz.draw_water(read, picture, triangles)
+        say(f"written: {picture}")
+    found = [dataclasses.asdict(message) for message in messages]
+    write_json({"scene": scene, "faces": faces, **numbers, "messages": found})
+
+
+_MUCH_NOISE = 1.0 / 3.0  # of the information of the run
+
+
+@command()
+def plan(
+    scene: Path,
+    *,
+    depth_error: opt.Length = 0.01,
+    time: opt.Seconds = 1.0,
+    range_: str | None = None,
+    margin: opt.Length = 0.25,
+    method: opt.Method = "likelihood",
+    full_power: bool = False,
+    eye_distance: opt.Length | None = None,
+    eye_exposure: opt.Seconds = 100.0,
+    photons: int = 2_000_000,
+    seed: int = 0,
+    no_range: bool = False,
+    channel: opt.Channel = "I",
+    write: Path | None = None,
+    mesh: Path | None = None,
+    overrides: list[str] | None = None,
+    device: str | None = None,
+) -> None:
+    """Gate, pulses and laser power for a depth error, and what limits it.
+
+    A short Monte Carlo run of a window of the image measures the light. The Cramér–Rao bound is what any unbiased
+    estimator can reach; it falls with the pulses. Forward scattering leaves an error that more pulses do not reduce.
+    The limit for the eye is a guide, after IEC 60825-1:2014.
+
+    Args:
+        depth_error (LENGTH): Depth error asked for, such as "1cm" [m].
+        time (TIME): Longest time for a depth frame [s].
+        range_ (FROM:TO): Where the target may be, such as 80cm:1.2m [m]; a plane at TO then stands for it. By default
+            the scene's targets.
+        margin (LENGTH): Water in the gate before and behind it [m].
+        method: Estimator whose error counts.
+        full_power: Take the largest pulse energy within the limits.
+        eye_distance (LENGTH): Also keep the pulse energy safe for an eye at this distance from the laser [m].
+        eye_exposure (TIME): How long the eye looks into the beam [s].
+        photons: Photons of the Monte Carlo run.
+        no_range: Do not look for the largest range.
+        write: Scene file to write with the proposed values.
+
+    \b
+    Examples:
+      spadwarp plan configs/scenes/staircase_5m.toml --depth-error 1cm --write planned.toml
+      spadwarp plan configs/scenes/harbour_5m.toml --range 2:3 --time 100ms --eye-distance 1m
+    """
+    read = opt.read_scene(scene, overrides, mesh=mesh)
+    check_outputs(files={"--write": write}, inputs=(scene, *read.files))
+    if range_ is None:
+        _complain_of_targets(read)
+    with progress() as report:
+        found = spadwarp.plan(
+            read,
+            depth_error=depth_error,
+            time=time,
+            ranges=None if range_ is None else opt.from_to(range_, "m", "--range"),
+            margin=margin,
+            method=method,
+            full_power=full_power,
+            eye_distance=eye_distance,
+            eye_exposure=eye_exposure,
+            photons=photons,
+            seed=seed,
+            largest_range=not no_range,
+            channel=channel,
+            device=device,
+            progress=report,
+        )
+    if write is not None:
+        made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
+        spadwarp.io.write_text(made + found.scene.to_toml(folder=write.parent), write)
+    hidden = ("pilot", "channels", "terms", "advice", "limit")
+    say(readable({name: value for name, value in found.to_dict().items() if name not in hidden}))
+    if found.largest_range == found.largest_range:
+        say(f"largest range, for a plane square to the optical axis: {found.largest_range:.3g} m; {found.range_limit}")
+    say(rows(_terms(found)))
+    for name in ("co", "cross") if found.channels else ():
+        say(_reception(found, name))
+    say(_verdict(found))
+    say(f"What would help: {found.advice}.")
+    if found.pilot.run_noise > 0.5 * found.terms["forward scattering"]:
+        say("The Monte Carlo run is too short to know the floor: it may be smaller; --photons takes more.")
+    if found.pilot.information_noise > _MUCH_NOISE:
+        say(
+            f"The Monte Carlo run is short for the bound: {100 * found.pilot.information_noise:.0f} % of what its "
+            "histograms say of the depth was noise, and is left out; --photons takes more."
+        )
+    if write is not None:
+        say(f"written: {write}")
+    write_json({"scene": scene, **found.to_dict(), "files": [] if write is None else [write]})
+
+
+def _complain_of_targets(scene: Scene) -> None:
+    """What `check` warns of in the targets, before a run that would be in vain; the gate is what is proposed."""
+    for message in spadwarp.check(scene):
+        if message.level == "warning" and message.field.startswith("targets") and "gate" not in message.text:
+            complain(str(message))
+
+
+def _verdict(found: Proposal) -> str:
+    """One sentence."""
+    asked, total = with_prefix(found.depth_error, "m"), with_prefix(found.terms["total"], "m")
+    pulses = f"{count(found.pulses)} pulses, {with_prefix(found.frame_time, 's')}"
+    if found.pulses_for == "false peaks":
+        pulses += ", for fewer than 1 % false peaks"
+    if found.reached:
+        return f"A depth error of {asked} is reached with {pulses} ({total}); limit: {found.limit}."
+    if found.pulses_for in ("depth error", "false peaks"):
+        longest = with_prefix(found.time, "s")
+        return f"A depth error of {asked} takes {pulses}, more than {longest}; limit: {found.limit}."
+    return f"A depth error of {asked} is out of reach: {total} with {pulses}; limit: {found.limit}."
+
+
+def _reception(found: Proposal, name: str) -> str:
+    """What a channel of the analyser keeps of all light."""
+    whole, part = found.channels["I"], found.channels[name]
+
+    def share(field: str) -> str:
+        return f"{100 * getattr(part, field) / getattr(whole, field):.3g} %" if getattr(whole, field) else "none"
+
+    text = f"{name.capitalize()}-polarised reception keeps {share('target')} of the target's light"
+    text += f", {share('backscatter')} of the backscatter and {share('noise')} of the noise"
+    if not math.isfinite(part.bound) or not math.isfinite(whole.bound):
+        return text + "."
+    ratio = part.bound / whole.bound
+    return f"{text}; the same Cramér–Rao bound takes {ratio**2:.2g} times the pulses."
+
+
+def _terms(found: Proposal) -> dict[str, str]:
+    """The parts of the depth error at the proposed pulses."""
+    pilot = found.pilot
+    floors = ", ".join(f"{name} {1000 * value:.3g}" for name, value in pilot.floor.items() if name != found.method)
+    alone = pilot.unscattered_floor[found.method]
+    unscattered = f"unscattered light alone: {1000 * alone:.3g}" if alone < math.inf else "all light is scattered"
+    about = {
+        "shot noise": "falls with the root of the pulses",
+        "background": "backscatter, dark counts, ambient light; falls likewise",
+        "Cramér–Rao bound": "both together: the least error of an unbiased estimator",
+        "forward scattering": f"{found.method}; does not fall with the pulses; {floors}; from {count(pilot.photons)} "
+        f"traced photons, ±{1000 * pilot.run_noise:.2g} a pixel; {unscattered}",
+        "pile-up": "change of the median depth",
+        "total": "root of the sum of squares",
+    }
+    title = f"depth error, {count(found.pulses)} pulses"
+    return {title: "mm"} | {name: f"{short(1000 * value):<6}  {about[name]}" for name, value in found.terms.items()}
+
+
+@command()
+def sweep(
+    scene: Path,
+    *,
+    vary: str | None = None,
+    medium: list[str] | None = None,
+    reflectance: float | None = None,
+    of: Literal["budget", "depth-error"] = "budget",
+    out: Path | None = None,
+    overrides: list[str] | None = None,
+    device: str | None = None,
+) -> None:
+    """Photon budget, or depth error, over range and water, or over any field of the scene.
+
+    Signal and background per pulse and pixel, depth error, and pulses for a depth error of 1 cm, from the analytic
+    model. Depth errors are those of one depth frame, of so many pulses as the table shows:
+    analytic.pulses_per_depth_frame if opt.given, else detector.pulses_per_frame. In brackets they are not reached: more
+    than 1 % of the fits would find a false peak. Where a return misses the scene's gate, gates as long follow the
+    returns, marked *.
+
+    Args:
+        vary (FIELD=FROM:TO:N): Field and values; with :log a geometric progression; or a,b,c. FIELD may be an item of a
+            list, and values may have units. By default "range", of a surface on the optical axis, 1 to 50 m.
+        medium: With range: a named water; may be repeated. By default the scene's.
+        reflectance: With range: of the surface; by default that of the first target.
+        of: Budget of the central pixel, or depth error of all pixels.
+        out (DIR): Directory for sweep.png and sweep.csv; with range, budget.png and budget.csv.
+
+    \b
+    Examples:
+      spadwarp sweep configs/scenes/harbour_5m.toml --vary range=1:10:10 --medium petzold-nuc-2240 --medium uwoc-clear
+      spadwarp sweep configs/scenes/staircase_5m.toml --vary 'targets[0].translation[2]=3:8:11' --out sweep/
+      spadwarp sweep configs/scenes/staircase_5m.toml --vary medium.extinction=0.1:2:20 --of depth-error --out sweep/
+    """
+    read = opt.read_scene(scene, overrides)
+    field, _, values = (vary or "range=").partition("=")
+    of_range = field.strip() == "range"
+    if of_range:
+        opt.refuse("needs --vary with a field of the scene", "--of")
+    else:
+        opt.refuse("is for --vary range=FROM:TO:N", "--medium", "--reflectance")
+    stem = "budget" if of_range else "sweep"
+    check_outputs(out, (f"{stem}.png", f"{stem}.csv"), inputs=(scene, *read.files))
+    notes: list[str] = []
+    summary: dict[str, Any] = {}
+    if of_range:
+        budget = spadwarp.budget(read, _ranges(values), medium or None, reflectance=reflectance, device=device)
+        found = [dataclasses.asdict(row) for row in budget]
+        table = _budget_table("water", [row.medium for row in budget], budget)
+        written = _write_curves(out, stem, spadwarp.viz.draw_budget, budget, found)
+        notes = _budget_notes(budget, read)
+    else:
+        curves = spadwarp.sweep(read, vary=str(vary), of=of, device=device)
+        found = [dataclasses.asdict(row) for row in curves.rows]
+        plain = [{curves.field: value, **row} for value, row in zip(curves.values, found, strict=True)]
+        written = _write_curves(out, stem, spadwarp.viz.draw_sweep, curves, plain)
+        names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in curves.values]
+        draw: Any = _budget_table if of == "budget" else _error_table
+        table = draw(curves.field, names, curves.rows)
+        notes = _budget_notes(list[Any](curves.rows), read) if of == "budget" else []
+        summary = {"field": curves.field, "values": list(curves.values), "of": of}
+    show_table(table, keys=2 if of == "budget" else 1)
+    for text in notes:
+        say(text)
+    if written:
+        say(f"written: {names_of(written)}")
+    write_json({**summary, "rows": found, "notes": spadwarp.analytic.model_notes(read), "files": written})
+
+
+def _ranges(text: str) -> list[float] | None:
+    """Lengths [m] of `1:10:10` or `1,2,5`; both ends have a unit, or none of them."""
+    if not text:
+        return None
+    lengths = [part.strip() for part in (text.split(":")[:2] if ":" in text else text.split(","))]
+    if len({part[-1:] in "0123456789." for part in lengths}) > 1:
+        raise ArgumentError(f"range = {shown(text)} is ambiguous: write the unit of all lengths, or of none")
+    values = spadwarp.analytic.parse_values(text, "m", name="range")
+    if not all(isinstance(value, (int, float)) for value in values):
+        raise ArgumentError(f"range = {shown(text)} is not of the form from:to:count or a,b,c")
+    return [float(value) for value in values]
+
+
+def _write_curves(
+    out: Path | None, stem: str, draw: Callable[..., Any], found: Any, table: list[dict[str, Any]]
+) -> list[Path]:
+    """The picture and the table, if a directory is named."""
+    if out is None:
+        return []
+    draw(found, out / f"{stem}.png")
+    return [out / f"{stem}.png", spadwarp.io.write_csv(table, out / f"{stem}.csv")]
+
+
+_SCATTERS = 0.2  # optical depth: from here on scattered light adds more than a quarter to a target's
+
+
+def _budget_table(title: str, names: Sequence[str], found: Sequence[BudgetRow]) -> list[dict[str, Any]]:
+    table = []
+    for name, row in zip(names, found, strict=True):
+        reached = row.outlier_probability <= spadwarp.analytic.OUTLIERS
+        gate = f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}"
+        table.append(
+            {
+                title: name,
+                "range [m]": f"{row.range:.4g}",
+                "c·r": row.optical_depth,
+                "gate [ns]": f"{gate}{'*' if row.gate_moved else ' '}",
+                "pulses": counted(row.pulses),
+                "signal": row.signal,
+                "background": row.background,
+                "α": row.alpha,
+                "signal/backscatter": row.signal_to_backscatter,
+                "σ* [ps]": bracketed(1e12 * row.sigma_time, reached),
+                "σ* [mm]": bracketed(1e3 * row.sigma_depth, reached),
+                "outliers": percent(row.outlier_probability),
+                "pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else counted(row.pulses_for_1cm),
+            }
+        )
+    return table
+
+
+def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
+    """Notes below the table of a budget."""
+    notes = []
+    if any(row.gate_moved for row in found):
+        gate = scene.gate
+        notes.append(
+            f"* not the scene's gate, {gate.start_ns:.4g}-{gate.stop * 1e9:.4g} ns, which misses the return of one of "
+            "the ranges, but one as long around the return"
+        )
+    if any(row.optical_depth > _SCATTERS for row in found):
+        notes.append(
+            "signal: unscattered light alone. In water that scatters, more light comes back from a target: in a view "
+            "of 10° of a plane at 5 m, in water of albedo 0.83 and anisotropy 0.924, 1.3 times as much at c·r = 0.2 "
+            "and 3.6 times at 1; `spadwarp plan` traces all of it"
+        )
+    own, detector = scene.analytic.pulses_per_depth_frame, scene.detector.pulses_per_frame
+    if scene.analytic.count_law == "per_pulse" and own is not None and own != detector:
+        notes.append(
+            f"pulses: analytic.pulses_per_depth_frame = {own}; without it, detector.pulses_per_frame = {detector} "
+            "would count"
+        )
+    return notes
+
+
+def _error_table(title: str, names: Sequence[str], found: Sequence[DepthErrorRow]) -> list[dict[str, Any]]:
+    return [
+        {
+            title: name,
+            "σ* median [mm]": 1e3 * row.sigma_depth,
+            "σ* 90 % below [mm]": 1e3 * row.sigma_depth_p90,
+            "outliers": percent(row.outlier_probability),
+            "pixels with an estimate": percent(row.estimate_fraction),
+            "signal/backscatter": row.signal_to_backscatter,
+        }
+        for name, row in zip(names, found, strict=True)
+    ]
+
+
+# Values of --particles, by theory.
+_KOPELEVICH = ("small", "large")
+_SIZES = {"slope": ("smallest", "largest"), "median": ("deviation",), "diameter": ()}
+_OPTICS = ("absorption", "scattering", "extinction", "albedo", "mean_cosine", "backscatter_fraction")
+
+
+@command(without=("quiet",))
+def water(
+    wavelength_nm: Annotated[float, opt.from_unit("nm")],
+    *,
+    chlorophyll: float = 0.0,
+    temperature: float = 20.0,
+    salinity: float = 35.0,
+    particles: str | None = None,
+    water: bool = True,
+    out: Path | None = None,
+    matrix: Path | None = None,
+) -> None:
+    """Optical properties of water at a wavelength; with particles also scattering and phase function from their sizes.
+
+    A scene gets those of water by medium.chlorophyll, temperature and salinity, those of particles from the files.
+
+    \b
+    Particles in two components after Kopelevich [ppm]:
+      small, large   mineral particles below 1 um, organic ones above
+    or by Mie's theory, which needs miepython: pip install 'spadwarp[mie]':
+      index          index over that of the water, such as 1.05 or 1.15
+      absorbing      imaginary part of that index, 0 to 0.01
+      concentration  volume of the particles [ppm]
+      slope, smallest, largest  power law of diameters, slope mostly near 4
+      median, deviation         log-normal diameters, geometric standard deviation > 1
+      diameter                  particles of one diameter
+
+    Args:
+        wavelength_nm (NM): Vacuum wavelength, 400 to 700 [nm].
+        chlorophyll (C): 0 (pure water) to 30 [mg/m3].
+        temperature (T): 0 to 30 [degrees Celsius].
+        salinity (S): 0 (fresh) to 40 [g/kg].
+        particles (NAME=VALUE,...): Their components, or index, concentration and sizes, as above.
+        water: With --particles: add the water's own optics.
+        out: With --particles: the phase function as .csv, for medium.phase_table.
+        matrix: By Mie's theory: the scattering matrix as .csv, for medium.matrix_table.
+
+    \b
+    Examples:
+      spadwarp water 532 --chlorophyll 0.5 --temperature 10 --salinity 35
+      spadwarp water 532 --particles small=0.05,large=0.2 --out coast.csv
+      spadwarp water 532 --particles index=1.1,concentration=1,slope=4,smallest=0.1um,largest=50um
+    """
+    check_outputs(files={"--out": out, "--matrix": matrix})
+    if particles is None:
+        opt.refuse("needs --particles", "--out", "--matrix", "--water")
+        asked = {"chlorophyll": chlorophyll, "temperature": temperature, "salinity": salinity}
+        _water(wavelength_nm, asked)
+        return
+    opt.refuse("cannot be combined with --particles", "--chlorophyll")
+    for option, field, file in (("--out", "phase_table", out), ("--matrix", "matrix_table", matrix)):
+        if file is not None and file.suffix.lower() != ".csv":
+            raise typer.BadParameter(f"{file} does not end in .csv, as medium.{field} must", param_hint=option)
+    names = {"small", "large", "index", "absorbing", "concentration", "slope", "deviation"}
+    readers: dict[str, Callable[[str], float]] = dict.fromkeys(sorted(names), opt.real_number)
+    readers |= dict.fromkeys(("smallest", "largest", "median", "diameter"), opt.from_unit("m"))
+    values = opt.items(particles, readers, "--particles")
+    if matrix is not None and "index" not in values:
+        raise typer.BadParameter("is by Mie's theory: Kopelevich's components have no matrix", param_hint="--matrix")
+    surroundings = {"temperature": temperature, "salinity": salinity}
+    parts, text = _particles(wavelength_nm, values, surroundings)
+    whole = spadwarp.water.mixture([parts], water=water, **surroundings)
+    optics = {name: getattr(whole, name) for name in _OPTICS}
+    say(readable({"particles": text, **optics, "attenuation_length": 1.0 / whole.extinction}))
+    if out is not None:
+        spadwarp.water.save_phase_table(whole, out)
+        say(
+            f"written: {out}; in the scene:\n[medium]\nabsorption = {whole.absorption:.6g}\nscattering = "
+            f'{whole.scattering:.6g}\nphase_function = "tabulated"\nphase_table = "{out.as_posix()}"'
+        )
+    if matrix is not None:
+        spadwarp.water.save_matrix_table(whole, matrix)
+        say(
+            f"written: {matrix}; in the scene, for polarised light:\n[medium]\n"
+            f'scattering_matrix = "tabulated"\nmatrix_table = "{matrix.as_posix()}"'
+        )
+    write_json({"wavelength_nm": wavelength_nm, **optics, "water": water, "file": out, "matrix_file": matrix})
+
+
+def _water(wavelength_nm: float, asked: dict[str, float]) -> None:
+    optics = spadwarp.water.water_optics(wavelength_nm, **asked)
+    answer({**asked, **dataclasses.asdict(optics), "extinction": optics.extinction})
+
+
+def _particles(
+    wavelength_nm: float, values: dict[str, float], surroundings: dict[str, float]
+) -> tuple[ParticleOptics, str]:
+    """The particles of --particles, and what they are in words."""
+
+    def refuse(text: str) -> NoReturn:
+        raise typer.BadParameter(text, param_hint="--particles")
+
+    by_mie, kopelevich = "index" in values, [name for name in _KOPELEVICH if name in values]
+    if by_mie == bool(kopelevich):
+        refuse("give small and large, or index with concentration and sizes")
+    if not by_mie:
+        if others := [name for name in values if name not in _KOPELEVICH]:
+            refuse(f"{', '.join(others)} belongs to index, not to small and large")
+        small, large = (values.get(name, 0.0) for name in _KOPELEVICH)
+        text = f"Kopelevich, {small:g} ppm below and {large:g} ppm above 1 um"
+        return spadwarp.water.kopelevich_particles(wavelength_nm, small=small, large=large), text
+    if "concentration" not in values:
+        refuse("concentration is missing")
+    laws = [name for name in _SIZES if name in values]
+    if len(laws) != 1:
+        refuse("one law of sizes is needed: slope, median or diameter")
+    if missing := [name for name in _SIZES[laws[0]] if name not in values]:
+        refuse(f"{laws[0]} needs {' and '.join(_SIZES[laws[0]])}; {missing[0]} is missing")
+    make: Any = {
+        "slope": spadwarp.water.power_law,
+        "median": spadwarp.water.log_normal,
+        "diameter": spadwarp.water.single_size,
+    }[laws[0]]
+    sizes = make(values[laws[0]], **{name: values[name] for name in _SIZES[laws[0]]})
+    parts = spadwarp.water.mie_particles(
+        sizes,
+        wavelength_nm,
+        index=complex(values["index"], values.get("absorbing", 0.0)),
+        concentration=values["concentration"],
+        **surroundings,
+    )
+    return parts, f"Mie, {values['concentration']:g} ppm of index {values['index']:g}, {sizes.text}"

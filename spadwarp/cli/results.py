@@ -1,0 +1,264 @@
+"""Commands that look at files: `info`, `view`, `export`."""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import typer
+
+import spadwarp
+from spadwarp.cli import options as opt
+from spadwarp.cli.app import fail, running, say
+from spadwarp.cli.options import command
+from spadwarp.cli.outputs import answer, check_outputs, write_json
+from spadwarp.cli.text import in_bytes, progress, readable, rows
+
+
+@command(without=("quiet",))
+def info(path: Path, *, verify: bool = False) -> None:
+    """Contents of any of our files; of a result also how it was made; of a mesh file size, unit, orientation, holes.
+
+    A result's includes the energy balance: where the emitted light went.
+
+    Args:
+        path (FILE): A result, checkpoint, frames, analytic file, records, dataset or shard, or their directory; or a
+            mesh file (STL, OBJ, PLY, OFF, GLB, USD).
+        verify: Compare every file of a dataset with its checksum; exit code 1 if something is missing or damaged.
+
+    \b
+    Examples:
+      spadwarp info out/result.h5
+      spadwarp info bust.stl
+      spadwarp info data/small/ --verify
+    """
+    check_outputs(inputs=(path,))
+    if verify:
+        wrong = spadwarp.dataset.verify_dataset(path)
+        write_json({"folder": path, "wrong": wrong})
+        if wrong:
+            fail("\n".join(wrong) + "\n`spadwarp dataset` makes them again")
+        say(f"{path}: complete")
+        return
+    if path.suffix.lower() in spadwarp.io.MESH_ENDINGS:
+        mesh = spadwarp.mesh.describe_mesh(path)
+        answer({"kind": "mesh", **dataclasses.asdict(mesh), "hints": mesh.hints})
+    elif (path / "recipe.toml").is_file():
+        manifest = spadwarp.dataset.read_manifest(path)
+        size = sum(one["bytes"] for one in manifest["files"].values())
+        say(readable({"kind": "dataset", "bytes": size, **{**manifest, "files": len(manifest["files"])}}))
+        write_json({"kind": "dataset", **manifest})
+    else:
+        held = spadwarp.load(path)
+        summary = spadwarp.files.summary(held)
+        if isinstance(held, spadwarp.Result):
+            say(readable({"energy_balance": _energy_balance(summary["energy_balance"])}))
+        answer(summary, hide=("energy_balance",))
+
+
+def _energy_balance(balance: Mapping[str, Any]) -> dict[str, str]:
+    """Where the emitted light went."""
+    verdict = "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"
+    fractions = {name: f"{100 * part:10.6f} %" for name, part in balance["fractions"].items() if part}
+    return {"verdict": verdict, **fractions, "sum": f"{100 * sum(balance['fractions'].values()):10.6f} %"}
+
+
+@command(without=("json",))
+def view(
+    path: Path,
+    *,
+    out: Path | None = None,
+    method: opt.Method | None = None,
+    frame: int | None = None,
+    channel: opt.Channel = "I",
+    window: str | None = None,
+    pictures: int | None = None,
+    fps: float | None = None,
+    linear: bool = False,
+    split: Literal["train", "validation", "test", "all"] | None = None,
+    device: str | None = None,
+) -> None:
+    """A run as a page for a browser, light in flight as a video, a dataset or a mesh as a picture.
+
+    The ending of --out decides. Page: one HTML file; click a pixel to see its histogram. Depth as a point cloud
+    coloured by its error; depth, truth, error and intensity as images; the histogram of a pixel with its components and
+    the instrument response. Opens in any browser, without a network connection. Video: the light that each pixel
+    receives, from time bin to time bin; of a scene that moves its frames. Picture: frames of a dataset on one sheet,
+    with true depth, measured depth and recorded photons; or a mesh file from several sides.
+
+    Args:
+        path (FILE): A result, frames, an analytic file, a dataset or a shard, or their directory; or a mesh file.
+        out (FILE): .html for a page, .gif or .mp4 (needs ffmpeg) for a video, .png for a picture of a dataset or mesh.
+            By default view.html, and of a mesh NAME.png.
+        method: Page: estimator of depth.
+        frame: Page and video: number of the frame, if FILE holds frames.
+        channel: Page: which light counts where the camera has an analyser: I (all of it), co or cross.
+        window (FROM:TO): Video: times of flight, such as 40:55 [ns]; by default those with light.
+        pictures: Video: largest number of pictures, by default 120; bins are merged. Dataset: frames, spread evenly
+            over the split, by default 20.
+        fps (N): Video: pictures per second, up to 50; by default 12.
+        linear: Video: a linear colour scale instead of four decades.
+        split: Dataset: split of the frames, by default all.
+
+    \b
+    Examples:
+      spadwarp view out/
+      spadwarp view frames/frames.h5 --frame 3 --out frame.html
+      spadwarp view out/ --out light.mp4 --window 40:55 --fps 20
+      spadwarp view data/small/ --out sheet.png
+      spadwarp view bust.stl --out bust.png
+    """
+    is_mesh = path.suffix.lower() in spadwarp.io.MESH_ENDINGS
+    target = out or Path(f"{path.stem}.png" if is_mesh else "view.html")
+    ending = target.suffix.lower()
+    kind = "video" if ending in (".gif", ".mp4") else "picture" if ending == ".png" else "page"
+    if is_mesh and kind != "picture":
+        raise typer.BadParameter(f"{target} does not end in .png: {path} is a mesh", param_hint="--out")
+    used = {
+        "page": ("--method", "--frame", "--channel"),
+        "video": ("--frame", "--window", "--pictures", "--fps", "--linear"),
+        "picture": () if is_mesh else ("--pictures", "--split"),
+    }[kind]
+    options = ("--method", "--frame", "--channel", "--window", "--pictures", "--fps", "--linear", "--split")
+    opt.refuse(f"is not for a {kind} ({target})", *(one for one in options if one not in used))
+    times = None if window is None else opt.from_to(window, "ns", "--window")
+    if kind == "picture" and not is_mesh:
+        spadwarp.dataset.read_manifest(path)  # before a folder is made for the picture
+    check_outputs(files={"--out": target}, inputs=(path,))
+    if is_mesh:
+        written = spadwarp.viz.draw_mesh(spadwarp.mesh.describe_mesh(path), target, device=device)
+    elif kind == "picture":
+        written = spadwarp.viz.draw_dataset(path, target, **opt.given(split=split, frames=pictures))
+    elif kind == "video":
+        scale: Literal["log", "linear"] = "linear" if linear else "log"
+        more = opt.given(pictures=pictures, fps=fps, frame=frame)
+        written = spadwarp.viz.video(path, target, window_ns=times, scale=scale, **more)
+    else:
+        written = spadwarp.viz.view(path, target, method=method, frame=frame or 0, channel=channel, device=device)
+    say(f"written: {written} ({in_bytes(written.stat().st_size)})")
+
+
+# Formats in the order of writing: those that not every source has go first, so that nothing is written where one is
+# refused.
+_FORMATS = ("fusion", "ptu", "mat", "npy", "exr", "xml")
+Format = Literal["npy", "mat", "ptu", "exr", "xml", "fusion", "parquet", "webdataset", "zarr"]
+
+
+@command()
+def export(
+    path: Path,
+    *,
+    format: list[Format],
+    out: Path,
+    frames: str | None = None,
+    split: str = "all",
+    factor: int = 8,
+    channel: opt.Channel = "I",
+    field: list[str] | None = None,
+    frames_per_file: int = 1000,
+) -> None:
+    """Results, frames and datasets in the formats of other programs.
+
+    \b
+    npy  NumPy: [height, width, bin], with frames before that; depth where there are no counts
+    mat  MATLAB, one file a frame, as the simulated data that single-photon
+         denoisers read: sparse spad, rates, 1-based bin, bin_size in seconds
+    ptu  PicoQuant T3 image, one record a detection
+    exr  images: depth, intensity, truth; one file a frame
+    xml  the camera's calibration, as OpenCV's cv::FileStorage reads it
+    fusion  mat files and a camera image of finer pixels, as networks for
+         sensor fusion read them: intensity/, spad/ with bin_hr, a list
+
+    \b
+    A whole dataset as trainers load it in one line, in a new folder with a card (README.md) and Croissant metadata
+    (croissant.json); depth in metres, labels, numbers:
+    parquet     datasets.load_dataset(DIR) of Hugging Face
+    webdataset  train-00000.tar, ... of .npy images and one .json a frame
+    zarr        xarray.open_zarr(DIR / "frames.zarr", group="train")
+
+    The folder may hold other files, but of a whole dataset. fusion, mat and ptu are for counts (`spadwarp detect`);
+    ptu needs spadwarp[formats], parquet and zarr need spadwarp[datasets].
+
+    Args:
+        path (FILE): A result, frames, an analytic file, a dataset or a shard; or their directory.
+        format: Format to write; may be repeated.
+        frames (N or A:B): Only frame N, or A to B - 1; by default all.
+        split: Split of a dataset: train, validation, test or all.
+        factor: fusion: finer pixels of the camera image, each way.
+        field: Whole dataset: image of a frame; may be repeated: noisy, clean, label, intensity, bound, normal, albedo,
+            prior, and of traced scenes features, counts, expected, polarisation. By default the first five, and
+            features.
+        frames_per_file: Whole dataset: most frames of a Parquet file or an archive.
+
+    \b
+    Examples:
+      spadwarp export frames/frames.h5 --format mat --format ptu --out exported/
+      spadwarp export run1/result.h5 --format npy --out exported/
+      spadwarp export data/small/ --split test --frames 0:20 --format exr --out exported/
+      spadwarp export data/small/ --format parquet --out data/small-parquet/
+      spadwarp export data/small/ --format webdataset --field noisy --field clean --out data/small-tar/
+    """
+    if whole := [one for one in format if one not in _FORMATS]:
+        if len(set(format)) > 1:
+            raise typer.BadParameter(f"{whole[0]} cannot be combined with other formats", param_hint="--format")
+        _export_dataset(path, whole[0], out, field, frames_per_file)
+        return
+    opt.refuse("is for parquet, webdataset and zarr", "--field", "--frames-per-file")
+    source = spadwarp.files.locate(path)
+    chosen = _frames(frames)
+    stem = source.resolve().stem
+    check_outputs(
+        out,
+        [name for one in dict.fromkeys(format) for name in _names(stem, one)],
+        inputs=(source,),
+        beside=True,
+        needed=source.stat().st_size if source.is_file() else 0,
+    )
+    written: dict[str, list[Path]] = {}
+    for one in sorted(set(format), key=_FORMATS.index):
+        options: dict[str, Any] = {"frames": chosen, "split": split}
+        if one == "fusion":
+            written[one] = spadwarp.files.export_sensor_fusion(source, out, stem=stem, factor=factor, **options)
+        else:
+            written[one] = spadwarp.export(source, out / f"{stem}.{one}", channel=channel, **options)
+    lines = {}
+    for name, paths in written.items():
+        more = f" to {paths[-1].name} ({len(paths)} files)" if len(paths) > 1 else ""
+        lines[name] = f"{paths[0]}{more}"
+    say(rows(lines))
+    write_json({"files": [path for paths in written.values() for path in paths]})
+
+
+def _export_dataset(folder: Path, format: str, out: Path, fields: list[str] | None, frames_per_file: int) -> None:
+    check_outputs(inputs=(folder,))
+    if out.resolve() == folder.resolve() or out.resolve() in folder.resolve().parents:
+        raise typer.BadParameter(f"{out} holds the dataset", param_hint="--out")
+    if out.exists() and not running.overwrite and not (out.is_dir() and not any(out.iterdir())):
+        raise typer.BadParameter(f"{out} exists; --overwrite replaces it", param_hint="--out")
+    options: dict[str, Any] = {"fields": fields, "frames_per_file": frames_per_file, "overwrite": running.overwrite}
+    with progress("frames") as report:
+        spadwarp.dataset.export_dataset(folder, out, format, progress=report, **options)
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    say(rows({"written": f"{out}, {in_bytes(size)}"}))
+    write_json({"folder": out, "bytes": size})
+
+
+def _names(stem: str, one: str) -> list[str]:
+    """Names of the files of a format, as patterns."""
+    stem = glob.escape(stem)
+    if one == "fusion":
+        return [f"{stem}.txt", f"intensity/{stem}-[0-9]*.mat", f"spad/{stem}-[0-9]*_p1.mat"]
+    return [f"{stem}.{one}", f"{stem}-[0-9]*.{one}"]
+
+
+def _frames(text: str | None) -> int | slice | None:
+    if text is None:
+        return None
+    first, colon, stop = text.partition(":")
+    numbers = [int(one) if one else None for one in (first, stop) if not one or one.isdecimal()]
+    if len(numbers) != 2 or (not colon and not first):
+        raise typer.BadParameter(f"{text!r} is not of the form N or A:B", param_hint="--frames")
+    return slice(*numbers) if colon else int(first)

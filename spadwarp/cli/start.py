@@ -1,0 +1,216 @@
+"""Commands to begin with: `init`, `list`, `doctor`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import typer
+
+import spadwarp
+from spadwarp.cli import options as opt
+from spadwarp.cli.app import complain, fail, running, say
+from spadwarp.cli.options import command
+from spadwarp.cli.outputs import check_outputs, write_json
+from spadwarp.cli.text import count, rows
+from spadwarp.limits import suggestion
+
+
+def _model(kind: str) -> Any:
+    if kind == "scene":
+        return spadwarp.Scene
+    return spadwarp.dataset.Recipe if kind == "dataset" else spadwarp.denoise.TrainingRecipe
+
+
+@command(without=("json",))
+def init(
+    name: str | None = None,
+    *,
+    example: str | None = None,
+    schema: Literal["scene", "dataset", "training"] | None = None,
+) -> None:
+    """Write a commented scene to start from, or a JSON Schema with which editors complete and check TOML.
+
+    VS Code reads a schema with the extension Even Better TOML, other editors with taplo.
+
+    Args:
+        name ([NAME]): The file to write, by default scene.toml, or KIND.schema.json; .toml may be left out.
+        example (EXAMPLE): A scene of `spadwarp list scenes` instead of the template.
+        schema (KIND): Write the schema of this kind of TOML file instead: scene, dataset or training.
+
+    \b
+    Examples:
+      spadwarp init
+      spadwarp init my_harbour --example harbour_5m
+      spadwarp init --schema scene
+    """
+    if schema is not None:
+        opt.refuse("cannot be combined with --schema", "--example")
+        path = Path(name or f"{schema}.schema.json")
+        check_outputs(files={"NAME": path})
+        spadwarp.io.write_json(spadwarp.files.json_schema(_model(schema)), path)
+        place = path if path.is_absolute() or path.parent.parts else f"./{path}"
+        say(f"written: {path}")
+        say("VS Code, once:\n  code --install-extension tamasfe.even-better-toml")
+        say(f"first line of a TOML file beside it, for VS Code and taplo:\n  #:schema {place}")
+        return
+    name = name or "scene"
+    path = Path(name if name.endswith(".toml") else f"{name}.toml")
+    check_outputs(files={"NAME": path})
+    out = f"{path.with_suffix('')}/"
+    if example is None:
+        text = spadwarp.scene.template().replace("out/", out).replace(" scene.toml", f" {path}")
+    else:
+        text = spadwarp.io.example_or_path(example, "scenes").read_text(encoding="utf-8")
+    spadwarp.io.write_text(text, path)
+    say(f"written: {path}")
+    say(f"next: spadwarp check {path}; spadwarp plan {path}; spadwarp simulate {path} --out {out}")
+
+
+# Scenes and recipes that commands take by name.
+_EXAMPLES = {
+    "scenes": "spadwarp simulate NAME",
+    "datasets": "spadwarp dataset NAME",
+    "training": "spadwarp train NAME",
+}
+
+
+@command(without=("quiet",), name="list")
+def listed(
+    kind: Literal["scenes", "datasets", "training", "presets", "targets", "validation", "benchmarks"] | None = None,
+    name: str | None = None,
+    *,
+    out: Path | None = None,
+    device: str | None = None,
+) -> None:
+    """Scenes, recipes, presets, targets and cases that come with spadwarp.
+
+    \b
+    scenes, datasets, training  scenes and recipes, which commands take by name; with NAME this one
+    presets     waters, lasers, cameras, ports, detectors and gates with their sources; a scene
+                selects one by preset = "NAME" in the section of that name; with NAME one section.
+                The waters are for about 532 nm; `spadwarp water` computes other wavelengths
+    targets     the built-in targets, which a scene selects by builtin = "NAME" in [[targets]]
+    validation, benchmarks  cases of `spadwarp validate` and `spadwarp bench`
+
+    Args:
+        kind (KIND): One of these; without it, scenes and recipes.
+        name ([NAME]): A scene or a recipe to print; a section of presets.
+        out (DIR): Directory for targets.png, a picture of the built-in targets.
+
+    \b
+    Examples:
+      spadwarp list
+      spadwarp list scenes staircase_5m
+      spadwarp list presets medium
+      spadwarp list targets --out pictures/
+    """
+    if kind != "targets":
+        opt.refuse("is for `spadwarp list targets`", "--out", "--device")
+    if kind in ("targets", "validation", "benchmarks"):
+        opt.refuse(f"{name!r}: `spadwarp list {kind}` has no parts", "NAME")
+    check_outputs(out, ["targets.png"])
+    if kind == "presets":
+        _list_presets(name)
+    elif kind == "targets":
+        _list_targets(out, device)
+    elif kind in ("validation", "benchmarks"):
+        cases = spadwarp.validate.CASES if kind == "validation" else spadwarp.benchmark.CASES
+        found = {case.name: case.summary for case in cases.values()}
+        if kind == "benchmarks":
+            found["scaling"] = "how cost and memory grow with photons, faces and bins"
+        say(rows(found))
+        write_json({kind: found})
+    else:
+        _list_examples(kind, name)
+
+
+def _list_examples(kind: str | None, name: str | None) -> None:
+    known = {one: spadwarp.io.examples(one) for one in _EXAMPLES if kind in (None, one)}
+    if name is None:
+        for one, paths in known.items():
+            say(f"{one}: {_EXAMPLES[one]}")
+            say(rows({path.stem: _heading(path.read_text(encoding="utf-8")) for path in paths.values()}, indent="  "))
+        write_json(known)
+        return
+    found = [paths[name] for paths in known.values() if name in paths]
+    if not found:
+        hint = suggestion(name, [one for paths in known.values() for one in paths])
+        raise typer.BadParameter(f"{name!r} is not one of `spadwarp list {kind}`{hint}", param_hint="NAME")
+    for path in found:
+        say(path.read_text(encoding="utf-8").rstrip())
+
+
+def _heading(text: str) -> str:
+    """The first sentence of a file's comment."""
+    lines = []
+    for line in text.splitlines():
+        if not line.startswith("# ") or line.startswith("#   "):
+            break
+        lines.append(line[2:])
+    return " ".join(lines)
+
+
+def _list_presets(section: str | None) -> None:
+    everything = spadwarp.scene.presets()
+    sections = list(dict.fromkeys(preset.section for preset in everything.values()))
+    if section is not None and section not in sections:
+        raise typer.BadParameter(f"{section!r} is not one of {', '.join(sections)}", param_hint="NAME")
+    chosen = [preset for preset in everything.values() if section in (None, preset.section)]
+    source = None
+    for preset in chosen:
+        if (preset.section, preset.source) != source:
+            say(f"{'' if source is None else chr(10)}[{preset.section}] {preset.source}")
+            source = (preset.section, preset.source)
+        shown = {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in preset.values.items()}
+        say(f"  {preset.name:<28}  " + ", ".join(f"{name} {value}" for name, value in shown.items()))
+    write_json({"presets": [dataclasses.asdict(preset) for preset in chosen]})
+
+
+def _list_targets(out: Path | None, device: str | None) -> None:
+    found = spadwarp.viz.describe_targets()
+    sheet = None if out is None else spadwarp.viz.draw_targets(out / "targets.png", device=device)
+    for one in found:
+        extent = " x ".join(f"{side:.2f}" for side in one["extent"])
+        say(f"{one['name']:<14}  {extent} m  {count(one['faces']):>7} faces")
+    if sheet is not None:
+        say(f"written: {sheet}")
+    write_json({"targets": found, "files": [] if sheet is None else [sheet]})
+
+
+@command()
+def doctor(*, device: str | None = None, self_test: bool = True) -> None:
+    """Check the installation, show the devices that can trace photons, and run a self-test.
+
+    Shows versions, devices, driver, kernel cache, and what is missing for a GPU.
+
+    The self-test takes a few seconds, and about twice as long when it first compiles its kernels. It compares ballistic
+    light from a plate with the lidar equation, and a slab with published values. Exit code 1 for a problem or a failed
+    test.
+
+    Args:
+        self_test: Trace two small scenes.
+
+    \b
+    Examples:
+      spadwarp doctor
+      spadwarp doctor --device cpu --json report.json
+    """
+    check_outputs()
+    progress: Callable[[str], Any] | None = None if running.quiet else complain
+    found = spadwarp.doctor.diagnose(device=device, self_test=self_test, progress=progress)
+    for title, facts in found.facts.items():
+        say(f"{title}\n{rows(facts, indent='  ')}")
+    if found.gpu:
+        say("No GPU is used\n" + "\n".join(f"  {reason}" for reason in found.gpu))
+    if found.tests:
+        took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found.seconds.items())
+        say(f"Self-test ({took})")
+        say(rows({test.name: str(test) for test in found.tests}, indent="  "))
+    devices = spadwarp.device.devices()
+    write_json({**dataclasses.asdict(found), "devices": devices, "healthy": found.healthy})
+    if not found.healthy:
+        failed = [f"self-test: {test.name}: {test}" for test in found.tests if not test.passed]
+        fail("\n".join([*found.problems, *failed]))
