@@ -306,18 +306,17 @@ def kernels() -> str:
     """The public names of `spadwarp_kernels`, by package."""
     import spadwarp_kernels
 
-    rooms = [one.name for one in pkgutil.iter_modules(spadwarp_kernels.__path__) if one.ispkg]
     parts = [
         MADE
         + "# Kernel library\n\n`import spadwarp_kernels as sk`; what it is for: [README](../../kernels/README.md). "
         "Warp functions (`wp.func`) go into kernels of your own; structs and the other functions are for Python. "
-        "Names of `sk.__all__` stand at the top too."
+        "All names stand at the top, as `sk.NAME`, too."
     ]
-    for room in sorted(rooms):
-        package = import_module(f"spadwarp_kernels.{room}")
-        parts.append(f"## {room.capitalize()}\n\n{package.__doc__}")
-        parts += [f"::: spadwarp_kernels.{room}.{name}" for name in package.__all__]
-    parts.append("## Ray cast\n\n::: spadwarp_kernels.surface.ray_cast.truth_kernel")
+    for folder in pkgutil.iter_modules(spadwarp_kernels.__path__):
+        package = import_module(f"spadwarp_kernels.{folder.name}")
+        if names := getattr(package, "__all__", ()):
+            parts.append(f"## {folder.name.capitalize()}\n\n{package.__doc__}")
+            parts += [f"::: spadwarp_kernels.{folder.name}.{name}" for name in names]
     return "\n\n".join(parts) + "\n"
 
 

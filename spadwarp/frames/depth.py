@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
 from spadwarp.errors import ArgumentError, kernel_errors
-from spadwarp.frames.measured import Histograms
 from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
 from spadwarp.scene import Camera, Medium
 from spadwarp.scene.sections import field_range
