@@ -12,19 +12,50 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
 from spadwarp.errors import ArgumentError, kernel_errors
 from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
-from spadwarp.scene import Camera, Medium
+from spadwarp.scene import Camera, Medium, Scene
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
 from spadwarp.units import path_from_time
 
 if TYPE_CHECKING:
-    from spadwarp.frames.measured import Histograms
+    from spadwarp.frames.response import InstrumentResponse
     from spadwarp.result import Result
 
-__all__ = ["METHODS", "Method", "Reduction", "arrival_time", "depth_frame", "depth_of"]
+__all__ = ["METHODS", "Histograms", "Method", "Reduction", "arrival_time", "depth_frame", "depth_of"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Histograms:
+    """Histograms with what the file knows about them.
+
+    Attributes:
+        values: `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not.
+        bin_width: [s]; None where the file does not hold it.
+        gate_start: Time of flight at the lower edge of bin 0 [s].
+        background: Expected background in the unit of `values`, of a shape that `arrival_time` takes, or None.
+        irf: The response that the histograms contain; None: unknown, or none.
+        response: The response to filter with; differs from `irf` for expected histograms of infinitely short pulses.
+        scene: Of a simulation, else None.
+        notes: What was inferred from the file, in words.
+    """
+
+    values: NDArray[Any]
+    bin_width: float | None = None
+    gate_start: float = 0.0
+    background: NDArray[np.float32] | None = None
+    irf: InstrumentResponse | None = None
+    response: InstrumentResponse | None = None
+    scene: Scene | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def background_per_bin(self) -> NDArray[np.float32] | None:
+        """The background where it has a value for each bin `[..., T]`, else None."""
+        known = self.background
+        return known if known is not None and known.ndim and known.shape[-1] == self.values.shape[-1] else None
 
 
 @kernel_errors()

@@ -10,7 +10,6 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError, SpadwarpError, SpadwarpWarning
+from spadwarp.frames.depth import Histograms
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.io.arrays import read_npy
@@ -29,9 +29,9 @@ from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.file import load_result
 
 if TYPE_CHECKING:
-    from spadwarp.scene import Scene
+    pass
 
-__all__ = ["Histograms", "read_histograms"]
+__all__ = ["read_histograms"]
 
 ENDINGS = (".h5", ".hdf5", ".npy", ".mat", ".ptu")
 """Of files that may hold histograms."""
@@ -43,37 +43,6 @@ _MOST_VALUES = 1 << 29  # 2 GiB of counts
 _MARKERS = 16  # of T3 records; four today
 # What ptufile says about a damaged file stands in our errors, too.
 logging.getLogger("ptufile").addHandler(logging.NullHandler())
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Histograms:
-    """Histograms with what the file knows about them.
-
-    Attributes:
-        values: `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not.
-        bin_width: [s]; None where the file does not hold it.
-        gate_start: Time of flight at the lower edge of bin 0 [s].
-        background: Expected background in the unit of `values`, of a shape that `arrival_time` takes, or None.
-        irf: The response that the histograms contain; None: unknown, or none.
-        response: The response to filter with; differs from `irf` for expected histograms of infinitely short pulses.
-        scene: Of a simulation, else None.
-        notes: What was inferred from the file, in words.
-    """
-
-    values: NDArray[Any]
-    bin_width: float | None = None
-    gate_start: float = 0.0
-    background: NDArray[np.float32] | None = None
-    irf: InstrumentResponse | None = None
-    response: InstrumentResponse | None = None
-    scene: Scene | None = None
-    notes: tuple[str, ...] = ()
-
-    @property
-    def background_per_bin(self) -> NDArray[np.float32] | None:
-        """The background where it has a value for each bin `[..., T]`, else None."""
-        known = self.background
-        return known if known is not None and known.ndim and known.shape[-1] == self.values.shape[-1] else None
 
 
 class _Request(NamedTuple):
