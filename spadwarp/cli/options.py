@@ -139,7 +139,9 @@ def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name:
     elif inner in (int, float):
         extra["parser"] = whole_number if inner is int else real_number
     elif get_origin(inner) is list:
-        inner = list[_choices(get_args(inner)[0])]  # type: ignore[misc]
+        (item,) = get_args(inner)
+        metavar = metavar or {Path: "PATH", str: "NAME"}.get(item) or "|".join(get_args(item))
+        inner = list[_choices(item)]  # type: ignore[misc]
     inner = _choices(inner)
     metavar = metavar or {int: "N", float: "X", Path: "FILE", str: "NAME"}.get(inner, "")
     extra |= {"metavar": metavar or None, "help": text}
