@@ -396,7 +396,7 @@ def make_loop_tree(spec: TransportSpec, split: bool) -> wp.Kernel:
                         if wp.static(flights):
                             if round == wp.static(2 - rounds):
                                 ask_flight(s, world, memory)
-                        if round == 1 and not is_planned(s.flight):
+                        if round == 1 and (wp.static(not flights) or not is_planned(s.flight)):
                             cross(s, world, sink)
                             collide(s, world)
                             if s.stage == SCATTER:
