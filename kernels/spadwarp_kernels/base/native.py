@@ -66,8 +66,10 @@ def load_vec2(values: wp.array[wp.vec2], index: int) -> wp.vec2:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // Plus 0 in a launch along one axis, which the compiler does not know.
-    return word + (gridDim.y - 1u);
+    // Plus 0 in a launch along one axis, which the compiler does not know. Volatile: else it adds within the loop.
+    unsigned int held;
+    asm volatile("add.u32 %0, %1, %2;" : "=r"(held) : "r"(word), "r"(gridDim.y - 1u));
+    return held;
 #else
     return word;
 #endif

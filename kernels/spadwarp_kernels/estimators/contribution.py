@@ -230,7 +230,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                     q.carried = s.carried
                 if on_surface:
                     q.slot = s.hit.slot
-                    if s.collisions == 1:
+                    if s.collisions == 0:
                         q.component = BALLISTIC
                 else:
                     q.weight *= s.albedo

@@ -73,7 +73,7 @@ def project(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
 
 @wp.func
 def project_about_axis(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
-    """`project` for a camera from `with_field`."""
+    """`project` for a camera from `ready_camera`."""
     return _pixel(camera, camera.focal, camera.principal, x, o)
 
 
@@ -174,19 +174,15 @@ def field(camera: Camera) -> wp.vec4:
     return wp.vec4(-half_width, -half_height, half_width, half_height)
 
 
-def with_field(camera: Any) -> Any:
-    """A copy of the camera that has what threads would otherwise compute: as its view its `field`, rounded as there,
+def ready_camera(copy: Any, camera: Any) -> None:
+    """Readies a copy for a kernel with what threads would otherwise compute: as its view its `field`, rounded as there,
     and the focal lengths and principal point of square pixels about the axis."""
-    copy = Camera()
-    for name in Camera.vars:
-        setattr(copy, name, getattr(camera, name))
     tangent = np.float32(camera.pixel_tangent)
     half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
     copy.view = wp.vec4(-half_width, -half_height, half_width, half_height)
     focal = float(1.0 / tangent) if tangent > 0.0 else 0.0  # 0 where nothing asks for an image
     copy.focal = wp.vec2(focal, focal)
     copy.principal = wp.vec2(0.5 * int(camera.width), 0.5 * int(camera.height))
-    return copy
 
 
 @wp.func

@@ -113,17 +113,14 @@ def threads_of_blocks(threads: int, blocks: Blocks) -> int:
     return min(threads, max(_LARGEST_MEMORY // _numbers(blocks) // 1024, 1) * 1024)
 
 
-def blocks_with_memory(blocks: Blocks, threads: int, device: wp.DeviceLike) -> Blocks:
-    """With memory of so many threads, of which no light has met a block."""
-    found = Blocks()
-    for name in Blocks.vars:
-        setattr(found, name, getattr(blocks, name))
-    found.threads = threads
+def ready_blocks(copy: Blocks, blocks: Blocks, threads: int, device: wp.DeviceLike) -> None:
+    """Readies a copy for a kernel with memory of so many threads, of which no light has met a block: of each launch its
+    own, since several may run at a time."""
+    copy.threads = threads
     half = _numbers(blocks) // 2 * threads
-    found.memory = wp.full(2 * half, NOT_MET, dtype=float, device=device)
+    copy.memory = wp.full(2 * half, NOT_MET, dtype=float, device=device)
     for end in (half, 2 * half):
-        found.memory[end - threads : end].zero_()
-    return found
+        copy.memory[end - threads : end].zero_()
 
 
 def _numbers(blocks: Blocks) -> int:

@@ -105,10 +105,8 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
                     s.x = offset_from_surface(s.x, s.hit.normal, c.distance)
         if wp.static(reflecting):
             next_bounce(s.bounces, c.mirror)
-        # A branch, since after a select a core waits for the flight before it draws the next words.
         if c.reason < 0 or c.mirror > 0:
             s.stage = SCATTER
-            s.collisions += 1
 
     return collide
 

@@ -26,7 +26,7 @@ from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.base.tables import TABLE_CELLS
 from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.optics.camera import PLAIN, Camera, Gate, check_camera, with_field
+from spadwarp_kernels.optics.camera import PLAIN, Camera, Gate, check_camera, ready_camera
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
 from spadwarp_kernels.optics.polarisation import MATRIX_POINTS, Polarisation
 from spadwarp_kernels.optics.port import check_port
@@ -39,7 +39,7 @@ from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, 
 from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
 from spadwarp_kernels.tally.blocks import (
     MOST_BLOCK_DERIVATIVES,
-    blocks_with_memory,
+    ready_blocks,
     threads_of_blocks,
 )
 from spadwarp_kernels.tally.ledger import (
@@ -529,15 +529,19 @@ def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_co
 
 
 def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> World:
+    """The fields of a model as they are now, which are copied as bytes: attribute by attribute takes Python 0.3 ms. The
+    model keeps their arrays."""
     world = World()
+    held = world.__ctype__()
     for name in _STRUCTS:
-        setattr(world, name, getattr(model, name))
+        setattr(held, name, getattr(model, name).__ctype__())
+    held.seed, held.keys = seed, round_keys(seed).__ctype__()
+    ready_medium(world.medium, model.medium)
+    ready_limits(world.limits, model.limits)
     if spec.lens == PLAIN:
-        world.camera = with_field(model.camera)
-    world.medium, world.limits = ready_medium(model.medium), ready_limits(model.limits)
+        ready_camera(world.camera, model.camera)
     if spec.blocks:
-        world.derivatives = _with_memory(model.derivatives, threads, model.device)
-    world.seed, world.keys = seed, round_keys(seed)
+        ready_blocks(world.derivatives.blocks, model.derivatives.blocks, threads, model.device)
     return world
 
 
@@ -549,15 +553,6 @@ def _make_sink(model: Model, data: Data, split_accumulators: wp.array | None) ->
     if split_accumulators is not None:
         sink.low = split_accumulators
     return sink
-
-
-def _with_memory(derivatives: Derivatives, threads: int, device: wp.Device) -> Derivatives:
-    """With memory for the scores of blocks: of each launch its own, since several may run at a time."""
-    found = Derivatives()
-    for name in Derivatives.vars:
-        setattr(found, name, getattr(derivatives, name))
-    found.blocks = blocks_with_memory(derivatives.blocks, threads, device)
-    return found
 
 
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:

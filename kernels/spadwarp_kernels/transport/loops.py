@@ -138,12 +138,11 @@ class WarpStatus:
     """What the lanes of a warp count in a turn of its loop; a struct for the reason of `PhotonState`.
 
     Attributes:
-        done: Lanes for which no photons are left.
-        waiting: Lanes that wait for a ray or, where there are none, for nothing but the others.
+        waiting: Lanes that wait for a ray or, where there are none, that have no photons left, 0 while requests are
+            in the queue.
         enough: Requests in the queue that are to be scored: 32 or, when no photons are left, any.
     """
 
-    done: int
     waiting: int
     enough: int
 
@@ -228,7 +227,7 @@ def make_loop_flat(spec: TransportSpec, split: bool) -> wp.Kernel:
         if wp.static(used):
             queued = queue_size(memory, SET_SIZE, 0)
 
-        while status.done < 32 or queued > 0:
+        while status.waiting < 32:
             flying = s.stage == FLIGHT
             if wp.static(not fused) and flying:
                 fly(s, world, draws, cursor)
@@ -265,8 +264,9 @@ def make_loop_flat(spec: TransportSpec, split: bool) -> wp.Kernel:
                 scatter(s, world, sink, draws)
             if count_lanes(s.stage >= START) >= wp.static(start_lanes):
                 renew(s, world, sink, out, memory, lane, base, photon_count, cursor)
-            status.done = count_lanes(s.stage == DONE)
-            status.enough = wp.where(status.done == 32, 1, 32)
+                done = count_lanes(s.stage == DONE)
+                status.enough = wp.where(done == 32, 1, 32)
+                status.waiting = wp.where(queued > 0, 0, done)
 
         flush(s, sink)
 
@@ -396,7 +396,7 @@ def make_loop_tree(spec: TransportSpec, split: bool) -> wp.Kernel:
                         if wp.static(flights):
                             if round == wp.static(2 - rounds):
                                 ask_flight(s, world, memory)
-                        if round == 1 and not is_planned(s.flight):
+                        if round == 1 and (wp.static(not flights) or not is_planned(s.flight)):
                             cross(s, world, sink)
                             collide(s, world)
                             if s.stage == SCATTER:
@@ -416,8 +416,7 @@ def make_loop_tree(spec: TransportSpec, split: bool) -> wp.Kernel:
                     scatter(s, world, sink, draws)
                 if count_lanes(s.stage >= START) >= wp.static(start_lanes):
                     renew(s, world, sink, out, memory, lane, base, photon_count, cursor)
-                status.done = count_lanes(s.stage == DONE)
-                status.enough = wp.where(status.done == 32, 1, 32)
+                    status.enough = wp.where(count_lanes(s.stage == DONE) == 32, 1, 32)
                 status.waiting = count_lanes(s.stage != FLIGHT)
 
             # ---- Surfaces: the warp traces its rays together

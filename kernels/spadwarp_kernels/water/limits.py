@@ -229,13 +229,9 @@ class Limits:
 _LEAST_WEIGHT = 1.1754943508222875e-38
 
 
-def ready_limits(limits: Limits) -> Limits:
-    """A copy for a kernel, whose cut-off is above 0, so that it takes a weight of 0 as well."""
-    copy = Limits()
-    for name in Limits.vars:
-        setattr(copy, name, getattr(limits, name))
+def ready_limits(copy: Limits, limits: Limits) -> None:
+    """Readies a copy for a kernel: its cut-off is above 0, so that it takes a weight of 0 as well."""
     copy.weight_cutoff = max(limits.weight_cutoff, _LEAST_WEIGHT)
-    return copy
 
 
 @wp.func

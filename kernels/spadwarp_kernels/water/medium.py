@@ -51,14 +51,10 @@ class Medium:
     phase: DensityTables
 
 
-def ready_medium(medium: Medium) -> Medium:
-    """A copy for a kernel: a threshold of 1 is OFF_AXIS, and `per_bit` is filled."""
-    copy = Medium()
-    for name in Medium.vars:
-        setattr(copy, name, getattr(medium, name))
+def ready_medium(copy: Medium, medium: Medium) -> None:
+    """Readies a copy for a kernel: a threshold of 1 is OFF_AXIS, and `per_bit` is filled."""
     copy.axis_threshold = medium.axis_threshold if np.float32(medium.axis_threshold) < 1.0 else OFF_AXIS
     copy.per_bit = -math.log(2.0) / medium.extinction if medium.extinction > 0.0 else 0.0
-    return copy
 
 
 @wp.func
