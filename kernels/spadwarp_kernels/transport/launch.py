@@ -529,12 +529,15 @@ def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_co
 
 
 def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> World:
-    """The fields of a model as they are now, which are copied as bytes: attribute by attribute takes Python 0.3 ms. The
-    model keeps their arrays."""
+    """The fields of a model as they are now. Bytes are all that a launch takes, and attribute by attribute costs Python
+    0.3 ms; but what records a graph reads the attributes. The model keeps their arrays."""
     world = World()
-    held = world.__ctype__()
+    held, recorded = world.__ctype__(), model.device.is_capturing
     for name in _STRUCTS:
-        setattr(held, name, getattr(model, name).__ctype__())
+        if recorded:
+            setattr(world, name, getattr(model, name))
+        else:
+            setattr(held, name, getattr(model, name).__ctype__())
     held.seed, held.keys = seed, round_keys(seed).__ctype__()
     ready_medium(world.medium, model.medium)
     ready_limits(world.limits, model.limits)
