@@ -157,7 +157,7 @@ SIGNED = {
     "derivatives": (
         {"transport": {"estimator": "guided"}},
         {"derivatives": ("absorption", "scattering", "anisotropy", "reflectance")},
-        "derivatives  by medium.absorption, medium.scattering",
+        "medium.absorption, medium.scattering",
     ),
     "blocks": (
         {"medium": {"grid": CELLS}, "transport": {"estimator": "next_event"}},

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 import spadwarp
-from helpers.hostile import datasets
+from helpers import datasets
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.frames import record_frames
 from spadwarp.mesh import describe_mesh

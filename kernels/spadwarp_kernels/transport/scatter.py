@@ -248,8 +248,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
 
     @wp.func
     def scatter(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], draws: wp.ref[Draws]):
-        # Here, not where the flight ends: there a select takes the place of the branch, and a core waits for the flight
-        # before it draws the next words.
+        # Here, not in `collide`: there a select takes the place of the branch, and a core waits for the flight.
         s.collisions += 1
         id = draws.base + wp.uint64(s.photon)
         bounced = False
