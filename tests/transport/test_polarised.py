@@ -38,8 +38,8 @@ def totals(result):
 @pytest.mark.parametrize("targets", [[PLATE], [], [TREE]], ids=["plate", "water", "tree"])
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
 def test_the_intensity_keeps_its_bits_where_nothing_polarises(estimator, targets, device):
-    """With m12 = 0 and no Fresnel element, I is the unpolarised run's, photon by photon; on CUDA, where the compiler joins
-    products and sums of the two kernels in its own way, to the last bits."""
+    """With m12 = 0 and no Fresnel element, I is the unpolarised run's, photon by photon; on CUDA, where the compiler
+    joins products and sums of the two kernels in its own way, to the last bits."""
     sections = {"transport": {"estimator": estimator}, "targets": targets}
     plain = simulate(scene(**sections), photons=20_000, device=device)
     medium = {"scattering_matrix": "scaled_rayleigh", "largest_polarisation": 0.0}
