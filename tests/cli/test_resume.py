@@ -136,7 +136,7 @@ def test_a_killed_run_resumes_from_its_checkpoint(scene, tmp_path):
     result = spadwarp.load_result(out / "result.h5")
     long = spadwarp.simulate(spadwarp.load_scene(scene), photons=total, device="cpu")
     assert np.array_equal(result.tallies, long.tallies) and result.energy_balance == long.energy_balance
-    assert not result.partial and run("info", out).stdout.count("photons") > 2
+    assert not result.partial and "photon ranges" in run("info", out).stdout
     assert {path.name for path in out.iterdir()} == FILES
 
 

@@ -75,6 +75,6 @@ def test_of_several_images_the_largest_is_named_and_equals_are_refused(tmp_path)
     assert found.depth[0] == pytest.approx(depth, rel=1e-6)
     savemat(tmp_path / "two.mat", {"depth": depth, "intensity": depth, "K": np.eye(3)})
     listed = r"depth \(20, 30\), intensity \(20, 30\), K \(3, 3\)"
-    with pytest.raises(ArgumentError, match=rf"dataset is missing \(--dataset\); the file holds {listed}"):
+    with pytest.raises(ArgumentError, match=rf"dataset is missing \(dataset\); the file holds {listed}"):
         read_depth(tmp_path / "two.mat")
     assert read_depth(tmp_path / "two.mat", dataset="depth").source == "depth as it is"

@@ -45,13 +45,13 @@ def moving(base, tmp_path_factory):
 
 
 def test_a_refitted_mesh_gives_the_bits_of_one_that_is_built(base, poses, device):
-    kept = {}
+    mesh_cache = {}
     for scene in load_trajectory(poses).scenes(base):
-        one = spadwarp.simulate(scene, photons=3000, seed=3, device=device, kept=kept)
+        one = spadwarp.simulate(scene, photons=3000, seed=3, device=device, mesh_cache=mesh_cache)
         other = spadwarp.simulate(scene, photons=3000, seed=3, device=device)
         assert one.tallies.any() and np.array_equal(one.tallies, other.tallies)
         assert np.array_equal(one.truth.depth, other.truth.depth, equal_nan=True)
-    assert len(kept) == 1
+    assert len(mesh_cache) == 1
 
 
 def test_frames_have_the_truth_of_the_scene_at_their_time(base, moving, poses):
