@@ -77,11 +77,6 @@ class _Commands(TyperGroup):
                 _complain_about(error)
             sys.exit(_exit_code(error))
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        """In the order of the help."""
-        ordered = [name for names in STAGES.values() for name in names if name in self.commands]
-        return ordered + [name for name in self.commands if name not in ordered]
-
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """A heading for each stage, and the whole first sentence of each command."""
         width = max(map(len, self.commands))
@@ -149,9 +144,20 @@ def say(text: str = "") -> None:
         typer.echo(text)
 
 
+def note(text: str) -> None:
+    """Prints how far a command is to stderr, but with --quiet."""
+    if not running.quiet:
+        complain(text)
+
+
 def complain(text: str) -> None:
-    """Prints progress, warnings and errors to stderr."""
+    """Prints a warning or an error to stderr."""
     typer.echo(text, err=True)
+
+
+def wrong(text: str, option: str) -> NoReturn:
+    """Ends the command for a wrong value of the option."""
+    raise typer.BadParameter(text, param_hint=option)
 
 
 def fail(text: str, code: int = FAILED) -> NoReturn:

@@ -5,38 +5,26 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import complain, running, say
+from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, write_json
-from spadwarp.cli.text import count, progress, rows, show_table
-from spadwarp.cli.text import written as names_of
+from spadwarp.cli.outputs import answer, check_outputs, count, progress, rows, show_table, write_json, written
 from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.limits import parse_number
 from spadwarp.units import percent, range_from_time, rounded
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from spadwarp import Result, Scene
     from spadwarp.frames import Recording
-    from spadwarp.inverse import Bounds, EstimateMap, Fit
+    from spadwarp.inverse import EstimateMap
 
-# What a detector sees of a scene; the rest has decided which photons came.
-_DETECTOR_FIELDS = (
-    "detector",
-    "daylight",
-    *(f"laser.{name}" for name in ("pulse_energy", "average_power", "peak_power", "repetition_rate", "pulse_fwhm_ps")),
-    *(f"laser.{name}" for name in ("linewidth_nm", "spectrum")),
-)
-
-_MEDIAN_PER_SIGMA = 0.6745  # of the absolute values of normal errors
+_LASER = ("pulse_energy", "average_power", "peak_power", "repetition_rate", "pulse_fwhm_ps", "linewidth_nm", "spectrum")
+_DETECTOR_FIELDS = ("detector", "daylight", *(f"laser.{name}" for name in _LASER))
+"""What a detector sees of a scene; the rest has decided which photons came."""
 _NOISE = 0.1  # part of the bound's information that is noise of the simulation, from which on it is said
 
 
@@ -80,30 +68,26 @@ def detect(
     recorded = _window(window)
     result = _with_detector(opt.load_run(run, channel), overrides)
     scene, methods = result.scene, list(dict.fromkeys(method or get_args(opt.Method)))
-    pixels = max(frames, 0) * scene.camera.width * scene.camera.height
     bins = recorded[1] if recorded else scene.gate.bins
     shots = scene.detector.pulses_per_frame if pulses is None else pulses
     counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
-    needed = pixels * (4 * counted + 4 * len(methods) + 8) + (16 << 20)
-    check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed)
-    with progress("frames") as report:
-        recording = spadwarp.frames.record_frames(
-            result,
-            out / "frames.h5",
-            pulses=pulses,
-            frames=frames,
-            seed=seed,
-            methods=methods,
-            undo_pile_up=coates,
-            tags=tags,
-            window=recorded,
-            device=device,
-            progress=report,
-        )
-    for note in recording.notes:
-        complain(f"note: {note}")
-    if recording.bound_noise > _NOISE and not _refused(recording):
-        complain(f"note: {_bound_noise(recording, result.photons)}")
+    needed = max(frames, 0) * scene.camera.width * scene.camera.height * (4 * counted + 4 * len(methods) + 8)
+    check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed + (16 << 20))
+    recording = spadwarp.frames.record_frames(
+        result,
+        out / "frames.h5",
+        pulses=pulses,
+        frames=frames,
+        seed=seed,
+        methods=methods,
+        undo_pile_up=coates,
+        tags=tags,
+        window=recorded,
+        device=device,
+        progress=progress("frames"),
+    )
+    for text in (*recording.notes, *_bound_noise(recording, result.photons)):
+        complain(f"note: {text}")
     files = [recording.path, spadwarp.viz.draw_recording(recording, result, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
@@ -133,13 +117,13 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
 
     first, bound = recording.first, recording.bound_depth[~np.isnan(recording.bound_depth)]
     median = float(np.median(bound)) if bound.size else math.inf
-    pixels = first.counts.shape[1] * first.counts.shape[2]
+    drawn = frames * first.counts.shape[1] * first.counts.shape[2]
     return {
         "pulses": first.pulses,
         "frames": frames,
         "seed": first.seed,
-        "detections_per_frame_and_pixel": recording.detections / (frames * pixels),
-        "detections_per_pulse_and_pixel": recording.detections / (frames * pixels * first.pulses),
+        "detections_per_frame_and_pixel": recording.detections / drawn,
+        "detections_per_pulse_and_pixel": recording.detections / (drawn * first.pulses),
         "bound": {
             "pixels": int(bound.size),
             "median_m": median if math.isfinite(median) else None,
@@ -151,19 +135,25 @@ def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
     }
 
 
-def _refused(recording: Recording) -> bool:
-    """There is information, but no bound: too few photons were traced, as a note says."""
-    return math.isfinite(recording.bound_noise) and not (recording.bound_time == recording.bound_time).any()
+def _bound_noise(recording: Recording, photons: int) -> list[str]:
+    """How much of the bound's information was noise, and the photons that would leave a tenth.
 
-
-def _bound_noise(recording: Recording, photons: int) -> str:
-    """How much of the bound's information was noise, and the photons that would leave a tenth."""
-    return (
+    Nothing where there is no bound: too few photons were traced, as a note of the recording says.
+    """
+    refused = not (recording.bound_time == recording.bound_time).any()
+    if not recording.bound_noise > _NOISE or (refused and math.isfinite(recording.bound_noise)):
+        return []
+    return [
         f"{percent(recording.bound_noise)} % of the information in the median pixel was noise of the simulation; the "
         "Cramér–Rao bound is without it"
         + (", and only roughly known" if recording.bound_noise > 0.3 else "")
         + f"; about {recording.bound_photons:.1e} photons instead of {photons:.1e} would make that a tenth"
-    )
+    ]
+
+
+_SEEN = {"group_index": opt.real_number, "horizontal_fov_deg": opt.from_unit("°")}
+_DepthInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _SEEN)]
+_Background = Annotated[float | Literal["median"], opt.number_or("median")]
 
 
 @command()
@@ -173,8 +163,8 @@ def depth(
     out: Path,
     method: opt.Method = "centroid",
     channel: opt.Channel = "I",
-    inputs: list[str] | None = None,
-    background: str | None = None,
+    inputs: _DepthInputs | None = None,
+    background: _Background | None = None,
     ply: Path | None = None,
     ply_frame: Literal["camera", "world"] = "camera",
     device: str | None = None,
@@ -201,41 +191,34 @@ def depth(
           --input axes=tyx,bin_width=55ps,gate_start=20ns,group_index=1.3566,irf=200ps
       spadwarp depth tags.mat --input tag_unit=8ps,bin_width=64ps,gate_start=0s,group_index=1 --out depth/
     """
+    import numpy as np
+
     from spadwarp.frames import depth_of, read_histograms
 
-    facts, files = opt.measured(inputs, group_index=opt.real_number, horizontal_fov_deg=opt.from_unit("°"))
-    seen = {name: facts.pop(name, None) for name in ("group_index", "horizontal_fov_deg")}
+    facts, files = opt.read_measured(inputs)
+    seen = {name: facts.get(name) for name in _SEEN}
     place = spadwarp.files.locate(path)
     reduced = spadwarp.files.stored_depth(spadwarp.load(place)) if spadwarp.files.is_own_file(place) else None
     if reduced is None:
+        facts = {name: value for name, value in facts.items() if name not in _SEEN}
         histograms = read_histograms(place, channel=channel, **facts)
         for text in histograms.notes:
             complain(f"note: {text}")
-    values = histograms.values[..., 0] if reduced is None else reduced.values
+    pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
     names = [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")]
-    check_outputs(out, names, files={"--ply": ply}, inputs=(path, *files), needed=32 * values.size)
+    check_outputs(out, names, files={"--ply": ply}, inputs=(path, *files), needed=32 * pixels)
     if reduced is None:
-        reduced = depth_of(histograms, method=method, background=_background(background), device=device, **seen)
+        reduced = depth_of(histograms, method=method, background=background, device=device, **seen)
     comment = f"{path.name}, {reduced.method}"
     files = spadwarp.files.write_depth(reduced, out, ply=ply, ply_frame=ply_frame, comment=comment)
-    answer({**_distances(reduced.first), "quantity": reduced.quantity, "frames": reduced.frames, "files": files})
+    found = reduced.first[np.isfinite(reduced.first)]
+    metres = [float(of(found)) for of in (np.min, np.max, np.median)] if found.size else None
+    summary = {"pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
+    answer({**summary, "frames": reduced.frames, "files": files})
 
 
-def _background(text: str | None) -> Any:
-    if text is None or text == "median":
-        return text
-    try:
-        return parse_number(text)
-    except ValueError:
-        raise typer.BadParameter(f"{text!r} is neither a number nor 'median'", param_hint="--background") from None
-
-
-def _distances(image: NDArray[np.float64]) -> dict[str, Any]:
-    import numpy as np
-
-    there = image[np.isfinite(image)]
-    metres = [float(there.min()), float(there.max()), float(np.median(there))] if there.size else None
-    return {"pixels_with_return": int(there.size), "metres": metres}
+_Start = Annotated[dict[str, float], opt.numbers("NAME=VALUE")]
+_Prior = Annotated[dict[str, tuple[float, float]], opt.numbers("NAME=MEAN,SD")]
 
 
 @command()
@@ -246,12 +229,12 @@ def fit(
     unknown: str,
     out: Path | None = None,
     bounds: bool = False,
-    start: list[str] | None = None,
-    prior: list[str] | None = None,
+    start: _Start | None = None,
+    prior: _Prior | None = None,
     pulses: int | None = None,
     photons: int | None = None,
     seed: int = 0,
-    inputs: list[str] | None = None,
+    inputs: opt.Measured | None = None,
     overrides: list[str] | None = None,
     device: str | None = None,
 ) -> None:
@@ -287,35 +270,44 @@ def fit(
       spadwarp fit harbour_5m --bounds --unknown depth,absorption,scattering
     """
     options: dict[str, Any] = {"unknown": unknown, "pulses": pulses, "photons": photons, "seed": seed, "device": device}
-    options["prior"] = opt.named_values(prior, 2, "--prior")
+    options["prior"] = prior or {}
     if bounds:
         opt.refuse("cannot be combined with --bounds, which takes SCENE alone", "SCENE", "--out", "--start", "--input")
         _bounds(path, opt.read_scene(path, overrides), options)
         return
     if scene is None or out is None:
         hint, text = ("SCENE", "a scene file, or --bounds") if scene is None else ("--out", "a directory, --out fit/")
-        raise typer.BadParameter(f"is missing; give {text}", param_hint=hint)
-    read, (facts, files) = opt.read_scene(scene, overrides), opt.measured(inputs)
+        wrong(f"is missing; give {text}", hint)
+    read, (facts, files) = opt.read_scene(scene, overrides), opt.read_measured(inputs)
     names = spadwarp.files.fit_files(spadwarp.inverse.read_unknowns(read, unknown))
     check_outputs(out, names, inputs=(path, scene, *files, *read.files))
-    begin = opt.named_values(start, 1, "--start") or None
-    with progress() as report:
-        found = spadwarp.fit(
-            spadwarp.files.locate(path), read, initial_guess=begin, progress=report, **options, **facts
-        )
+    found = spadwarp.fit(
+        spadwarp.files.locate(path), read, initial_guess=start, progress=progress(), **options, **facts
+    )
     for text in found.warnings:
         complain(f"warning: {text}")
-    written = spadwarp.files.write_fit(found, out)
+    files = spadwarp.files.write_fit(found, out)
     if found.estimates:
-        show_table(_estimates(found))
+        show_table(
+            {
+                "estimate": f"{one.name} [{one.unit}]" if one.unit else one.name,
+                "value": rounded(one.value, one.standard_error),
+                "±": f"{one.standard_error:.2g}",
+                "95 % interval": " to ".join(rounded(end, one.standard_error) for end in one.interval),
+                "start": rounded(one.initial_guess, one.standard_error),
+                "noise of simulation": f"{percent(one.simulation)} %",
+            }
+            for one in found.estimates.values()
+        )
     lines = {f"{name} of each pixel": _of_pixels(one) for name, one in found.maps.items()}
     lines["counts"] = f"{count(found.counts.sum())} of {count(found.pulses)} pulses"
     lines["fit"] = (
         f"{'converged' if found.converged else 'not converged'} after {len(found.iterations)} renderings of "
         f"{found.photons:.2e} photons in all, {found.seconds:.3g} s"
     )
-    say(rows({**lines, "written": names_of(written)}))
-    write_json({**found.to_dict(), "files": written})
+    say(rows(lines))
+    written(files)
+    write_json({**found.to_dict(), "files": files})
 
 
 def _bounds(path: Path, scene: Scene, options: dict[str, Any]) -> None:
@@ -323,12 +315,6 @@ def _bounds(path: Path, scene: Scene, options: dict[str, Any]) -> None:
     found = spadwarp.inverse.bounds(scene, **options)
     for text in found.warnings:
         complain(f"warning: {text}")
-    show_table(_bounds_table(found))
-    say(f"{count(found.counts)} counts expected in {count(found.pulses)} pulses")
-    write_json(found.to_dict())
-
-
-def _bounds_table(found: Bounds) -> list[dict[str, Any]]:
     table = []
     for name, one in found.bounds.items():
         row = found.names.index(name) if name in found.names else 0
@@ -343,21 +329,9 @@ def _bounds_table(found: Bounds) -> list[dict[str, Any]]:
         }
         others = enumerate(found.names[:row])
         table.append(cells | {f"with {other}": f"{found.correlation[row, k]:+.3f}" for k, other in others})
-    return table
-
-
-def _estimates(found: Fit) -> list[dict[str, Any]]:
-    return [
-        {
-            "estimate": f"{one.name} [{one.unit}]" if one.unit else one.name,
-            "value": rounded(one.value, one.standard_error),
-            "±": f"{one.standard_error:.2g}",
-            "95 % interval": " to ".join(rounded(end, one.standard_error) for end in one.interval),
-            "start": rounded(one.initial_guess, one.standard_error),
-            "noise of simulation": f"{percent(one.simulation)} %",
-        }
-        for one in found.estimates.values()
-    ]
+    show_table(table)
+    say(f"{count(found.counts)} counts expected in {count(found.pulses)} pulses")
+    write_json(found.to_dict())
 
 
 def _of_pixels(one: EstimateMap) -> str:
@@ -372,6 +346,8 @@ def _of_pixels(one: EstimateMap) -> str:
 
 
 _ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_second.npy", ".exr", ".png")
+_OF_IMAGES = {"group_index": opt.real_number, "channel": str, "scale": opt.real_number, "as_depth": bool}
+_DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _OF_IMAGES)]
 
 
 @command()
@@ -383,7 +359,7 @@ def denoise(
     gate: str | None = None,
     profile: Path | None = None,
     weights: Path | None = None,
-    inputs: list[str] | None = None,
+    inputs: _DenoiseInputs | None = None,
     mask: float | None = None,
     device: str | None = None,
     precision: Literal["float32", "float16", "bfloat16"] | None = None,
@@ -425,7 +401,7 @@ def denoise(
 
     from spadwarp.denoise import denoise_file, depth_files
 
-    facts, files = opt.measured(inputs, group_index=opt.real_number, channel=str, scale=opt.real_number, as_depth=bool)
+    facts, files = opt.read_measured(inputs)
     depths = _gate(gate, facts.get("group_index"))
     paths = depth_files(path)
     stems = [one.stem for one in paths]
@@ -438,7 +414,6 @@ def denoise(
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
     summary: list[dict[str, Any]] = []
-    failed = 0
     for number, one in enumerate(paths, 1):
         try:
             done = denoise_file(one, out, precision=precision, **settings, **facts)
@@ -447,40 +422,35 @@ def denoise(
             if len(paths) == 1:
                 raise type(error)(text) from None
             complain(f"error: {text}")
-            failed += 1
             continue
         filled = float(np.isfinite(done.depth).mean())
         target = float((done.target_probability >= done.threshold).mean())
         frames = "1 frame" if len(done.depth) == 1 else f"{count(len(done.depth))} frames"
-        lines[one.name] = (
-            f"{frames}, {100 * filled:.3g} % of the pixels have a depth, {100 * target:.3g} % show a target"
-        )
+        shares = f"{100 * filled:.3g} % of the pixels have a depth, {100 * target:.3g} % show a target"
+        lines[one.name] = f"{frames}, {shares}"
         facts_of_file = {"file": one, "gate": done.gate, "filled": filled, "target": target}
         summary.append({**facts_of_file, "files": done.files, "notes": done.notes})
-        if not running.quiet:
-            for note in done.notes:
-                complain(f"{one.name}: {note}")
-            if len(paths) > 1:
-                complain(f"{number} of {len(paths)}")
+        for text in done.notes:
+            note(f"{one.name}: {text}")
+        if len(paths) > 1:
+            note(f"{number} of {len(paths)}")
     say(rows({**lines, "written": f"{sum(len(one['files']) for one in summary)} files in {out}"}))
     write_json({"model": model, "files": summary})
-    if failed:
-        raise FileError(f"{path}: {failed} of {len(paths)} files could not be denoised")
+    if len(summary) < len(paths):
+        raise FileError(f"{path}: {len(paths) - len(summary)} of {len(paths)} files could not be denoised")
 
 
 def _gate(text: str | None, group_index: float | None) -> tuple[float, float] | None:
     """Depths [m] of a gate in depth, or in time of flight."""
-    if text is None:
-        return None
+    in_time = text is not None and "s" in text  # no unit of length has an s
     try:
-        return opt.from_to(text, "m", "--gate")
+        if text is None or not in_time:
+            return None if text is None else opt.from_to("m")(text)
+        if group_index is None:
+            problem = "is in time of flight: --input group_index=N makes depth of it; or give two lengths"
+            raise typer.BadParameter(f"{text!r} {problem}")
+        start, stop = opt.from_to("s")(text)
     except typer.BadParameter as error:
-        if " is a time" not in error.message:
-            raise
-    if group_index is None:
-        raise typer.BadParameter(
-            f"{text!r} is in time of flight: --input group_index=N makes depth of it; or give two lengths",
-            param_hint="--gate",
-        )
-    start, stop = opt.from_to(text, "s", "--gate")
+        error.param_hint = "--gate"
+        raise
     return range_from_time(start, group_index), range_from_time(stop, group_index)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import complain, running, say
+from spadwarp.cli.app import note, running, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, write_json
-from spadwarp.cli.text import count, progress, readable, show_table
+from spadwarp.cli.outputs import answer, check_outputs, count, progress, show_table, write_json, written
 from spadwarp.limits import environment_integer
 
 if TYPE_CHECKING:
-    from spadwarp.denoise import Evaluation
+    from spadwarp.denoise import Evaluation, HistogramScores, PhotonSweep, SceneScores
 
 
 @command()
@@ -25,7 +22,7 @@ def dataset(
     recipe: Path,
     *,
     out: Path,
-    part: str | None = None,
+    part: opt.Part | None = None,
     overrides: list[str] | None = None,
     devices: str | None = None,
     processes: int = 4,
@@ -54,22 +51,13 @@ def dataset(
         read = read.with_overrides(overrides)
     engine = opt.read_engine(ray, workers)
     if running.json is not None and out.resolve() in running.json.resolve().parents:
-        raise typer.BadParameter(f"{running.json} is in the dataset's folder", param_hint="--json")
+        wrong(f"{running.json} is in the dataset's folder", "--json")
     check_outputs(inputs=(recipe,))
-    with progress("frames") as report:
-        found = spadwarp.dataset.make_dataset(
-            read,
-            out,
-            device=devices,
-            processes=processes,
-            engine=engine,
-            part=opt.read_part(part, "--part") or (1, 1),
-            progress=report,
-        )
+    common: dict[str, Any] = {"device": devices, "processes": processes, "engine": engine, "part": part or (1, 1)}
+    found = spadwarp.dataset.make_dataset(read, out, progress=progress("frames"), **common)
     summary = {"folder": found.folder, "frames": found.frames, "made": list(found.made), "kept": len(found.kept)}
     summary |= {"broken": list(found.broken), "missing": len(found.missing)}
-    say(readable({**summary, "made": f"{count(len(found.made))} shards"}))
-    write_json(summary)
+    answer(summary, shown={**summary, "made": f"{count(len(found.made))} shards"})
 
 
 @command()
@@ -92,16 +80,12 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
       spadwarp train configs/training/pyramid.toml --out runs/pyramid/
       spadwarp train usdn --set data=data/small/ --set optimiser.steps=2000 --out runs/usdn/
     """
-    from spadwarp.denoise import load_training_recipe
-    from spadwarp.denoise import train as run
-
-    chosen = load_training_recipe(recipe, overrides or ())
+    chosen = spadwarp.denoise.load_training_recipe(recipe, overrides or ())
     first = environment_integer("RANK", 0) == 0
     names = (f"{chosen.model}.safetensors", "log.jsonl", "curves.png", "checkpoint.pt")
     check_outputs(out if first else None, names, inputs=(recipe,), resume=True)  # one process of torchrun writes
     running.quiet |= not first
-    with progress("steps") as shown:
-        trained = run(chosen, out, device=device, progress=shown, notify=None if running.quiet else complain)
+    trained = spadwarp.denoise.train(chosen, out, device=device, progress=progress("steps"), notify=note)
     if first:
         answer({"psnr": trained.psnr, "seconds": trained.seconds, "weights": trained.weights})
 
@@ -154,43 +138,44 @@ def evaluate(
       spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
       spadwarp evaluate out/result.h5 --report photons/
     """
-    from spadwarp.denoise import evaluate as run
-    from spadwarp.denoise import write_report
-
-    named = {"all": ["median", "gating", "usdn", "dncnn", "pyramid"]}
-    chosen = [name.strip() for name in named.get(models, models.split(","))]
+    denoise = spadwarp.denoise
+    chosen = [name.strip() for name in ("median,gating,usdn,dncnn,pyramid" if models == "all" else models).split(",")]
     check_outputs(report, _REPORT, inputs=(data, weights), option="--report")
-    common: dict[str, Any] = {"weights": weights, "device": device}
-    if data is None:
-        if chosen == ["histograms"]:
-            _points(seed=seed, **common)
-        else:
-            _scenes(chosen, report, seed=seed, **common)
-        return
-    if data.is_file() or (data / "result.h5").is_file():
-        _photons(data, [*chosen, "histograms"] if models == "all" else chosen, report, seed=seed, **common)
-        return
-    bm3d_frames = bm3d_frames or (20 if "bm3d" in chosen else 0)
-    options: dict[str, Any] = {"split": split, "frames": frames, "bm3d_frames": bm3d_frames, "crop": crop}
-    with progress("frames") as shown:
-        found = run(data, models=chosen, progress=shown, **options, **common)
-    written = write_report(found, report) if report is not None else []
-    _say_gains(found)
-    _finish(found, written)
+    options: dict[str, Any] = {"models": chosen, "seed": seed}
+    run: Any
+    write: Any = None
+    show: Any
+    if data is None and chosen == ["histograms"]:
+        run, show, options = denoise.evaluate_histograms, _show_points, {"seed": seed}
+    elif data is None:
+        run, show, write = denoise.evaluate_scenes, _show_scenes, denoise.write_scene_report
+    elif data.is_file() or (data / "result.h5").is_file():
+        run, show = partial(denoise.photon_sweep, opt.load_run(data)), _show_photons
+        named = [*chosen, "histograms"] if models == "all" else chosen
+        options["models"] = [name for name in named if name != "bm3d"]
+
+        def write(found: PhotonSweep, folder: Path) -> list[Path]:
+            return [denoise.draw_photon_sweep(found, folder / "photons.png")]
+
+    else:
+        run, show, write = partial(denoise.evaluate, data), _show_gains, denoise.write_report
+        bm3d_frames = bm3d_frames or (20 if "bm3d" in chosen else 0)
+        options = {"models": chosen, "split": split, "frames": frames, "bm3d_frames": bm3d_frames, "crop": crop}
+    found = run(
+        weights=weights, device=device, progress=progress("points" if show is _show_points else "frames"), **options
+    )
+    files = [] if report is None or write is None else write(found, report)
+    show(found)
+    written(files)
+    write_json({**found.to_dict(), "files": files})
 
 
-def _finish(found: Any, written: Sequence[Path]) -> None:
-    if written:
-        say(f"written: {written[0]}")
-    write_json({**found.to_dict(), "files": written})
-
-
-def _say_gains(found: Evaluation) -> None:
-    from spadwarp.denoise import TITLES
-
+def _show_gains(found: Evaluation) -> None:
+    """Of a dataset, by backscatter fraction or photons."""
+    titles = spadwarp.denoise.TITLES
     table = []
     for method in found.ranking():
-        row = {"method": TITLES[method]}
+        row = {"method": titles[method]}
         for level in (*found.levels, None):
             after, before = found.mean(method, level=level), found.mean("input", level=level)
             gain = f"{after.psnr:.2f}" if method == "input" else f"{after.psnr - before.psnr:+.2f}"
@@ -200,56 +185,38 @@ def _say_gains(found: Evaluation) -> None:
     show_table(table)
     for method in found.methods if found.steps else ():
         steps = [item for (name, _), item in found.steps.items() if name == method]
-        say(f"{TITLES[method]}: {sum(s.resolved for s in steps)} of {sum(s.total for s in steps)} steps")
+        say(f"{titles[method]}: {sum(s.resolved for s in steps)} of {sum(s.total for s in steps)} steps")
 
 
-def _scenes(models: list[str], report: Path | None, **options: Any) -> None:
+def _show_scenes(found: SceneScores) -> None:
     """Scenes that no training saw, by scene type."""
-    from spadwarp.denoise import evaluate_scenes, scene_table, write_scene_report
-
-    with progress("frames") as shown:
-        found = evaluate_scenes(models=models, progress=shown, **options)
-    written = write_scene_report(found, report) if report is not None else []
     for setting, water in found.types():
-        names, lines = scene_table(found, setting, water)
+        names, lines = spadwarp.denoise.scene_table(found, setting, water)
         say(f"{setting}, backscatter {water}: PSNR of the input and gains over it [dB] by backscatter fraction")
-        show_table([dict(zip(names, line, strict=True)) for line in lines])
-    _finish(found, written)
+        show_table(dict(zip(names, line, strict=True)) for line in lines)
 
 
-def _points(**options: Any) -> None:
+def _show_points(found: HistogramScores) -> None:
     """Histograms: ours and the best tuned classical estimate of each point."""
     import numpy as np
 
-    from spadwarp.denoise import TITLES, evaluate_histograms
-
-    with progress("points") as shown:
-        found = evaluate_histograms(progress=shown, **options)
     table = []
     for point, values in found.rmse.items():
         name, best = found.best(point)
         row = dict(zip(("photons", "SBR", "background", "returns"), map(str, point), strict=True))
         row |= {"RMSE [mm]": f"{1e3 * values['histograms']:.1f}", "best classical [mm]": f"{1e3 * best:.1f}"}
-        table.append({**row, "which": TITLES[name]})
+        table.append({**row, "which": spadwarp.denoise.TITLES[name]})
     show_table(table)
     ratios = found.ratios()
     say(f"RMSE over that of the best classical estimate: median {np.median(ratios):.2f}, highest {ratios.max():.2f}")
-    write_json(found.to_dict())
 
 
-def _photons(data: Path, models: list[str], report: Path | None, **options: Any) -> None:
+def _show_photons(found: PhotonSweep) -> None:
     """Frames of few photons from a result."""
-    from spadwarp.denoise import TITLES, draw_photon_sweep, photon_sweep
-
-    result = opt.load_run(data)
-    with progress("frames") as shown:
-        found = photon_sweep(result, models=[one for one in models if one != "bm3d"], progress=shown, **options)
-    written = [draw_photon_sweep(found, report / "photons.png")] if report is not None else []
+    titles = {"input": "likelihood of each pixel", **spadwarp.denoise.TITLES, "bound": "Cramér–Rao bound"}
     say(f"RMSE [mm]; {found.summary}")
-    titles = {"input": "likelihood of each pixel", **TITLES, "bound": "Cramér–Rao bound"}
     for row, ratio in enumerate(found.sbr):
         methods = {name: values[row] for name, values in found.rmse.items()} | {"bound": found.bound[row]}
         columns = [f"SBR {ratio:g}", *(f"{n:g} photon{'s' * (n != 1)}" for n in found.photons)]
         lines = [[titles[name], *(1e3 * float(one) for one in values)] for name, values in methods.items()]
-        show_table([dict(zip(columns, line, strict=True)) for line in lines])
-    _finish(found, written)
+        show_table(dict(zip(columns, line, strict=True)) for line in lines)

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import typer
 
 import spadwarp
-from spadwarp.cli.app import Command, app, running
+from spadwarp.cli.app import Command, app, running, wrong
 from spadwarp.limits import parse_number, shown, suggestion
 from spadwarp.units import quantity
 
 if TYPE_CHECKING:
     from spadwarp import Ray, Result, Scene
 
-__all__ = ["Channel", "Length", "Method", "Seconds", "command", "from_to", "from_unit", "given", "items", "load_run"]
-__all__ += ["measured", "named_values", "one_device", "read_engine", "read_part", "read_scene", "real_number", "refuse"]
-__all__ += ["whole_number"]
+__all__ = ["MEASURED", "Channel", "Length", "Measured", "Method", "Part", "Seconds", "command", "from_to", "from_unit"]
+__all__ += ["given", "items", "load_run", "number_or", "numbers", "one_device", "read_engine", "read_measured"]
+__all__ += ["read_scene", "real_number", "refuse", "whole_number"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 """`spadwarp.frames.METHODS`, known without loading it."""
@@ -85,19 +85,19 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
 
     def register(function: Callable[..., None]) -> Callable[..., None]:
         text, described = _documentation(function)
-        hints = get_type_hints(function, include_extras=True)
+        hints = {**_COMMON, **get_type_hints(function, include_extras=True)}
         made, names = [], {}
-        for one in inspect.signature(function).parameters.values():
-            shared = SHARED.get(one.name, ("", ""))
-            (metavar, about), option = described.get(one.name, shared[:2]), shared[2:]
-            is_option = one.kind is inspect.Parameter.KEYWORD_ONLY
-            names[one.name] = _option_name(one.name, *option) if is_option else metavar.strip("[]")
+        common = [
+            inspect.Parameter(one, inspect.Parameter.KEYWORD_ONLY, default=False if kind is bool else None)
+            for one, kind in _COMMON.items()
+            if one not in without
+        ]
+        for one in (*inspect.signature(function).parameters.values(), *common):
+            metavar, about, *option = SHARED.get(one.name, ("", ""))
+            metavar, about = described.get(one.name, (metavar, about))
+            long = option[0] if option else "--" + one.name.rstrip("_").replace("_", "-")
+            names[one.name] = long if one.kind is inspect.Parameter.KEYWORD_ONLY else metavar.strip("[]")
             made.append(_parameter(one, hints[one.name], metavar, about, names[one.name]))
-        for common, kind in _COMMON.items():
-            if common not in without:
-                default = False if kind is bool else None
-                parameter = inspect.Parameter(common, inspect.Parameter.KEYWORD_ONLY, default=default)
-                made.append(_parameter(parameter, kind, *SHARED[common][:2], f"--{common}"))
         defaults = {one.name: one.default for one in made}
 
         @functools.wraps(function)
@@ -125,26 +125,26 @@ def _documentation(function: Callable[..., None]) -> tuple[str, dict[str, tuple[
     return f"{before}\n{after}", {name: (metavar, " ".join(text.split())) for name, metavar, text in found}
 
 
-def _option_name(parameter: str, option: str | None = None) -> str:
-    return option or "--" + parameter.rstrip("_").replace("_", "-")
-
-
 def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name: str) -> inspect.Parameter:
     """The parameter as typer takes it."""
     optional = get_origin(kind) in (Union, UnionType)
     inner = next(part for part in get_args(kind) if part is not NoneType) if optional else kind
-    extra: dict[str, Any] = {}
-    if get_origin(inner) is Annotated:
-        inner, extra["parser"] = get_args(inner)
-    elif inner in (int, float):
-        extra["parser"] = whole_number if inner is int else real_number
-    elif get_origin(inner) is list:
-        (item,) = get_args(inner)
-        metavar = metavar or {Path: "PATH", str: "NAME"}.get(item) or "|".join(get_args(item))
-        inner = list[_choices(item)]  # type: ignore[misc]
-    inner = _choices(inner)
-    metavar = metavar or {int: "N", float: "X", Path: "FILE", str: "NAME"}.get(inner, "")
-    extra |= {"metavar": metavar or None, "help": text}
+    repeated = get_origin(inner) is list
+    item: Any = get_args(inner)[0] if repeated else inner
+    extra: dict[str, Any] = {"help": text}
+    if get_origin(item) is Annotated:
+        item, extra["parser"] = get_args(item)
+        repeated = repeated or get_origin(item) is dict
+    elif item in (int, float):
+        extra["parser"] = whole_number if item is int else real_number
+    elif get_origin(item) is Literal:
+        metavar = metavar or ("|".join(get_args(item)) if repeated else "")
+        choice = enum.StrEnum("Choice", {word: word for word in get_args(item)})  # type: ignore[misc]
+        item = choice
+    kinds: dict[Any, str] = {int: "N", float: "X", Path: "PATH" if repeated else "FILE", str: "NAME"}
+    extra["metavar"] = metavar or kinds.get(item)
+    if "parser" in extra and item is not float:  # which decides what typer makes of the text
+        item = str
     if one.default in (None, inspect.Parameter.empty):
         extra["show_default"] = False
     if one.kind is not inspect.Parameter.KEYWORD_ONLY:
@@ -152,25 +152,20 @@ def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name:
     else:
         names = [f"{name}/--no-{name[2:]}"] if one.default is True else [name]
         about = typer.Option(*names, *(["-q"] if one.name == "quiet" else []), **extra)
-    return one.replace(
-        kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[inner | None if optional else inner, about]
-    )
-
-
-def _choices(kind: Any) -> Any:
-    """A literal type as the enumeration that typer takes."""
-    if get_origin(kind) is not Literal:
-        return kind
-    return enum.StrEnum("Choice", {word: word for word in get_args(kind)})  # type: ignore[misc]
+    annotation = list[item] if repeated else item  # type: ignore[valid-type]
+    annotation = Annotated[annotation | None if optional else annotation, about]
+    return one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
 
 
 def _plain(value: Any) -> Any:
+    """Choices as text, and the tables of a repeated option as one."""
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        tables = [item for item in value if isinstance(item, dict)]
+        return {name: item for table in tables for name, item in table.items()} if tables else list(map(_plain, value))
     return value.value if isinstance(value, enum.Enum) else value
 
 
-# Values
+# Values, each read from its text; what is wrong with them is a `typer.BadParameter`
 
 
 def whole_number(text: str | int) -> int:
@@ -196,7 +191,7 @@ def real_number(text: str | float) -> float:
 
 
 def from_unit(unit: str) -> Callable[[str | float], float]:
-    """A parser for a number in the unit, bare or with a unit of its own: `0.01` or `1cm` for m."""
+    """A number in the unit, bare or with a unit of its own: `0.01` or `1cm` for m."""
 
     def parse(text: str | float) -> float:
         word = str(text).strip()
@@ -205,72 +200,127 @@ def from_unit(unit: str) -> Callable[[str | float], float]:
         except ValueError as error:
             raise typer.BadParameter(f"{shown(text)} {error}") from None
 
-    parse.__name__ = unit
     return parse
 
 
-Length = Annotated[float, from_unit("m")]
-Seconds = Annotated[float, from_unit("s")]
-
-
-def from_to(text: str, unit: str, option: str) -> tuple[float, float]:
+def from_to(unit: str) -> Callable[[str], tuple[float, float]]:
     """Two numbers of the unit from `2:3`, `2,3` or `80cm:1.2m`; both have a unit of their own, or none of them."""
-    parts = [part.strip() for part in re.split("[:,]", text)]
-    try:
+
+    def parse(text: str) -> tuple[float, float]:
+        parts = [part.strip() for part in re.split("[:,]", text)]
         if len(parts) != 2 or "" in parts:
             raise typer.BadParameter(f"{shown(text)} is not FROM:TO, two numbers such as 2:3 or 2{unit}:3{unit}")
         first, second = map(from_unit(unit), parts)
-        bare = [part[-1] in "0123456789." for part in parts]
-        if bare[0] != bare[1]:
-            with_unit, without = parts[bare.index(False)], parts[bare.index(True)]
+        without, with_unit = sorted(parts, key=lambda part: part[-1] not in "0123456789.")
+        if (without[-1] in "0123456789.") != (with_unit[-1] in "0123456789."):
             raise typer.BadParameter(
                 f"{shown(text)} is ambiguous: {with_unit} has a unit and {without} has none; write the unit of both"
             )
         if first > second:
             raise typer.BadParameter(f"{shown(text)} is FROM:TO; {parts[0]} is more than {parts[1]}")
-    except typer.BadParameter as error:
-        error.param_hint = option
-        raise
-    return first, second
+        return first, second
+
+    return parse
 
 
-def items(texts: list[str] | str | None, readers: Mapping[str, Callable[[str], Any]], option: str) -> dict[str, Any]:
+def items(readers: Mapping[str, Callable[[str], Any]]) -> Callable[[str], dict[str, Any]]:
     """Values by name from `NAME=VALUE,NAME=VALUE`, each read by the reader of its name; a bare name is true."""
-    texts = [texts] if isinstance(texts, str) else texts or []
-    found: dict[str, Any] = {}
-    for one in (one for text in texts for one in re.split(r",(?=\s*[a-z_]+\s*(?:=|,|$))", text)):
-        name, equals, value = (part.strip() for part in one.partition("="))
-        if name not in readers:
-            raise typer.BadParameter(
-                f"{shown(name)} is not one of {', '.join(readers)}{suggestion(name, [*readers])}", param_hint=option
-            )
-        if bool(equals) == (readers[name] is bool):
-            shape = name if equals else f"{name}=VALUE"
-            raise typer.BadParameter(f"{shown(one)} is not of the form {shape}", param_hint=option)
-        try:
-            found[name] = readers[name](value) if equals else True
-        except typer.BadParameter as error:
-            error.message, error.param_hint = f"{name} = {error.message}", option
-            raise
-    return found
+
+    def parse(text: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for one in re.split(r",(?=\s*[a-z_]+\s*(?:=|,|$))", text):
+            name, equals, value = (part.strip() for part in one.partition("="))
+            if name not in readers:
+                hint = suggestion(name, [*readers])
+                raise typer.BadParameter(f"{shown(name)} is not one of {', '.join(readers)}{hint}")
+            if bool(equals) == (readers[name] is bool):
+                raise typer.BadParameter(f"{shown(one)} is not of the form {name if equals else f'{name}=VALUE'}")
+            try:
+                found[name] = readers[name](value) if equals else True
+            except typer.BadParameter as error:
+                raise typer.BadParameter(f"{name} = {error.message}") from None
+        return found
+
+    return parse
 
 
-def named_values(texts: list[str] | None, numbers: int, option: str) -> dict[str, Any]:
-    """Name and so many numbers from texts such as `medium.anisotropy=0.92,0.01`."""
-    found = {}
-    for text in texts or []:
+def numbers(form: str) -> Callable[[str], dict[str, Any]]:
+    """A name and the numbers of the form, such as `NAME=MEAN,SD`; one number alone is no tuple."""
+
+    def parse(text: str) -> dict[str, Any]:
         name, _, values = text.partition("=")
         parts = values.split(",")
-        if not values or len(parts) != numbers:
-            shape = "NAME=MEAN,SD" if numbers == 2 else "NAME=VALUE"
-            raise typer.BadParameter(f"{text!r} is not {shape}", param_hint=option)
+        if not values or len(parts) != len(form.split(",")):
+            raise typer.BadParameter(f"{text!r} is not {form}")
+        read = tuple(real_number(part.strip()) for part in parts)
+        return {name.strip(): read if len(read) > 1 else read[0]}
+
+    return parse
+
+
+def _part(text: str) -> tuple[int, int]:
+    number, _, parts = text.partition("/")
+    if not (number.isdecimal() and parts.isdecimal()):
+        raise typer.BadParameter(f"{text!r} is not a part such as 3/64")
+    return int(number), int(parts)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """(height, width) of "640x480"."""
+    found = re.fullmatch(r"([1-9][0-9]{0,4})[x×]([1-9][0-9]{0,4})", text.strip())
+    if found is None:
+        raise typer.BadParameter(f"{text!r} is not of the form WIDTHxHEIGHT")
+    return int(found[2]), int(found[1])
+
+
+def number_or(*others: str) -> Callable[[str], float | str]:
+    """A number, or one of the words; any text where none is named."""
+
+    def parse(text: str) -> float | str:
         try:
-            read = tuple(real_number(part.strip()) for part in parts)
-        except typer.BadParameter as error:
-            error.param_hint = option
-            raise
-        found[name.strip()] = read if numbers > 1 else read[0]
-    return found
+            return text if text in others else parse_number(text)
+        except ValueError:
+            if others:
+                words = " or ".join(map(repr, others))
+                raise typer.BadParameter(f"{text!r} is neither a number nor {words}") from None
+            return text
+
+    return parse
+
+
+Length = Annotated[float, from_unit("m")]
+Seconds = Annotated[float, from_unit("s")]
+Part = Annotated[tuple[int, int], _part]
+"""`3/64`; Python checks the range."""
+
+
+def _response(text: str) -> Any:
+    """The instrument response of --input; that of a file is read when all values are known."""
+    if Path(text).suffix.lower() in (".csv", ".npy"):
+        return Path(text)
+    return spadwarp.frames.instrument_response(pulse_fwhm=0.0, jitter_fwhm=from_unit("s")(text))
+
+
+# Names of --input and their readers: arguments of `spadwarp.frames.read_histograms`.
+MEASURED: dict[str, Callable[[str], Any]] = {
+    "bin_width": from_unit("s"),
+    "gate_start": from_unit("s"),
+    "irf": _response,
+    "axes": str,
+    "dataset": str,
+    "image_size": _size,
+    "tag_unit": from_unit("s"),
+    "sum_frames": bool,
+}
+Measured = Annotated[dict[str, Any], items(MEASURED)]
+
+
+def read_measured(values: dict[str, Any] | None) -> tuple[dict[str, Any], list[Path]]:
+    """The values of --input with the instrument response read, and the files that they name."""
+    found = values or {}
+    if not isinstance(path := found.get("irf"), Path):
+        return found, []
+    return {**found, "irf": spadwarp.frames.read_response(path, bin_width=found.get("bin_width"))}, [path]
 
 
 def refuse(text: str, *options: str) -> None:
@@ -312,44 +362,12 @@ def load_run(place: Path, channel: Channel = "I") -> Result:
     return spadwarp.result.analyser_channel(result, channel)
 
 
-def measured(texts: list[str] | None, **more: Callable[[str], Any]) -> tuple[dict[str, Any], list[Path]]:
-    """Arguments of `spadwarp.frames.read_histograms` from --input, and those of `more`; and files that they name."""
-    from spadwarp.frames import instrument_response, read_response
-
-    time = from_unit("s")
-
-    def response(text: str) -> Any:
-        if Path(text).suffix.lower() in (".csv", ".npy"):
-            return Path(text)
-        return instrument_response(pulse_fwhm=0.0, jitter_fwhm=time(text))
-
-    found = items(
-        texts,
-        {
-            "bin_width": time, "gate_start": time, "irf": response, "axes": str, "dataset": str, "image_size": _size,
-            "tag_unit": time, "sum_frames": bool, **more,
-        },
-        "--input",
-    )  # fmt: skip
-    if not isinstance(path := found.get("irf"), Path):
-        return found, []
-    return {**found, "irf": read_response(path, bin_width=found.get("bin_width"))}, [path]
-
-
-def _size(text: str) -> tuple[int, int]:
-    """(height, width) of "640x480"."""
-    found = re.fullmatch(r"([1-9][0-9]{0,4})[x×]([1-9][0-9]{0,4})", text.strip())
-    if found is None:
-        raise typer.BadParameter(f"{text!r} is not of the form WIDTHxHEIGHT")
-    return int(found[2]), int(found[1])
-
-
 def read_engine(address: str | None, workers: int | None) -> Ray | None:
     """The argument `engine` from --ray and --workers."""
     if address is not None:
         return spadwarp.Ray(None if address == "start" else address, workers)
     if workers is not None:
-        raise typer.BadParameter("needs --ray", param_hint="--workers")
+        wrong("needs --ray", "--workers")
     return None
 
 
@@ -358,13 +376,3 @@ def one_device(devices: str | None, engine: Ray | None) -> str | None:
     if devices is None or engine is not None:
         return None
     return "cuda:0" if devices == "cuda:all" else devices.split(",")[0]
-
-
-def read_part(text: str | None, option: str) -> tuple[int, int] | None:
-    """The numbers of `3/64`, which Python checks."""
-    if text is None:
-        return None
-    number, _, parts = text.partition("/")
-    if not (number.isdecimal() and parts.isdecimal()):
-        raise typer.BadParameter(f"{text!r} is not a part such as 3/64", param_hint=option)
-    return int(number), int(parts)

@@ -1,4 +1,4 @@
-"""What a command writes, checked before it works: one rule for all commands.
+"""What commands print and write: numbers, tables, progress; files, checked before the work begins.
 
 A file that exists is refused by name unless --overwrite is given, and so is a directory that is not empty. What a
 command reads is never what it writes. Pipes and devices such as /dev/stdout are written to as they are.
@@ -6,10 +6,13 @@ command reads is never what it writes. Pipes and devices such as /dev/stdout are
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -17,22 +20,173 @@ from typing import Any
 import typer
 
 import spadwarp
-from spadwarp.cli.app import running, say, until_the_end
-from spadwarp.cli.text import in_bytes, readable, written
+from spadwarp.cli.app import complain, running, say, until_the_end, wrong
 from spadwarp.errors import FileError
 
-__all__ = ["answer", "check_outputs", "write_json"]
+__all__ = ["Report", "answer", "check_outputs", "count", "in_bytes", "in_percent", "progress", "readable", "rows"]
+__all__ += ["short", "show_table", "write_json", "written"]
 
-# Where an input is the directory of one of them.
-_READ_IN_DIRECTORIES = ("result.h5", "frames.h5", "sequence.h5", "analytic.h5")
+Report = Callable[[str, int, int], None]
 
 
-def answer(summary: Mapping[str, Any], hide: Iterable[str] = ()) -> None:
-    """Prints a summary without the names in `hide`, and the files in it; and writes all of it as JSON."""
-    hidden = {"files", "notes", "warnings", *hide}
-    say(readable({name: value for name, value in summary.items() if name not in hidden}))
-    if files := summary.get("files"):
-        say(f"written: {written(files)}")
+# Numbers
+
+
+def count(number: float) -> str:
+    """2 000 000"""
+    return f"{number:,.0f}".replace(",", " ")
+
+
+def short(value: float) -> str:
+    """A number to three digits; "-" for NaN."""
+    return "-" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.3g}"
+
+
+def in_percent(value: float) -> str:
+    """A fraction in per cent."""
+    if math.isnan(value):
+        return "-"
+    return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
+
+
+def in_bytes(number: float) -> str:
+    """1.5 GiB"""
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if number < 1024:
+            return f"{number:.4g} {unit}"
+        number /= 1024
+    return f"{number:.3g} TiB"
+
+
+# Tables
+
+
+def rows(table: Mapping[str, str], *, indent: str = "") -> str:
+    """Names and values in two columns."""
+    width = max(map(len, table), default=0)
+    return "\n".join(f"{indent}{name:<{width}}  {value}".rstrip() for name, value in table.items())
+
+
+_UNITS = {"_m": "m", "_mm": "mm", "_s": "s", "_ns": "ns", "_ps": "ps", "_nm": "nm", "_deg": "°", "_bytes": "bytes"}
+_UNITS |= dict.fromkeys(("range", "length", "distance", "extent", "centre", "limit", "depth_error"), "m")
+_UNITS |= dict.fromkeys(("absorption", "scattering", "extinction"), "1/m")
+_UNITS |= {"energy": "J", "power": "W", "rate": "Hz", "irradiance": "W/m²", "area": "m²", "seconds": "s"}
+
+
+def readable(summary: Mapping[str, Any]) -> str:
+    """A summary in two columns, its tables below their names."""
+    tables = {name: value for name, value in summary.items() if isinstance(value, Mapping) and len(value) > 3}
+    flat = {name: value for name, value in summary.items() if name not in tables and value not in ({}, [], ())}
+    parts = [rows(dict(_row(name, value) for name, value in flat.items()))] if flat else []
+    for name, table in tables.items():
+        parts.append(f"{name.replace('_', ' ')}\n" + rows(dict(map(_row, table, table.values())), indent="  "))
+    return "\n".join(parts)
+
+
+def _row(name: str, value: Any) -> tuple[str, str]:
+    """A name without its unit, and its value with it; fields of a scene keep their names."""
+    numbers = value if isinstance(value, list | tuple) else [value]
+    if "." in name or not all(isinstance(one, int | float) for one in numbers):
+        return name.replace("_", " ") if "." not in name else name, _plain(value)
+    ending = next((one for one in _UNITS if name.endswith(one)), "")
+    label = name.removesuffix(ending) if ending.startswith("_") else name
+    return label.replace("_", " "), f"{_plain(value)} {_UNITS.get(ending, '')}".rstrip()
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(" ".join(_row(name, item)) for name, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_plain, value))
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:.4g}"
+    return count(value) if isinstance(value, int) else str(value)
+
+
+def show_table(table: Iterable[Mapping[str, Any]], *, keys: int = 1) -> None:
+    """Rows of values by title on stdout, numbers to three digits, as wide as the terminal; 160 columns elsewhere.
+
+    A table that is wider is printed in several parts, each with the first `keys` columns, so that no number is cut off.
+    """
+    cells: dict[str, list[str]] = {}
+    for number, row in enumerate(table := list(table)):
+        for title, value in row.items():
+            column = cells.setdefault(title, [title, *[""] * len(table)])
+            column[number + 1] = short(value) if isinstance(value, float) else "-" if value is None else str(value)
+    titles, widths = list(cells), {title: max(map(len, column)) for title, column in cells.items()}
+    width = shutil.get_terminal_size().columns if sys.stdout is not None and sys.stdout.isatty() else 160
+    first, groups = titles[:keys], [titles[keys : keys + 1]]
+    for title in titles[keys + 1 :]:
+        if sum(widths[one] + 2 for one in (*first, *groups[-1], title)) - 2 <= width:
+            groups[-1].append(title)
+        else:
+            groups.append([title])
+    for group in groups:
+        for line in range(len(table) + 1):
+            parts = [cells[title][line].ljust(widths[title]) for title in first]
+            parts += [cells[title][line].rjust(widths[title]) for title in group]
+            say("  ".join(parts).rstrip())
+
+
+# Progress
+
+
+def progress(unit: str = "photons") -> Report | None:
+    """The argument `progress` of `spadwarp.simulate`; None where nothing is to be said.
+
+    On a terminal one line that changes; elsewhere a line at every tenth, but not more often than every second, in a
+    long run soon, then ever more seldom.
+    """
+    if running.quiet:
+        return None
+    terminal = sys.stderr is not None and sys.stderr.isatty()
+    began: tuple[float, int] | None = None  # the first report: kernels are loaded and truth maps made before it
+    reported_at, reported_done, patience = time.monotonic(), 0, 2.0
+
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal began, reported_at, reported_done, patience
+        now = time.monotonic()
+        if not total:
+            compiling = "loading kernels; the first run of a kind compiles them, which takes a while"
+            complain(compiling if stage == "compile" else stage)
+            return
+        began = began or (now, done)
+        seconds, waited = now - began[0], now - reported_at
+        often = waited >= 0.1 if terminal else (done - reported_done >= 0.1 * total and waited >= 1.0)
+        if done > reported_done and (often or waited >= patience or done == total):
+            line = f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}"
+            if seconds > 0.05 and (rate := (done - began[1]) / seconds):
+                line += f", {rate:.3g} {unit}/s"
+                line += f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(seconds)}"
+            typer.echo(f"\r{line:<79}" if terminal else line, err=True, nl=not terminal or done == total)
+            reported_at, reported_done, patience = now, done, min(2.0 * patience, 60.0)
+
+    return report
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 100 else f"{minutes} min {seconds:.0f} s"
+
+
+# Files
+
+
+def written(paths: Sequence[Path]) -> None:
+    """Prints the names of files of one folder, if there are any."""
+    if paths:
+        say(f"written: {', '.join(path.name for path in paths)} in {paths[0].parent}")
+
+
+def answer(summary: Mapping[str, Any], *, shown: Mapping[str, Any] | None = None) -> None:
+    """Prints a summary, or what is shown of it, and the files in it; and writes all of it as JSON."""
+    hidden = ("files", "notes", "warnings")
+    say(readable({name: value for name, value in summary.items() if name not in hidden} if shown is None else shown))
+    written(summary.get("files") or ())
     write_json(summary)
 
 
@@ -76,58 +230,59 @@ def check_outputs(
         typer.BadParameter: An output exists, is an input, or is given twice.
         FileError: A directory cannot be written, is in use by another process, or has too little space.
     """
-    json, overwrite = running.json, running.overwrite
+    asked = {option: path for option, path in {**(files or {}), "--json": running.json}.items() if path is not None}
+    named = {option: path for option, path in asked.items() if not spadwarp.io.is_stream(path)}
     names = list(names)
-    named = {option: path for option, path in {**(files or {}), "--json": json}.items() if path is not None}
-    named = {option: path for option, path in named.items() if not spadwarp.io.is_stream(path)}
-    written = [*named.items(), *((option, out / name) for name in names if out is not None)]
-    _check_apart(written, inputs)
+    _check_apart([*named.items(), *((option, out / name) for name in names if out is not None)], inputs)
     for name, path in named.items():
         if path.is_dir():
-            raise typer.BadParameter(f"{path} is a directory; a file is needed", param_hint=name)
-        if os.path.lexists(path) and not overwrite:
-            raise typer.BadParameter(f"{path} exists; --overwrite replaces it", param_hint=name)
+            wrong(f"{path} is a directory; a file is needed", name)
+        if os.path.lexists(path) and not running.overwrite:
+            wrong(f"{path} exists; --overwrite replaces it", name)
     if out is not None:
-        if beside and not overwrite and out.is_dir():
+        if beside and not running.overwrite and out.is_dir():
             for path in sorted(path for name in names for path in out.glob(name)):
-                raise typer.BadParameter(f"{path} exists; --overwrite replaces it", param_hint=option)
-        _prepare_directory(out, option, may_hold_files=overwrite or resume or beside, needed=needed)
+                wrong(f"{path} exists; --overwrite replaces it", option)
+        _prepare_directory(out, option, may_hold_files=running.overwrite or resume or beside, needed=needed)
     for path in named.values():
         _check_writable(path.parent)
 
 
+# Where an input is the directory of one of them.
+_READ_IN_DIRECTORIES = ("result.h5", "frames.h5", "sequence.h5", "analytic.h5")
+
+
 def _check_apart(written: Iterable[tuple[str, Path]], inputs: Iterable[str | Path | None]) -> None:
     """Raises `typer.BadParameter` where two outputs, or an output and an input, are one file."""
+
+    def place(path: Path) -> Path:
+        """Links in a file's folder are followed, but not one in its own place, which is replaced."""
+        return path.parent.resolve() / path.name
+
     read = [Path(path) for path in inputs if path is not None]
     for folder in [path for path in read if path.is_dir()]:
         if (folder / "recipe.toml").exists():  # a dataset
             read += [path for path in (*folder.glob("*"), *folder.glob("*/*")) if path.name != "preview.png"]
         else:
             read += [folder / name for name in _READ_IN_DIRECTORIES]
-    kept = {place for path in read for place in (_place(path), path.resolve())}
+    kept = {one for path in read for one in (place(path), path.resolve())}
     taken: dict[Path, str] = {}
     for option, path in written:
-        place = _place(path)
-        if place in kept:
-            raise typer.BadParameter(f"{path} is read by this command and would be replaced", param_hint=option)
-        if place in taken:
-            raise typer.BadParameter(f"{path} is also written for {taken[place]}", param_hint=option)
-        taken[place] = option
-
-
-def _place(path: Path) -> Path:
-    """Where a file is written: links in its folder are followed, but not one in its own place, which is replaced."""
-    return path.parent.resolve() / path.name
+        if place(path) in kept:
+            wrong(f"{path} is read by this command and would be replaced", option)
+        if place(path) in taken:
+            wrong(f"{path} is also written for {taken[place(path)]}", option)
+        taken[place(path)] = option
 
 
 def _prepare_directory(out: Path, option: str, *, may_hold_files: bool, needed: int) -> None:
     if out.exists() and not out.is_dir():
-        raise typer.BadParameter(f"{out} is a file; a directory is needed", param_hint=option)
+        wrong(f"{out} is a file; a directory is needed", option)
     _check_writable(out)
     if not until_the_end(spadwarp.io.lock(out / ".lock")):
         raise FileError(f"{out}: another process is writing to this directory; wait for it, or name another one")
     if any(not path.name.startswith(".") for path in out.iterdir()) and not may_hold_files:
-        raise typer.BadParameter(f"{out} is not empty; --overwrite replaces results in it", param_hint=option)
+        wrong(f"{out} is not empty; --overwrite replaces results in it", option)
     free = shutil.disk_usage(out).free
     if free < needed:
         raise FileError(f"{out}: up to {in_bytes(needed)} will be written; {in_bytes(free)} are free there")

@@ -12,21 +12,21 @@ import typer
 
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import complain, say
+from spadwarp.cli.app import complain, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, write_json
-from spadwarp.cli.text import (
-    bracketed,
+from spadwarp.cli.outputs import (
+    answer,
+    check_outputs,
     count,
-    counted,
-    percent,
+    in_percent,
     progress,
     readable,
     rows,
     short,
     show_table,
+    write_json,
+    written,
 )
-from spadwarp.cli.text import written as names_of
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import shown
 from spadwarp.units import with_prefix
@@ -59,24 +59,21 @@ def check(
     read = opt.read_scene(scene, overrides, mesh=mesh)
     check_outputs(files={"--picture": picture}, inputs=(scene, *read.files))
     triangles = build_mesh(read)
-    messages, numbers = spadwarp.check(read, triangles), summary(read, triangles)
-    faces = 0 if triangles is None else triangles.face_count
-    say(readable({"faces": faces, **numbers}) + "\n")
+    messages = spadwarp.check(read, triangles)
+    numbers = {"faces": 0 if triangles is None else triangles.face_count, **summary(read, triangles)}
+    say(readable(numbers) + "\n")
     for message in messages:
-        if message.level == "warning":
-            typer.echo(str(message))  # also with --quiet
-        else:
-            say(str(message))
+        (typer.echo if message.level == "warning" else say)(str(message))  # a warning also with --quiet
     if not any(message.level == "warning" for message in messages):
         say(f"{scene}: valid, no warnings")
     if picture is not None:
         spadwarp.viz.draw_water(read, picture, triangles)
         say(f"written: {picture}")
-    found = [dataclasses.asdict(message) for message in messages]
-    write_json({"scene": scene, "faces": faces, **numbers, "messages": found})
+    write_json({"scene": scene, **numbers, "messages": [dataclasses.asdict(message) for message in messages]})
 
 
 _MUCH_NOISE = 1.0 / 3.0  # of the information of the run
+_Range = Annotated[tuple[float, float], opt.from_to("m")]
 
 
 @command()
@@ -85,7 +82,7 @@ def plan(
     *,
     depth_error: opt.Length = 0.01,
     time: opt.Seconds = 1.0,
-    range_: str | None = None,
+    range_: _Range | None = None,
     margin: opt.Length = 0.25,
     method: opt.Method = "likelihood",
     full_power: bool = False,
@@ -127,29 +124,31 @@ def plan(
     """
     read = opt.read_scene(scene, overrides, mesh=mesh)
     check_outputs(files={"--write": write}, inputs=(scene, *read.files))
-    if range_ is None:
-        _complain_of_targets(read)
-    with progress() as report:
-        found = spadwarp.plan(
-            read,
-            depth_error=depth_error,
-            time=time,
-            ranges=None if range_ is None else opt.from_to(range_, "m", "--range"),
-            margin=margin,
-            method=method,
-            full_power=full_power,
-            eye_distance=eye_distance,
-            eye_exposure=eye_exposure,
-            photons=photons,
-            seed=seed,
-            largest_range=not no_range,
-            channel=channel,
-            device=device,
-            progress=report,
-        )
-    if write is not None:
+    # What `check` warns of in the targets, before a run that would be in vain; the gate is what is proposed.
+    for message in spadwarp.check(read) if range_ is None else ():
+        if message.level == "warning" and message.field.startswith("targets") and "gate" not in message.text:
+            complain(str(message))
+    found = spadwarp.plan(
+        read,
+        depth_error=depth_error,
+        time=time,
+        ranges=range_,
+        margin=margin,
+        method=method,
+        full_power=full_power,
+        eye_distance=eye_distance,
+        eye_exposure=eye_exposure,
+        photons=photons,
+        seed=seed,
+        largest_range=not no_range,
+        channel=channel,
+        device=device,
+        progress=progress(),
+    )
+    files = [] if write is None else [write]
+    for file in files:
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
-        spadwarp.io.write_text(made + found.scene.to_toml(folder=write.parent), write)
+        spadwarp.io.write_text(made + found.scene.to_toml(folder=file.parent), file)
     hidden = ("pilot", "channels", "terms", "advice", "limit")
     say(readable({name: value for name, value in found.to_dict().items() if name not in hidden}))
     if found.largest_range == found.largest_range:
@@ -157,8 +156,7 @@ def plan(
     say(rows(_terms(found)))
     for name in ("co", "cross") if found.channels else ():
         say(_reception(found, name))
-    say(_verdict(found))
-    say(f"What would help: {found.advice}.")
+    say(f"{_verdict(found)}\nWhat would help: {found.advice}.")
     if found.pilot.run_noise > 0.5 * found.terms["forward scattering"]:
         say("The Monte Carlo run is too short to know the floor: it may be smaller; --photons takes more.")
     if found.pilot.information_noise > _MUCH_NOISE:
@@ -166,16 +164,9 @@ def plan(
             f"The Monte Carlo run is short for the bound: {100 * found.pilot.information_noise:.0f} % of what its "
             "histograms say of the depth was noise, and is left out; --photons takes more."
         )
-    if write is not None:
-        say(f"written: {write}")
-    write_json({"scene": scene, **found.to_dict(), "files": [] if write is None else [write]})
-
-
-def _complain_of_targets(scene: Scene) -> None:
-    """What `check` warns of in the targets, before a run that would be in vain; the gate is what is proposed."""
-    for message in spadwarp.check(scene):
-        if message.level == "warning" and message.field.startswith("targets") and "gate" not in message.text:
-            complain(str(message))
+    for file in files:
+        say(f"written: {file}")
+    write_json({"scene": scene, **found.to_dict(), "files": files})
 
 
 def _verdict(found: Proposal) -> str:
@@ -269,30 +260,32 @@ def sweep(
         opt.refuse("is for --vary range=FROM:TO:N", "--medium", "--reflectance")
     stem = "budget" if of_range else "sweep"
     check_outputs(out, (f"{stem}.png", f"{stem}.csv"), inputs=(scene, *read.files))
-    notes: list[str] = []
     summary: dict[str, Any] = {}
+    found: Any
+    lines: Any
+    draw: Any
     if of_range:
-        budget = spadwarp.budget(read, _ranges(values), medium or None, reflectance=reflectance, device=device)
-        found = [dataclasses.asdict(row) for row in budget]
-        table = _budget_table("water", [row.medium for row in budget], budget)
-        written = _write_curves(out, stem, spadwarp.viz.draw_budget, budget, found)
-        notes = _budget_notes(budget, read)
+        lines = found = spadwarp.budget(read, _ranges(values), medium or None, reflectance=reflectance, device=device)
+        title, names, draw = "water", [row.medium for row in found], spadwarp.viz.draw_budget
     else:
-        curves = spadwarp.sweep(read, vary=str(vary), of=of, device=device)
-        found = [dataclasses.asdict(row) for row in curves.rows]
-        plain = [{curves.field: value, **row} for value, row in zip(curves.values, found, strict=True)]
-        written = _write_curves(out, stem, spadwarp.viz.draw_sweep, curves, plain)
-        names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in curves.values]
-        draw: Any = _budget_table if of == "budget" else _error_table
-        table = draw(curves.field, names, curves.rows)
-        notes = _budget_notes(list[Any](curves.rows), read) if of == "budget" else []
-        summary = {"field": curves.field, "values": list(curves.values), "of": of}
-    show_table(table, keys=2 if of == "budget" else 1)
-    for text in notes:
+        found = spadwarp.sweep(read, vary=str(vary), of=of, device=device)
+        title, lines, draw = found.field, found.rows, spadwarp.viz.draw_sweep
+        names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in found.values]
+        summary = {"field": found.field, "values": list(found.values), "of": of}
+    plain = [dataclasses.asdict(row) for row in lines]
+    files = []
+    if out is not None:
+        draw(found, out / f"{stem}.png")
+        table = plain if of_range else [{title: value, **row} for value, row in zip(found.values, plain, strict=True)]
+        files = [out / f"{stem}.png", spadwarp.io.write_csv(table, out / f"{stem}.csv")]
+    cells = _budget_cells if of == "budget" else _error_cells
+    show_table(
+        ({title: name, **cells(row)} for name, row in zip(names, lines, strict=True)), keys=2 if of == "budget" else 1
+    )
+    for text in _budget_notes(lines, read) if of == "budget" else ():
         say(text)
-    if written:
-        say(f"written: {names_of(written)}")
-    write_json({**summary, "rows": found, "notes": spadwarp.analytic.model_notes(read), "files": written})
+    written(files)
+    write_json({**summary, "rows": plain, "notes": spadwarp.analytic.model_notes(read), "files": files})
 
 
 def _ranges(text: str) -> list[float] | None:
@@ -308,42 +301,43 @@ def _ranges(text: str) -> list[float] | None:
     return [float(value) for value in values]
 
 
-def _write_curves(
-    out: Path | None, stem: str, draw: Callable[..., Any], found: Any, table: list[dict[str, Any]]
-) -> list[Path]:
-    """The picture and the table, if a directory is named."""
-    if out is None:
-        return []
-    draw(found, out / f"{stem}.png")
-    return [out / f"{stem}.png", spadwarp.io.write_csv(table, out / f"{stem}.csv")]
+def _budget_cells(row: BudgetRow) -> dict[str, Any]:
+    def sigma(value: float) -> str:
+        """In brackets where it is not reached."""
+        reached = row.outlier_probability <= spadwarp.analytic.OUTLIERS or math.isnan(value)
+        return short(value) if reached else f"({short(value)})"
+
+    def pulses(value: float) -> str:
+        """To three digits: 5 300, 1.2e+07."""
+        return count(float(f"{value:.3g}")) if 100.0 <= value < 1e7 else short(value)
+
+    return {
+        "range [m]": f"{row.range:.4g}",
+        "c·r": row.optical_depth,
+        "gate [ns]": f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
+        "pulses": pulses(row.pulses),
+        "signal": row.signal,
+        "background": row.background,
+        "α": row.alpha,
+        "signal/backscatter": row.signal_to_backscatter,
+        "σ* [ps]": sigma(1e12 * row.sigma_time),
+        "σ* [mm]": sigma(1e3 * row.sigma_depth),
+        "outliers": in_percent(row.outlier_probability),
+        "pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
+    }
+
+
+def _error_cells(row: DepthErrorRow) -> dict[str, Any]:
+    return {
+        "σ* median [mm]": 1e3 * row.sigma_depth,
+        "σ* 90 % below [mm]": 1e3 * row.sigma_depth_p90,
+        "outliers": in_percent(row.outlier_probability),
+        "pixels with an estimate": in_percent(row.estimate_fraction),
+        "signal/backscatter": row.signal_to_backscatter,
+    }
 
 
 _SCATTERS = 0.2  # optical depth: from here on scattered light adds more than a quarter to a target's
-
-
-def _budget_table(title: str, names: Sequence[str], found: Sequence[BudgetRow]) -> list[dict[str, Any]]:
-    table = []
-    for name, row in zip(names, found, strict=True):
-        reached = row.outlier_probability <= spadwarp.analytic.OUTLIERS
-        gate = f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}"
-        table.append(
-            {
-                title: name,
-                "range [m]": f"{row.range:.4g}",
-                "c·r": row.optical_depth,
-                "gate [ns]": f"{gate}{'*' if row.gate_moved else ' '}",
-                "pulses": counted(row.pulses),
-                "signal": row.signal,
-                "background": row.background,
-                "α": row.alpha,
-                "signal/backscatter": row.signal_to_backscatter,
-                "σ* [ps]": bracketed(1e12 * row.sigma_time, reached),
-                "σ* [mm]": bracketed(1e3 * row.sigma_depth, reached),
-                "outliers": percent(row.outlier_probability),
-                "pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else counted(row.pulses_for_1cm),
-            }
-        )
-    return table
 
 
 def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
@@ -370,23 +364,14 @@ def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
     return notes
 
 
-def _error_table(title: str, names: Sequence[str], found: Sequence[DepthErrorRow]) -> list[dict[str, Any]]:
-    return [
-        {
-            title: name,
-            "σ* median [mm]": 1e3 * row.sigma_depth,
-            "σ* 90 % below [mm]": 1e3 * row.sigma_depth_p90,
-            "outliers": percent(row.outlier_probability),
-            "pixels with an estimate": percent(row.estimate_fraction),
-            "signal/backscatter": row.signal_to_backscatter,
-        }
-        for name, row in zip(names, found, strict=True)
-    ]
-
-
 # Values of --particles, by theory.
 _KOPELEVICH = ("small", "large")
 _SIZES = {"slope": ("smallest", "largest"), "median": ("deviation",), "diameter": ()}
+_PARTICLES: dict[str, Callable[[str], float]] = dict.fromkeys(
+    ("absorbing", "concentration", "deviation", "index", "large", "slope", "small"), opt.real_number
+)
+_PARTICLES |= dict.fromkeys(("smallest", "largest", "median", "diameter"), opt.from_unit("m"))
+_Particles = Annotated[dict[str, float], opt.items(_PARTICLES)]
 _OPTICS = ("absorption", "scattering", "extinction", "albedo", "mean_cosine", "backscatter_fraction")
 
 
@@ -397,7 +382,7 @@ def water(
     chlorophyll: float = 0.0,
     temperature: float = 20.0,
     salinity: float = 35.0,
-    particles: str | None = None,
+    particles: _Particles | None = None,
     water: bool = True,
     out: Path | None = None,
     matrix: Path | None = None,
@@ -434,23 +419,20 @@ def water(
       spadwarp water 532 --particles index=1.1,concentration=1,slope=4,smallest=0.1um,largest=50um
     """
     check_outputs(files={"--out": out, "--matrix": matrix})
+    surroundings = {"temperature": temperature, "salinity": salinity}
     if particles is None:
         opt.refuse("needs --particles", "--out", "--matrix", "--water")
-        asked = {"chlorophyll": chlorophyll, "temperature": temperature, "salinity": salinity}
-        _water(wavelength_nm, asked)
+        pure = spadwarp.water.water_optics(wavelength_nm, chlorophyll=chlorophyll, **surroundings)
+        facts = {"chlorophyll": chlorophyll, **surroundings, **dataclasses.asdict(pure)}
+        answer({**facts, "extinction": pure.extinction})
         return
     opt.refuse("cannot be combined with --particles", "--chlorophyll")
     for option, field, file in (("--out", "phase_table", out), ("--matrix", "matrix_table", matrix)):
         if file is not None and file.suffix.lower() != ".csv":
-            raise typer.BadParameter(f"{file} does not end in .csv, as medium.{field} must", param_hint=option)
-    names = {"small", "large", "index", "absorbing", "concentration", "slope", "deviation"}
-    readers: dict[str, Callable[[str], float]] = dict.fromkeys(sorted(names), opt.real_number)
-    readers |= dict.fromkeys(("smallest", "largest", "median", "diameter"), opt.from_unit("m"))
-    values = opt.items(particles, readers, "--particles")
-    if matrix is not None and "index" not in values:
-        raise typer.BadParameter("is by Mie's theory: Kopelevich's components have no matrix", param_hint="--matrix")
-    surroundings = {"temperature": temperature, "salinity": salinity}
-    parts, text = _particles(wavelength_nm, values, surroundings)
+            wrong(f"{file} does not end in .csv, as medium.{field} must", option)
+    if matrix is not None and "index" not in particles:
+        wrong("is by Mie's theory: Kopelevich's components have no matrix", "--matrix")
+    parts, text = _particles(wavelength_nm, particles, surroundings)
     whole = spadwarp.water.mixture([parts], water=water, **surroundings)
     optics = {name: getattr(whole, name) for name in _OPTICS}
     say(readable({"particles": text, **optics, "attenuation_length": 1.0 / whole.extinction}))
@@ -469,18 +451,13 @@ def water(
     write_json({"wavelength_nm": wavelength_nm, **optics, "water": water, "file": out, "matrix_file": matrix})
 
 
-def _water(wavelength_nm: float, asked: dict[str, float]) -> None:
-    optics = spadwarp.water.water_optics(wavelength_nm, **asked)
-    answer({**asked, **dataclasses.asdict(optics), "extinction": optics.extinction})
-
-
 def _particles(
     wavelength_nm: float, values: dict[str, float], surroundings: dict[str, float]
 ) -> tuple[ParticleOptics, str]:
     """The particles of --particles, and what they are in words."""
 
     def refuse(text: str) -> NoReturn:
-        raise typer.BadParameter(text, param_hint="--particles")
+        wrong(text, "--particles")
 
     by_mie, kopelevich = "index" in values, [name for name in _KOPELEVICH if name in values]
     if by_mie == bool(kopelevich):

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import glob
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import fail, running, say
+from spadwarp.cli.app import fail, running, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, write_json
-from spadwarp.cli.text import in_bytes, progress, readable, rows
+from spadwarp.cli.outputs import answer, check_outputs, in_bytes, progress, readable, rows, write_json
 
 
 @command(without=("quiet",))
@@ -42,28 +40,37 @@ def info(path: Path, *, verify: bool = False) -> None:
         if wrong:
             fail("\n".join(wrong) + "\n`spadwarp dataset` makes them again")
         say(f"{path}: complete")
-        return
-    if path.suffix.lower() in spadwarp.io.MESH_ENDINGS:
+    elif _is_mesh(path):
         mesh = spadwarp.mesh.describe_mesh(path)
         answer({"kind": "mesh", **dataclasses.asdict(mesh), "hints": mesh.hints})
     elif (path / "recipe.toml").is_file():
         manifest = spadwarp.dataset.read_manifest(path)
         size = sum(one["bytes"] for one in manifest["files"].values())
-        say(readable({"kind": "dataset", "bytes": size, **{**manifest, "files": len(manifest["files"])}}))
-        write_json({"kind": "dataset", **manifest})
+        shown = {"kind": "dataset", "bytes": size, **{**manifest, "files": len(manifest["files"])}}
+        answer({"kind": "dataset", **manifest}, shown=shown)
     else:
-        held = spadwarp.load(path)
-        summary = spadwarp.files.summary(held)
-        if isinstance(held, spadwarp.Result):
-            say(readable({"energy_balance": _energy_balance(summary["energy_balance"])}))
-        answer(summary, hide=("energy_balance",))
+        summary = spadwarp.files.summary(spadwarp.load(path))
+        shown = dict(summary)
+        if (balance := shown.pop("energy_balance", None)) is not None:  # where the emitted light went
+            verdict = "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"
+            parts = {**balance["fractions"], "sum": sum(balance["fractions"].values())}
+            fractions = {name: f"{100 * part:10.6f} %" for name, part in parts.items() if part or name == "sum"}
+            say(readable({"energy_balance": {"verdict": verdict, **fractions}}))
+        answer(summary, shown=shown)
 
 
-def _energy_balance(balance: Mapping[str, Any]) -> dict[str, str]:
-    """Where the emitted light went."""
-    verdict = "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"
-    fractions = {name: f"{100 * part:10.6f} %" for name, part in balance["fractions"].items() if part}
-    return {"verdict": verdict, **fractions, "sum": f"{100 * sum(balance['fractions'].values()):10.6f} %"}
+def _is_mesh(path: Path) -> bool:
+    return path.suffix.lower() in spadwarp.io.MESH_ENDINGS
+
+
+# Options of `view` by what is drawn.
+_DRAWN = {
+    "page": ("--method", "--frame", "--channel"),
+    "video": ("--frame", "--window", "--pictures", "--fps", "--linear"),
+    "picture": ("--pictures", "--split"),
+    "picture of a mesh": (),
+}
+_Window = Annotated[tuple[float, float], opt.from_to("ns")]
 
 
 @command(without=("json",))
@@ -74,7 +81,7 @@ def view(
     method: opt.Method | None = None,
     frame: int | None = None,
     channel: opt.Channel = "I",
-    window: str | None = None,
+    window: _Window | None = None,
     pictures: int | None = None,
     fps: float | None = None,
     linear: bool = False,
@@ -111,49 +118,52 @@ def view(
       spadwarp view data/small/ --out sheet.png
       spadwarp view bust.stl --out bust.png
     """
-    is_mesh = path.suffix.lower() in spadwarp.io.MESH_ENDINGS
-    target = out or Path(f"{path.stem}.png" if is_mesh else "view.html")
-    ending = target.suffix.lower()
-    kind = "video" if ending in (".gif", ".mp4") else "picture" if ending == ".png" else "page"
-    if is_mesh and kind != "picture":
-        raise typer.BadParameter(f"{target} does not end in .png: {path} is a mesh", param_hint="--out")
-    used = {
-        "page": ("--method", "--frame", "--channel"),
-        "video": ("--frame", "--window", "--pictures", "--fps", "--linear"),
-        "picture": () if is_mesh else ("--pictures", "--split"),
-    }[kind]
-    options = ("--method", "--frame", "--channel", "--window", "--pictures", "--fps", "--linear", "--split")
-    opt.refuse(f"is not for a {kind} ({target})", *(one for one in options if one not in used))
-    times = None if window is None else opt.from_to(window, "ns", "--window")
-    if kind == "picture" and not is_mesh:
+    target = out or Path(f"{path.stem}.png" if _is_mesh(path) else "view.html")
+    kind = {".gif": "video", ".mp4": "video", ".png": "picture"}.get(target.suffix.lower(), "page")
+    if _is_mesh(path):
+        if kind != "picture":
+            wrong(f"{target} does not end in .png: {path} is a mesh", "--out")
+        kind = "picture of a mesh"
+    others = {option for options in _DRAWN.values() for option in options} - {*_DRAWN[kind]}
+    opt.refuse(f"is not for a {kind} ({target})", *sorted(others))
+    if kind == "picture":
         spadwarp.dataset.read_manifest(path)  # before a folder is made for the picture
     check_outputs(files={"--out": target}, inputs=(path,))
-    if is_mesh:
+    if kind == "picture of a mesh":
         written = spadwarp.viz.draw_mesh(spadwarp.mesh.describe_mesh(path), target, device=device)
     elif kind == "picture":
         written = spadwarp.viz.draw_dataset(path, target, **opt.given(split=split, frames=pictures))
     elif kind == "video":
-        scale: Literal["log", "linear"] = "linear" if linear else "log"
         more = opt.given(pictures=pictures, fps=fps, frame=frame)
-        written = spadwarp.viz.video(path, target, window_ns=times, scale=scale, **more)
+        written = spadwarp.viz.video(path, target, window_ns=window, scale="linear" if linear else "log", **more)
     else:
         written = spadwarp.viz.view(path, target, method=method, frame=frame or 0, channel=channel, device=device)
     say(f"written: {written} ({in_bytes(written.stat().st_size)})")
 
 
-# Formats in the order of writing: those that not every source has go first, so that nothing is written where one is
-# refused.
-_FORMATS = ("fusion", "ptu", "mat", "npy", "exr", "xml")
-Format = Literal["npy", "mat", "ptu", "exr", "xml", "fusion", "parquet", "webdataset", "zarr"]
+def _frames(text: str) -> int | slice:
+    first, colon, stop = text.partition(":")
+    numbers = [int(one) if one else None for one in (first, stop) if not one or one.isdecimal()]
+    if len(numbers) != 2 or (not colon and not first):
+        raise typer.BadParameter(f"{text!r} is not of the form N or A:B")
+    return slice(*numbers) if colon else int(first)
+
+
+# Formats of frames in the order of writing: those that not every source has go first, so that nothing is written where
+# one is refused. The files of each in a folder, as patterns.
+_FORMATS: dict[str, tuple[str, ...]] = {"fusion": ("{}.txt", "intensity/{}-[0-9]*.mat", "spad/{}-[0-9]*_p1.mat")}
+_FORMATS |= {one: (f"{{}}.{one}", f"{{}}-[0-9]*.{one}") for one in ("ptu", "mat", "npy", "exr", "xml")}
+_Format = Literal["npy", "mat", "ptu", "exr", "xml", "fusion", "parquet", "webdataset", "zarr"]
+_Frames = Annotated[int | slice, _frames]
 
 
 @command()
 def export(
     path: Path,
     *,
-    format: list[Format],
+    format: list[_Format],
     out: Path,
-    frames: str | None = None,
+    frames: _Frames | None = None,
     split: str = "all",
     factor: int = 8,
     channel: opt.Channel = "I",
@@ -203,62 +213,37 @@ def export(
     """
     if whole := [one for one in format if one not in _FORMATS]:
         if len(set(format)) > 1:
-            raise typer.BadParameter(f"{whole[0]} cannot be combined with other formats", param_hint="--format")
+            wrong(f"{whole[0]} cannot be combined with other formats", "--format")
         _export_dataset(path, whole[0], out, field, frames_per_file)
         return
     opt.refuse("is for parquet, webdataset and zarr", "--field", "--frames-per-file")
     source = spadwarp.files.locate(path)
-    chosen = _frames(frames)
     stem = source.resolve().stem
-    check_outputs(
-        out,
-        [name for one in dict.fromkeys(format) for name in _names(stem, one)],
-        inputs=(source,),
-        beside=True,
-        needed=source.stat().st_size if source.is_file() else 0,
-    )
-    written: dict[str, list[Path]] = {}
-    for one in sorted(set(format), key=_FORMATS.index):
-        options: dict[str, Any] = {"frames": chosen, "split": split}
+    names = [name.format(glob.escape(stem)) for one in set(format) for name in _FORMATS[one]]
+    needed = source.stat().st_size if source.is_file() else 0
+    check_outputs(out, names, inputs=(source,), beside=True, needed=needed)
+    lines: dict[str, str] = {}
+    files: list[Path] = []
+    for one in sorted(set(format), key=[*_FORMATS].index):
+        options: dict[str, Any] = {"frames": frames, "split": split}
         if one == "fusion":
-            written[one] = spadwarp.files.export_sensor_fusion(source, out, stem=stem, factor=factor, **options)
+            paths = spadwarp.files.export_sensor_fusion(source, out, stem=stem, factor=factor, **options)
         else:
-            written[one] = spadwarp.export(source, out / f"{stem}.{one}", channel=channel, **options)
-    lines = {}
-    for name, paths in written.items():
-        more = f" to {paths[-1].name} ({len(paths)} files)" if len(paths) > 1 else ""
-        lines[name] = f"{paths[0]}{more}"
+            paths = spadwarp.export(source, out / f"{stem}.{one}", channel=channel, **options)
+        lines[one] = f"{paths[0]}" + (f" to {paths[-1].name} ({len(paths)} files)" if len(paths) > 1 else "")
+        files += paths
     say(rows(lines))
-    write_json({"files": [path for paths in written.values() for path in paths]})
+    write_json({"files": files})
 
 
 def _export_dataset(folder: Path, format: str, out: Path, fields: list[str] | None, frames_per_file: int) -> None:
     check_outputs(inputs=(folder,))
     if out.resolve() == folder.resolve() or out.resolve() in folder.resolve().parents:
-        raise typer.BadParameter(f"{out} holds the dataset", param_hint="--out")
+        wrong(f"{out} holds the dataset", "--out")
     if out.exists() and not running.overwrite and not (out.is_dir() and not any(out.iterdir())):
-        raise typer.BadParameter(f"{out} exists; --overwrite replaces it", param_hint="--out")
+        wrong(f"{out} exists; --overwrite replaces it", "--out")
     options: dict[str, Any] = {"fields": fields, "frames_per_file": frames_per_file, "overwrite": running.overwrite}
-    with progress("frames") as report:
-        spadwarp.dataset.export_dataset(folder, out, format, progress=report, **options)
+    spadwarp.dataset.export_dataset(folder, out, format, progress=progress("frames"), **options)
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     say(rows({"written": f"{out}, {in_bytes(size)}"}))
     write_json({"folder": out, "bytes": size})
-
-
-def _names(stem: str, one: str) -> list[str]:
-    """Names of the files of a format, as patterns."""
-    stem = glob.escape(stem)
-    if one == "fusion":
-        return [f"{stem}.txt", f"intensity/{stem}-[0-9]*.mat", f"spad/{stem}-[0-9]*_p1.mat"]
-    return [f"{stem}.{one}", f"{stem}-[0-9]*.{one}"]
-
-
-def _frames(text: str | None) -> int | slice | None:
-    if text is None:
-        return None
-    first, colon, stop = text.partition(":")
-    numbers = [int(one) if one else None for one in (first, stop) if not one or one.isdecimal()]
-    if len(numbers) != 2 or (not colon and not first):
-        raise typer.BadParameter(f"{text!r} is not of the form N or A:B", param_hint="--frames")
-    return slice(*numbers) if colon else int(first)

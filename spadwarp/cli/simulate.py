@@ -5,28 +5,21 @@ from __future__ import annotations
 import importlib
 import math
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import typer
+from typing import TYPE_CHECKING, Annotated, Any
 
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import INTERRUPTED, complain, fail, running, say
+from spadwarp.cli.app import INTERRUPTED, complain, fail, note, running, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, write_json
-from spadwarp.cli.text import count, progress, readable, rows, written
+from spadwarp.cli.outputs import answer, check_outputs, count, progress
 from spadwarp.errors import ArgumentError, ConfigError, address_space
-from spadwarp.limits import parse_number
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
-    from spadwarp import Ray, Result, Scene
+    from spadwarp import Result, Scene
     from spadwarp.analytic import AnalyticResult
-    from spadwarp.cli.text import Report
+    from spadwarp.cli.outputs import Report
     from spadwarp.files import RunFiles
 
 
@@ -50,7 +43,7 @@ def simulate(
     resume: Path | None = None,
     checkpoint: float = 60.0,
     first_photon: int = 0,
-    shard: str | None = None,
+    shard: opt.Part | None = None,
     trajectory: Path | None = None,
     frame_rate: float | None = None,
     method: opt.Method = "matched",
@@ -104,16 +97,12 @@ def simulate(
       spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --shard 3/64 --out part3/
       spadwarp simulate staircase_5m --trajectory poses.csv --frame-rate 10 --out moving/
     """
-    if trajectory is not None:
+    if trajectory is None:
+        opt.refuse("needs --trajectory", "--frame-rate", "--method", "--tags")
+    else:
         text = "cannot be combined with --trajectory"
         opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
         opt.refuse(text, "--records", "--uncertainty", "--relative-error", "--derivatives")
-        if scene is None or out is None:
-            raise _missing(scene)
-        drawn = {"frame_rate": frame_rate, "photons": photons, "seed": seed, "methods": (method,), "tags": tags}
-        _simulate_moving(scene, trajectory, out, opt.read_scene(scene, overrides, mesh=mesh), device=devices, **drawn)
-        return
-    opt.refuse("needs --trajectory", "--frame-rate", "--method", "--tags")
     earlier = None
     if resume is not None:
         text = "cannot be combined with --resume: the run has it"
@@ -121,61 +110,65 @@ def simulate(
         opt.refuse(text, "--first-photon", "--shard")
         out = resume if resume.is_dir() else resume.parent
         earlier = _earlier(resume, photons)
-        photons, read = None if photons is None else earlier.scene.transport.photons, earlier.scene
+        read = earlier.scene
+    elif scene is None or out is None:
+        hint, text = ("--out", "a directory, --out out/") if scene else ("SCENE", "a scene file, or --resume DIR")
+        wrong(f"is missing; give {text}", hint)
+    elif trajectory is not None:
+        drawn = {"frame_rate": frame_rate, "photons": photons, "seed": seed, "methods": (method,), "tags": tags}
+        _simulate_moving(scene, trajectory, out, opt.read_scene(scene, overrides, mesh=mesh), device=devices, **drawn)
+        return
     else:
-        if scene is None or out is None:
-            raise _missing(scene)
         read = opt.read_scene(scene, overrides, mesh=mesh, photons=photons, seed=seed)
-        photons = None
-    if records:
-        _check_records(read, whole=not (first_photon or shard))
-    part, engine = opt.read_part(shard, "--shard"), opt.read_engine(ray, workers)
-    run = _prepared(devices, engine)
+    if records and (first_photon or shard):
+        wrong("needs all photons from photon 0 on", "--records")
+    if records and read.transport.photons >= 2**31:
+        raise ConfigError(f"--records: photons = {read.transport.photons} is outside [1, {2**31 - 1}]")
+    engine = opt.read_engine(ray, workers)
+    if engine is None:
+        spadwarp.transport.prepare_kernels(devices)
     _warn(read, devices)
     batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
     names = _parameters(read, derivatives, earlier)
-    sizes: dict[str, Any] = {"batches": batches, "records": records, "checkpoint": checkpoint > 0}
-    needed = run.bytes_needed(read, derivatives=len(names), **sizes)
-    _check_run(out, resume=earlier is not None, inputs=(scene, *read.files), needed=needed)
-    pictures = _load_pictures(read)
-    with progress() as report:
-        result = spadwarp.simulate(
-            read,
-            photons=photons,
-            device=devices,
-            engine=engine,
-            progress=_joined_at_the_end(report, pictures),
-            uncertainty=uncertainty,
-            relative_error=relative_error,
-            derivatives=names,
-            run=spadwarp.RunOptions(
-                threads=threads,
-                first_photon=first_photon,
-                shard=part,
-                resume=earlier,
-                checkpoint=out / run.CHECKPOINT if checkpoint > 0 else None,
-                checkpoint_every=checkpoint,
-            ),
-        )
+    _prepare_directory(
+        out, read, earlier, scene, derivatives=len(names), batches=batches, records=records, checkpoint=checkpoint > 0
+    )
+    result = spadwarp.simulate(
+        read,
+        photons=None if earlier is None or photons is None else read.transport.photons,
+        device=devices,
+        engine=engine,
+        progress=_while_pictures_load(progress(), read),
+        uncertainty=uncertainty,
+        relative_error=relative_error,
+        derivatives=names,
+        run=spadwarp.RunOptions(
+            threads=threads,
+            first_photon=first_photon,
+            shard=shard,
+            resume=earlier,
+            checkpoint=out / spadwarp.files.CHECKPOINT if checkpoint > 0 else None,
+            checkpoint_every=checkpoint,
+        ),
+    )
     device = opt.one_device(devices, engine)
-    files = run.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
+    files = spadwarp.files.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
     if records and not result.partial:
-        files.written.append(_write_records(read, result.photons, out, device=device))
-    say(readable(_brief(result, files)) + f"\nwritten: {written(files.written)}")
-    error = result.relative_error if _has_errors(result) else None
-    write_json({**result.summary(), "relative_error": error, "files": files.written})
+        note("the photons are traced again for their records")
+        traced = spadwarp.transport.trace(read, photons=result.photons, device=device, progress=progress())
+        files.written.append(spadwarp.transport.save_records(traced, out / "records.h5", scene=read))
+    shown = _brief(result, files)
+    error = shown.get("relative_error")
+    answer({**result.summary(), "relative_error": error, "files": files.written}, shown=shown)
     if result.partial:
-        _fail_as_interrupted(result, records)
+        done = f"{count(result.photons)} of {count(result.requested[1] - result.requested[0])} photons"
+        without = "; no records were written" if records else ""
+        fail(f"interrupted after {done}, which are written and marked partial{without}", INTERRUPTED)
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
         late = result.photons < read.transport.photons
         why = "since rare heavy photons arrived late" if late else "after all photons"
         complain(f"warning: the error {reached} {why}, not {100 * relative_error:.3g} %; --resume {out} adds photons")
-
-
-def _missing(scene_path: Path | None) -> typer.BadParameter:
-    hint, text = ("--out", "a directory, --out out/") if scene_path else ("SCENE", "a scene file, or --resume DIR")
-    return typer.BadParameter(f"is missing; give {text}", param_hint=hint)
 
 
 def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tuple[str, ...]:
@@ -188,7 +181,7 @@ def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tupl
         plain.append(name)
         if counts:
             if not all(count.isdecimal() for count in counts):
-                raise typer.BadParameter(f"{text!r} is not of the form NAME:NX:NY:NZ", param_hint="--derivatives")
+                wrong(f"{text!r} is not of the form NAME:NX:NY:NZ", "--derivatives")
             blocks = [int(count) for count in counts]
     return spadwarp.transport.resolve_derivatives(scene, plain, blocks)
 
@@ -217,110 +210,69 @@ def _earlier(place: Path, photons: int | None) -> Result:
     return replace(earlier, scene=earlier.scene.with_overrides(transport={"photons": photons}))
 
 
-def _check_records(scene: Scene, *, whole: bool) -> None:
-    if not whole:
-        raise typer.BadParameter("needs all photons from photon 0 on", param_hint="--records")
-    if scene.transport.photons >= 2**31:
-        raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
-
-
-def _check_run(out: Path, *, resume: bool, **options: Any) -> None:
+def _prepare_directory(out: Path, scene: Scene, earlier: Result | None, source: Path | None, **kept: Any) -> None:
     """Makes the directory; refuses one that holds another run, or a part of one."""
-    from spadwarp.files import CHECKPOINT, RUN_FILES, remove_checkpoint
-
-    if (out / CHECKPOINT).exists() and not (resume or running.overwrite):
+    files, resume = spadwarp.files, earlier is not None
+    if (out / files.CHECKPOINT).exists() and not (resume or running.overwrite):
         problem = f"{out} has a run that was not finished; --resume {out} resumes it, --overwrite replaces it"
-        raise typer.BadParameter(problem, param_hint="--out")
-    check_outputs(out, RUN_FILES, resume=resume, **options)
+        wrong(problem, "--out")
+    needed = files.bytes_needed(scene, **kept)
+    check_outputs(out, files.RUN_FILES, resume=resume, inputs=(source, *scene.files), needed=needed)
     if not resume:
-        remove_checkpoint(out)
+        files.remove_checkpoint(out)
 
 
-def _prepared(device: str | None, engine: Ray | None) -> ModuleType:
-    """Begins to prepare the compiler of kernels; returns the package `spadwarp.files`, which is loaded meanwhile."""
-    if engine is None:
-        spadwarp.transport.prepare_kernels(device)
-    return importlib.import_module("spadwarp.files")
+def _while_pictures_load(report: Report | None, scene: Scene) -> Report | None:
+    """Loads what draws the pictures in the end while kernels are loaded and photons traced; not before, since it would
+    hold up this thread.
 
-
-def _load_pictures(scene: Scene) -> threading.Thread | None:
-    """Begins to load what draws the pictures at the end: while kernels are loaded and photons traced, not before, since
-    it would hold up this thread."""
+    The progress waits for it when all photons are traced: while Matplotlib is loaded, it takes the warnings of every
+    thread for its own, those about the result too.
+    """
     if not (scene.output.png or scene.output.pdf) or address_space() is not None:
-        return None
-    thread = threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True)
-    thread.start()
-    return thread
-
-
-def _joined_at_the_end(report: Report | None, pictures: threading.Thread | None) -> Report | None:
-    """Progress that waits, when all photons are traced, for what is loaded meanwhile: while Matplotlib is loaded, it
-    takes the warnings of every thread for its own, those about the result too."""
-    if pictures is None:
         return report
+    loading = threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True)
+    loading.start()
 
     def reported(stage: str, done: int, total: int) -> None:
         if report is not None:
             report(stage, done, total)
         if total and done >= total:
-            pictures.join()
+            loading.join()
 
     return reported
-
-
-def _has_errors(result: Result) -> bool:
-    return result.second_moment is not None and result.photons >= 2 * result.batch_size
-
-
-def _write_records(scene: Scene, photons: int, out: Path, *, device: str | None) -> Path:
-    from spadwarp.transport import save_records
-
-    if not running.quiet:
-        complain("the photons are traced again for their records")
-    with progress() as report:
-        records = spadwarp.transport.trace(scene, photons=photons, device=device, progress=report)
-    return save_records(records, out / "records.h5", scene=scene)
-
-
-def _fail_as_interrupted(result: Result, records: bool) -> None:
-    start, stop = result.requested
-    left_out = "; no records were written" if records else ""
-    fail(
-        f"interrupted after {count(result.photons)} of {count(stop - start)} photons, "
-        f"which are written and marked partial{left_out}",
-        INTERRUPTED,
-    )
 
 
 def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
     """A run in a few numbers."""
     import numpy as np
 
-    summary, truth, frame = result.summary(), result.truth.depth, files.depth
+    summary, frame = result.summary(), files.depth
     seconds, balance = result.timing.get("trace", 0.0), summary["energy_balance"]
-    error = np.abs(frame - truth)[np.isfinite(frame) & np.isfinite(truth)]
-    returned = frame[np.isfinite(frame)]
-    return {
+    error = np.abs(frame - result.truth.depth)
+    error, returned = error[np.isfinite(error)], frame[np.isfinite(frame)]
+    device = f"{result.provenance.get('device', 'unknown')}, {seconds:.3g} s"
+    found = {
         "photons": result.photons,
         "seed": result.seed,
-        "device": f"{result.provenance.get('device', 'unknown')}, {seconds:.3g} s"
-        + (f", {result.photons / seconds:.3g} photons/s" if seconds > 0 else ""),
+        "device": f"{device}, {result.photons / seconds:.3g} photons/s" if seconds > 0 else device,
         "collected_fraction": summary["collected_fraction"],
         "detections_per_pulse": summary["detections_per_pulse"],
         "depth_m": [float(returned.min()), float(returned.max())] if returned.size else None,
         "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
-        **({"derivatives": summary["derivatives"]} if result.derivatives else {}),
-        **({"relative_error": result.relative_error} if _has_errors(result) else {}),
-        "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS",
     }
+    if result.derivatives:
+        found["derivatives"] = summary["derivatives"]
+    if result.second_moment is not None and result.photons >= 2 * result.batch_size:
+        found["relative_error"] = result.relative_error
+    return {**found, "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"}
 
 
 def _simulate_moving(path: Path, trajectory: Path, out: Path, scene: Scene, **options: Any) -> None:
     """Simulates the frames of a scene that moves, and shows them."""
     names = ("sequence.h5", "sequence.gif")
     check_outputs(out, names, inputs=(path, trajectory, *scene.files))
-    with progress("frames") as report:
-        file = spadwarp.frames.simulate_sequence(scene, trajectory, out / names[0], progress=report, **options)
+    file = spadwarp.frames.simulate_sequence(scene, trajectory, out / names[0], progress=progress("frames"), **options)
     picture = spadwarp.viz.video(file, out / names[1])
     answer({**spadwarp.files.summary(file), "files": [file.path, picture]})
 
@@ -340,16 +292,20 @@ def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
       spadwarp simulate configs/scenes/plane_5m.toml --photons 1e8 --first-photon 1e8 --out b/
       spadwarp merge a/ b/ --out ab/
     """
-    from spadwarp.files import RUN_FILES, bytes_needed, write_run
-
+    files = spadwarp.files
     result = spadwarp.merge(opt.load_run(place) for place in runs)
-    needed = bytes_needed(result.scene, batches=result.batch_size > 0, derivatives=len(result.derivatives))
-    check_outputs(out, RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
-    files = write_run(result, out, device=device)
-    ids = ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges)
-    say(rows({"photon ids": ids}))
-    say(readable(_brief(result, files)) + f"\nwritten: {written(files.written)}")
-    write_json({**result.summary(), "photon_ranges": result.photon_ranges, "files": files.written})
+    needed = files.bytes_needed(result.scene, batches=result.batch_size > 0, derivatives=len(result.derivatives))
+    check_outputs(out, files.RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
+    made = files.write_run(result, out, device=device)
+    say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))
+    summary = {**result.summary(), "photon_ranges": result.photon_ranges, "files": made.written}
+    answer(summary, shown=_brief(result, made))
+
+
+# Of --rendered: arguments of `spadwarp.result.load_truth_exr`.
+_IMAGES = {"depth": Path, "depth_channel": str, "depth_scale": opt.real_number, "radial": bool, "normal": Path}
+_IMAGES |= {"albedo": opt.number_or(), "albedo_channel": str, "preset": str}
+_Images = Annotated[dict[str, Any], opt.items(_IMAGES)]
 
 
 @command()
@@ -360,7 +316,7 @@ def analytic(
     frames: int = 1,
     seed: int = 0,
     overrides: list[str] | None = None,
-    rendered: list[str] | None = None,
+    rendered: _Images | None = None,
     profile: Path | None = None,
     device: str | None = None,
 ) -> None:
@@ -383,21 +339,17 @@ def analytic(
       spadwarp analytic scene.toml --out cat/ \\
           --rendered depth=cat_RGBD.EXR,depth_channel=A,normal=cat_Surf_Norm.EXR,albedo=cat_Base_Col.EXR
     """
-    read = opt.read_scene(scene, overrides)
-    maps = opt.items(rendered, _RENDERED, "--rendered")
+    read, maps = opt.read_scene(scene, overrides), rendered or {}
     if maps and "depth" not in maps:
-        raise typer.BadParameter(f"{', '.join(maps)} needs depth=EXR", param_hint="--rendered")
+        wrong(f"{', '.join(maps)} needs depth=EXR", "--rendered")
+    if isinstance(albedo := maps.get("albedo"), str):
+        maps["albedo"] = Path(albedo)
     if profile is not None and read.analytic.backscatter != "monte_carlo":
-        raise typer.BadParameter(
-            f"needs --set analytic.backscatter=monte_carlo; the scene's is {read.analytic.backscatter!r}",
-            param_hint="--profile",
-        )
-    check_outputs(
-        out,
-        ("analytic.h5", "analytic.png"),
-        inputs=(scene, *read.files, *(value for value in maps.values() if isinstance(value, Path)), profile),
-        needed=(5 * max(frames, 0) + 200) * read.camera.width * read.camera.height + (16 << 20),
-    )
+        text = f"needs --set analytic.backscatter=monte_carlo; the scene's is {read.analytic.backscatter!r}"
+        wrong(text, "--profile")
+    inputs = [scene, *read.files, *(value for value in maps.values() if isinstance(value, Path)), profile]
+    needed = (5 * max(frames, 0) + 200) * read.camera.width * read.camera.height + (16 << 20)
+    check_outputs(out, ("analytic.h5", "analytic.png"), inputs=inputs, needed=needed)
     if frames < 0:
         raise ArgumentError(f"frames = {frames} is outside [0, inf)")
     result = spadwarp.simulate_analytic(
@@ -411,46 +363,23 @@ def analytic(
     files = [result.save(out / "analytic.h5", frames=frames, device=device)]
     files.append(spadwarp.viz.draw_analytic(result, out / "analytic.png"))
     notes = spadwarp.analytic.model_notes(read)
-    answer({"frames": frames, "seed": seed, **_medians(result), "notes": notes, "files": files})
+    answer({"frames": frames, "seed": seed, **_typical(result), "notes": notes, "files": files})
 
 
-def _number_or_path(text: str) -> Path | float:
-    try:
-        return parse_number(text)
-    except ValueError:
-        return Path(text)
+_MEDIANS = ("signal", "backscatter", "alpha", "signal_to_backscatter", "sigma_time", "sigma_depth")
+_MEANS = ("outlier_probability", "background_probability")
 
 
-# Arguments of `spadwarp.result.load_truth_exr`.
-_RENDERED: dict[str, Callable[[str], Any]] = {
-    "depth": Path,
-    "depth_channel": str,
-    "depth_scale": opt.real_number,
-    "radial": bool,
-    "normal": Path,
-    "albedo": _number_or_path,
-    "albedo_channel": str,
-    "preset": str,
-}
-
-
-def _medians(result: AnalyticResult) -> dict[str, Any]:
+def _typical(result: AnalyticResult) -> dict[str, Any]:
+    """Numbers of pixels, and medians or means of those with an estimate."""
     import numpy as np
 
-    def median(values: Any) -> float:
-        return float(np.median(values[there])) if there.any() else math.nan
-
-    there = result.fisher > 0
-    return {
-        "pixels": int(there.size),
+    known = result.fisher > 0
+    found: dict[str, Any] = {
+        "pixels": int(known.size),
         "pixels_with_target": int(np.isfinite(result.truth.depth).sum()),
-        "pixels_with_estimate": int(there.sum()),
-        "signal": median(result.signal),
-        "backscatter": median(result.backscatter),
-        "alpha": median(result.alpha),
-        "signal_to_backscatter": median(result.signal_to_backscatter),
-        "sigma_time": median(result.sigma_time),
-        "sigma_depth": median(result.sigma_depth),
-        "outlier_probability": float(result.outlier_probability[there].mean()) if there.any() else math.nan,
-        "background_probability": float(result.background_probability[there].mean()) if there.any() else math.nan,
+        "pixels_with_estimate": int(known.sum()),
     }
+    for names, average in ((_MEDIANS, np.median), (_MEANS, np.mean)):
+        found |= {name: float(average(getattr(result, name)[known])) if known.any() else math.nan for name in names}
+    return found

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import itertools
 from pathlib import Path
 from typing import Any, Literal
 
-import typer
-
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import complain, fail, running, say
+from spadwarp.cli.app import fail, note, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import check_outputs, write_json
-from spadwarp.cli.text import count, rows
+from spadwarp.cli.outputs import check_outputs, count, rows, write_json
 from spadwarp.limits import suggestion
-
-
-def _model(kind: str) -> Any:
-    if kind == "scene":
-        return spadwarp.Scene
-    return spadwarp.dataset.Recipe if kind == "dataset" else spadwarp.denoise.TrainingRecipe
 
 
 @command(without=("json",))
@@ -50,10 +41,13 @@ def init(
         opt.refuse("cannot be combined with --schema", "--example")
         path = Path(name or f"{schema}.schema.json")
         check_outputs(files={"NAME": path})
-        spadwarp.io.write_json(spadwarp.files.json_schema(_model(schema)), path)
+        if schema == "scene":
+            model: Any = spadwarp.Scene
+        else:
+            model = spadwarp.dataset.Recipe if schema == "dataset" else spadwarp.denoise.TrainingRecipe
+        spadwarp.io.write_json(spadwarp.files.json_schema(model), path)
         place = path if path.is_absolute() or path.parent.parts else f"./{path}"
-        say(f"written: {path}")
-        say("VS Code, once:\n  code --install-extension tamasfe.even-better-toml")
+        say(f"written: {path}\nVS Code, once:\n  code --install-extension tamasfe.even-better-toml")
         say(f"first line of a TOML file beside it, for VS Code and taplo:\n  #:schema {place}")
         return
     name = name or "scene"
@@ -65,16 +59,7 @@ def init(
     else:
         text = spadwarp.io.example_or_path(example, "scenes").read_text(encoding="utf-8")
     spadwarp.io.write_text(text, path)
-    say(f"written: {path}")
-    say(f"next: spadwarp check {path}; spadwarp plan {path}; spadwarp simulate {path} --out {out}")
-
-
-# Scenes and recipes that commands take by name.
-_EXAMPLES = {
-    "scenes": "spadwarp simulate NAME",
-    "datasets": "spadwarp dataset NAME",
-    "training": "spadwarp train NAME",
-}
+    say(f"written: {path}\nnext: spadwarp check {path}; spadwarp plan {path}; spadwarp simulate {path} --out {out}")
 
 
 @command(without=("quiet",), name="list")
@@ -127,57 +112,57 @@ def listed(
         _list_examples(kind, name)
 
 
+# Commands that take scenes and recipes by name.
+_USES = {"scenes": "spadwarp simulate NAME", "datasets": "spadwarp dataset NAME", "training": "spadwarp train NAME"}
+
+
 def _list_examples(kind: str | None, name: str | None) -> None:
-    known = {one: spadwarp.io.examples(one) for one in _EXAMPLES if kind in (None, one)}
+    known = {one: spadwarp.io.examples(one) for one in _USES if kind in (None, one)}
     if name is None:
         for one, paths in known.items():
-            say(f"{one}: {_EXAMPLES[one]}")
-            say(rows({path.stem: _heading(path.read_text(encoding="utf-8")) for path in paths.values()}, indent="  "))
+            headings = {path.stem: _heading(path.read_text(encoding="utf-8")) for path in paths.values()}
+            say(f"{one}: {_USES[one]}\n{rows(headings, indent='  ')}")
         write_json(known)
         return
     found = [paths[name] for paths in known.values() if name in paths]
     if not found:
         hint = suggestion(name, [one for paths in known.values() for one in paths])
-        raise typer.BadParameter(f"{name!r} is not one of `spadwarp list {kind}`{hint}", param_hint="NAME")
+        wrong(f"{name!r} is not one of `spadwarp list {kind}`{hint}", "NAME")
     for path in found:
         say(path.read_text(encoding="utf-8").rstrip())
 
 
 def _heading(text: str) -> str:
     """The first sentence of a file's comment."""
-    lines = []
-    for line in text.splitlines():
-        if not line.startswith("# ") or line.startswith("#   "):
-            break
-        lines.append(line[2:])
-    return " ".join(lines)
+    lines = text.splitlines()
+    first = itertools.takewhile(lambda line: line.startswith("# ") and not line.startswith("#   "), lines)
+    return " ".join(line[2:] for line in first)
 
 
 def _list_presets(section: str | None) -> None:
     everything = spadwarp.scene.presets()
     sections = list(dict.fromkeys(preset.section for preset in everything.values()))
     if section is not None and section not in sections:
-        raise typer.BadParameter(f"{section!r} is not one of {', '.join(sections)}", param_hint="NAME")
+        wrong(f"{section!r} is not one of {', '.join(sections)}", "NAME")
     chosen = [preset for preset in everything.values() if section in (None, preset.section)]
-    source = None
-    for preset in chosen:
-        if (preset.section, preset.source) != source:
-            say(f"{'' if source is None else chr(10)}[{preset.section}] {preset.source}")
-            source = (preset.section, preset.source)
-        shown = {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in preset.values.items()}
-        say(f"  {preset.name:<28}  " + ", ".join(f"{name} {value}" for name, value in shown.items()))
+    groups = itertools.groupby(chosen, lambda preset: f"[{preset.section}] {preset.source}")
+    for number, (source, presets) in enumerate(groups):
+        say("\n" * (number > 0) + source)
+        for preset in presets:
+            values = {name: f"{x:.5g}" if isinstance(x, float) else x for name, x in preset.values.items()}
+            say(f"  {preset.name:<28}  " + ", ".join(f"{name} {value}" for name, value in values.items()))
     write_json({"presets": [dataclasses.asdict(preset) for preset in chosen]})
 
 
 def _list_targets(out: Path | None, device: str | None) -> None:
     found = spadwarp.viz.describe_targets()
-    sheet = None if out is None else spadwarp.viz.draw_targets(out / "targets.png", device=device)
+    files = [] if out is None else [spadwarp.viz.draw_targets(out / "targets.png", device=device)]
     for one in found:
         extent = " x ".join(f"{side:.2f}" for side in one["extent"])
         say(f"{one['name']:<14}  {extent} m  {count(one['faces']):>7} faces")
-    if sheet is not None:
-        say(f"written: {sheet}")
-    write_json({"targets": found, "files": [] if sheet is None else [sheet]})
+    for path in files:
+        say(f"written: {path}")
+    write_json({"targets": found, "files": files})
 
 
 @command()
@@ -199,16 +184,14 @@ def doctor(*, device: str | None = None, self_test: bool = True) -> None:
       spadwarp doctor --device cpu --json report.json
     """
     check_outputs()
-    progress: Callable[[str], Any] | None = None if running.quiet else complain
-    found = spadwarp.doctor.diagnose(device=device, self_test=self_test, progress=progress)
+    found = spadwarp.doctor.diagnose(device=device, self_test=self_test, progress=note)
     for title, facts in found.facts.items():
         say(f"{title}\n{rows(facts, indent='  ')}")
     if found.gpu:
         say("No GPU is used\n" + "\n".join(f"  {reason}" for reason in found.gpu))
     if found.tests:
         took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in found.seconds.items())
-        say(f"Self-test ({took})")
-        say(rows({test.name: str(test) for test in found.tests}, indent="  "))
+        say(f"Self-test ({took})\n" + rows({test.name: str(test) for test in found.tests}, indent="  "))
     devices = spadwarp.device.devices()
     write_json({**dataclasses.asdict(found), "devices": devices, "healthy": found.healthy})
     if not found.healthy:

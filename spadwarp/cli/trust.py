@@ -8,18 +8,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
-from spadwarp.cli.app import complain, fail, running, say
+import spadwarp
+from spadwarp.cli.app import fail, note, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import check_outputs, write_json
-from spadwarp.cli.text import in_bytes, show_table
-from spadwarp.errors import FileError
+from spadwarp.cli.outputs import check_outputs, in_bytes, show_table, write_json
 from spadwarp.units import percent
 
 if TYPE_CHECKING:
-    from spadwarp.benchmark import BenchResult, Comparison
-    from spadwarp.validate import CaseResult
+    from spadwarp.benchmark import BenchResult
+
+
+def _announce(case: Any) -> None:
+    note(f"{case.name}: {case.summary}")
 
 
 @command()
@@ -47,23 +47,14 @@ def validate(
       spadwarp validate
       spadwarp validate slab cube60 --photons 1e7 --seed 1 --json report.json --plots plots/
     """
-    from spadwarp.validate import CASES, draw_results, report, run
-
-    check_outputs(plots, [f"{name}.png" for name in CASES], option="--plots")
-    announce = None if running.quiet else lambda case: complain(f"{case.name}: {case.summary}")
+    trust = spadwarp.validate
+    check_outputs(plots, [f"{name}.png" for name in trust.CASES], option="--plots")
     options: dict[str, Any] = {"photons": photons, "seed": seed}
-    results = run(cases or None, device=device, tabulated=tabulated, progress=announce, **options)
+    results = trust.run(cases or None, device=device, tabulated=tabulated, progress=_announce, **options)
     failed = [result for result in results if not result.passed]
-    write_json(report(results, **options))
-    drawn = [] if plots is None else draw_results(results, plots)
-    show_table(_case_table(results), keys=2)
-    say(f"{len(results) - len(failed)} of {len(results)} agree" + (f"; plots in {plots}" if drawn else ""))
-    if failed:
-        fail("\n".join(f"{one.name}: {one.quantity}: z = {one.z:.2f}" for one in failed))
-
-
-def _case_table(results: Sequence[CaseResult]) -> list[dict[str, Any]]:
-    return [
+    write_json(trust.report(results, **options))
+    drawn = [] if plots is None else trust.draw_results(results, plots)
+    table = (
         {
             "case": one.name,
             "quantity": one.quantity,
@@ -74,7 +65,11 @@ def _case_table(results: Sequence[CaseResult]) -> list[dict[str, Any]]:
             "": "ok" if one.passed else "FAILED",
         }
         for one in results
-    ]
+    )
+    show_table(table, keys=2)
+    say(f"{len(results) - len(failed)} of {len(results)} agree" + (f"; plots in {plots}" if drawn else ""))
+    if failed:
+        fail("\n".join(f"{one.name}: {one.quantity}: z = {one.z:.2f}" for one in failed))
 
 
 @command()
@@ -111,29 +106,25 @@ def bench(
       spadwarp bench --compare before.json after.json
       spadwarp bench scaling --device cpu
     """
-    from spadwarp.benchmark import history, load_report
-
-    stored = _stored_results(cases)
+    load = spadwarp.benchmark.load_report
+    files = [case for case in cases or () if case.endswith(".json")]  # one stands for results
+    if files and len(cases or ()) > 1:
+        wrong(f"{files[0]} cannot be combined with other cases and files", "CASE")
     before = None
     if compare is not None and compare.is_dir():
-        history(compare)  # one without reports is known before cases are measured
+        spadwarp.benchmark.history(compare)  # one without reports is known before cases are measured
     elif compare is not None:
-        before = load_report(compare)
-    check_outputs(inputs=(compare, stored))
-    if stored is not None:
-        summary = load_report(stored)
-    else:
-        summary = _measure(cases, device=device, photons=photons, repeats=repeats)
-    _say_report(summary)
+        before = load(compare)
+    check_outputs(inputs=(compare, *files))
+    measured = load(files[0]) if files else _measure(cases, device=device, photons=photons, repeats=repeats)
+    _show_report(measured)
     slower = []
-    if compare is not None:
-        try:
-            slower = _compare(summary, compare, before)
-        except FileError:  # no report of such a device: what was measured is kept
-            write_json(summary)
-            raise
-    write_json(summary)
-    checks = {row["case"]: row["check"] for row in summary["results"]}
+    try:
+        if compare is not None:
+            slower = _compare(measured, compare, before)
+    finally:  # also without a report of such a device: what was measured is kept
+        write_json(measured)
+    checks = {row["case"]: row["check"] for row in measured["results"]}
     missed = [case for case, check in checks.items() if check is not None and not check["passed"]]
     problems = [f"{', '.join(missed)}: a mean is not what it should be"] if missed else []
     problems += [f"{', '.join(slower)}: slower than in {compare}"] if slower else []
@@ -141,58 +132,63 @@ def bench(
         fail("\n".join(problems))
 
 
-def _stored_results(cases: Sequence[str] | None) -> Path | None:
-    """The file that stands for results, instead of names of cases."""
-    files = [case for case in cases or () if case.endswith(".json")]
-    if files and len(cases or ()) > 1:
-        raise typer.BadParameter(f"{files[0]} cannot be combined with other cases and files", param_hint="CASE")
-    return Path(files[0]) if files else None
-
-
 def _measure(cases: list[str] | None, **options: Any) -> dict[str, Any]:
     """Runs the cases."""
-    from spadwarp.benchmark import report, run
-
     results: list[BenchResult] = []
-    announce = None if running.quiet else lambda case: complain(f"{case.name}: {case.summary}")
     try:
-        run(cases or None, progress=announce, found=results.append, **options)
+        spadwarp.benchmark.run(cases or None, progress=_announce, found=results.append, **options)
     except BaseException:  # Ctrl-C and a device that is too small leave what was measured until then
         if results:
-            _say_report(report(results))
-            write_json(report(results))
+            report = spadwarp.benchmark.report(results)
+            _show_report(report)
+            write_json(report)
         raise
-    return report(results)
+    return spadwarp.benchmark.report(results)
 
 
 def _compare(summary: dict[str, Any], place: Path, before: dict[str, Any] | None) -> list[str]:
     """Adds the comparison to the summary; returns the cases that are slower."""
-    from spadwarp.benchmark import compare, load_report, newest_report
-
     if before is None:
         cases = [row["case"] for row in summary["results"]]
-        place = newest_report(place, like=summary["provenance"], cases=cases)
-        before = load_report(place)
-    found = compare(summary, before)
+        place = spadwarp.benchmark.newest_report(place, like=summary["provenance"], cases=cases)
+        before = spadwarp.benchmark.load_report(place)
+    found = spadwarp.benchmark.compare(summary, before)
     summary["comparison"] = [asdict(one) for one in found]
     made = before["provenance"]
     say(f"against {place}: {made['device_name']}, spadwarp {made['spadwarp']}, {made['date']}")
-    if found:
-        show_table(_comparison_table(found))
+
+    def rate(value: float, spread: float | None) -> str:
+        return f"{value:.3g} ± " + ("?" if spread is None else f"{percent(spread)} %")
+
+    table = [
+        {
+            "case": f"{one.case} [{one.unit}/s]",
+            "": one.verdict,
+            "before": rate(one.before, one.spread_before),
+            "now": rate(one.now, one.spread_now),
+            "ratio": f"{one.ratio:.3f}",
+            "99 % interval": "-" if one.interval is None else f"{one.interval[0]:.3f} to {one.interval[1]:.3f}",
+        }
+        for one in found
+    ]
+    if table:
+        show_table(table)
     else:
         say("no case is in both")
     return [one.case for one in found if one.verdict == "slower"]
 
 
-def _say_report(report: Mapping[str, Any]) -> None:
+def _show_report(report: Mapping[str, Any]) -> None:
     """A report as a table, and what follows from it."""
     table, made = [], report["provenance"]
     for result in report["results"]:
         unit, rate = next(iter(result["rates"].items()))
         memory = result["tally_bytes"] if result["memory"] is None else result["memory"]
         error = result["error_per_root_second"]
-        cells = {"case": result["case"], "faces": result["faces"] or "-", "setup [s]": result["setup"]}
-        cells |= {
+        cells = {
+            "case": result["case"],
+            "faces": result["faces"] or "-",
+            "setup [s]": result["setup"],
             "compile [s]": result["compile"],
             "run [s]": min(result["seconds"]),
             "per second": f"{rate:.3g} {unit}",
@@ -227,21 +223,3 @@ def _growth(results: Sequence[Mapping[str, Any]]) -> list[str]:
             line += f", {large['memory'] / small['memory']:.3g} times the memory"
         lines.append(line)
     return lines
-
-
-def _comparison_table(found: Sequence[Comparison]) -> list[dict[str, str]]:
-    return [
-        {
-            "case": f"{one.case} [{one.unit}/s]",
-            "": one.verdict,
-            "before": _with_spread(one.before, one.spread_before),
-            "now": _with_spread(one.now, one.spread_now),
-            "ratio": f"{one.ratio:.3f}",
-            "99 % interval": "-" if one.interval is None else f"{one.interval[0]:.3f} to {one.interval[1]:.3f}",
-        }
-        for one in found
-    ]
-
-
-def _with_spread(rate: float, spread: float | None) -> str:
-    return f"{rate:.3g} ± ?" if spread is None else f"{rate:.3g} ± {percent(spread)} %"

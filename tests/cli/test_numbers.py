@@ -7,7 +7,7 @@ import typer
 from helpers.cli import run
 from spadwarp.cli import app
 from spadwarp.cli.options import from_to
-from spadwarp.cli.text import show_table
+from spadwarp.cli.outputs import show_table
 
 
 def test_every_option_says_what_it_is():
@@ -54,7 +54,7 @@ def test_a_range_is_finite(text, scene):
     ],
 )
 def test_two_numbers_take_units(text, unit, values):
-    assert from_to(text, unit, "--range") == pytest.approx(values)
+    assert from_to(unit)(text) == pytest.approx(values)
 
 
 @pytest.mark.parametrize(
