@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 import spadwarp
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, in_words
@@ -73,9 +73,10 @@ class _Commands(TyperGroup):
         except Exception as error:
             if isinstance(error, OSError) and error.filename is None and sys.stdout is sys.__stdout__:
                 sys.stdout = io.StringIO()  # Python would else try to write to it again
+            text, code = _described(error)
             with suppress(OSError):
-                _complain_about(error)
-            sys.exit(_exit_code(error))
+                complain(text, "error")
+            sys.exit(code)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """A heading for each stage, and the whole first sentence of each command."""
@@ -98,18 +99,13 @@ class _Commands(TyperGroup):
                 fail(str(stop) or "interrupted; unfinished files were not written", INTERRUPTED)
 
 
-def _exit_code(error: Exception) -> int:
-    if isinstance(error, ConfigError | ArgumentError):
-        return WRONG_USE
-    return FAILED if isinstance(error, SpadwarpError) or in_words(error) is not None else BUG
-
-
-def _complain_about(error: Exception) -> None:
+def _described(error: Exception) -> tuple[str, int]:
+    """The error in words, and the exit code."""
     text = str(error) if isinstance(error, SpadwarpError) else in_words(error)
-    if text is None:
-        what = traceback.format_exception_only(error)[-1].strip()
-        text = f"spadwarp has a bug: {what[:300]}\nplease report it with {_kept(error)}"
-    complain("\n".join(f"error: {line}" for line in text.splitlines()))
+    if text is not None:
+        return text, WRONG_USE if isinstance(error, ConfigError | ArgumentError) else FAILED
+    what = traceback.format_exception_only(error)[-1].strip()
+    return f"spadwarp has a bug: {what[:300]}\nplease report it with {_kept(error)}", BUG
 
 
 def _kept(error: Exception) -> str:
@@ -130,7 +126,7 @@ def _kept(error: Exception) -> str:
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    complain(f"warning: {message}")
+    complain(str(message), "warning")
 
 
 def until_the_end(context: AbstractContextManager[Value]) -> Value:
@@ -150,9 +146,9 @@ def note(text: str) -> None:
         complain(text)
 
 
-def complain(text: str) -> None:
-    """Prints a warning or an error to stderr."""
-    typer.echo(text, err=True)
+def complain(text: str, kind: str = "") -> None:
+    """Prints to stderr, each line behind its kind: error, warning or note."""
+    typer.echo("\n".join(f"{kind}: {line}" for line in text.splitlines()) if kind else text, err=True)
 
 
 def wrong(text: str, option: str) -> NoReturn:
@@ -162,19 +158,8 @@ def wrong(text: str, option: str) -> NoReturn:
 
 def fail(text: str, code: int = FAILED) -> NoReturn:
     """Ends the command with an error."""
-    complain("\n".join(f"error: {line}" for line in text.splitlines()))
+    complain(text, "error")
     raise typer.Exit(code)
-
-
-class Command(TyperCommand):
-    """Complains of values in its own words."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        try:
-            return super().parse_args(ctx, args)
-        except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ").removesuffix(".")  # of the parser's own making
-            raise
 
 
 # Help in plain text: units in square brackets stay, and nothing is loaded to draw boxes.

@@ -46,9 +46,8 @@ def detect(
 ) -> None:
     """Frames of counts that the camera would record.
 
-    Writes frames.h5 (counts, depth frames of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set
-    takes fields of the detector and of daylight, and of the laser its energy or power, repetition_rate, pulse_fwhm_ps
-    and spectrum.
+    Writes frames.h5 (counts, depth of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set takes
+    fields of detector and daylight, and of the laser energy or power, repetition_rate, pulse_fwhm_ps and spectrum.
 
     Args:
         run (RUN): A result, or its directory.
@@ -62,8 +61,7 @@ def detect(
 
     \b
     Example:
-      spadwarp detect run1/result.h5 --pulses 20000 --frames 100 --seed 3 --out frames/
-      spadwarp detect run1/ --pulses 1e6 --out frames/ --coates --set detector.dark_count_rate=1e3
+      spadwarp detect run1/ --pulses 1e6 --frames 100 --out frames/ --set detector.dark_count_rate=1e3
     """
     recorded = _window(window)
     result = _with_detector(opt.load_run(run, channel), overrides)
@@ -87,7 +85,7 @@ def detect(
         progress=progress("frames"),
     )
     for text in (*recording.notes, *_bound_noise(recording, result.photons)):
-        complain(f"note: {text}")
+        complain(text, "note")
     files = [recording.path, spadwarp.viz.draw_recording(recording, result, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
@@ -171,9 +169,9 @@ def depth(
 ) -> None:
     """Depth from histograms, simulated or measured.
 
-    Writes depth.npy (all frames), depth.exr and depth.png (the first). Measured histograms are arrays of any order of
-    axes, sparse matrices, cells of time tags, or T3 records. Facts that the file lacks are asked for; what was inferred
-    is printed. Without a field of view, the output is the range along the line of sight, for a laser in the lens.
+    Writes depth.npy (all frames), depth.exr and depth.png (the first). Measured histograms are arrays, sparse matrices,
+    cells of time tags, or T3 records; what was inferred is printed. Without a field of view, the output is the range
+    along the line of sight, for a laser in the lens.
 
     Args:
         path (FILE): A result or frames (.h5, or their directory), or measured: .npy, .mat, .h5, .ptu. Of an analytic
@@ -203,7 +201,7 @@ def depth(
         facts = {name: value for name, value in facts.items() if name not in _SEEN}
         histograms = read_histograms(place, channel=channel, **facts)
         for text in histograms.notes:
-            complain(f"note: {text}")
+            complain(text, "note")
     pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
     names = [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")]
     check_outputs(out, names, files={"--ply": ply}, inputs=(path, *files), needed=32 * pixels)
@@ -244,10 +242,9 @@ def fit(
     laser and all that is known. Writes fit.png (counts, fit, residuals), scene.toml (with the estimates), and NAME.npy
     and NAME_error.npy for each unknown of the pixels.
 
-    With --bounds, SCENE stands alone, without COUNTS, and nothing is written: Cramér–Rao bounds of all unknowns
-    together, from one exposure. The least standard deviation of any unbiased estimate, when everything that is named is
-    unknown, and when all others are known; what not knowing the water costs in depth is the ratio. Of values of the
-    pixels, the table shows the median of the pixels that see a target.
+    With --bounds, SCENE stands alone, and nothing is written: Cramér–Rao bounds from one exposure, the least standard
+    deviation of any unbiased estimate, when everything that is named is unknown, and when all others are known. Of
+    values of the pixels, the table shows the median of the pixels that see a target.
 
     Args:
         path (COUNTS): Frames (.h5, or their directory), or measured histograms: .npy, .mat, .h5, .ptu; none with
@@ -285,7 +282,7 @@ def fit(
         spadwarp.files.locate(path), read, initial_guess=start, progress=progress(), **options, **facts
     )
     for text in found.warnings:
-        complain(f"warning: {text}")
+        complain(text, "warning")
     files = spadwarp.files.write_fit(found, out)
     if found.estimates:
         show_table(
@@ -314,7 +311,7 @@ def _bounds(path: Path, scene: Scene, options: dict[str, Any]) -> None:
     check_outputs(inputs=(path, *scene.files))
     found = spadwarp.inverse.bounds(scene, **options)
     for text in found.warnings:
-        complain(f"warning: {text}")
+        complain(text, "warning")
     table = []
     for name, one in found.bounds.items():
         row = found.names.index(name) if name in found.names else 0
@@ -370,12 +367,11 @@ def denoise(
     that a pixel sees a target, and that its depth is right), NAME.exr (all three of the first frame) and NAME.png.
     Every pixel has a depth, also where there is only water; --mask leaves these out. Histograms become depth first:
     counts by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then
-    denoised with their histograms, and NAME_second.npy has second surfaces in a pixel. Datasets do not keep the
-    background that this needs: their depth frames are denoised without their histograms, as one line of the output
-    says. Needs pip install "spadwarp[denoise]".
+    denoised with their histograms, and NAME_second.npy has second surfaces in a pixel; but those of a dataset, which
+    does not keep their background. Needs pip install "spadwarp[denoise]".
 
-    --input also takes of depth: channel=NAME (of an EXR; of a result co or cross), scale=0.01 (metres per unit) and
-    as_depth (three dimensions in .npy, .mat and .h5 are frames of depth, not a histogram).
+    --input also takes channel=NAME (of an EXR; of a result co or cross), scale=0.01 (metres per unit) and as_depth
+    (three dimensions in .npy, .mat and .h5 are frames of depth, not a histogram).
 
     Args:
         path (IN): A result or frames (.h5, or their directory); an analytic file, a dataset or a shard, of which the
@@ -394,7 +390,6 @@ def denoise(
     \b
     Examples:
       spadwarp denoise out/result.h5 --out denoised/
-      spadwarp denoise depth.npy --gate 13.5:16 --model dncnn --out denoised/
       spadwarp denoise engine/ --input channel=A,scale=0.01 --gate 13.5:16 --out denoised/
     """
     import numpy as np
@@ -421,7 +416,7 @@ def denoise(
             text = str(error) if str(one) in str(error) else f"{one}: {error}"
             if len(paths) == 1:
                 raise type(error)(text) from None
-            complain(f"error: {text}")
+            complain(text, "error")
             continue
         filled = float(np.isfinite(done.depth).mean())
         target = float((done.target_probability >= done.threshold).mean())

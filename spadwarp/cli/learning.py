@@ -43,8 +43,7 @@ def dataset(
     \b
     Examples:
       spadwarp dataset configs/datasets/small.toml --out data/small/
-      spadwarp dataset configs/datasets/lu2024.toml --out data/lu2024/ --device cuda:all
-      spadwarp dataset configs/datasets/lu2024.toml --out data/lu2024/ --part 3/64
+      spadwarp dataset configs/datasets/lu2024.toml --out data/lu2024/ --device cuda:all --part 3/64
     """
     read = spadwarp.dataset.load_recipe(recipe)
     if overrides:
@@ -64,11 +63,9 @@ def dataset(
 def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device: str | None = None) -> None:
     """Train a denoiser on scenes that are drawn as it goes, or on the clean scenes of a dataset.
 
-    New noise is drawn for each step; with a pool, as in the recipe for histograms, a sample serves several steps (6
-    there, on average). After the first steps the command says how long it will take. Writes weights (safetensors),
-    log.jsonl, curves.png and a checkpoint; Ctrl-C or SIGTERM keep a checkpoint of the last step, and the same command
-    resumes the training. Another recipe or number of steps needs a new folder. On several GPUs: torchrun
-    --nproc-per-node N -m spadwarp train ...
+    New noise is drawn for each step; with a pool, as in the recipe for histograms, a sample serves several. Writes
+    weights (safetensors), log.jsonl, curves.png and a checkpoint, also at Ctrl-C or SIGTERM; the same command resumes
+    the training. Another recipe needs a new folder. On several GPUs: torchrun --nproc-per-node N -m spadwarp train ...
 
     Args:
         recipe (RECIPE): Training recipe (TOML), or the name of one of `spadwarp list training`.
@@ -111,10 +108,10 @@ def evaluate(
     """Compare denoisers by scene type, on a dataset, or on frames with few photons.
 
     Without DATA: scenes before a wall, above a floor and in open water, with backscatter from in front, from the whole
-    gate and from near-range, at six backscatter fractions; gains, errors near rims and inside, targets missed and
-    invented. With --models histograms: the network for histograms against classical estimates, point by point.
-    On a dataset: PSNR, SSIM and entropy over the gate, errors in millimetres, steps resolved. On a Monte Carlo result:
-    frames of 1 to 100 signal photons a pixel at several signal-to-background ratios, RMSE beside the Cramér-Rao bound.
+    gate and from near-range; gains, errors near rims and inside, targets missed and invented; with --models histograms
+    the network for histograms against classical estimates. On a dataset: PSNR, SSIM and entropy over the gate, errors
+    in millimetres, steps resolved. On a Monte Carlo result: frames of 1 to 100 signal photons a pixel at several
+    signal-to-background ratios, RMSE beside the Cramér-Rao bound.
 
     Args:
         data ([DATA]): A dataset's folder; or a Monte Carlo result. Without it, scenes of the package that no training
@@ -132,8 +129,6 @@ def evaluate(
     Examples:
       spadwarp evaluate --report report/
       spadwarp evaluate --models histograms
-      spadwarp dataset configs/datasets/lu2024.toml --out data/lu2024/
-      spadwarp evaluate data/lu2024/ --models all --report report/
       spadwarp evaluate data/lu2024/ --weights runs/pyramid/pyramid.safetensors --report report/
       spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
       spadwarp evaluate out/result.h5 --report photons/

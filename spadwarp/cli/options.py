@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import typer
 
 import spadwarp
-from spadwarp.cli.app import Command, app, running, wrong
+from spadwarp.cli.app import app, running, wrong
 from spadwarp.limits import parse_number, shown, suggestion
 from spadwarp.units import quantity
 
@@ -111,7 +111,7 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
         run.__dict__["__signature__"] = inspect.Signature(made)
         del run.__dict__["__wrapped__"]
         run.__annotations__ = {one.name: one.annotation for one in made}
-        app.command(name or function.__name__, cls=Command)(run)
+        app.command(name or function.__name__)(run)
         return function
 
     return register
@@ -211,11 +211,11 @@ def from_to(unit: str) -> Callable[[str], tuple[float, float]]:
         if len(parts) != 2 or "" in parts:
             raise typer.BadParameter(f"{shown(text)} is not FROM:TO, two numbers such as 2:3 or 2{unit}:3{unit}")
         first, second = map(from_unit(unit), parts)
-        without, with_unit = sorted(parts, key=lambda part: part[-1] not in "0123456789.")
-        if (without[-1] in "0123456789.") != (with_unit[-1] in "0123456789."):
-            raise typer.BadParameter(
-                f"{shown(text)} is ambiguous: {with_unit} has a unit and {without} has none; write the unit of both"
-            )
+        bare = [part for part in parts if part[-1] in "0123456789."]
+        if len(bare) == 1:
+            (other,) = {*parts} - {*bare}
+            problem = f"{other} has a unit and {bare[0]} has none; write the unit of both"
+            raise typer.BadParameter(f"{shown(text)} is ambiguous: {problem}")
         if first > second:
             raise typer.BadParameter(f"{shown(text)} is FROM:TO; {parts[0]} is more than {parts[1]}")
         return first, second

@@ -110,24 +110,24 @@ def show_table(table: Iterable[Mapping[str, Any]], *, keys: int = 1) -> None:
 
     A table that is wider is printed in several parts, each with the first `keys` columns, so that no number is cut off.
     """
-    cells: dict[str, list[str]] = {}
-    for number, row in enumerate(table := list(table)):
-        for title, value in row.items():
-            column = cells.setdefault(title, [title, *[""] * len(table)])
-            column[number + 1] = short(value) if isinstance(value, float) else "-" if value is None else str(value)
-    titles, widths = list(cells), {title: max(map(len, column)) for title, column in cells.items()}
+    table, columns = list(table), list[list[str]]()
+    for title in dict.fromkeys(title for row in table for title in row):
+        texts = [title, *(_cell(row.get(title, "")) for row in table)]
+        width = max(map(len, texts))
+        columns.append([text.ljust(width) if len(columns) < keys else text.rjust(width) for text in texts])
     width = shutil.get_terminal_size().columns if sys.stdout is not None and sys.stdout.isatty() else 160
-    first, groups = titles[:keys], [titles[keys : keys + 1]]
-    for title in titles[keys + 1 :]:
-        if sum(widths[one] + 2 for one in (*first, *groups[-1], title)) - 2 <= width:
-            groups[-1].append(title)
-        else:
-            groups.append([title])
-    for group in groups:
-        for line in range(len(table) + 1):
-            parts = [cells[title][line].ljust(widths[title]) for title in first]
-            parts += [cells[title][line].rjust(widths[title]) for title in group]
-            say("  ".join(parts).rstrip())
+    first, others = columns[:keys], columns[keys:]
+    while others:
+        taken = 1
+        while taken < len(others) and sum(len(one[0]) + 2 for one in (*first, *others[: taken + 1])) - 2 <= width:
+            taken += 1
+        for line in zip(*first, *others[:taken], strict=True):
+            say("  ".join(line).rstrip())
+        others = others[taken:]
+
+
+def _cell(value: Any) -> str:
+    return short(value) if isinstance(value, float) else "-" if value is None else str(value)
 
 
 # Progress
@@ -217,18 +217,11 @@ def check_outputs(
     The output directory is made, and locked until the command ends.
 
     Args:
-        out: Directory of `option`.
-        names: Files that the command may write in it; patterns such as `frames-*.mat` where `beside` is given.
+        out: Directory of `option`, for as many bytes as are `needed`.
+        names: Files that the command may write in it; patterns where it may hold others `beside` them.
         files: Option → file that the command writes.
         inputs: Files that the command reads, or directories of a result or frames.
         resume: Whether the command continues what is in the directory.
-        beside: Whether the directory may hold other files than `names`.
-        needed: Bytes that may be written to `out`.
-        option: That names the directory.
-
-    Raises:
-        typer.BadParameter: An output exists, is an input, or is given twice.
-        FileError: A directory cannot be written, is in use by another process, or has too little space.
     """
     asked = {option: path for option, path in {**(files or {}), "--json": running.json}.items() if path is not None}
     named = {option: path for option, path in asked.items() if not spadwarp.io.is_stream(path)}

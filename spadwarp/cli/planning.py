@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -99,9 +99,8 @@ def plan(
 ) -> None:
     """Gate, pulses and laser power for a depth error, and what limits it.
 
-    A short Monte Carlo run of a window of the image measures the light. The Cramér–Rao bound is what any unbiased
-    estimator can reach; it falls with the pulses. Forward scattering leaves an error that more pulses do not reduce.
-    The limit for the eye is a guide, after IEC 60825-1:2014.
+    A short Monte Carlo run of a window of the image measures the light. The Cramér–Rao bound falls with the pulses;
+    forward scattering leaves an error that does not. The limit for the eye is a guide, after IEC 60825-1:2014.
 
     Args:
         depth_error (LENGTH): Depth error asked for, such as "1cm" [m].
@@ -231,15 +230,14 @@ def sweep(
 ) -> None:
     """Photon budget, or depth error, over range and water, or over any field of the scene.
 
-    Signal and background per pulse and pixel, depth error, and pulses for a depth error of 1 cm, from the analytic
-    model. Depth errors are those of one depth frame, of so many pulses as the table shows:
-    analytic.pulses_per_depth_frame if opt.given, else detector.pulses_per_frame. In brackets they are not reached: more
-    than 1 % of the fits would find a false peak. Where a return misses the scene's gate, gates as long follow the
-    returns, marked *.
+    By the analytic model, per pulse and pixel. Depth errors are those of one depth frame:
+    analytic.pulses_per_depth_frame, else detector.pulses_per_frame. In brackets they are not reached: more than 1 % of
+    the fits would find a false peak. Where a return misses the scene's gate, gates as long follow the returns, marked
+    *.
 
     Args:
-        vary (FIELD=FROM:TO:N): Field and values; with :log a geometric progression; or a,b,c. FIELD may be an item of a
-            list, and values may have units. By default "range", of a surface on the optical axis, 1 to 50 m.
+        vary (FIELD=FROM:TO:N): Field and values, which may have units; with :log a geometric progression; or a,b,c. By
+            default "range", of a surface on the optical axis, 1 to 50 m.
         medium: With range: a named water; may be repeated. By default the scene's.
         reflectance: With range: of the surface; by default that of the first target.
         of: Budget of the central pixel, or depth error of all pixels.
@@ -248,8 +246,7 @@ def sweep(
     \b
     Examples:
       spadwarp sweep configs/scenes/harbour_5m.toml --vary range=1:10:10 --medium petzold-nuc-2240 --medium uwoc-clear
-      spadwarp sweep configs/scenes/staircase_5m.toml --vary 'targets[0].translation[2]=3:8:11' --out sweep/
-      spadwarp sweep configs/scenes/staircase_5m.toml --vary medium.extinction=0.1:2:20 --of depth-error --out sweep/
+      spadwarp sweep staircase_5m --vary 'targets[0].translation[2]=3:8:11' --of depth-error --out sweep/
     """
     read = opt.read_scene(scene, overrides)
     field, _, values = (vary or "range=").partition("=")
@@ -366,7 +363,6 @@ def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
 
 # Values of --particles, by theory.
 _KOPELEVICH = ("small", "large")
-_SIZES = {"slope": ("smallest", "largest"), "median": ("deviation",), "diameter": ()}
 _PARTICLES: dict[str, Callable[[str], float]] = dict.fromkeys(
     ("absorbing", "concentration", "deviation", "index", "large", "slope", "small"), opt.real_number
 )
@@ -455,37 +451,28 @@ def _particles(
     wavelength_nm: float, values: dict[str, float], surroundings: dict[str, float]
 ) -> tuple[ParticleOptics, str]:
     """The particles of --particles, and what they are in words."""
-
-    def refuse(text: str) -> NoReturn:
-        wrong(text, "--particles")
-
-    by_mie, kopelevich = "index" in values, [name for name in _KOPELEVICH if name in values]
-    if by_mie == bool(kopelevich):
-        refuse("give small and large, or index with concentration and sizes")
-    if not by_mie:
-        if others := [name for name in values if name not in _KOPELEVICH]:
-            refuse(f"{', '.join(others)} belongs to index, not to small and large")
+    water, option = spadwarp.water, "--particles"
+    others = [name for name in values if name not in _KOPELEVICH]
+    if not others:
         small, large = (values.get(name, 0.0) for name in _KOPELEVICH)
         text = f"Kopelevich, {small:g} ppm below and {large:g} ppm above 1 um"
-        return spadwarp.water.kopelevich_particles(wavelength_nm, small=small, large=large), text
+        return water.kopelevich_particles(wavelength_nm, small=small, large=large), text
+    if "index" not in values or len(others) < len(values):
+        wrong(f"give small and large, or index with concentration and sizes; {others[0]} belongs to index", option)
     if "concentration" not in values:
-        refuse("concentration is missing")
-    laws = [name for name in _SIZES if name in values]
-    if len(laws) != 1:
-        refuse("one law of sizes is needed: slope, median or diameter")
-    if missing := [name for name in _SIZES[laws[0]] if name not in values]:
-        refuse(f"{laws[0]} needs {' and '.join(_SIZES[laws[0]])}; {missing[0]} is missing")
-    make: Any = {
-        "slope": spadwarp.water.power_law,
-        "median": spadwarp.water.log_normal,
-        "diameter": spadwarp.water.single_size,
-    }[laws[0]]
-    sizes = make(values[laws[0]], **{name: values[name] for name in _SIZES[laws[0]]})
-    parts = spadwarp.water.mie_particles(
-        sizes,
-        wavelength_nm,
-        index=complex(values["index"], values.get("absorbing", 0.0)),
-        concentration=values["concentration"],
-        **surroundings,
-    )
-    return parts, f"Mie, {values['concentration']:g} ppm of index {values['index']:g}, {sizes.text}"
+        wrong("concentration is missing", option)
+    laws: dict[str, tuple[Any, tuple[str, ...]]] = {
+        "slope": (water.power_law, ("smallest", "largest")),
+        "median": (water.log_normal, ("deviation",)),
+        "diameter": (water.single_size, ()),
+    }
+    chosen = [name for name in laws if name in values]
+    if len(chosen) != 1:
+        wrong("one law of sizes is needed: slope, median or diameter", option)
+    make, names = laws[chosen[0]]
+    if missing := [name for name in names if name not in values]:
+        wrong(f"{chosen[0]} needs {' and '.join(names)}; {missing[0]} is missing", option)
+    sizes = make(values[chosen[0]], **{name: values[name] for name in names})
+    index, concentration = complex(values["index"], values.get("absorbing", 0.0)), values["concentration"]
+    parts = water.mie_particles(sizes, wavelength_nm, index=index, concentration=concentration, **surroundings)
+    return parts, f"Mie, {concentration:g} ppm of index {values['index']:g}, {sizes.text}"

@@ -30,7 +30,6 @@ def info(path: Path, *, verify: bool = False) -> None:
     \b
     Examples:
       spadwarp info out/result.h5
-      spadwarp info bust.stl
       spadwarp info data/small/ --verify
     """
     check_outputs(inputs=(path,))
@@ -90,11 +89,10 @@ def view(
 ) -> None:
     """A run as a page for a browser, light in flight as a video, a dataset or a mesh as a picture.
 
-    The ending of --out decides. Page: one HTML file; click a pixel to see its histogram. Depth as a point cloud
-    coloured by its error; depth, truth, error and intensity as images; the histogram of a pixel with its components and
-    the instrument response. Opens in any browser, without a network connection. Video: the light that each pixel
-    receives, from time bin to time bin; of a scene that moves its frames. Picture: frames of a dataset on one sheet,
-    with true depth, measured depth and recorded photons; or a mesh file from several sides.
+    The ending of --out decides. Page: one HTML file, also without a network connection: depth as a point cloud coloured
+    by its error; depth, truth, error and intensity as images; click a pixel to see its histogram. Video: the light that
+    each pixel receives, from time bin to time bin; of a scene that moves its frames. Picture: frames of a dataset on
+    one sheet, with true depth, measured depth and recorded photons; or a mesh file from several sides.
 
     Args:
         path (FILE): A result, frames, an analytic file, a dataset or a shard, or their directory; or a mesh file.
@@ -116,7 +114,6 @@ def view(
       spadwarp view frames/frames.h5 --frame 3 --out frame.html
       spadwarp view out/ --out light.mp4 --window 40:55 --fps 20
       spadwarp view data/small/ --out sheet.png
-      spadwarp view bust.stl --out bust.png
     """
     target = out or Path(f"{path.stem}.png" if _is_mesh(path) else "view.html")
     kind = {".gif": "video", ".mp4": "video", ".png": "picture"}.get(target.suffix.lower(), "page")
@@ -173,18 +170,13 @@ def export(
     """Results, frames and datasets in the formats of other programs.
 
     \b
-    npy  NumPy: [height, width, bin], with frames before that; depth where there are no counts
-    mat  MATLAB, one file a frame, as the simulated data that single-photon
-         denoisers read: sparse spad, rates, 1-based bin, bin_size in seconds
-    ptu  PicoQuant T3 image, one record a detection
-    exr  images: depth, intensity, truth; one file a frame
-    xml  the camera's calibration, as OpenCV's cv::FileStorage reads it
-    fusion  mat files and a camera image of finer pixels, as networks for
-         sensor fusion read them: intensity/, spad/ with bin_hr, a list
-
-    \b
-    A whole dataset as trainers load it in one line, in a new folder with a card (README.md) and Croissant metadata
-    (croissant.json); depth in metres, labels, numbers:
+    npy     NumPy: [height, width, bin], with frames before that; depth where there are no counts
+    mat     MATLAB, one file a frame, as single-photon denoisers read: sparse spad, rates, bin from 1, bin_size [s]
+    ptu     PicoQuant T3 image, one record a detection
+    exr     images: depth, intensity, truth; one file a frame
+    xml     the camera's calibration, as OpenCV's cv::FileStorage reads it
+    fusion  mat files and a camera image of finer pixels, for sensor fusion: intensity/, spad/ with bin_hr, a list
+    A whole dataset in a new folder with a card (README.md) and Croissant metadata (croissant.json):
     parquet     datasets.load_dataset(DIR) of Hugging Face
     webdataset  train-00000.tar, ... of .npy images and one .json a frame
     zarr        xarray.open_zarr(DIR / "frames.zarr", group="train")
@@ -206,9 +198,7 @@ def export(
     \b
     Examples:
       spadwarp export frames/frames.h5 --format mat --format ptu --out exported/
-      spadwarp export run1/result.h5 --format npy --out exported/
       spadwarp export data/small/ --split test --frames 0:20 --format exr --out exported/
-      spadwarp export data/small/ --format parquet --out data/small-parquet/
       spadwarp export data/small/ --format webdataset --field noisy --field clean --out data/small-tar/
     """
     if whole := [one for one in format if one not in _FORMATS]:

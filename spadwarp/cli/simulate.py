@@ -51,22 +51,20 @@ def simulate(
 ) -> None:
     """Trace photons through a scene into histograms, or through each frame of a scene that moves.
 
-    Writes to the output directory: result.h5 (the complete result, for `spadwarp info` and `spadwarp.load_result`),
-    scene.toml (the complete scene of the run), depth.exr, truth.exr and pictures. Ctrl-C or SIGTERM ends the run and
-    writes the photons traced so far; after a crash, --resume continues from the last checkpoint.
-
-    With --trajectory: sequence.h5 with counts, depth, truth and, with --tags, detections of all frames, and
-    sequence.gif, which shows them.
+    Writes result.h5 (for `spadwarp info` and `spadwarp.load_result`), the complete scene.toml, depth.exr, truth.exr and
+    pictures. Ctrl-C or SIGTERM ends the run and writes the photons traced so far; after a crash, --resume continues
+    from the last checkpoint. With --trajectory: sequence.h5 (counts, depth, truth; with --tags detections) and
+    sequence.gif.
 
     Args:
         scene (SCENE): Scene file (TOML), or the name of a scene of `spadwarp list scenes`; none with --resume.
         seed: Key of the random numbers. By default the scene's.
         threads: CPU threads; by default one for each core.
         records: Also write the terminal state of every photon: records.h5.
-        uncertainty: Keep batches for the standard error of every bin; twice the memory. --photons is rounded up to
-            whole batches.
-        relative_error (X): Stop at this relative error of the bins that decide the depth (0.02: 2 %); --photons is then
-            the largest number of photons, rounded up to whole batches.
+        uncertainty: Keep batches, to which --photons is rounded up, for the standard error of every bin; twice the
+            memory.
+        relative_error (X): Stop at this relative error of the bins that decide the depth (0.02: 2 %), or after
+            --photons in whole batches.
         derivatives (NAME,...): Also the derivatives of the histogram by these parameters, 8 at most:
             medium.absorption, medium.scattering, medium.anisotropy, medium.layers[0].scattering,
             targets[0].reflectance, ...; short, absorption, where one alone can be meant. medium.grid.absorption,
@@ -89,12 +87,10 @@ def simulate(
       spadwarp simulate configs/scenes/staircase_15m.toml --out out/
       spadwarp simulate configs/scenes/harbour_5m.toml --mesh bust.stl --device cuda:0 \\
           --photons 2e9 --seed 7 --out run1/ --set medium.extinction=0.9
-      spadwarp simulate configs/scenes/plane_5m.toml --relative-error 0.02 --photons 1e8 --out run2/
-      spadwarp simulate configs/scenes/plane_5m.toml --derivatives absorption,scattering --out run5/
+      spadwarp simulate plane_5m --relative-error 0.02 --derivatives absorption,scattering --out run2/
       spadwarp simulate --resume run1/ --photons 4e9
-      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e10 --device cuda:all --out run3/
-      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --ray auto --out run4/
-      spadwarp simulate configs/scenes/staircase_5m.toml --photons 1e12 --shard 3/64 --out part3/
+      spadwarp simulate staircase_5m --photons 1e10 --device cuda:all --out run3/
+      spadwarp simulate staircase_5m --photons 1e12 --ray auto --shard 3/64 --out part3/
       spadwarp simulate staircase_5m --trajectory poses.csv --frame-rate 10 --out moving/
     """
     if trajectory is None:
@@ -322,8 +318,8 @@ def analytic(
 ) -> None:
     """Depth frames by the analytic model.
 
-    From the scene's targets, or from images that a game engine or Blender rendered with the scene's camera. Writes
-    analytic.h5 (maps, frames, and labels of the pixels that report background) and analytic.png.
+    From the scene's targets, or from images rendered with the scene's camera. Writes analytic.h5 (maps, frames, and
+    labels of the pixels that report background) and analytic.png.
 
     Args:
         frames: Depth frames to draw.

@@ -33,7 +33,6 @@ def init(
 
     \b
     Examples:
-      spadwarp init
       spadwarp init my_harbour --example harbour_5m
       spadwarp init --schema scene
     """
@@ -88,7 +87,6 @@ def listed(
     \b
     Examples:
       spadwarp list
-      spadwarp list scenes staircase_5m
       spadwarp list presets medium
       spadwarp list targets --out pictures/
     """
@@ -169,11 +167,9 @@ def _list_targets(out: Path | None, device: str | None) -> None:
 def doctor(*, device: str | None = None, self_test: bool = True) -> None:
     """Check the installation, show the devices that can trace photons, and run a self-test.
 
-    Shows versions, devices, driver, kernel cache, and what is missing for a GPU.
-
-    The self-test takes a few seconds, and about twice as long when it first compiles its kernels. It compares ballistic
-    light from a plate with the lidar equation, and a slab with published values. Exit code 1 for a problem or a failed
-    test.
+    Shows versions, devices, driver, kernel cache, and what is missing for a GPU. The self-test takes some seconds, and
+    compares ballistic light from a plate with the lidar equation, and a slab with published values. Exit code 1 for a
+    problem or a failed test.
 
     Args:
         self_test: Trace two small scenes.

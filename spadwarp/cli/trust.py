@@ -83,13 +83,10 @@ def bench(
 ) -> None:
     """Measure the speed of named cases.
 
-    Compile time is apart from run time. "error" is the relative standard error of the brightest bins after one second
-    of transport.
-
-    With --compare, a case is faster or slower where the 99 % confidence interval of the ratio of its speeds (the t-test
-    of Welch on the logarithms of the timed runs) lies more than 3 % from 1; the same where it stays within 10 %; else
-    unclear, for which more --repeats help. Ends with code 1 where a case is slower, or a mean that is known from
-    elsewhere is missed.
+    "error" is the relative standard error of the brightest bins after one second of transport. With --compare, a case
+    is faster or slower where the 99 % confidence interval of the ratio of its speeds (Welch's t-test on the logarithms
+    of the timed runs) lies more than 3 % from 1; the same where it stays within 10 %; else unclear, for which more
+    --repeats help. Exit code 1 where a case is slower, or a mean that is known from elsewhere is missed.
 
     Args:
         cases (CASE): Names of `spadwarp list benchmarks`, or "scaling"; all if left out. A FILE.json that --json wrote
@@ -104,7 +101,6 @@ def bench(
       spadwarp bench water staircase_5m --json before.json
       spadwarp bench water staircase_5m --compare before.json
       spadwarp bench --compare before.json after.json
-      spadwarp bench scaling --device cpu
     """
     load = spadwarp.benchmark.load_report
     files = [case for case in cases or () if case.endswith(".json")]  # one stands for results

@@ -149,7 +149,3 @@ def test_help_shows_every_command_once_by_stage_and_in_full():
     joined = " ".join(printed.split())
     for name, command in commands.items():
         assert f"{name} {command.get_short_help_str(limit=200)}" in joined
-
-
-def test_completion_can_be_installed():
-    assert "--install-completion" in run("--help").stdout
