@@ -14,7 +14,7 @@ from scipy import stats
 import spadwarp
 from helpers.cli import DEVICE, run
 from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, newest_report, report
-from spadwarp.benchmark.runs import measure_transport
+from spadwarp.benchmark.runs import measure
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
@@ -257,7 +257,7 @@ def test_scaling_spans_what_it_is_meant_to_show():
 def test_runs_are_repeated_until_enough():
     case = replace(CASES["water"], error=False, time_limit=1e-9)
     device = spadwarp.device.pick_device("cpu")
-    result = measure_transport(case, device, 1000, 5)
+    result = measure(case, device, 1000, 5)
     assert len(result.seconds) == 1
     assert result.error_per_root_second is None
 

@@ -15,7 +15,7 @@ from reference.slab_derivatives import slab_derivatives
 from spadwarp.errors import ArgumentError
 from spadwarp.io import json_text
 from spadwarp.validate import CASES, draw_results, references, report, run
-from spadwarp.validate.measure import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
+from spadwarp.validate.measure import Estimate, Quantity, batch_means, block_means, holm, two_sided_p
 
 # The statistics
 
@@ -47,13 +47,11 @@ def test_a_rounded_reference_is_an_interval():
 
 def test_means_in_blocks_are_those_of_the_whole():
     scores = np.random.default_rng(0).random((1000, 2))
-    means = ScoreMeans()
-    for block in np.split(scores, [300, 700]):
-        means.add(block)
-    for i, estimate in enumerate(means.estimates()):
+    means = block_means(np.split(scores, [300, 700]))
+    for i, estimate in enumerate(means):
         assert estimate.value == pytest.approx(scores[:, i].mean(), rel=1e-12)
         assert estimate.standard_error == pytest.approx(scores[:, i].std(ddof=1) / math.sqrt(1000), rel=1e-9)
-    assert batch_means(scores)[1].standard_error == pytest.approx(means.estimates()[1].standard_error, rel=1e-9)
+    assert batch_means(scores)[1].standard_error == pytest.approx(means[1].standard_error, rel=1e-9)
 
 
 # The numbers that the cases are held to
@@ -92,10 +90,9 @@ def test_exit_cosine_references():
 
 @pytest.mark.physics
 def test_time_resolved_references():
-    pulse = references.TIME_RESOLVED
-    medium = {"scattering": pulse.scattering, "absorption": pulse.absorption, "anisotropy": pulse.anisotropy}
-    until = [0.0, *(cumulative_reflectance(path, **medium, nodes=24) for path in pulse.edges[1:])]
-    np.testing.assert_allclose(pulse.fractions, np.diff(until), atol=2e-8)
+    medium, edges = references.TIME_RESOLVED_MEDIUM, references.TIME_RESOLVED_EDGES
+    until = [0.0, *(cumulative_reflectance(path, **medium, nodes=24) for path in edges[1:])]
+    np.testing.assert_allclose(references.TIME_RESOLVED, np.diff(until), atol=2e-8)
 
 
 @pytest.mark.physics
@@ -121,10 +118,10 @@ def test_references_of_the_rules_that_bias():
 
 @pytest.mark.physics
 def test_fluence_references():
-    shells = references.FLUENCE
-    inside = isotropic_radial_cdf(shells.edges[1:-1], path=shells.path, scattering=1.0)
-    fractions = np.diff([0.0, *inside, 1.0]) * math.exp(-shells.absorption * shells.path)
-    np.testing.assert_allclose(shells.fractions, fractions, atol=2e-7)
+    path = references.FLUENCE_PATH
+    inside = isotropic_radial_cdf(references.FLUENCE_EDGES[1:-1], path=path, scattering=1.0)
+    fractions = np.diff([0.0, *inside, 1.0]) * math.exp(-references.FLUENCE_ABSORPTION * path)
+    np.testing.assert_allclose(references.FLUENCE, fractions, atol=2e-7)
 
 
 @pytest.mark.physics
