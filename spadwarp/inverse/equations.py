@@ -26,8 +26,7 @@ from spadwarp.inverse.unknowns import DEPTH, Unknown
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
-Cell = tuple[int, int, int]
-"""Rows, columns and bins."""
+Cell = tuple[int, int, int]  # rows, columns and bins
 
 _PIXELS = 256  # of a part that a thread works on
 _LEVELS = (1, 2, 4, 8, 16)  # pixels along the side of a cell
@@ -70,13 +69,12 @@ class Law(NamedTuple):
         share: Any = np.divide(mean, trials, out=np.zeros_like(mean), where=trials > 0)
         return mean * (np.float32(1.0) - share)
 
-
-def planned_pulses(law: Law, rates: Rows, pulses: float) -> Rows:
-    """Mean of the pulses that no earlier bin has counted in, `[pixel, bin]`, where there are no counts to know it."""
-    if not law.first_photon:
-        return np.full((rates.shape[0], law.recorded), pulses, np.float32)
-    before = np.cumsum(rates, axis=1, dtype=np.float64) - rates
-    return (pulses * np.exp(-before)).astype(np.float32)
+    def planned(self, rates: Rows, pulses: float) -> Rows:
+        """Mean of the pulses that no earlier bin has counted in, `[pixel, bin]`: trials where there are no counts."""
+        if not self.first_photon:
+            return np.full((rates.shape[0], self.recorded), pulses, np.float32)
+        before = np.cumsum(rates, axis=1, dtype=np.float64) - rates
+        return (pulses * np.exp(-before)).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +86,7 @@ class Equations:
         slope: Σ w dm, `[pixel, unknown, unknown]`: minus the derivative of the score by the unknowns (last axis).
         noise: Σ w w v, its covariance by the counts, `[pixel, unknown, unknown]`.
         simulation: Σ w m of each batch of photons less their mean, of the two halves: `[half][batch, pixel, unknown]`.
-        weights: w, the mean of both halves', float32 `[pixel, unknown, bin]`; whatever the unknowns' units are, they
-            are those of the scene.
+        weights: w, the mean of both halves', float32 `[pixel, unknown, bin]`, in units of the scene.
     """
 
     score: Floats
@@ -97,17 +94,6 @@ class Equations:
     noise: Floats
     simulation: list[Floats]
     weights: Rows
-
-    def times(self, scales: Floats) -> Equations:
-        """The equations for unknowns in other units: each unknown is `scales` `[pixel, unknown]` times the new one."""
-        left, right = scales[:, :, None], scales[:, None, :]
-        return Equations(
-            self.score * scales,
-            self.slope * left * right,
-            self.noise * left * right,
-            [part * scales for part in self.simulation],
-            self.weights,
-        )
 
 
 class Moments:
@@ -127,13 +113,12 @@ class Moments:
         halves: list[Half],
         trials: Rows | None,
         counts: NDArray[np.integer] | None,
-        *,
         pulses: float,
         image: tuple[int, int],
     ) -> None:
         self.law, self.halves, self.image = law, halves, image
         self.rates = 0.5 * (halves[0].rates + halves[1].rates)
-        self.trials = planned_pulses(law, self.rates, pulses) if trials is None else trials
+        self.trials = law.planned(self.rates, pulses) if trials is None else trials
         pixels, unknowns = self.rates.shape[0], halves[0].slopes.shape[0]
 
         def rows() -> Rows:
@@ -158,11 +143,11 @@ class Moments:
         with ThreadPoolExecutor(core_count()) as pool:
             list(pool.map(part, _parts(pixels)))
 
-    def equations(self, cells: Sequence[Cell]) -> Equations:
+    def equations(self, cells: Sequence[Cell], scales: Floats) -> Equations:
         """The equations of the counts, or of a plan of them.
 
         `cells`: of each unknown the rows, columns and bins over which its weights are averaged. Any weights give
-        equations that are right in the mean; noisy ones are less precise.
+        equations that are right in the mean; noisy ones are less precise. `scales` `[pixel, unknown]`: its unit.
         """
         pixels, unknowns = self.slopes[0].shape[:2]
         score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
@@ -184,7 +169,9 @@ class Moments:
                 noise[chosen] = np.matmul(both * self.variance[chosen, None], both.transpose(0, 2, 1))
 
             list(pool.map(part, _parts(pixels)))
-        return Equations(score, slope, noise, [part - part.mean(axis=0) for part in simulation], mean_weights)
+        left, right = scales[:, :, None], scales[:, None, :]
+        simulation = [(part - part.mean(axis=0)) * scales for part in simulation]
+        return Equations(score * scales, slope * left * right, noise * left * right, simulation, mean_weights)
 
     def _weights(self, number: int, cells: Sequence[Cell], pool: ThreadPoolExecutor) -> Rows:
         """By a half: derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
@@ -344,25 +331,16 @@ def _largest_ratio(parts: Floats, wholes: Floats) -> float:
     return float(np.max(np.divide(parts, wholes, out=np.zeros_like(parts), where=wholes > 0), initial=0.0))
 
 
-class Pooled(NamedTuple):
-    """Equations with cells of `level` pixels on a side, and their solution."""
-
-    level: int
-    equations: Equations
-    solution: Solution
-
-
 def solve_pooled(
     unknowns: Sequence[Unknown],
     moments: Moments,
     scales: Floats,
     solve: Callable[[Equations], Solution],
-    *,
     pooling_level: int | None,
-) -> Pooled:
-    """The equations with the cells that have the least standard errors, from coarse to fine.
+) -> tuple[int, Equations, Solution]:
+    """The equations with the cells, of so many pixels on a side, that have the least standard errors; their solution.
 
-    Fine weights of the score are sharp but noisy, coarse ones know little of edges.
+    From coarse to fine: fine weights of the score are sharp but noisy, coarse ones know little of edges.
 
     Args:
         unknowns: In the order of the slopes.
@@ -371,28 +349,28 @@ def solve_pooled(
         solve: Solves equations in these units.
         pooling_level: The coarsest that is tried, as that of an earlier rendering; None: the coarsest of all.
     """
+
+    def cell(unknown: Unknown, size: int) -> Cell:
+        """A pixel's own unknown has weights of its own; a shift in time needs every bin."""
+        if unknown.per_pixel:
+            return (1, 1, 1)
+        return (size, size, 1 if unknown.name == DEPTH else min(size, _MOST_BINS))
+
     coarsest = max(moments.image) if pooling_level is None else pooling_level
     levels = [size for size in _LEVELS if size <= coarsest]
     if all(unknown.per_pixel for unknown in unknowns):
         levels = [1]
     best, least, worse = None, np.inf, 0
     for size in reversed(levels):
-        equations = moments.equations([_cell(unknown, size) for unknown in unknowns]).times(scales)
+        equations = moments.equations([cell(unknown, size) for unknown in unknowns], scales)
         solution = solve(equations)
         variances = np.diag(solution.covariance)
         total = float(np.log(np.maximum(variances, 1e-300)).sum()) if (variances > 0).all() else np.inf
         if best is None or total < least:
-            best, least, worse = Pooled(size, equations, solution), total, 0
+            best, least, worse = (size, equations, solution), total, 0
         elif np.isfinite(least):
             worse += 1
         if worse == 2:  # the noise of the errors can hide one better level behind a worse one
             break
     assert best is not None
     return best
-
-
-def _cell(unknown: Unknown, size: int) -> Cell:
-    """A pixel's own unknown has weights of its own; a shift in time needs every bin."""
-    if unknown.per_pixel:
-        return (1, 1, 1)
-    return (size, size, 1 if unknown.name == DEPTH else min(size, _MOST_BINS))

@@ -139,10 +139,23 @@ class Renderer:
         return [receiver.slopes({DEPTH: light}, depth)[0] for light in lights]
 
     def _at(self, values: Values) -> Scene:
-        """The scene with one number for each unknown."""
-        return self._with_focus(
-            with_values(self.scene, {name: float(np.mean(value)) for name, value in values.items()})
-        )
+        """The scene with one number for each unknown.
+
+        The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved, and so does
+        the view: with a focus in metres, the distance of the sensor would follow it.
+        """
+        from spadwarp.mesh import build_mesh, focus_distance
+
+        scene = with_values(self.scene, {name: float(np.mean(value)) for name, value in values.items()})
+        if "focus" not in self._kept:
+            self._kept["focus"] = focus_distance(self.scene, build_mesh(self.scene))
+        focus, camera = self._kept["focus"], scene.camera
+        if focus is None or camera.focus_distance != "target":
+            return scene
+        changes: dict[str, Any] = {"focus_distance": focus}
+        if camera.pixel_pitch_um is not None:
+            changes |= {"fx": camera.focal_pixels[0], "pixel_pitch_um": None}
+        return scene.model_copy(update={"camera": camera.model_copy(update=changes)})
 
     def _take(self, photons: int) -> int:
         """The first of photons that were not traced before."""
@@ -158,52 +171,31 @@ class Renderer:
     def _depth_difference(self, scene: Scene, step: float, photons: int) -> Callable[[int], ExpectedLight]:
         """Derivative by the depth of the targets [1/m] from a first photon on: of two runs with the same photons and
         the targets at ± `step` [m]."""
-        far, near = (
+        import warp as wp
+
+        tracers = [
             LightTracer(
                 moved(scene, shift), mesh_cache=self._kept.setdefault(name, {}), photons=photons, **self._choices
             )
             for name, shift in (("far", step), ("near", -step))
-        )
+        ]
 
         def slope(far: Any, near: Any) -> Any:
-            import warp as wp
-
             if far is None:
                 return None
             return wp.array((far.numpy() - near.numpy()) * (0.5 / step), dtype=wp.float32, device=far.device)
 
         def difference(first: int) -> ExpectedLight:
-            beyond, before = (tracer(first, photons)[0] for tracer in (far, near))
-            return ExpectedLight(slope(beyond.total, before.total), slope(beyond.target, before.target))
+            far, near = (tracer(first, photons)[0] for tracer in tracers)
+            return ExpectedLight(slope(far.total, near.total), slope(far.target, near.target))
 
         return difference
 
     @property
-    def _apart(self) -> bool:
-        """Whether light of the targets is held apart, because each pixel places it."""
-        return any(unknown.per_pixel and unknown.name != BACKGROUND for unknown in self.unknowns)
-
-    @property
     def _choices(self) -> dict[str, Any]:
-        """Of all tracers; one tally serves them in turn."""
-        return {"seed": self.seed, "device": self.device, "separate_targets": self._apart, "tally": self._tally}
-
-    def _with_focus(self, scene: Scene) -> Scene:
-        """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved.
-
-        The view stays that of the scene, too: with a focus in metres, the distance of the sensor would follow it.
-        """
-        from spadwarp.mesh import build_mesh, focus_distance
-
-        if "focus" not in self._kept:
-            self._kept["focus"] = focus_distance(self.scene, build_mesh(self.scene))
-        focus, camera = self._kept["focus"], scene.camera
-        if focus is None or camera.focus_distance != "target":
-            return scene
-        changes: dict[str, Any] = {"focus_distance": focus}
-        if camera.pixel_pitch_um is not None:
-            changes |= {"fx": camera.focal_pixels[0], "pixel_pitch_um": None}
-        return scene.model_copy(update={"camera": camera.model_copy(update=changes)})
+        """Of all tracers; one tally serves them in turn. Light of the targets is apart where each pixel places it."""
+        separate = any(unknown.per_pixel and unknown.name != BACKGROUND for unknown in self.unknowns)
+        return {"seed": self.seed, "device": self.device, "separate_targets": separate, "tally": self._tally}
 
     def _receiver(self, scene: Scene, values: Values) -> Receiver:
         gate, camera, detector = scene.gate, scene.camera, scene.detector
@@ -229,16 +221,17 @@ class Renderer:
 
     def _placed(self, scene: Scene, values: Values) -> _PlacedReceiver:
         receiver = self._receiver(scene, values)
-        if not self._apart:
+        moving = [unknown for unknown in self.unknowns if unknown.per_pixel and unknown.name != BACKGROUND]
+        if not moving:
             return _PlacedReceiver(receiver)
         pixels = scene.camera.width * scene.camera.height
         delay, factor = np.zeros(pixels), np.ones(pixels)
-        for unknown in self.unknowns:
-            value = values[unknown.name]
-            if unknown.per_pixel and unknown.name == DEPTH:
-                delay += (np.asarray(value) - float(np.mean(value))) * _bins_per_metre(scene).reshape(-1)
-            elif unknown.per_pixel and unknown.name != BACKGROUND:
-                factor *= np.asarray(value) / float(np.mean(value))
+        for unknown in moving:
+            value = np.asarray(values[unknown.name])
+            if unknown.name == DEPTH:
+                delay += (value - float(np.mean(value))) * _bins_per_metre(scene).reshape(-1)
+            else:
+                factor *= value / float(np.mean(value))
         return _PlacedReceiver(receiver, delay, factor)
 
 
