@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -54,6 +55,14 @@ PILE_UP = 0.05
 """Detections per pulse of the brightest pixels up to which pile-up is small: the usual rule of 1 to 5 % (O'Connor &
 Phillips, Time-correlated single photon counting, 1984)."""
 
+_PROPOSED = (
+    "gate.start_ns",
+    "gate.bin_width_ps",
+    "gate.bins",
+    "laser.repetition_rate",
+    "laser.pulse_energy",
+    "detector.pulses_per_frame",
+)
 _SIDE = 16  # largest width and height of the window [pixels]
 _MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
 _MANY_PHOTONS = 100.0  # of the return, from which on the width of the response is the cheaper thing to improve
@@ -176,24 +185,19 @@ class Proposal:
     @property
     def values(self) -> dict[str, float | int]:
         """The proposed values by the names of the scene's fields."""
-        proposed = {
-            "gate": ("start_ns", "bin_width_ps", "bins"),
-            "laser": ("repetition_rate", "pulse_energy"),
-            "detector": ("pulses_per_frame",),
-        }
-        return {
-            f"{section}.{name}": getattr(getattr(self.scene, section), name)
-            for section, names in proposed.items()
-            for name in names
-        }
+        return {name: operator.attrgetter(name)(self.scene) for name in _PROPOSED}
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, in numbers and text that JSON can hold."""
-        fields = {name: value for name, value in vars(self).items() if name != "scene"}
-        for name in ("eye", "pilot"):
-            fields[name] = dataclasses.asdict(fields[name])
-        channels = {name: dataclasses.asdict(pilot) for name, pilot in self.channels.items()}
-        return {"values": self.values, **fields, "channels": channels}
+        fields = {one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name != "scene"}
+        return {"values": self.values, **_plain(fields)}
+
+
+def _plain(value: Any) -> Any:
+    """Dicts of dicts and data classes as dicts."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value
 
 
 def plan(
@@ -261,18 +265,15 @@ def plan(
         channel=channel,
         progress=progress,
     )
+    problem = ""
     if channel != "I" and not scene.camera.channels:
-        raise ConfigError(
-            f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'", source=source_name(scene)
-        )
-    if ranges is None:
+        problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'"
+    elif ranges is None:
         distance = truth_maps(scene, device=device).range
         if np.isnan(distance).all():
-            raise ConfigError(
-                "no target is in view: give one in [[targets]], or the ranges where it may be",
-                source=source_name(scene),
-            )
-        span = float(np.nanmin(distance)), float(np.nanmax(distance))
+            problem = "no target is in view: give one in [[targets]], or the ranges where it may be"
+        else:
+            span = float(np.nanmin(distance)), float(np.nanmax(distance))
     else:
         if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
             raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
@@ -280,7 +281,9 @@ def plan(
         if not 0 < span[0] <= span[1] < math.inf:
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
         scene = with_plane(scene, span[1])
-    proposal = planner.propose(scene, span, propose_gate(scene, span, planner.margin), photons)
+    if problem:
+        raise ConfigError(problem, source=source_name(scene))
+    proposal = planner.propose(scene, span, photons)
     if not largest_range:
         return proposal
     largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
@@ -312,11 +315,9 @@ class _Planner:
     channel: Channel
     progress: Progress | None
 
-    def propose(
-        self, scene: Scene, span: tuple[float, float], gate: Gate, photons: int, *, even: bool = False
-    ) -> Proposal:
+    def propose(self, scene: Scene, span: tuple[float, float], photons: int, *, even: bool = False) -> Proposal:
         """The experiment with a target at these ranges: light, pulse energy, pulses, error; `even` as in `measure`."""
-        rate, target = scene.laser.repetition_rate, scene
+        rate, target, gate = scene.laser.repetition_rate, scene, propose_gate(scene, span, self.margin)
         if scene.detector.wrap and rate > gate.largest_rate:
             rate = _rounded_down(gate.largest_rate)
         fields = {"start_ns": gate.start_ns, "bins": gate.bins}
@@ -382,10 +383,8 @@ class _Planner:
         fixed = math.hypot(pilot.floor[self.method], pilot.pile_up[self.method])
         left = math.sqrt(max(self.depth_error**2 - fixed**2, 0.0))
         purpose = "depth error" if left > 0 else "floor"
-        wanted, peaks = (
-            (pilot.bound / (left or fixed / 3.0)) ** 2,
-            _pulses_without_false_peaks(scene, pilot, self.device),
-        )
+        wanted = (pilot.bound / (left or fixed / 3.0)) ** 2
+        peaks = _pulses_without_false_peaks(scene, pilot, self.device)
         if peaks > wanted:
             wanted, purpose = peaks, "false peaks" if left > 0 else "floor"
         if not wanted <= _MOST_PULSES:
@@ -425,13 +424,13 @@ class _Planner:
                 return False
             if self.progress is not None:
                 self.progress(f"a plane at {distance:.3g} m", 0, 0)
-            target, span = with_plane(scene, distance), (distance, distance)
-            gate = propose_gate(target, span, self.margin)
+            target = with_plane(scene, distance)
+            gate = propose_gate(target, (distance, distance), self.margin)
             if scene.detector.wrap and gate.largest_rate < scene.laser.repetition_rate:
                 reason = "repetition rate"
                 return False
             try:
-                proposal = self.propose(target, span, gate, photons, even=True)
+                proposal = self.propose(target, (distance, distance), photons, even=True)
             except ConfigError:
                 reason = "no light of the target"
                 return False
@@ -541,18 +540,15 @@ def trace(
     """Two runs of half the photons each."""
     half = max(1, photons // 2)
 
-    def report(stage: str, done: int, total: int) -> None:
-        if progress is not None and total:
-            progress(stage, traced + done, 2 * half)
-        elif progress is not None and not traced:
-            progress(stage, done, total)
+    def half_run(first: int) -> Result:
+        def report(stage: str, done: int, total: int) -> None:
+            if progress is not None and (total or not first):
+                progress(stage, first + done if total else done, 2 * half if total else total)
 
-    runs = []
-    for traced in (0, half):
-        run = RunOptions(first_photon=traced)
-        options: dict[str, Any] = {"run": run, "seed": seed, "device": device, "progress": report}
-        runs.append(simulate(scene, photons=half, **options))
-    return runs[0], runs[1]
+        options: dict[str, Any] = {"seed": seed, "device": device, "progress": report}
+        return simulate(scene, photons=half, run=RunOptions(first_photon=first), **options)
+
+    return half_run(0), half_run(half)
 
 
 def measure(

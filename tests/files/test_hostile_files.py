@@ -11,7 +11,6 @@ import spadwarp
 from helpers import hostile
 from helpers.datasets import make, recipe
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.analytic import save_analytic
 from spadwarp.dataset import FIELDS, FrameReader
 from spadwarp.errors import FileError
 from spadwarp.files import open_source
@@ -81,7 +80,7 @@ def valid(tmp_path_factory):
     result = make_result(scene)
     spadwarp.result.save_result(type(result)(**{**vars(result), **batches}), folder / "result.h5")
     record_frames(result, folder / "frames.h5", pulses=1000, frames=2, seed=1, tags=True, device="cpu")
-    save_analytic(spadwarp.simulate_analytic(scene, frames=2, seed=1, device="cpu"), folder / "analytic.h5")
+    spadwarp.simulate_analytic(scene, frames=2, seed=1, device="cpu").save(folder / "analytic.h5")
     save_records(trace(scene, photons=100, seed=1, device="cpu"), folder / "records.h5", scene=scene)
     make(recipe(**SMALL), folder / "data")
     for name, read in READERS.items():
