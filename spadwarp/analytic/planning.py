@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.eye_safety import EyeLimit, beam_axis_fluence, scene_eye_limit
+from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
 from spadwarp.analytic.model import false_peaks, source_name
 from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
 from spadwarp.errors import ArgumentError, ConfigError
@@ -325,7 +325,7 @@ class _Planner:
         small = window(scene, self.device)
         runs = trace(small, photons, self.seed, self.device, None if even else self.progress)
         pilot = measure(runs, scene, self.device, even=even, channel=self.channel)
-        eye = scene_eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
+        eye = eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
         piled = scene.laser.pulse_energy * max(PILE_UP - pilot.noise, 0.0) / pilot.brightest
         allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": eye.pulse_energy})
         energy_limit = min(allowed, key=allowed.__getitem__)
@@ -347,7 +347,7 @@ class _Planner:
         compared = CHANNELS if small.camera.channels and not even else ()
         line = axis_line(target)
         optical_depth = target.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
-        fluence = beam_axis_fluence(scene, span[0]) * math.exp(-optical_depth)
+        fluence = axis_fluence(scene, span[0]) * math.exp(-optical_depth)
         index, advance = scene.medium.group_index, port_advance(target)
         return Proposal(
             scene=scene,

@@ -296,8 +296,7 @@ def _central_row(scene: Scene, device: str | None) -> BudgetRow:
     warn_of_model(scene, stacklevel=4)
     truth = truth_maps(scene)
     pixel = central_pixel(scene, truth)
-    distance = np.array([float(truth.range[pixel])])
-    return axis_rows(scene, None, distance, float(truth.reflectance[pixel]), device)[0]
+    return axis_rows(scene, None, np.array([float(truth.range[pixel])]), float(truth.reflectance[pixel]), device)[0]
 
 
 def _depth_error(scene: Scene, device: str | None) -> DepthErrorRow:

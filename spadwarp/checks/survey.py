@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic import beam_axis_fluence
+from spadwarp.analytic import axis_fluence
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.scene import Scene
 from spadwarp.scene.laser import profile_extent
@@ -166,7 +166,7 @@ class Survey:
         return OnAxis(
             distance=distance,
             optical_depth=optical_depth,
-            irradiance=beam_axis_fluence(scene, distance) * passed * scene.laser.average_power,
+            irradiance=axis_fluence(scene, distance) * passed * scene.laser.average_power,
             samples_per_pixel=scene.transport.photons / scene.scan_positions * ballistic,
             photons_per_pixel=photons,
             signal_per_pulse=photons * scene.detections_per_photon,

@@ -34,18 +34,11 @@ _MOST_BINS = 4  # of a cell
 
 
 class Law(NamedTuple):
-    """How a detector counts.
+    """How a detector counts."""
 
-    Attributes:
-        first_photon: One count a pulse at most: in each bin a binomial of the pulses that no earlier bin has counted
-            in. Otherwise counts of all detections, Poisson.
-        dead_share: Dead time over the period between windows, for free-running counts.
-        recorded: Bins that are counted; later ones are there for the dead time alone.
-    """
-
-    first_photon: bool
-    dead_share: float
-    recorded: int
+    first_photon: bool  # in each bin a binomial of the pulses that no earlier bin has counted in; else Poisson, of all
+    dead_share: float  # dead time over the period between windows, for free-running counts
+    recorded: int  # bins that are counted; later ones are there for the dead time alone
 
     def mean(self, rates: Rows, trials: Rows) -> Rows:
         """Expected counts `[pixel, bin]` for λ `[pixel, bin]`; `trials`: pulses that can still count in each bin."""
@@ -79,21 +72,13 @@ class Law(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Sums over the bins of each pixel, float64.
+    """Sums over the bins of each pixel, float64; w are weights, m, n and v counts with their mean and variance."""
 
-    Attributes:
-        score: Σ w (n − m), `[pixel, unknown]`; 0 without counts.
-        slope: Σ w dm, `[pixel, unknown, unknown]`: minus the derivative of the score by the unknowns (last axis).
-        noise: Σ w w v, its covariance by the counts, `[pixel, unknown, unknown]`.
-        simulation: Σ w m of each batch of photons less their mean, of the two halves: `[half][batch, pixel, unknown]`.
-        weights: w, the mean of both halves', float32 `[pixel, unknown, bin]`, in units of the scene.
-    """
-
-    score: Floats
-    slope: Floats
-    noise: Floats
-    simulation: list[Floats]
-    weights: Rows
+    score: Floats  # Σ w (n − m), [pixel, unknown]; 0 without counts
+    slope: Floats  # Σ w dm, [pixel, unknown, unknown]: minus the derivative of the score by the unknowns (last axis)
+    noise: Floats  # Σ w w v, its covariance by the counts, [pixel, unknown, unknown]
+    simulation: list[Floats]  # Σ w m of batches of photons less their mean, of two halves [batch, pixel, unknown]
+    weights: Rows  # the mean of both halves', float32 [pixel, unknown, bin], in units of the scene
 
 
 class Moments:
@@ -101,6 +86,7 @@ class Moments:
 
     Args:
         law, halves: The detector; what the photons say.
+        limits: Of weights, `Renderer.limits`.
         trials: Pulses that can still count in each bin `[pixel, bin]`; None: their mean.
         counts: `[pixel, bin]`; None for a plan.
         pulses: In all.
@@ -111,12 +97,13 @@ class Moments:
         self,
         law: Law,
         halves: list[Half],
+        limits: Rows,
         trials: Rows | None,
         counts: NDArray[np.integer] | None,
         pulses: float,
         image: tuple[int, int],
     ) -> None:
-        self.law, self.halves, self.image = law, halves, image
+        self.law, self.limits, self.image = law, limits, image
         self.rates = 0.5 * (halves[0].rates + halves[1].rates)
         self.trials = law.planned(self.rates, pulses) if trials is None else trials
         pixels, unknowns = self.rates.shape[0], halves[0].slopes.shape[0]
@@ -133,15 +120,14 @@ class Moments:
             trials = self.trials[chosen]
             for i, half in enumerate(halves):
                 slopes = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
-                self.slopes[i][chosen] = law.slopes(half.first[chosen], slopes, trials)
+                self.slopes[i][chosen] = law.slopes(half.batches[0][chosen], slopes, trials)
                 for mean, rates in zip(self.batches[i], half.batches, strict=True):
                     mean[chosen] = law.mean(rates[chosen], trials)
                 if self.rest is not None and counts is not None:
                     self.rest[i][chosen] = counts[chosen] - law.mean(half.rates[chosen], trials)
             self.variance[chosen] = law.variance(law.mean(self.rates[chosen], trials), trials)
 
-        with ThreadPoolExecutor(core_count()) as pool:
-            list(pool.map(part, _parts(pixels)))
+        _in_threads(part, _parts(pixels))
 
     def equations(self, cells: Sequence[Cell], scales: Floats) -> Equations:
         """The equations of the counts, or of a plan of them.
@@ -154,28 +140,27 @@ class Moments:
         noise = np.zeros_like(slope)
         simulation = [np.zeros((len(batches), pixels, unknowns)) for batches in self.batches]
         mean_weights = np.empty((pixels, unknowns, self.law.recorded), np.float32)
-        with ThreadPoolExecutor(core_count()) as pool:
-            weights = [self._weights(i, cells, pool) for i in (0, 1)]
+        weights = [self._weights(i, cells) for i in (0, 1)]
 
-            def part(chosen: slice) -> None:
-                for i, weight in enumerate(half[chosen] for half in weights):
-                    slope[chosen] += 0.5 * np.matmul(weight, self.slopes[1 - i][chosen].transpose(0, 2, 1))
-                    if self.rest is not None:
-                        score[chosen] += 0.5 * np.matmul(weight, self.rest[1 - i][chosen, :, None])[..., 0]
-                    for batch, mean in enumerate(self.batches[1 - i]):
-                        simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
-                both = mean_weights[chosen]
-                np.multiply(weights[0][chosen] + weights[1][chosen], np.float32(0.5), out=both)
-                noise[chosen] = np.matmul(both * self.variance[chosen, None], both.transpose(0, 2, 1))
+        def part(chosen: slice) -> None:
+            for i, weight in enumerate(half[chosen] for half in weights):
+                slope[chosen] += 0.5 * np.matmul(weight, self.slopes[1 - i][chosen].transpose(0, 2, 1))
+                if self.rest is not None:
+                    score[chosen] += 0.5 * np.matmul(weight, self.rest[1 - i][chosen, :, None])[..., 0]
+                for batch, mean in enumerate(self.batches[1 - i]):
+                    simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
+            both = mean_weights[chosen]
+            np.multiply(weights[0][chosen] + weights[1][chosen], np.float32(0.5), out=both)
+            noise[chosen] = np.matmul(both * self.variance[chosen, None], both.transpose(0, 2, 1))
 
-            list(pool.map(part, _parts(pixels)))
+        _in_threads(part, _parts(pixels))
         left, right = scales[:, :, None], scales[:, None, :]
         simulation = [(part - part.mean(axis=0)) * scales for part in simulation]
         return Equations(score * scales, slope * left * right, noise * left * right, simulation, mean_weights)
 
-    def _weights(self, number: int, cells: Sequence[Cell], pool: ThreadPoolExecutor) -> Rows:
+    def _weights(self, number: int, cells: Sequence[Cell]) -> Rows:
         """By a half: derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
-        slopes, limits = self.slopes[number], self.halves[number].limits
+        slopes, limits = self.slopes[number], self.limits
         variance = self.law.variance(self.batches[number][0], self.trials)
         below = {cell: _in_cells(variance, self.image, cell) for cell in set(cells)}
         weights = np.empty_like(slopes)
@@ -186,8 +171,13 @@ class Moments:
             np.clip(weight, -limits[i], limits[i], out=weight)
             weights[:, i] = _expanded(weight, self.image, cells[i], slopes.shape[2])
 
-        list(pool.map(unknown, range(len(cells))))
+        _in_threads(unknown, range(len(cells)))
         return weights
+
+
+def _in_threads(work: Callable[[Any], None], items: Sequence[Any]) -> None:
+    with ThreadPoolExecutor(core_count()) as pool:
+        list(pool.map(work, items))
 
 
 def _parts(pixels: int) -> list[slice]:
@@ -216,32 +206,22 @@ def _expanded(cube: Rows, image: tuple[int, int], cell: Cell, bins: int) -> Rows
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A step towards the solution and its covariance; in the unit of the equations.
+    """A step towards the solution and its covariance, in the unit of the equations.
 
-    Attributes:
-        shared: Step of what all pixels share, `[S]`.
-        pixels: Steps of the pixels' own unknowns, `[pixel, Q]`; NaN where a pixel knows nothing of them.
-        information: Fisher information of the shared unknowns when the own ones are unknown too, `[S, S]`.
-        covariance: Of the shared, counts and simulation together, `[S, S]`.
-        simulation: The part of it that is noise of the simulation.
-        pixel_covariance: `[pixel, Q, Q]`.
-        pixel_bound: Their Cramér–Rao bound, `[pixel, Q, Q]`.
-        simulation_share: Largest variance by the simulation over that by the counts, of the shared unknowns;
-            without any, of the median pixel.
-        gain: What the step adds to the log-likelihood, of the shared unknowns in their covariance.
-        slope_ratio: The depth's slope over that of the renderer's wide difference; 1 where no difference was seen; 0
-            where it is not known how far the depth can move without a change of the counts.
+    S unknowns are shared by all pixels, Q are a pixel's own; a pixel that knows nothing of its own has NaN.
     """
 
-    shared: Floats
-    pixels: Floats
-    information: Floats
-    covariance: Floats
-    simulation: Floats
-    pixel_covariance: Floats
-    pixel_bound: Floats
-    simulation_share: float
-    gain: float
+    shared: Floats  # step of the shared, [S]
+    pixels: Floats  # steps of the own, [pixel, Q]
+    information: Floats  # Fisher information of the shared when the own ones are unknown too, [S, S]
+    covariance: Floats  # of the shared, by counts and simulation together, [S, S]
+    simulation: Floats  # the part of it that is noise of the simulation
+    pixel_covariance: Floats  # [pixel, Q, Q]
+    pixel_bound: Floats  # Cramér–Rao bound of the own, [pixel, Q, Q]
+    simulation_share: float  # largest variance by the simulation over that by the counts; without shared: median pixel
+    gain: float  # what the step adds to the log-likelihood, of the shared in their covariance
+    # The depth's slope over that of the renderer's wide difference; 1: no difference was seen; 0: it is not known how
+    # far the depth can move without a change of the counts.
     slope_ratio: float = 1.0
 
 

@@ -119,14 +119,7 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Joint:
-    """What a fit and bounds have in common: unknowns of the whole exposure with their covariance.
-
-    Attributes:
-        names, covariance: Of these unknowns `[S, S]`, on the scale that is searched: the logarithm for positive values.
-        warnings: What may mislead, in words.
-        pulses: Of the exposure, in all.
-        photons: Traced in all.
-    """
+    """What a fit and bounds have in common: unknowns of the whole exposure with their covariance."""
 
     names: Sequence[str]
     covariance: Floats
@@ -428,9 +421,9 @@ class Fitter:
         for _ in range(_COARSE):
             photons = max(photons, 1000)
             (half,) = self.render(state.values, photons=photons, halves=1)
-            half = replace(half, slopes=half.slopes[columns], limits=half.limits[columns])
-            scales = state.scales(self.shared, 1)[0]
-            blocks = _in_blocks(self.law, half, trials, self.exposure.counts, scales, self.image)
+            scales, limits = state.scales(self.shared, 1)[0], self.render.limits[columns]
+            half = half._replace(slopes=half.slopes[columns])
+            blocks = _in_blocks(self.law, half, trials, self.exposure.counts, scales, limits, self.image)
             step, error = _coarse_step(*blocks, largest, self.prior_at(state))
             gain = 0.5 * float(np.sum((step / np.maximum(error, 1e-12)) ** 2))
             iteration = Iteration(values=state.means(), gain=gain, photons=photons, coarse=True)
@@ -465,7 +458,9 @@ class Fitter:
         self, state: State, halves: list[Half], trials: Rows | None, pooling_level: int | None
     ) -> tuple[int, Equations, Solution]:
         """The step from a rendering, see `solve_pooled`; without `trials` of a plan of the exposure."""
-        moments = Moments(self.law, halves, trials, self.exposure.counts, self.exposure.pulses, self.image)
+        moments = Moments(
+            self.law, halves, self.render.limits, trials, self.exposure.counts, self.exposure.pulses, self.image
+        )
         scales = state.scales(self.unknowns, self.image[0] * self.image[1])
         return solve_pooled(self.unknowns, moments, scales, self._solver(state), pooling_level)
 
@@ -643,11 +638,11 @@ class Fitter:
 
 
 def _in_blocks(
-    law: Law, half: Half, trials: Rows, counts: NDArray[Any], scales: Floats, image: tuple[int, int]
+    law: Law, half: Half, trials: Rows, counts: NDArray[Any], scales: Floats, limits: Rows, image: tuple[int, int]
 ) -> tuple[Floats, Floats, Floats]:
     """Counts, their mean `[block, bin]` and its relative derivatives `[unknown, block, bin]` in blocks of pixels.
 
-    `scales` `[unknown]`: units of the unknowns.
+    `scales` `[unknown]`: units of the unknowns; `limits`: of the derivatives by the unknowns of the scene.
     """
     rows, columns = (np.arange(size) * min(_ACROSS, size) // size for size in image)
     blocks = (rows[:, None] * (columns[-1] + 1) + columns).reshape(-1)
@@ -661,8 +656,8 @@ def _in_blocks(
         mean[block] = law.mean(half.rates[chosen], trials[chosen]).sum(axis=0)
         slopes[:, block] = law.slopes(half.rates[chosen], by_unknowns, trials[chosen]).sum(axis=0) * scales[:, None]
     mean += 1e-3  # of a count: a block that no photon has reached can still have one
-    limits = (half.limits * scales)[:, None, None]
-    return observed, mean, np.clip(slopes / mean, -limits, limits)
+    bounds = (limits * scales)[:, None, None]
+    return observed, mean, np.clip(slopes / mean, -bounds, bounds)
 
 
 def _coarse_step(

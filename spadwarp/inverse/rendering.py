@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,49 +28,26 @@ Values = Mapping[str, Any]
 """By name a number, or for an unknown of each pixel `[pixel]`; depth as a shift from the scene's [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Half:
-    """Rates and derivatives by one group of photons.
+class Half(NamedTuple):
+    """Rates and derivatives by one group of photons."""
 
-    Attributes:
-        rates: λ, expected detections per pulse, float32 `[pixel, bin]`.
-        slopes: dλ/d(unknown), float32 `[unknown, pixel, bin]`, of the first batch of the group.
-        first: λ of that batch.
-        limits: Largest |dλ|/λ that a weight takes, `[unknown]`. A scored derivative is λ times a mean of what its
-            photons scored, and needs none; a difference of two places is noise alone where λ is hardly known.
-        batches: λ of each batch; their mean is `rates`.
-    """
-
-    rates: Rows
-    slopes: Rows
-    first: Rows
-    limits: Rows
-    batches: list[Rows]
+    rates: Rows  # λ, expected detections per pulse, float32 [pixel, bin]: the mean of the batches
+    slopes: Rows  # dλ/d(unknown), float32 [unknown, pixel, bin], of the first batch
+    batches: list[Rows]  # λ of each batch
 
 
 @dataclass(eq=False)
 class Renderer:
-    """Renders a scene at values of its unknowns; every call takes photons that no other call has taken.
+    """Renders a scene at values of its unknowns; every call takes photons that no other call has taken."""
 
-    Attributes:
-        scene: With the values that are known.
-        unknowns: In the order of the slopes.
-        exposure: Time axis and response of the counts.
-        device: As in `simulate`.
-        seed: Key of the random numbers.
-        depth_step: Half of the distance between the two places of central differences [m].
-        truth: Truth maps of the scene at the values rendered last.
-        photons: Emitted so far.
-    """
-
-    scene: Scene
-    unknowns: tuple[Unknown, ...]
-    exposure: Exposure
+    scene: Scene  # with the values that are known
+    unknowns: tuple[Unknown, ...]  # in the order of the slopes
+    exposure: Exposure  # time axis and response of the counts
     device: str | None = None
     seed: int = 0
-    depth_step: float = 0.0
-    truth: Truth | None = None
-    photons: int = 0
+    depth_step: float = 0.0  # half of the distance between the two places of central differences [m]
+    truth: Truth | None = None  # truth maps of the scene at the values rendered last
+    photons: int = 0  # emitted so far
     _kept: dict[str, Any] = field(default_factory=dict)
     _tally: Any = None
 
@@ -102,6 +79,15 @@ class Renderer:
         """The detector's bins in time."""
         return self._receiver(self.scene, {}).window
 
+    @property
+    def limits(self) -> NDArray[np.float32]:
+        """Largest |dλ|/λ that a weight takes, `[unknown]`.
+
+        A scored derivative is λ times a mean of what its photons scored, and needs none; a difference of two places is
+        noise alone where λ is hardly known.
+        """
+        return np.array([1.0 / self.depth_step if one.name == DEPTH else 1e30 for one in self.unknowns], np.float32)
+
     def __call__(self, values: Values, *, photons: int, halves: int = 2, batches: int = 1) -> list[Half]:
         """Groups of `photons` · `batches` photons each, which are independent of each other."""
         scene = self._at(values)
@@ -113,20 +99,17 @@ class Renderer:
             depth = self._depth_difference(scene, self.depth_step, photons)
         self.truth = scored.truth
         receiver = self._placed(scene, values)
-        limits = [1.0 / self.depth_step if unknown.name == DEPTH else 1e30 for unknown in self.unknowns]
         groups = []
         for _ in range(halves):
             number = self._take(photons)
             light, slopes = scored(number, photons)
             if depth is not None:
                 slopes[DEPTH] = depth(number)
-            first = receiver.rates(light)
-            group = [first]
+            group = [receiver.rates(light)]
             for _ in range(batches - 1):
                 group.append(receiver.rates(plain(self._take(photons), photons)[0]))
-            rates: Rows = first if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
-            unknowns = receiver.slopes(slopes, self.unknowns)
-            groups.append(Half(rates, unknowns, first, np.array(limits, np.float32), group))
+            rates: Rows = group[0] if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
+            groups.append(Half(rates, receiver.slopes(slopes, self.unknowns), group))
         return groups
 
     def depth_slopes(self, values: Values, *, shift: float, step: float, photons: int, batches: int) -> list[Rows]:
@@ -224,49 +207,46 @@ class Renderer:
         moving = [unknown for unknown in self.unknowns if unknown.per_pixel and unknown.name != BACKGROUND]
         if not moving:
             return _PlacedReceiver(receiver)
-        pixels = scene.camera.width * scene.camera.height
-        delay, factor = np.zeros(pixels), np.ones(pixels)
+        delay, factor = np.zeros(scene.camera.width * scene.camera.height), 1.0
         for unknown in moving:
             value = np.asarray(values[unknown.name])
             if unknown.name == DEPTH:
-                delay += (value - float(np.mean(value))) * _bins_per_metre(scene).reshape(-1)
+                delay = (value - float(np.mean(value))) * _bins_per_metre(scene).reshape(-1)
             else:
-                factor *= value / float(np.mean(value))
-        return _PlacedReceiver(receiver, delay, factor)
+                factor = factor * (value / float(np.mean(value)))
+        return _PlacedReceiver(receiver, delay, np.broadcast_to(factor, delay.shape).astype(np.float32))
 
 
-@dataclass(frozen=True, eq=False)
-class _PlacedReceiver:
+class _PlacedReceiver(NamedTuple):
     """The receiver, and how each pixel changes the light of the targets: a delay in bins and a factor, `[pixel]`."""
 
     receiver: Receiver
     delay: NDArray[np.float64] | None = None
-    factor: NDArray[np.float64] | None = None
+    factor: Rows | None = None
 
     def rates(self, light: ExpectedLight) -> Rows:
         """λ of light."""
-        rates: Rows = self.receiver.hazard(light.total).numpy()
-        return rates if self.delay is None else rates + self._change(light)
+        return self._with_change(self.receiver.hazard(light.total).numpy(), light)
 
     def slopes(self, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown]) -> Rows:
         """Derivatives of λ, `[unknown, pixel, bin]`."""
         widths = np.diff(self.receiver.window.edges).astype(np.float32)
-        pixels = self.receiver.image[0] * self.receiver.image[1]
-        result = np.empty((len(unknowns), pixels, widths.size), np.float32)
+        result = np.empty((len(unknowns), self.receiver.image[0] * self.receiver.image[1], widths.size), np.float32)
         for row, unknown in zip(result, unknowns, strict=True):
             if unknown.name == BACKGROUND:
                 row[:] = widths
-                continue
-            row[:] = self.receiver.slope(slopes[unknown.name].total).numpy()
-            if self.delay is not None:
-                row += self._change(slopes[unknown.name])
+            else:
+                light = slopes[unknown.name]
+                row[:] = self._with_change(self.receiver.slope(light.total).numpy(), light)
         return result
 
-    def _change(self, light: ExpectedLight) -> Rows:
-        """What is added to λ, or to its derivative: the light of the targets in its new place, less that in the old."""
-        assert light.target is not None and self.delay is not None and self.factor is not None
+    def _with_change(self, rows: Rows, light: ExpectedLight) -> Rows:
+        """With the light of the targets in its new place, less that in the old."""
+        if self.delay is None:
+            return rows
+        assert light.target is not None and self.factor is not None
         target: Rows = self.receiver.slope(light.target).numpy()
-        return subbin_shift(target, self.delay) * self.factor.astype(np.float32)[:, None] - target
+        return rows + (subbin_shift(target, self.delay) * self.factor[:, None] - target)
 
 
 def _bins_per_metre(scene: Scene) -> NDArray[np.float64]:

@@ -103,18 +103,16 @@ def _checked(scene: Scene, parameters: Mapping[str, torch.Tensor]) -> tuple[list
     unknowns = dict(zip(plain, read_unknowns(scene, plain), strict=True)) if plain else {}
     names, shapes = list[str](), set[tuple[int, ...]]()
     for name, value in parameters.items():
-        if name not in unknowns:
-            if not isinstance(value, torch.Tensor) or value.ndim != 3:
+        unknown, is_tensor = unknowns.get(name), isinstance(value, torch.Tensor)
+        if unknown is None:
+            if not is_tensor or value.ndim != 3:
                 raise ArgumentError(f"parameters: {name} is not a tensor [x, y, z] of blocks")
             shapes.add(tuple(value.shape))
-            names.append(name)
-            continue
-        unknown = unknowns[name]
-        if not unknown.is_light or unknown.per_pixel:
+        elif not unknown.is_light or unknown.per_pixel:
             raise ArgumentError(f"parameters: {unknown} has no scored derivative")
-        if not isinstance(value, torch.Tensor) or value.numel() != 1:
+        elif not is_tensor or value.numel() != 1:
             raise ArgumentError(f"parameters: {unknown} is not a tensor of one number")
-        names.append(unknown.name)
+        names.append(unknown.name if unknown else name)
     if len(shapes) > 1:
         raise ArgumentError(f"parameters: blocks of different numbers, {sorted(shapes)}")
     shape = shapes.pop() if shapes else None

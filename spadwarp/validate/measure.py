@@ -33,21 +33,13 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Quantity:
-    """One measured number of a case beside its reference.
+    """One measured number of a case beside its reference."""
 
-    Attributes:
-        name: What was measured, with its unit.
-        estimate: The simulator's value.
-        reference: The known value.
-        reference_error: Standard error of the reference, 0 where it is known.
-        rounding: Half a unit of the last published digit: the reference lies within it, and z counts from its edge.
-    """
-
-    name: str
+    name: str  # what was measured, with its unit
     estimate: Estimate
     reference: float
-    reference_error: float = 0.0
-    rounding: float = 0.0
+    reference_error: float = 0.0  # standard error of the reference, 0 where it is known
+    rounding: float = 0.0  # half a unit of the last published digit: z counts from the edge of this interval
 
     @property
     def standard_error(self) -> float:

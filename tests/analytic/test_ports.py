@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import spadwarp
-from spadwarp.analytic import pixel_maps, scene_eye_limit
+from spadwarp.analytic import eye_limit, pixel_maps
 from spadwarp.analytic.eye_safety import as_if_bare
 from spadwarp.checks import summary
 from spadwarp.errors import ArgumentError, ConfigError
@@ -202,10 +202,10 @@ def test_the_beam_is_as_narrow_as_its_photons(port):
     irradiance = behind.transmission(np.zeros(3), u)[inside].sum() / t.size / (np.pi * 0.05**2)
     bare = 1.0 / (2.0 * np.pi * (1.0 - math.cos(math.radians(3.0))) * as_if_bare(one, 4.0) ** 2)
     assert bare == pytest.approx(irradiance, rel=4.0 / math.sqrt(inside.sum()))
-    limit = scene_eye_limit(one, distance=4.0, exposure=100.0)
+    limit = eye_limit(one, distance=4.0, exposure=100.0)
     assert limit.distance == 4.0
     if 0.0 < limit.hazard_distance < math.inf:
-        wide = scene_eye_limit(one.with_overrides({"laser.port": None}), distance=4.0, exposure=100.0)
+        wide = eye_limit(one.with_overrides({"laser.port": None}), distance=4.0, exposure=100.0)
         assert as_if_bare(one, limit.hazard_distance) == pytest.approx(wide.hazard_distance, rel=1e-6)
 
 
