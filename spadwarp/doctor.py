@@ -113,12 +113,9 @@ def _packages(problems: list[str]) -> dict[str, str]:
 
 def _device_text(device: dict[str, Any]) -> str:
     memory, capability = device["memory"], device["compute_capability"]
-    parts = [
-        device["description"],
-        f"{memory / 2**30:.1f} GiB" if memory else "",
-        f"compute capability {capability}" if capability else "",
-    ]
-    return ", ".join(filter(None, parts)) + (" (default)" if device["default"] else "")
+    size = f", {memory / 2**30:.1f} GiB" if memory else ""
+    newest = f", compute capability {capability}" if capability else ""
+    return f"{device['description']}{size}{newest}{' (default)' if device['default'] else ''}"
 
 
 def _cache(problems: list[str]) -> dict[str, str]:
@@ -185,10 +182,11 @@ _PHOTONS = 400_000
 
 # A pencil beam at normal incidence on a plate in turbid water, seen by one pixel.
 _PENCIL = {"profile": "collimated", "beam_radius": 0.0, "position": [0.0, 0.0, 0.0]}
+_CAMERA = {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01}
 _PLATE = {
     "medium": {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.924},
     "laser": _PENCIL,
-    "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01},
+    "camera": _CAMERA,
     "gate": {"start_ns": 17.0, "bin_width_ps": 500.0, "bins": 8},
     "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}],
     "transport": {"axis_threshold": 1.0},
@@ -198,8 +196,8 @@ _PLATE = {
 _SLAB = {
     "medium": {"extinction": 1.0, "albedo": 0.9, "anisotropy": 0.75},
     "laser": _PENCIL,
+    "camera": _CAMERA,
     "domain": {"shape": "slab", "lower": [0.0, 0.0, 0.0], "upper": [0.0, 0.0, 2.0]},
-    "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01},
     "gate": {"start_ns": 0.0, "bin_width_ps": 1e6, "bins": 1},
     "transport": {"axis_threshold": 1.0, "termination": "roulette", "weight_cutoff": 0.05},
 }
@@ -251,13 +249,10 @@ def _run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[S
     ballistic = float(result.component("ballistic").sum()) / returned
     error = math.sqrt(arrive * (1 - arrive) / _PHOTONS)
     measured = [("ballistic light from the plate", ballistic, arrive, error)]
-    for name, face, reference in (
-        ("reflected by the slab", "exit_z_low", _REFLECTED),
-        ("transmitted by the slab", "exit_z_high", _TRANSMITTED),
-    ):
-        weight = records.weight * records.ended(face)
+    for part, face, reference in (("reflected", "low", _REFLECTED), ("transmitted", "high", _TRANSMITTED)):
+        weight = records.weight * records.ended(f"exit_z_{face}")
         error = math.hypot(float(weight.std()) / math.sqrt(_PHOTONS), _ROUNDING)
-        measured.append((name, float(weight.mean(dtype=float)), reference, error))
+        measured.append((f"{part} by the slab", float(weight.mean(dtype=float)), reference, error))
     tests = [SelfTest(*row, abs(row[1] - row[2]) < _LARGEST_Z * row[3]) for row in measured]
     difference = float(result.energy_report()["difference"])
     return [*tests, SelfTest("energy that is not accounted for", difference, 0.0, 0.0, difference == 0)], seconds

@@ -13,13 +13,13 @@ import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
-from spadwarp.analytic.model import false_peaks, source_name
+from spadwarp.analytic.model import false_peaks
 from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import (
@@ -197,7 +197,7 @@ def _plain(value: Any) -> Any:
     """Dicts of dicts and data classes as dicts."""
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
-    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else value
+    return dataclasses.asdict(value) if isinstance(value, EyeLimit | Pilot) else value
 
 
 def plan(
@@ -282,7 +282,7 @@ def plan(
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
         scene = with_plane(scene, span[1])
     if problem:
-        raise ConfigError(problem, source=source_name(scene))
+        raise ConfigError(problem, source=scene.source)
     proposal = planner.propose(scene, span, photons)
     if not largest_range:
         return proposal
@@ -317,11 +317,11 @@ class _Planner:
 
     def propose(self, scene: Scene, span: tuple[float, float], photons: int, *, even: bool = False) -> Proposal:
         """The experiment with a target at these ranges: light, pulse energy, pulses, error; `even` as in `measure`."""
-        rate, target, gate = scene.laser.repetition_rate, scene, propose_gate(scene, span, self.margin)
-        if scene.detector.wrap and rate > gate.largest_rate:
-            rate = _rounded_down(gate.largest_rate)
-        fields = {"start_ns": gate.start_ns, "bins": gate.bins}
-        scene = scene.with_overrides(gate=fields, laser={"repetition_rate": rate}, transport={"max_path": None})
+        target, scene = scene, with_gate(scene, span, self.margin)
+        rate, largest_rate = scene.laser.repetition_rate, 1.0 / scene.gate.stop
+        if scene.detector.wrap and rate > largest_rate:
+            rate = _rounded_down(largest_rate)
+            scene = scene.with_overrides(laser={"repetition_rate": rate})
         small = window(scene, self.device)
         runs = trace(small, photons, self.seed, self.device, None if even else self.progress)
         pilot = measure(runs, scene, self.device, even=even, channel=self.channel)
@@ -358,7 +358,7 @@ class _Planner:
             optical_depth=optical_depth,
             gate_range=tuple(range_from_time(end, index) + advance for end in (scene.gate.start, scene.gate.stop)),
             unambiguous_range=range_from_time(1.0 / rate, index) + advance,
-            largest_rate=gate.largest_rate,
+            largest_rate=largest_rate,
             pile_up_energy=piled,
             eye=eye,
             energy_limit=energy_limit,
@@ -369,7 +369,7 @@ class _Planner:
             reached=purpose in ("depth error", "false peaks") and frame_time <= self.time,
             terms=terms,
             limit=limit,
-            advice=self._advice(limit, purpose, frame_time, rate, gate.largest_rate),
+            advice=self._advice(limit, purpose, frame_time, rate, largest_rate),
             pilot=pilot,
             channels={name: measure(runs, scene, self.device, channel=name) for name in compared},
         )
@@ -425,8 +425,8 @@ class _Planner:
             if self.progress is not None:
                 self.progress(f"a plane at {distance:.3g} m", 0, 0)
             target = with_plane(scene, distance)
-            gate = propose_gate(target, (distance, distance), self.margin)
-            if scene.detector.wrap and gate.largest_rate < scene.laser.repetition_rate:
+            gated = with_gate(target, (distance, distance), self.margin)
+            if scene.detector.wrap and 1.0 / gated.gate.stop < scene.laser.repetition_rate:
                 reason = "repetition rate"
                 return False
             try:
@@ -455,16 +455,9 @@ class _Planner:
 # Targets and gates
 
 
-class Gate(NamedTuple):
-    """Start [ns], as a file holds it, bins, and the rate up to which a pulse's gate ends before the next pulse [Hz]."""
-
-    start_ns: float
-    bins: int
-    largest_rate: float
-
-
-def propose_gate(scene: Scene, span: tuple[float, float], margin: float) -> Gate:
-    """A gate for returns from a span of ranges [m], with `margin` [m] and the instrument response on both sides.
+def with_gate(scene: Scene, span: tuple[float, float], margin: float) -> Scene:
+    """The scene with a gate for returns from a span of ranges [m], with `margin` [m] and the instrument response on
+    both sides. Its end is the least time between pulses.
 
     The bins keep their width. Raises `ConfigError` for a gate of more than a million bins.
     """
@@ -480,9 +473,9 @@ def propose_gate(scene: Scene, span: tuple[float, float], margin: float) -> Gate
         raise ConfigError(
             f"gate.bin_width_ps = {scene.gate.bin_width_ps:g}: a gate for {span[0]:.4g} to {span[1]:.4g} m takes "
             f"{bins} bins, more than {_MOST_BINS}",
-            source=source_name(scene),
+            source=scene.source,
         )
-    return Gate(start_ns, bins, 1.0 / (start_ns * 1e-9 + bins * width))
+    return scene.with_overrides(gate={"start_ns": start_ns, "bins": bins}, transport={"max_path": None})
 
 
 def with_plane(scene: Scene, distance: float) -> Scene:
@@ -565,9 +558,11 @@ def measure(
     `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
     its modulus.
     """
-    first, second = (
-        analyser_channel(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs
-    )
+    # The traced scene with what a detector sees of the wanted one.
+    names = ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")
+    laser = runs[0].scene.laser.model_copy(update={name: getattr(scene.laser, name) for name in names})
+    seen_by = runs[0].scene.model_copy(update={"laser": laser, "detector": scene.detector})
+    first, second = (analyser_channel(dataclasses.replace(run, scene=seen_by), channel) for run in runs)
     both = merge([first, second])
     clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
     frames, clear_frames, *half_frames = (
@@ -580,7 +575,7 @@ def measure(
     if not seen.any():
         raise ConfigError(
             "no light of the target reaches the pixels near the axis: `spadwarp check` says why",
-            source=source_name(scene),
+            source=scene.source,
         )
 
     def median(values: Any) -> float:
@@ -623,14 +618,6 @@ def measure(
         level=median(level),
         photons=both.photons,
     )
-
-
-def _as_traced(traced: Scene, wanted: Scene) -> Scene:
-    """The traced scene with what a detector sees of the wanted one."""
-    laser = traced.laser.model_copy(
-        update={name: getattr(wanted.laser, name) for name in ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")}
-    )
-    return traced.model_copy(update={"laser": laser, "detector": wanted.detector})
 
 
 def _depth_error(result: Result, frames: Frames, histogram: Any, method: Any, device: str | None) -> Floats:

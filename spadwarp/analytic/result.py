@@ -16,7 +16,6 @@ from spadwarp.analytic.model import (
     pixel_maps,
     response_sigma,
     scene_optics,
-    source_name,
     warn_of_model,
 )
 from spadwarp.device import pick_device
@@ -161,16 +160,25 @@ class AnalyticResult:
 
         device = pick_device(device)
         shape, pixels = self.truth.depth.shape, self.truth.depth.size
-        inputs, (optics, ports) = self._inputs(device), scene_optics(self.scene)
+        optics, ports = scene_optics(self.scene)
         speed, gate = self.scene.medium.pulse_speed, self.scene.gate
         depth, labels = np.empty((frames, *shape), np.float32), np.empty((frames, *shape), np.bool_)
+        view, in_water = pixel_directions(self.scene.camera), lines_of_sight(self.scene).direction
+        # No bound is worse than a guess anywhere in the gate.
+        sigma = np.minimum(self.sigma_depth, gate_deviation(self.scene, in_water))
+        values = (np.where(np.isnan(self.sigma_depth), np.nan, self.truth.depth), sigma, self.background_probability)
+        rows = (*(one.reshape(-1) for one in values), self._flat_share, *self._table)
+        inputs: list[Any] = [
+            wp.array(np.ascontiguousarray(one, np.float32), dtype=kind, device=device)
+            for one, kind in ((view.reshape(-1, 3), wp.vec3), *((row, wp.float32) for row in rows))
+        ]
         # On the CPU kernels write into the result itself; a GPU works in parts.
         part = max(frames, 1) if device.is_cpu else max(_PART_PIXELS // pixels, 2)
         for start in range(0, frames, part):
             stop = min(start + part, frames)
-            rows: list[Any] = [
-                wp.array(values[start:stop].reshape(stop - start, pixels), dtype=kind, device="cpu", copy=False)
-                for values, kind in ((depth, wp.float32), (labels, wp.bool))
+            out: list[Any] = [
+                wp.array(whole[start:stop].reshape(stop - start, pixels), dtype=kind, device="cpu", copy=False)
+                for whole, kind in ((depth, wp.float32), (labels, wp.bool))
             ]
             drawn = kernels.sample_frames(
                 *inputs,
@@ -181,32 +189,13 @@ class AnalyticResult:
                 first_frame=first + start,
                 frames=stop - start,
                 seed=self.seed if seed is None else seed,
-                out=(rows[0], rows[1]) if device.is_cpu else None,
+                out=(out[0], out[1]) if device.is_cpu else None,
             )
             if not device.is_cpu:
-                for row, array in zip(rows, drawn, strict=True):
+                for row, array in zip(out, drawn, strict=True):
                     wp.copy(row, array)
                 wp.synchronize_device(device)
         return depth, labels
-
-    def _inputs(self, device: Any) -> list[Any]:
-        """Arrays of the sampler on the device: a value a pixel, and the table of backscatter."""
-        import warp as wp
-
-        def put(values: NDArray[Any], kind: Any = wp.float32) -> Any:
-            return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=device)
-
-        view, in_water = pixel_directions(self.scene.camera), lines_of_sight(self.scene).direction
-        return [
-            put(view.reshape(-1, 3), wp.vec3),
-            put(np.where(np.isnan(self.sigma_depth), np.nan, self.truth.depth).reshape(-1)),
-            # No bound is worse than a guess anywhere in the gate.
-            put(np.minimum(self.sigma_depth, gate_deviation(self.scene, in_water)).reshape(-1)),
-            put(self.background_probability.reshape(-1)),
-            put(self._flat_share),
-            put(self._table.paths),
-            put(self._table.cumulative),
-        ]
 
     def _array(self, stored: str) -> NDArray[Any]:
         """An array of the file by its name."""
@@ -327,7 +316,7 @@ def simulate_analytic(
         raise ConfigError(
             f"gate [{scene.gate.start * 1e9:.4g}, {scene.gate.stop * 1e9:.4g}) ns holds no return; "
             f"the target's arrive from {times.min():.4g} to {times.max():.4g} ns",
-            source=source_name(scene),
+            source=scene.source,
         )
     maps["background_probability"], flat = _background(scene, maps)
     result = AnalyticResult(

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, source_name, warn_of_model
+from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, warn_of_model
 from spadwarp.analytic.result import simulate_analytic
 from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 from spadwarp.io.text import parse_toml
@@ -237,7 +237,7 @@ def central_pixel(scene: Scene, truth: Truth) -> tuple[Any, ...]:
     """Row and column of the target pixel nearest to the optical axis. Raises `ConfigError` without any."""
     hit = ~np.isnan(truth.depth)
     if not hit.any():
-        raise ConfigError("no target is in view", source=source_name(scene))
+        raise ConfigError("no target is in view", source=scene.source)
     off_axis = np.where(hit, -pixel_directions(scene.camera)[..., 2], np.inf)
     return np.unravel_index(np.argmin(off_axis), off_axis.shape)
 

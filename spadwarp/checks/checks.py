@@ -6,7 +6,6 @@ import dataclasses
 import math
 from typing import Any
 
-from spadwarp.analytic.model import source_name
 from spadwarp.checks.geometry import check_focus, check_ports, check_scan, check_targets
 from spadwarp.checks.light import check_daylight, check_polarisation, check_spectrum, check_statistics, check_timing
 from spadwarp.checks.plausible import check_plausible
@@ -38,7 +37,7 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     try:  # read here, since only depth and counts need it: at the end of a run it would be too late
         detector_response(survey.scene.detector, survey.scene.laser)
     except ArgumentError as error:
-        raise ConfigError(f"detector.irf: {error}", source=source_name(survey.scene)) from None
+        raise ConfigError(f"detector.irf: {error}", source=survey.scene.source) from None
     for find in _CHECKS:
         find(survey)
     return sorted(survey.messages, key=lambda message: message.level != "warning")

@@ -84,13 +84,8 @@ class Equations:
 class Moments:
     """Means of the counts by two halves of photons, their derivatives and variance, float32: what equations are of.
 
-    Args:
-        law, halves: The detector; what the photons say.
-        limits: Of weights, `Renderer.limits`.
-        trials: Pulses that can still count in each bin `[pixel, bin]`; None: their mean.
-        counts: `[pixel, bin]`; None for a plan.
-        pulses: In all.
-        image: (height, width).
+    `limits` are the renderer's; without `trials`, the pulses that can still count in each bin `[pixel, bin]`, their
+    mean is taken; without `counts` `[pixel, bin]` it is a plan of `pulses` in all.
     """
 
     def __init__(
@@ -228,13 +223,7 @@ class Solution:
 def solve(
     equations: Equations, is_per_pixel: NDArray[np.bool_], prior: tuple[Floats, Floats] | None = None
 ) -> Solution:
-    """The Newton step of the equations.
-
-    Args:
-        equations: Of `Moments`.
-        is_per_pixel: Which unknowns each pixel has for itself, `[unknown]`.
-        prior: Score and information on the shared unknowns from elsewhere, `[S]` both.
-    """
+    """The Newton step of equations; `prior`: score and information on the shared from elsewhere, `[S]` both."""
     s, q = np.flatnonzero(~is_per_pixel), np.flatnonzero(is_per_pixel)
     slope, score = equations.slope, equations.score
     pull, known_before = (np.zeros(s.size), np.zeros(s.size)) if prior is None else prior
@@ -320,14 +309,8 @@ def solve_pooled(
 ) -> tuple[int, Equations, Solution]:
     """The equations with the cells, of so many pixels on a side, that have the least standard errors; their solution.
 
-    From coarse to fine: fine weights of the score are sharp but noisy, coarse ones know little of edges.
-
-    Args:
-        unknowns: In the order of the slopes.
-        moments: Of a rendering.
-        scales: Units of the unknowns, `[pixel, unknown]`.
-        solve: Solves equations in these units.
-        pooling_level: The coarsest that is tried, as that of an earlier rendering; None: the coarsest of all.
+    From coarse to fine: fine weights of the score are sharp but noisy, coarse ones know little of edges. Sides are at
+    most `pooling_level`, that of an earlier rendering. `solve` takes units of `scales` `[pixel, unknown]`.
     """
 
     def cell(unknown: Unknown, size: int) -> Cell:

@@ -500,23 +500,12 @@ class Fitter:
         return pull, information
 
     def _locally_solved(
-        self,
-        equations: Equations,
-        solution: Solution,
-        state: State,
-        halves: list[Half],
-        trials: Rows,
-        photons: int,
+        self, equations: Equations, solution: Solution, state: State, halves: list[Half], trials: Rows, photons: int
     ) -> Solution:
-        """Solves again with the slope by the common depth between the ends of its 95 % interval.
+        """Solves again with the slope by the common depth over its 95 % interval, not over the wide difference.
 
-        Where no interval shorter than the wide difference has a slope that belongs to it, the light can move inside a
-        bin: the depth's variance then is that of two places anywhere in the same bin.
-
-        Args:
-            equations, solution: With the renderer's wide difference, on the scale that is searched.
-            state, halves, trials: What the equations are made of.
-            photons: Of a difference.
+        Where no shorter interval has a slope that belongs to it, the light can move inside a bin: the depth's variance
+        then is that of two places anywhere in the same bin. `photons`: of a difference.
         """
         depth = [unknown.name for unknown in self.shared]
         if DEPTH not in depth:
@@ -663,10 +652,8 @@ def _in_blocks(
 def _coarse_step(
     counts: Floats, mean: Floats, slopes: Floats, largest: Floats, prior: tuple[Floats, Floats]
 ) -> tuple[Floats, Floats]:
-    """Step of the unknowns within ± `largest` `[unknown]` that maximises the likelihood, and its standard errors.
-
-    The exponential model: means times exp(Σ relative derivative · step). `prior`: score and information from elsewhere.
-    """
+    """Step within ± `largest` `[unknown]` that maximises an exponential model's likelihood, and its standard errors:
+    means times exp(Σ relative derivative · step). `prior`: score and information from elsewhere."""
     from scipy.optimize import minimize
 
     pull, known = prior

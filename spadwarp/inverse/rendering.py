@@ -207,7 +207,7 @@ class Renderer:
         moving = [unknown for unknown in self.unknowns if unknown.per_pixel and unknown.name != BACKGROUND]
         if not moving:
             return _PlacedReceiver(receiver)
-        delay, factor = np.zeros(scene.camera.width * scene.camera.height), 1.0
+        delay, factor = np.zeros(scene.camera.width * scene.camera.height), np.ones(1)
         for unknown in moving:
             value = np.asarray(values[unknown.name])
             if unknown.name == DEPTH:

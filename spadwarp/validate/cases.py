@@ -276,12 +276,7 @@ def fournier_forand(run: Run) -> Iterator[Quantity]:
 # Cases with a camera or a mesh, from histograms and from the energy balance
 
 _WATER = {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.924}
-_CAMERA = {
-    "width": 32,
-    "height": 32,
-    "horizontal_fov_deg": 10.0,
-    "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi),
-}
+_CAMERA = {"width": 32, "height": 32, "horizontal_fov_deg": 10.0, "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi)}
 
 
 def _scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
@@ -359,12 +354,7 @@ def reciprocity(run: Run) -> Iterator[Quantity]:
     """Laser and camera change places before a target in turbid water"""
     # Cones of equal half-angle, a box in the beams, many scatterings.
     half_angle, pixels = 6.0, 64
-    camera = {
-        "width": pixels,
-        "height": pixels,
-        "horizontal_fov_deg": 2 * half_angle,
-        "aperture_diameter": 1e-3,
-    }
+    camera = {"width": pixels, "height": pixels, "horizontal_fov_deg": 2 * half_angle, "aperture_diameter": 1e-3}
     position, direction = np.array([-0.8, 0.3, -0.4]), np.array([0.22, -0.05, 1.0])
     direction /= np.linalg.norm(direction)
     centre, ahead = np.array([0.25, 0.1, 3.2]), np.array([0.0, 0.0, 1.0])

@@ -140,7 +140,7 @@ class Run:
         for batch in range(BATCHES):
             yield simulate(simulated, photons=photons, seed=self._seed(repr(tables), batch), device=self.device)
 
-    def by_run(self, tables: Mapping[str, Any], numbers: Callable[[Any], ArrayLike]) -> list[Estimate]:
+    def by_run(self, tables: Mapping[str, Any], numbers: Callable[[Any], Any]) -> list[Estimate]:
         """Means over the runs of the numbers that a function makes of a `Result`."""
         return batch_means([numbers(result) for result in self.results(tables)])
 

@@ -174,15 +174,6 @@ def test_the_gate_of_a_plan_holds_the_return_of_a_simulation():
     assert path / one.medium.pulse_speed == pytest.approx(1.0 / found.scene.laser.repetition_rate, rel=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.physics
-def test_the_largest_range_behind_a_port_is_found():
-    laser = {"half_angle_deg": 12.0, "repetition_rate": 1e5, "pulse_energy": 1e-9}
-    one = ported(DOME, "camera", laser=laser, camera={"aperture_diameter": 0.01, "horizontal_fov_deg": 20.0})
-    found = spadwarp.plan(one, photons=20_000, depth_error=0.05, time=0.1, device="cpu")
-    assert found.largest_range > 3.0 and found.pilot.bound > 0
-
-
 @pytest.mark.physics
 @pytest.mark.parametrize("port", [WINDOW, WINDOW | {"normal": [0.1, 0.2, 1.0]}, DOME | {"offset": [0.0, 0.005, 0.01]}])
 def test_the_beam_is_as_narrow_as_its_photons(port):

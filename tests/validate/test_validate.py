@@ -34,15 +34,11 @@ def test_z_of_few_batches_allows_for_their_uncertain_error():
     assert two_sided_p(1.959964) == pytest.approx(0.05, abs=1e-7)
 
 
-def test_quantities_without_error_are_held_to_equality():
+def test_quantities_without_error_are_held_to_equality_and_a_rounded_reference_is_an_interval():
     assert Quantity("", Estimate(0.0, 0.0), 0.0).z == 0.0
     assert Quantity("", Estimate(1e-12, 0.0), 0.0).z == math.inf
-
-
-def test_a_rounded_reference_is_an_interval():
     near, far = (Quantity("", Estimate(value, 0.1), 1.0, rounding=0.05) for value in (1.04, 0.75))
-    assert near.z == 0.0
-    assert far.z == pytest.approx(-2.0)
+    assert near.z == 0.0 and far.z == pytest.approx(-2.0)
 
 
 def test_means_in_blocks_are_those_of_the_whole():
@@ -165,15 +161,13 @@ def test_fournier_forand_references():
 # The cases
 
 
+LONG = {"ledger", "mean-path", "white-vessel"}  # trace most
+
+
 @pytest.fixture(scope="module")
 def results():
-    """A short run of all cases but the three that trace most."""
-    return run(
-        [name for name in CASES if name not in ("ledger", "mean-path", "white-vessel")],
-        photons=10_000,
-        seed=3,
-        device="cpu",
-    )
+    """A short run of all other cases."""
+    return run([name for name in CASES if name not in LONG], photons=10_000, seed=3, device="cpu")
 
 
 @pytest.mark.physics
@@ -181,7 +175,7 @@ def results():
 def test_engine_agrees_with_every_reference(results):
     failed = [f"{r.quantity}: {r.value} against {r.reference}, z {r.z:.1f}" for r in results if not r.passed]
     assert not failed
-    assert {r.name for r in results} == set(CASES) - {"ledger", "mean-path", "white-vessel"}
+    assert {r.name for r in results} == set(CASES) - LONG
 
 
 @pytest.mark.physics
