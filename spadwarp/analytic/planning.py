@@ -283,7 +283,7 @@ def plan(
         scene = with_plane(scene, span[1])
     if problem:
         raise ConfigError(problem, source=scene.source)
-    proposal = planner.propose(scene, span, photons)
+    proposal = planner.propose(with_gate(scene, span, planner.margin), span, photons)
     if not largest_range:
         return proposal
     largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
@@ -317,7 +317,6 @@ class _Planner:
 
     def propose(self, scene: Scene, span: tuple[float, float], photons: int, *, even: bool = False) -> Proposal:
         """The experiment with a target at these ranges: light, pulse energy, pulses, error; `even` as in `measure`."""
-        target, scene = scene, with_gate(scene, span, self.margin)
         rate, largest_rate = scene.laser.repetition_rate, 1.0 / scene.gate.stop
         if scene.detector.wrap and rate > largest_rate:
             rate = _rounded_down(largest_rate)
@@ -345,10 +344,10 @@ class _Planner:
             detector={"pulses_per_frame": pulses}, analytic={"pulses_per_depth_frame": depth_pulses}
         )
         compared = CHANNELS if small.camera.channels and not even else ()
-        line = axis_line(target)
-        optical_depth = target.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
+        line = axis_line(scene)
+        optical_depth = scene.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
         fluence = axis_fluence(scene, span[0]) * math.exp(-optical_depth)
-        index, advance = scene.medium.group_index, port_advance(target)
+        index, advance = scene.medium.group_index, port_advance(scene)
         return Proposal(
             scene=scene,
             depth_error=self.depth_error,
@@ -424,13 +423,13 @@ class _Planner:
                 return False
             if self.progress is not None:
                 self.progress(f"a plane at {distance:.3g} m", 0, 0)
-            target = with_plane(scene, distance)
-            gated = with_gate(target, (distance, distance), self.margin)
+            span = (distance, distance)
+            gated = with_gate(with_plane(scene, distance), span, self.margin)
             if scene.detector.wrap and 1.0 / gated.gate.stop < scene.laser.repetition_rate:
                 reason = "repetition rate"
                 return False
             try:
-                proposal = self.propose(target, (distance, distance), photons, even=True)
+                proposal = self.propose(gated, span, photons, even=True)
             except ConfigError:
                 reason = "no light of the target"
                 return False
