@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, NoReturn, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError
+from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.io.paths import atomic_path, existing_file, used
 from spadwarp.io.text import parse_json
 from spadwarp.limits import check_integer, check_real
@@ -65,7 +65,7 @@ def read_hdf5(path: str | Path, format: str | None = None, *, version: int | Non
     file = open_hdf5(path, format, version=version)
     try:
         yield file
-    except (FileError, MemoryError):
+    except (SpadwarpError, MemoryError):
         raise
     except Exception as error:
         raise FileError(f"{path}: not a whole {file.kind}: {error}") from error
