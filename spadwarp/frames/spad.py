@@ -1,15 +1,17 @@
 """The camera: counts and time tags of a SPAD array from expected detections, and the noise they have of a simulation.
 
 Expected detections per pulse, `[H, W, T]`, in unwrapped time → response (pulse ⊗ jitter), wrapping at the pulse period,
-dark counts, ambient light, crosstalk → hazard λ per detector bin → counts, drawn exactly.
+dark counts, ambient light, effects such as crosstalk → hazard λ per detector bin → counts, drawn exactly.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,19 +19,229 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, output_tensor, tensor_of
 from spadwarp.errors import ArgumentError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.frames import Frames, TimeTags
-from spadwarp.frames.receiver import Receiver, missing_light
-from spadwarp.frames.response import InstrumentResponse, detector_response
+from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
 from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real, shown
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
 
-__all__ = ["MonteCarloNoise", "detect", "monte_carlo_noise"]
+__all__ = ["MonteCarloNoise", "Receiver", "detect", "monte_carlo_noise"]
 
 LIMIT = 0.5
 """Standard error of a pixel over its shot noise from which on it counts: variances then add up to 1.25 times."""
 
 _PART = 0.95  # of the pixels that have to be below the limit
+
+
+class Window(NamedTuple):
+    """Bins in which the detector is on, by their edges from the start; the first `recorded` are histogrammed.
+
+    `period`: from one window to the next. All times [s].
+    """
+
+    start: float
+    edges: NDArray[np.float64]
+    recorded: int
+    period: float
+
+    @classmethod
+    def of(
+        cls,
+        detector: Detector,
+        laser: Laser | None,
+        window: tuple[float, int],
+        bin_width: float,
+        tdc_widths: ArrayLike | None,
+    ) -> Self:
+        """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
+        if not (isinstance(window, tuple | list) and len(window) == 2):
+            raise ArgumentError(f"window = {shown(window)} is not (start [s], bins)")
+        start = check_real("start of window", window[0], TIME)
+        bins = check_integer("bins of window", window[1], "[1, 1000000]")
+        wrap, period = detector.wrap, math.inf if laser is None else 1.0 / laser.repetition_rate
+        if wrap:
+            # The detector knows no time beyond that from one pulse to the next.
+            bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))
+            if bins < 1:
+                raise ArgumentError(f"bin_width = {bin_width} s is longer than the pulse period, {period} s")
+        widths = np.ones(bins) if tdc_widths is None else np.asarray(tdc_widths, np.float64)
+        if widths.shape != (bins,):
+            raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
+        if not (np.isfinite(widths).all() and (widths > 0).all()):
+            raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
+        edges = np.append(0.0, np.cumsum(widths / widths.mean())) * bin_width
+        period = period if wrap else max(period, edges[-1])
+        rest = period - edges[-1]
+        if detector.mode == "free_running" and rest > 1e-9 * period:
+            # Between two windows the detector goes on detecting, unrecorded; where time does not wrap, noise alone.
+            extra = math.ceil(rest / bin_width) if wrap else 1
+            edges = np.append(edges, edges[-1] + rest * np.arange(1, extra + 1) / extra)
+        return cls(start, edges, bins, period)
+
+    def missing_light(self, gate_start: float) -> tuple[str, ...]:
+        """A note if light from before the source's first bin would fall into the window, some periods later."""
+        wrap = math.ceil((gate_start - self.start) / self.period - 1e-9) - 1
+        if gate_start <= 0 or self.start + wrap * self.period + self.edges[-1] <= 0:
+            return ()
+        return (
+            f"the source begins at {gate_start * 1e9:.6g} ns: earlier light of later pulses, near-range backscatter "
+            "above all, is missing in the window (start the source at 0 and give `window`)",
+        )
+
+
+class Effect(ABC):
+    """An effect of the detector that changes λ, in place; a fit follows it by its slope.
+
+    A new one takes fields in the scene's section `detector`, maybe a kernel, and a class in `EFFECTS`.
+    """
+
+    @abstractmethod
+    def apply(self, receiver: Receiver, hazard: Any) -> None:
+        """Changes λ, Warp float32 `[pixel, bin]`."""
+
+    @abstractmethod
+    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
+        """Changes a derivative of λ, of the same shape, by the derivative of the effect."""
+
+
+class _Crosstalk(Effect):
+    """λ gains a part of the detections of the four neighbours; a slope, as if their pile-up stayed as it is."""
+
+    def apply(self, receiver: Receiver, hazard: Any) -> None:
+        from spadwarp_kernels import detection as kernels
+
+        detector = receiver.detector
+        if detector.crosstalk_probability > 0 and detector.mode == "free_running":
+            dead_time, period = detector.dead_time_ns * 1e-9, receiver.window.period
+            self._add(receiver, hazard, kernels.free_running_probabilities(hazard, dead_time=dead_time, period=period))
+        elif detector.crosstalk_probability > 0:
+            self._add(receiver, hazard, kernels.first_photon_probabilities(hazard))
+
+    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
+        import warp as wp
+
+        if receiver.detector.crosstalk_probability > 0:
+            self._add(receiver, slope, wp.clone(slope))
+
+    def _add(self, receiver: Receiver, rates: Any, neighbours: Any) -> None:
+        from spadwarp_kernels import detection as kernels
+
+        probability = receiver.detector.crosstalk_probability
+        kernels.add_crosstalk(rates, neighbours, image_width=receiver.image[1], probability=probability)
+
+
+EFFECTS: tuple[Effect, ...] = (_Crosstalk(),)
+"""Of the detector on λ, in the order in which they act."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Receiver:
+    """The camera before it counts: expected detections of a detector, from expected light.
+
+    Attributes:
+        detector: The section of a scene.
+        window: Its bins in time.
+        image: (height, width).
+        noise: Dark counts and ambient light of each pixel [1/s], Warp float32 `[pixel]`; where it lies, the others lie.
+        matrix: Fraction of the light of each source bin that is detected in each detector bin.
+        equal_bins: Whether all bins of the window are equally wide.
+    """
+
+    detector: Detector
+    window: Window
+    image: tuple[int, int]
+    noise: Any
+    matrix: SparseResponse
+    equal_bins: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        detector: Detector,
+        laser: Laser | None,
+        *,
+        shape: tuple[int, ...],
+        axis: tuple[float, float],
+        device: Any,
+        irf: InstrumentResponse | None = None,
+        window: tuple[float, int] | None = None,
+        tdc_widths: ArrayLike | None = None,
+        ambient: ArrayLike | None = None,
+        camera_seed: int = 0,
+    ) -> Self:
+        """The receiver of a source of `shape` `[H, W, T]` whose time axis is (start, bin width) [s].
+
+        `device` is a Warp device; the others are arguments of `spadwarp.detect`. Raises `ArgumentError`.
+        """
+        import warp as wp
+
+        from spadwarp_kernels import detection as kernels
+
+        seen = Window.of(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
+        noise: Any = kernels.dark_count_rates(
+            shape[0] * shape[1],
+            median=detector.dark_count_rate,
+            spread=detector.dark_count_spread,
+            hot_fraction=detector.hot_pixel_fraction,
+            hot_rate=detector.hot_pixel_rate,
+            offset=detector.ambient_rate,
+            seed=camera_seed,
+            device=device,
+        )
+        if ambient is not None:
+            values: NDArray[np.float64] = np.asarray(ambient, np.float64)
+            if values.shape not in ((), shape[:2]):
+                raise ArgumentError(f"ambient has shape {values.shape}; a number or {shape[:2]} is needed")
+            if not (np.isfinite(values).all() and (values >= 0).all()):
+                raise ArgumentError("ambient holds a value outside [0, inf)")
+            rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
+            noise = wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
+        matrix = response_matrix(
+            detector_response(detector, laser) if irf is None else irf,
+            source_start=axis[0],
+            source_width=axis[1],
+            source_bins=shape[2],
+            edges=seen.start + seen.edges,
+            period=seen.period if detector.wrap else None,
+        )
+        image, even = (shape[0], shape[1]), tdc_widths is None
+        return cls(detector=detector, window=seen, image=image, noise=noise, matrix=matrix, equal_bins=even)
+
+    def light(self, rows: Any) -> Any:
+        """Light and noise in the detector's bins before its effects, Warp float32 `[pixel, bin]`, of source rows."""
+        return self._through(rows, self.noise)
+
+    def hazard(self, rows: Any) -> Any:
+        """λ: expected detections per pulse and bin of a detector that is always ready, Warp float32 `[pixel, bin]`."""
+        hazard = self.light(rows)
+        for effect in EFFECTS:
+            effect.apply(self, hazard)
+        return hazard
+
+    def slope(self, rows: Any) -> Any:
+        """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
+        import warp as wp
+
+        slope = self._through(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device))
+        for effect in EFFECTS:
+            effect.apply_to_slope(self, slope)
+        return slope
+
+    def noise_alone(self) -> Any:
+        """Dark counts and ambient light per pulse, `[pixel, T]`, or `[pixel, 1]` where all bins are equally wide."""
+        import warp as wp
+
+        widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
+        return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=self.noise.device)
+
+    def _through(self, rows: Any, noise: Any) -> Any:
+        from spadwarp_kernels import detection as kernels
+
+        widths = np.diff(self.window.edges)
+        return kernels.expected_detections(rows, **self.matrix._asdict(), width=widths, noise_rate=noise)
+
+
+# Noise of the simulation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,12 +293,9 @@ def noise_caption(ratio: float | None) -> str:
 def monte_carlo_noise(
     result: Any, *, pulses: int, detector: Detector | None = None, laser: Laser | None = None
 ) -> MonteCarloNoise | None:
-    """The noise that frames of so many pulses inherit from a result; None where it keeps no standard errors.
+    """The noise that frames of so many pulses inherit from a `Result`; None where it keeps no standard errors.
 
-    Args:
-        result: A `Result`.
-        pulses: Of one frame.
-        detector, laser: Sections of a scene; default: those of the result's.
+    `detector`, `laser`: sections of a scene; default: those of the result's.
     """
     if not isinstance(result, Result) or result.second_moment is None or result.photons < 2 * result.batch_size:
         return None
@@ -95,28 +304,21 @@ def monte_carlo_noise(
     scale = laser.photons_per_pulse * detection_efficiency(laser, detector)
     # Bins are nearly independent: a history adds to few of those of one pixel.
     error = np.sqrt(np.square(result.standard_error).sum(axis=2)) * scale
-    seen = scene.model_copy(update={"detector": detector, "laser": laser})
-    noise = noise_rate(seen, result.truth)
-    expected = result.intensity * scale + (noise[..., 0] if np.ndim(noise) else noise) * (
-        scene.gate.stop - scene.gate.start
-    )
+    noise = noise_rate(scene.model_copy(update={"detector": detector, "laser": laser}), result.truth)
+    noise = noise[..., 0] if np.ndim(noise) else noise
+    expected = result.intensity * scale + noise * (scene.gate.stop - scene.gate.start)
     # A first-photon detector counts one a pulse at most, of light and error in the same measure.
     counted = pulses * (-np.expm1(-expected) if detector.mode == "first_photon" else expected)
     ratios = np.sqrt(counted) * np.divide(error, expected, out=np.zeros_like(error), where=expected > 0)
-    ratio = float(np.quantile(ratios, _PART))
-    return MonteCarloNoise(
-        pulses=pulses,
-        ratio=ratio,
-        pixels=float(np.mean(ratios > LIMIT)),
-        photons=result.photons,
-        photons_needed=result.photons * (ratio / LIMIT) ** 2,
-    )
+    ratio, share = float(np.quantile(ratios, _PART)), float(np.mean(ratios > LIMIT))
+    needed = result.photons * (ratio / LIMIT) ** 2
+    return MonteCarloNoise(pulses=pulses, ratio=ratio, pixels=share, photons=result.photons, photons_needed=needed)
 
 
 # Frames
 
 
-_LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]"}
+_LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]", "seed": SEED}
 
 
 @kernel_errors()
@@ -204,14 +406,13 @@ def detect(
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses
     arguments = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}
-    numbers = {name: check_integer(name, value, _LIMITS.get(name, SEED)) for name, value in arguments.items()}
+    numbers = {name: check_integer(name, value, _LIMITS[name]) for name, value in arguments.items()}
     camera_seed = check_integer("camera_seed", camera_seed, SEED)
     if summed and (total := numbers["pulses"] * numbers["frames"]) > 2**31 - 1:
         raise ArgumentError(f"pulses · frames = {total} is above {2**31 - 1}: give fewer, or summed=False")
     if gate_start is None or bin_width is None:
         raise ArgumentError("gate_start or bin_width is missing: an array source needs both")
-    gate_start = check_real("gate_start", gate_start, TIME)
-    bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
+    axis = (check_real("gate_start", gate_start, TIME), check_real("bin_width", bin_width, BIN_WIDTH))
     if laser is None and (detector.wrap or detector.mode == "free_running" or tags):
         raise ArgumentError("laser is missing: the detector needs its repetition rate (unless wrap = false)")
     irf = detector_response(detector, laser) if irf is None else irf
@@ -219,10 +420,9 @@ def detect(
     form: Any = {"shape": "[H, W, T]", "dimensions": range(3, 4)}
     with in_torch_order(source, background, out):
         rows, shape = histogram_rows(source, name="source", device=device, **form)
-        axis = (gate_start, bin_width)
-        receiver = Receiver.of(
-            detector, laser, shape=shape, axis=axis, device=rows.device, camera_seed=camera_seed, **options
-        )
+        options |= {"shape": shape, "axis": axis, "device": rows.device, "camera_seed": camera_seed}
+        receiver = Receiver.of(detector, laser, **options)
+        seen, image = receiver.window, receiver.image
         hazard, known = receiver.hazard(rows), receiver.noise_alone()
         if background is not None:
             rows, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
@@ -231,26 +431,25 @@ def detect(
             known = receiver.light(rows)
         as_torch = is_torch(source) or out is not None
         if as_torch:
-            out_shape = (*(() if summed else (numbers["frames"],)), *receiver.image, receiver.window.recorded)
+            out_shape = (*(() if summed else (numbers["frames"],)), *image, seen.recorded)
             out = output_tensor(out, name="out", shape=out_shape, device=hazard.device)
         counts, events = _draw(receiver, hazard, numbers, summed=summed, tags=tags, out=out)
         to_caller: Any = tensor_of if as_torch else wp.array.numpy
-        expected, known = to_caller(hazard), to_caller(known)
-    recorded = receiver.window.recorded
-    notes = missing_light(receiver.window, gate_start) if detector.wrap else ()
+        expected, known = (to_caller(rows)[:, : seen.recorded].reshape(*image, -1) for rows in (hazard, known))
+    notes = seen.missing_light(axis[0]) if detector.wrap else ()
     noise = None if scene is None else monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
     if noise is not None and noise.exceeds:
         warnings.warn(str(noise), SpadwarpWarning, stacklevel=3)
     return Frames(
         counts=counts,
-        expected=expected[:, :recorded].reshape(*receiver.image, -1),
-        background=known[:, :recorded].reshape(*receiver.image, -1),
-        gate_start=receiver.window.start,
-        bin_width=bin_width,
-        edges=receiver.window.edges[: recorded + 1],
-        period=receiver.window.period if detector.wrap else None,
+        expected=expected,
+        background=known,
+        gate_start=seen.start,
+        bin_width=axis[1],
+        edges=seen.edges[: seen.recorded + 1],
+        period=seen.period if detector.wrap else None,
         irf=irf,
-        tags=None if events is None else _time_tags(events, receiver.image, first_frame),
+        tags=None if events is None else _time_tags(events, image, first_frame),
         notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
         monte_carlo_noise=None if noise is None else noise.ratio,
         **numbers,
@@ -265,7 +464,7 @@ def _draw(
 
     from spadwarp_kernels import detection as kernels
 
-    detector, window, frames = receiver.detector, receiver.window, numbers["frames"]
+    detector, window = receiver.detector, receiver.window
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
     in_place = out is not None and not add_frames
@@ -290,7 +489,8 @@ def _draw(
     if in_place:
         return out, events
     every: Any = counts.numpy() if out is None else tensor_of(counts)
-    every = every.reshape(*(() if summed and not add_frames else (frames,)), *receiver.image, window.recorded)
+    frames = () if summed and not add_frames else (numbers["frames"],)
+    every = every.reshape(*frames, *receiver.image, window.recorded)
     every = every.sum(0, dtype=every.dtype) if add_frames else every
     return (every if out is None else out.copy_(every)), events
 

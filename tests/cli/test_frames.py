@@ -47,7 +47,7 @@ def test_frames_without_a_detection(done, tmp_path):
 
 
 def test_frames_do_not_depend_on_the_parts_they_are_drawn_in(done, tmp_path, monkeypatch):
-    monkeypatch.setattr("spadwarp.frames.record._PART_BYTES", 1)
+    monkeypatch.setattr("spadwarp.frames.file._PART_BYTES", 1)
     run("detect", done, "--out", tmp_path, "--frames", 3, "--method", "peak", "--quiet", *DEVICE)
     with h5py.File(tmp_path / "frames.h5") as file:
         twin = spadwarp.detect(spadwarp.load_result(done / "result.h5"), frames=3, seed=0, device="cpu")
