@@ -6,13 +6,13 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError, SpadwarpWarning
-from spadwarp.frames.cramer_rao import bound_of_result, photons_for_noise
+from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse, detector_response
@@ -178,6 +178,7 @@ class FramesFile(_StoredFrames):
         truth_depth: float32 `[H, W]` [m].
         methods: Estimators whose depth frames the file holds.
         channel: Light that was counted: "I", all of it, or "co" or "cross" behind an analyser.
+        notes: What the simulation could not give, in words.
     """
 
     FORMAT = "spadwarp frames"
@@ -189,6 +190,7 @@ class FramesFile(_StoredFrames):
     truth_depth: NDArray[np.float32]
     monte_carlo_noise: float | None = None
     channel: str = "I"
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def _own(cls, file: Hdf5File, scene: Scene, shape: tuple[int, ...]) -> dict[str, Any]:
@@ -215,6 +217,7 @@ class FramesFile(_StoredFrames):
             "scene": scene,
             "truth_depth": file.array("truth/depth", np.float32, image),
             "channel": file.text_attribute("channel", "I"),
+            "notes": tuple(map(str, np.atleast_1d(file.attribute("notes", ())))),
             "monte_carlo_noise": None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
             **expectations,
         }
@@ -420,30 +423,20 @@ class Recording:
     """Summary of what `record_frames` wrote.
 
     Attributes:
-        path: The file.
-        first: The first frame, its counts `[1, H, W, T]`.
-        depth: First frame by each estimator, float64 `[H, W]` [m].
-        errors: By estimator; of at most the first 256 MiB of counts.
-        bound_time, bound_depth: Cramér–Rao bound of one frame, float64 `[H, W]` [s], [m]; see `crlb`. NaN where that
-            refuses, which the notes then say.
-        bound_noise: Part of the histograms' information that was noise of the simulation and is subtracted, median of
-            the pixels; NaN if the result keeps no standard errors.
-        bound_photons: Photons that would make that part a tenth.
+        file: The file, opened.
+        errors: Of depth, by estimator; of at most the first 256 MiB of counts.
+        bound: Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say.
+        bound_photons: Photons that would make the noise in the bound a tenth.
         detections: Counts of all frames.
-        notes: What the simulation could not give, in words.
-        monte_carlo: Its noise against the shot noise of one frame; None if the result keeps no standard errors.
+        monte_carlo: Noise of the simulation against the shot noise of one frame; None if the result keeps no standard
+            errors.
     """
 
-    path: Path
-    first: Frames
-    depth: dict[Method, Map]
+    file: FramesFile
     errors: dict[Method, FrameErrors]
-    bound_time: Map
-    bound_depth: Map
-    bound_noise: float
+    bound: ResultBound
     bound_photons: float
     detections: int
-    notes: tuple[str, ...]
     monte_carlo: MonteCarloNoise | None
 
 
@@ -484,8 +477,9 @@ def record_frames(
     bins = scene.gate.bins if window is None else window[1]
     size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
     options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
-    bound_time, bound_depth, noise, notes = _bounds(result, pulses, device)
-    recording: Recording | None = None
+    bound = _bound(result, pulses, device)
+    notes = () if bound.problem is None else (f"no Cramér–Rao bound: {bound.problem}",)
+    errors: dict[Method, FrameErrors] = {}
     detections = 0
     with write_hdf5(path) as opened:
         writer = _Writer(opened, frames)
@@ -496,31 +490,24 @@ def record_frames(
             for method in methods:
                 time = part.arrival_time(method, undo_pile_up=undo_pile_up, device=device)
                 depth[method] = depth_from_time(time, scene=scene)
-            writer.add(part, scene, depth, **_still(result, part, frames, bound_time, bound_depth))
+            writer.add(part, scene, depth, **_still(result, part, frames, bound.sigma))
             detections += int(part.intensity.sum())
-            if recording is None:
-                recording = Recording(
-                    path=Path(path),
-                    first=replace(part, counts=part.counts[:1].copy(), frames=1, tags=None),
-                    depth={method: values[0] for method, values in depth.items()},
-                    errors={method: FrameErrors.of(values, result.truth.depth) for method, values in depth.items()},
-                    bound_time=bound_time,
-                    bound_depth=bound_depth,
-                    bound_noise=noise,
-                    bound_photons=photons_for_noise(result.photons, noise, 0.1),
-                    detections=0,
-                    notes=part.notes,
-                    monte_carlo=monte_carlo_noise(result, pulses=pulses),
-                )
+            errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
             if progress is not None:
                 progress("frames", start + part.frames, frames)
-    assert recording is not None
-    return replace(recording, detections=detections)
+    return Recording(
+        file=FramesFile.load(path),
+        errors=errors,
+        bound=bound,
+        bound_photons=photons_for_noise(result.photons, bound.noise, 0.1),
+        detections=detections,
+        monte_carlo=monte_carlo_noise(result, pulses=pulses),
+    )
 
 
-def _still(result: Result, part: Frames, frames: int, bound_time: Map, bound_depth: Map) -> dict[str, dict[str, Any]]:
+def _still(result: Result, part: Frames, frames: int, bound: Map) -> dict[str, dict[str, Any]]:
     """What the file of a scene that stands still holds beside its frames: see `_Writer.add`."""
-    scene, irf = result.scene, part.irf
+    scene, irf, distance = result.scene, part.irf, result.truth.range.astype(np.float64)
     noise = {} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}
     attributes = {
         "format": FramesFile.FORMAT,
@@ -540,8 +527,8 @@ def _still(result: Result, part: Frames, frames: int, bound_time: Map, bound_dep
     arrays: dict[str, Variable] = {
         "expected": ((*PIXELS, "time"), part.expected, "1", "expected detections per pulse before pile-up"),
         "background": ((*PIXELS, bins), part.background, "1", "the part of `expected` that is not target"),
-        "bound/time": (PIXELS, bound_time, "s", "Cramér–Rao bound of one frame"),
-        "bound/depth": (PIXELS, bound_depth, "m", "Cramér–Rao bound of one frame"),
+        "bound/time": (PIXELS, bound, "s", "Cramér–Rao bound of one frame"),
+        "bound/depth": (PIXELS, bound * depth_per_time(scene, distance), "m", "Cramér–Rao bound of one frame"),
         "truth/depth": (PIXELS, result.truth.depth, "m", "true planar depth"),
         "edges": (("edges",), part.edges, "s", "edges of the bins after the start of the gate"),
     }
@@ -553,18 +540,14 @@ def _still(result: Result, part: Frames, frames: int, bound_time: Map, bound_dep
     return {"attributes": attributes, "coordinates": coordinates, "arrays": arrays}
 
 
-def _bounds(result: Result, pulses: int, device: Any) -> tuple[Map, Map, float, tuple[str, ...]]:
-    """Cramér–Rao bounds of one frame [s], [m], NaN for a response without a derivative or too few photons; the part
-    that was noise; and notes."""
-    scene, distance = result.scene, result.truth.range.astype(np.float64)
-    missing = np.full(distance.shape, np.nan)
-    if not detector_response(scene.detector, scene.laser).is_smooth:
-        return missing, missing, np.nan, ()
-    law: Literal["poisson", "first_photon"] = "poisson" if scene.detector.mode == "free_running" else "first_photon"
+def _bound(result: Result, pulses: int, device: Any) -> ResultBound:
+    """The bound of one frame, NaN for a response without a derivative or too few photons."""
+    missing = np.full(result.truth.range.shape, np.nan)
+    if not detector_response(result.scene.detector, result.scene.laser).is_smooth:
+        return ResultBound(missing, np.nan, None)
+    law: Any = "poisson" if result.scene.detector.mode == "free_running" else "first_photon"
     bound = bound_of_result(result, pulses=pulses, law=law, device=device)
-    if bound.problem is not None:
-        return missing, missing, bound.noise, (f"no Cramér–Rao bound: {bound.problem}",)
-    return bound.sigma, bound.sigma * depth_per_time(scene, distance), bound.noise, ()
+    return bound if bound.problem is None else bound._replace(sigma=missing)
 
 
 def simulate_sequence(
