@@ -91,40 +91,31 @@ def _of_frames(frames: Frames, result: Result | None) -> FrameSequence:
 
 
 def _of_stored(file: FramesFile | SequenceFile) -> FrameSequence:
-    best = file.best_method
-    still: dict[str, Any] = {}
-    content = [f"Z by {best}"] if best else []
-    if isinstance(file, FramesFile):
+    best, pulses = file.best_method, np.float32(file.pulses)
+    known = {name: getattr(file, name) for name in ("pulses", "gate_start", "bin_width", "period")}
+
+    def facts(number: int) -> dict[str, Any]:
+        content = [f"Z by {best}"] if best else []
+        if isinstance(file, SequenceFile):
+            return {
+                "scene": file.scene(number),
+                "depth": file.truth(number).depth,
+                "expected": file.expected(number) * pulses,
+                "background": file.background(number) * file.bins * file.pulses,
+                "content": ", ".join([*content, f"{file.trajectory.times[number]:g} s"]),
+            }
         still = {"scene": file.scene, "depth": file.truth_depth, "content": "".join(content)}
         if file.expected is not None:
-            still["expected"] = file.expected * np.float32(file.pulses)
+            still["expected"] = file.expected * pulses
         if file.expected is not None and file.background is not None:
             still["background"] = _mean_background(file.background, file.expected.shape) * file.pulses
-
-    def of_scene(number: int) -> dict[str, Any]:
-        if isinstance(file, FramesFile):
-            return still
-        return {
-            "scene": file.scene(number),
-            "depth": file.truth(number).depth,
-            "expected": file.expected(number) * np.float32(file.pulses),
-            "background": file.background(number) * file.bins * file.pulses,
-            "content": ", ".join([*content, f"{file.trajectory.times[number]:g} s"]),
-        }
+        return still
 
     def frame(number: int) -> SequenceFrame:
         depths = {f"{method}.Z": file.depth(method, number) for method in file.methods}
-        images = {"Z": depths[f"{best}.Z"]} if best else {}
-        facts = of_scene(number)
-        return SequenceFrame(
-            images={**images, "intensity": file.intensity(number), **depths, "truth.Z": facts["depth"]},
-            counts=file.counts(number),
-            pulses=file.pulses,
-            gate_start=file.gate_start,
-            bin_width=file.bin_width,
-            period=file.period,
-            **facts,
-        )
+        images, of_scene = {"Z": depths[f"{best}.Z"]} if best else {}, facts(number)
+        images |= {"intensity": file.intensity(number), **depths, "truth.Z": of_scene["depth"]}
+        return SequenceFrame(images=images, counts=file.counts(number), **known, **of_scene)
 
     return FrameSequence(name=str(file.path), count=file.frames, frame=frame)
 

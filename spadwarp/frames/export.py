@@ -21,16 +21,8 @@ from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
 from spadwarp.units import time_from_path
 
-__all__ = [
-    "FrameSequence",
-    "SequenceFrame",
-    "exr_metadata",
-    "write_exr_frame",
-    "write_mat",
-    "write_npy",
-    "write_ptu",
-    "write_sensor_fusion",
-]
+__all__ = ["FrameSequence", "SequenceFrame", "exr_metadata", "write_exr_frame", "write_mat", "write_npy", "write_ptu"]
+__all__ += ["write_sensor_fusion"]
 
 _LARGEST_VARIABLE = 2**31 - 1  # bytes of one array in a MATLAB 5 file
 _LARGEST_DTIME = 32768  # bins of a T3 record of PicoQuant
@@ -38,16 +30,13 @@ _LARGEST_DTIME = 32768  # bins of a T3 record of PicoQuant
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SequenceFrame:
-    """One frame.
+    """One frame of any source; without counts where there is depth alone.
 
     Attributes:
         images: Name → `[H, W]`; `Z` is the depth [m] where the source has it.
-        counts: `[H, W, T]`; None where there is depth alone.
-        expected: Expected counts before pile-up `[H, W, T]`, of all light and noise.
-        background: Its part that is not target, counts of a pixel over all bins, mean over pixels.
-        pulses: Of the frame.
-        gate_start, bin_width: [s].
-        period: At which time wraps [s], or None.
+        counts, expected: `[H, W, T]`; expected counts are those before pile-up, of all light and noise.
+        background: The part of `expected` that is not target, counts of a pixel over all bins, mean over pixels.
+        pulses, gate_start, bin_width, period: As of `Frames`.
         scene: What the camera looked at.
         depth: True depth [m] `[H, W]`.
         content: What the images are, in words.
@@ -65,21 +54,13 @@ class SequenceFrame:
     depth: NDArray[np.float32] | None = None
     content: str = ""
 
-    def true_bins(self) -> NDArray[np.float64]:
-        """Bin of the true time of flight `[H, W]`, counted from 1; 0 where there is no target in the window."""
-        assert self.scene is not None and self.depth is not None and self.counts is not None
-        bins = np.floor(self.bins_of(self.scene, self.depth)) + 1.0
-        return np.where((bins >= 1) & (bins <= self.counts.shape[-1]), bins, 0.0)
-
     def bins_of(self, scene: Scene, depth: NDArray[np.float32]) -> NDArray[np.float64]:
         """Time of flight in bins from the start of the gate, with its fraction, of depth [m] that a scene's camera sees
         `[H, W]`; NaN where there is none."""
         lines = lines_of_sight(scene)
         path = lines.path_from_range(lines.range_from_depth(depth.astype(np.float64)))
         time = time_from_path(path, scene.medium.group_index) - self.gate_start
-        if self.period is not None:
-            time = np.mod(time, self.period)
-        return time / self.bin_width
+        return (time if self.period is None else np.mod(time, self.period)) / self.bin_width
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,8 +71,7 @@ class FrameSequence:
         name: What to call the source in an error.
         count: Of the frames.
         frame: Number of a frame, from 0 → the frame.
-        same_scene: Number of a frame → numbers of the frames of the same scene, itself included; None where frames have
-            counts.
+        same_scene: Number of a frame → numbers of all frames of its scene; None where frames have counts.
     """
 
     name: str
@@ -120,12 +100,12 @@ def write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
         frame = frames.frame(number)
         return frame.images["Z"] if frame.counts is None else frame.counts
 
-    first = array_of(chosen[0])
+    first, several = array_of(chosen[0]), len(chosen) > 1
     with atomic_path(path) as temporary:
-        shape = first.shape if len(chosen) == 1 else (len(chosen), *first.shape)
+        shape = (len(chosen), *first.shape) if several else first.shape
         array = np.lib.format.open_memmap(temporary, mode="w+", dtype=first.dtype, shape=shape)
         for row, number in enumerate(chosen):
-            array[... if len(chosen) == 1 else row] = array_of(number)
+            array[row if several else ...] = array_of(number)
         array.flush()
         del array
     return path
@@ -134,7 +114,7 @@ def write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
 def write_mat(
     frames: FrameSequence, path: Path, number: int, *, extra: Mapping[str, NDArray[Any]] | None = None
 ) -> Path:
-    """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables. `more`: further ones."""
+    """One frame as single-photon denoisers read it; `spadwarp.export` lists the variables. `extra`: further ones."""
     from scipy.sparse import csc_matrix
 
     frame, counts = frames.with_counts(number, ".mat")
@@ -148,7 +128,8 @@ def write_mat(
     total = frame.expected.sum(axis=-1, dtype=np.float64)
     signal = np.clip(total - frame.background, 0.0, None)
     photons = max(float(total.mean()) - frame.background, 0.0)
-    true_bins = frame.true_bins()
+    true_bins = np.floor(frame.bins_of(frame.scene, frame.depth)) + 1.0
+    true_bins = np.where((true_bins >= 1) & (true_bins <= bins), true_bins, 0.0)
     variables = {
         # Pixels column by column, as MATLAB's reshape takes them.
         "spad": csc_matrix(counts.transpose(1, 0, 2).reshape(width * height, bins).astype(np.float64)),
@@ -228,10 +209,9 @@ def write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
 
 def write_exr_frame(frames: FrameSequence, path: Path, number: int) -> Path:
     """The images of one frame."""
-    frame = frames.frame(number)
-    # EXR's integers have no sign, and few programs show them.
-    images = frame.images.items()
-    channels = {name: image.astype(np.float32) if image.dtype.kind in "iu" else image for name, image in images}
+    frame, channels = frames.frame(number), {}
+    for name, image in frame.images.items():  # EXR's integers have no sign, and few programs show them
+        channels[name] = image.astype(np.float32) if image.dtype.kind in "iu" else image
     content = f"frame {number} of {frames.count}" + (f", {frame.content}" if frame.content else "")
     return write_exr(path, channels, exr_metadata(frame.scene, content))
 
@@ -244,14 +224,12 @@ def exr_metadata(scene: Scene | None, content: str) -> dict[str, str | int | flo
     return metadata
 
 
-# Sensor fusion
-
-
 def write_sensor_fusion(frames: FrameSequence, folder: Path, stem: str, chosen: range, factor: int) -> list[Path]:
     """Frames with counts, of scenes whose targets are meshes, and their camera images; see `spadwarp.files`'
     `export_sensor_fusion`."""
     factor = check_integer("factor", factor, "[1, 64]")
-    listed, written = [], []
+    listed: list[str] = []
+    written: list[Path] = []
     images: dict[Scene, dict[str, Any]] = {}
     for number in chosen:
         frame, _ = frames.with_counts(number, "sensor fusion")
@@ -261,21 +239,26 @@ def write_sensor_fusion(frames: FrameSequence, folder: Path, stem: str, chosen: 
             images = {frame.scene: _camera_image(frame, factor)}  # frames of one scene follow each other
         image = images[frame.scene]
         name = f"{stem}-{number:05}"
-        intensity = folder / "intensity" / f"{name}.mat"
-        _save_mat(intensity, {"intensity": image["intensity"]})
-        spad = folder / "spad" / f"{name}_p1.mat"
-        write_mat(frames, spad, number, extra={"bin_hr": image["bin_hr"]})
-        listed.append(os.path.abspath(intensity))
-        written += [intensity, spad]
-    path = folder / f"{stem}.txt"
-    write_text("".join(f"{name}\n" for name in listed), path)
-    return [*written, path]
+        written += [
+            _save_mat(folder / "intensity" / f"{name}.mat", {"intensity": image["intensity"]}),
+            write_mat(frames, folder / "spad" / f"{name}_p1.mat", number, extra={"bin_hr": image["bin_hr"]}),
+        ]
+        listed.append(f"{os.path.abspath(written[-2])}\n")
+    return [*written, write_text("".join(listed), folder / f"{stem}.txt")]
 
 
 def _camera_image(frame: SequenceFrame, factor: int) -> dict[str, NDArray[Any]]:
-    """Truth of a camera with `factor`² pixels in each pixel of the frame's."""
+    """Truth of a camera of the same place and view with `factor` times as many pixels each way."""
     assert frame.scene is not None and frame.counts is not None
-    scene, bins = _finer(frame.scene, factor), frame.counts.shape[-1]
+    camera, tables, bins = frame.scene.camera, frame.scene.to_dict(), frame.counts.shape[-1]
+    (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
+    pose = {"position": list(camera.position), "rotation_deg": list(camera.rotation_deg)}
+    sides = {"width": factor * camera.width, "height": factor * camera.height}
+    lens = {"fx": factor * fx, "fy": factor * fy, "cx": factor * column - 0.5, "cy": factor * row - 0.5}
+    lens |= {"distortion": list(camera.distortion), "pinhole": True, "aperture_diameter": 0.01}
+    tables["camera"] = {**sides, **lens, **pose}
+    tables.pop("scan", None)
+    scene = Scene.from_dict(tables, source=frame.scene.source)
     truth = truth_maps(scene, device="cpu")
     position = frame.bins_of(scene, truth.depth)
     inside = (position >= 0) & (position < bins)
@@ -285,24 +268,3 @@ def _camera_image(frame: SequenceFrame, factor: int) -> dict[str, NDArray[Any]]:
         "bin_hr": np.where(inside, np.clip(position + 0.5, 1.0, bins), 0.0),
         "intensity": (255.0 * light / max(float(light.max()), 1e-300)).astype(np.float32),
     }
-
-
-def _finer(scene: Scene, factor: int) -> Scene:
-    """The scene by a camera of the same place and view with `factor` times as many pixels each way."""
-    camera, tables = scene.camera, scene.to_dict()
-    (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
-    tables["camera"] = {
-        "width": factor * camera.width,
-        "height": factor * camera.height,
-        "fx": factor * fx,
-        "fy": factor * fy,
-        "cx": factor * column - 0.5,
-        "cy": factor * row - 0.5,
-        "distortion": list(camera.distortion),
-        "position": list(camera.position),
-        "rotation_deg": list(camera.rotation_deg),
-        "pinhole": True,
-        "aperture_diameter": 0.01,
-    }
-    tables.pop("scan", None)
-    return Scene.from_dict(tables, source=scene.source)

@@ -25,9 +25,7 @@ __all__ = ["Frames", "TimeTags", "coates", "first_photon_probabilities", "to_xar
 def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np.float64]:
     """Law of first-photon counting, with pile-up: P(k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)); same shape as `hazard` (λ).
 
-    Args:
-        hazard: Expected detections per pulse and bin `[..., T]`, not negative; NumPy, torch or Warp.
-        device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
+    `hazard`: expected detections per pulse and bin `[..., T]`, not negative; NumPy, torch or Warp; `device`: of Warp.
     """
     import warp as wp
 
@@ -47,10 +45,8 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
 
     NaN from the bin on that takes the last pulse. Source: P. B. Coates, J. Phys. E 1, 878 (1968).
 
-    Args:
-        counts: Integers `[..., T]`, not negative; NumPy, torch or Warp.
-        pulses: Pulses of each histogram, which may hold no more counts than that.
-        device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
+    `counts`: integers `[..., T]`, not negative; NumPy, torch or Warp; `pulses`: of each histogram, which may hold no
+    more counts than that; `device`: of Warp.
     """
     import warp as wp
 
@@ -64,8 +60,7 @@ def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float6
         if values.max() > 2**31 - 1:
             raise ArgumentError(f"counts = {values.max()} is above {2**31 - 1}")
         pulses = check_integer("pulses", pulses, "[1, 9007199254740992]")
-        most = int(values.sum(axis=1, dtype=np.int64).max())
-        if most > pulses:
+        if (most := int(values.sum(axis=1, dtype=np.int64).max())) > pulses:
             raise ArgumentError(
                 f"pulses = {pulses} is below the {most} counts of a histogram: it has seen more than one a pulse"
             )
@@ -183,41 +178,24 @@ class Frames:
         """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing returned.
 
         All bins count as equally wide, as in a camera without calibration. The estimator knows the background.
-
-        Args:
-            method: As in `spadwarp.arrival_time`.
-            irf: The response that the estimator assumes; default: the one that was applied.
-            undo_pile_up: Estimate from Coates' correction of the counts.
-            gate: (start, stop) [s] of the bins to use.
-            device: Warp device.
+        `method`, `gate` (start, stop) [s], `device`: as of `spadwarp.arrival_time`; `irf`: that the estimator assumes;
+        default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the counts.
         """
         histogram: Any = self.counts
         if undo_pile_up:
             corrected: Any = self.coates()
             histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
-        return arrival_time(
-            histogram,
-            gate_start=self.gate_start,
-            bin_width=self.bin_width,
-            method=method,
-            irf=self.irf if irf is None else irf,
-            background=self.background * float(self.exposure),
-            gate=gate,
-            device=device,
-        )
-
-
-# Labelled arrays
+        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
+        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
+        return arrival_time(histogram, **axis, method=method, irf=irf, background=known, device=device)
 
 
 def to_xarray(frames: Frames) -> xarray.Dataset:
     """Counts, and the expectation that they were drawn from, as an xarray data set with coordinates and units.
 
     `counts` has the dimensions (frame, y, x, time), without frame where they are added up; `expected` and `background`
-    are detections per pulse and bin before pile-up. Torch tensors are copied to the host.
-
-    Raises:
-        FileError: xarray is not installed.
+    are detections per pulse and bin before pile-up. Torch tensors are copied to the host. Raises `FileError` without
+    xarray.
     """
     counts, expected = on_host(frames.counts), on_host(frames.expected)
     background = np.broadcast_to(on_host(frames.background), expected.shape)

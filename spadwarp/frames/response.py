@@ -28,8 +28,6 @@ Floats = NDArray[np.float64]
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _SUPPORT_SIGMAS = 6.0  # 1e-9 of a Gaussian lies beyond on either side
 _SUPPORT_TAILS = 16.0  # 1e-7 of an exponential lies beyond
-
-
 _MOST_BINS = 1e7  # of a response on one side
 
 
@@ -111,10 +109,6 @@ class InstrumentResponse:
             peak = np.exp(-0.5 * (t / self.sigma) ** 2) * (self.sigma / math.sqrt(2 * math.pi))
             gaussian = t * _gaussian_cumulative(t, self.sigma) + peak
         return gaussian if self.tail == 0 else gaussian - self.tail * self.cumulative(t)
-
-    def bin_fractions(self, edges: ArrayLike, *, arrival: float = 0.0) -> Floats:
-        """Fraction of the detections of light at time `arrival` in each bin between `edges` [s]: `[edges - 1]`."""
-        return np.diff(self.cumulative(np.asarray(edges, np.float64) - arrival))
 
     def per_bin(self, bin_width: float) -> Floats:
         """Fractions of a return in the bins about its own, `[2 r + 1]`, for returns spread evenly over a bin."""
@@ -232,7 +226,7 @@ def instrument_response(
     shape: Literal["gaussian", "exponentially_modified_gaussian"] | str | Path = "gaussian",
     tail: float = 0.0,
 ) -> InstrumentResponse:
-    """Pulse ⊗ jitter.
+    """Pulse ⊗ jitter. Raises `ArgumentError`, which names the argument, or the file and the line.
 
     Args:
         pulse_fwhm, jitter_fwhm: Of laser pulse and detector [s], ≥ 0; as Gaussians their squares add.
@@ -240,9 +234,6 @@ def instrument_response(
             time_ps and value, a measured response (pulse included, so that the two widths are not used). The file's
             time 0 is the arrival of the photon; lines that start with # and one line of names are skipped.
         tail: Time constant of the exponential diffusion tail [s].
-
-    Raises:
-        ArgumentError: Names the argument, or the file and the line.
     """
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
         check_real(name, value, "[0, 1e6] s")
@@ -266,17 +257,14 @@ def detector_response(detector: Detector, laser: Laser | None = None) -> Instrum
 
 def _read_csv(path: Path) -> InstrumentResponse:
     if file_problem(path) is not None:
-        name = str(path)
-        raise ArgumentError(
-            f"irf = {repr(name) if len(name) < 300 else shown(name)} is neither a known shape nor a file"
-        )
+        name = repr(str(path)) if len(str(path)) < 300 else shown(str(path))
+        raise ArgumentError(f"irf = {name} is neither a known shape nor a file")
     try:
         times, values = read_columns(path, {"time_ps": "[-1e12, 1e12]", "value": "[0, 1e30]"}).T
+        return InstrumentResponse(times=times * 1e-12, values=values)
     except (ConfigError, FileError) as error:
         raise ArgumentError(str(error)) from None
-    try:
-        return InstrumentResponse(times=times * 1e-12, values=values)
-    except ValueError as error:
+    except ArgumentError as error:
         raise ArgumentError(f"{path}: {error}") from None
 
 
@@ -288,13 +276,9 @@ def _near_1(values: Floats) -> Floats:
 def read_response(path: str | Path, *, bin_width: float | None = None) -> InstrumentResponse:
     """A measured response from a file.
 
-    Args:
-        path: `.csv` of time_ps and value, whose time 0 is the arrival of the photon; or `.csv` or `.npy` of one value
-            for each bin, whose mean is taken for that time.
-        bin_width: Of these bins [s].
-
-    Raises:
-        ArgumentError: No such file, not a response, or values of bins without their width.
+    `path`: `.csv` of time_ps and value, whose time 0 is the arrival of the photon; or `.csv` or `.npy` of one value for
+    each bin of `bin_width` [s], whose mean is taken for that time. Raises `ArgumentError`: no such file, not a
+    response, or values of bins without their width.
     """
     place = Path(path)
     try:
@@ -336,22 +320,13 @@ def response_matrix(
 
     Light is even over a source bin; response and bins are integrated exactly, so neither needs to be narrow beside the
     other. With a period P the detector sees time modulo P: source time t and detector time t − mP are one, for all m.
-
-    Args:
-        irf: The response.
-        source_start, source_width, source_bins: The axis of the source [s].
-        edges: Of the detector bins [s], ascending, `[bins + 1]`.
-        period: Of the pulses [s]; None: time does not wrap.
-
-    Raises:
-        ArgumentError: Names the argument, its value and what is allowed.
+    `source_start`, `source_width`, `source_bins`: the axis of the source [s]; `edges`: of the detector bins [s],
+    ascending, `[bins + 1]`; `period`: of the pulses [s], None: time does not wrap. Raises `ArgumentError`.
     """
     if not isinstance(irf, InstrumentResponse):
         raise ArgumentError(f"irf = {shown(irf)} is not an InstrumentResponse")
-    source_start, source_width = (
-        check_real("source_start", source_start, TIME),
-        check_real("source_width", source_width, BIN_WIDTH),
-    )
+    source_start = check_real("source_start", source_start, TIME)
+    source_width = check_real("source_width", source_width, BIN_WIDTH)
     source_bins = check_integer("source_bins", source_bins, "[1, 2147483647]")
     period = None if period is None else check_real("period", period, BIN_WIDTH)
     e = real_array("edges", edges, np.float64)

@@ -97,7 +97,7 @@ def test_depth_of_measured_histograms(tmp_path):
     arrival = 2 * 3.0 * index / 299_792_458.0
     edges = np.arange(401) * width + 20e-9
     irf = spadwarp.frames.instrument_response(pulse_fwhm=0.0, jitter_fwhm=300e-12)
-    expected = 4000 * irf.bin_fractions(edges, arrival=arrival) + 0.5
+    expected = 4000 * np.diff(irf.cumulative(edges - arrival)) + 0.5
     counts = np.random.default_rng(1).poisson(expected, (3, 4, 400)).astype(np.uint16)
     np.save(tmp_path / "counts.npy", counts)
     facts = ["bin_width=50ps", "gate_start=20ns", f"group_index={index}", "irf=300ps"]
