@@ -51,20 +51,9 @@ _TRUTH = {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}
 _OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf", "monte_carlo_noise")
 
 _READ_ME = (
-    "counts: [frame, height, width, bin], detections in bin k, which covers gate_start + edges[k] to edges[k + 1] "
-    "seconds of flight. depth/NAME: [frame, height, width], planar depth in metres by that estimator, NaN where "
-    "nothing was detected. intensity: counts over all bins. bound/time and bound/depth: Cramér–Rao standard deviation "
-    "of one frame [s], [m], NaN where there is no information. expected, background: expected detections per pulse and "
-    "bin of all light and noise, and of what is not target. "
-    "tags, if present: detections one by one. Camera frame: +x right, +y down, +z forward."
-)
-_READ_ME_MOVING = (
-    "Frames of a scene that moves; in each frame it stands still, at frame_time [s]. counts: [frame, height, width, "
-    "bin], detections. depth/NAME: planar depth in metres by that estimator, NaN where nothing was detected. expected: "
-    "expected detections per pulse and bin before pile-up; background: its part that is not target, mean over pixels "
-    "and bins. truth/: of each frame, by ray casting. camera_position, camera_rotation: the lens and the camera's axes "
-    "(columns) in the world. trajectory: values of the fields named in its coordinate. config: the scene before the "
-    "trajectory. Camera frame: +x right, +y down, +z forward."
+    "Frames of a SPAD camera. Bin k covers gate_start + edges[k] to edges[k + 1] seconds of flight; without edges, "
+    "bins are bin_width wide. NaN: nothing was detected, or there is no information. config: the scene, of frames "
+    "in motion before the trajectory. Camera frame: +x right, +y down, +z forward. "
 )
 
 
@@ -358,7 +347,8 @@ class _Writer:
             "group_index": scene.medium.group_index,
             "source": str(scene.source or ""),
         }
-        file.attrs.update({**common, **attributes})
+        words = [f"{name} ({', '.join(axes)}): {meaning} [{unit}]" for name, (axes, _, unit, meaning) in arrays.items()]
+        file.attrs.update({**common, **attributes, "read_me": _READ_ME + "; ".join(words)})
         file.create_dataset("config", data=scene.to_toml())
         for name, (dimensions, values, _, _) in arrays.items():
             array = np.asarray(values)
@@ -511,7 +501,6 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> dict[str, d
     noise = {} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}
     attributes = {
         "format": FramesFile.FORMAT,
-        "read_me": _READ_ME,
         "frames": frames,
         "laser_position": scene.beam.position,
         "pixel_tangent": scene.camera.pixel_tangent,
@@ -620,7 +609,7 @@ def simulate_sequence(
 def _moving(result: Result, part: Frames, moves: Trajectory, row: int, photons: int) -> dict[str, dict[str, Any]]:
     """What the file of a scene that moves holds of a frame beside its counts: see `_Writer.add`."""
     fields = list(moves.fields)
-    attributes = {"format": SequenceFile.FORMAT, "read_me": _READ_ME_MOVING, "photons": photons, "fields": fields}
+    attributes = {"format": SequenceFile.FORMAT, "photons": photons, "fields": fields}
     coordinates = {"camera_axis": (["x", "y", "z"], "1", "of the camera"), "field": (fields, "1", "of the scene")}
     camera: Any = camera_attributes(result.scene.camera, result.focus_distance)
     position, rotation = camera["camera_position"], camera["camera_rotation"].reshape(3, 3)

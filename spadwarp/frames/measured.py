@@ -10,7 +10,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from spadwarp.frames.depth import Histograms
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.io.arrays import read_npy
-from spadwarp.io.hdf5 import hdf5_format, read_hdf5
+from spadwarp.io.hdf5 import hdf5_format, open_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file
 from spadwarp.limits import check_real, shown
@@ -263,7 +263,7 @@ def _arrays(path: Path) -> Iterator[dict[str, Variable]]:
         array = read_npy(path)
         yield {"": Variable("dense", array.shape, lambda: array)}
     else:
-        with read_hdf5(path) as file:
+        with closing(open_hdf5(path)) as file:
             numbers = {name: about for name, about in file.arrays().items() if about[1].kind in "biuf"}
             yield {
                 name: Variable("dense", shape, partial(file.array, name, dtype, shape))

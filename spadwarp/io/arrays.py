@@ -27,10 +27,10 @@ _DEFLATE, _SMALL = 1100, 1 << 16  # no compression of EXR makes an image smaller
 def write_exr(
     path: str | Path, channels: Mapping[str, ArrayLike], metadata: Mapping[str, str | int | float] | None = None
 ) -> Path:
-    """Writes an EXR image, losslessly compressed; returns its path.
+    """Writes an EXR image, losslessly compressed, whole or not at all; returns its path.
 
     Args:
-        path: The file; an existing one is replaced when the new one is whole.
+        path: The file.
         channels: Name → `[H, W]`, all of one shape; float16, float32 and uint32 as they are, float64 as float32.
         metadata: Name → value. Stored as text, because EXR's own numbers have 32 bits.
 
@@ -71,12 +71,8 @@ def _exr_pixels(name: str, array: ArrayLike) -> NDArray[Any]:
 def read_exr(path: str | Path, *, largest: int = _LARGEST_IMAGE) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Channels (name → `[H, W]`, float16, float32 or uint32 as stored) and metadata of an EXR image's first part.
 
-    Args:
-        path: The file.
-        largest: Allowed number of values, of all channels and parts.
-
-    Raises:
-        FileError: No such file, not an EXR, damaged, or larger than allowed.
+    `largest`: allowed number of values, of all channels and parts. Raises `FileError`: no such file, not an EXR,
+    damaged, or larger than allowed.
     """
     import OpenEXR
 
@@ -115,12 +111,8 @@ def write_array(path: str | Path, array: ArrayLike) -> Path:
 def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
     """The array of a `.npy` file: real or complex numbers or booleans; pickles are never loaded.
 
-    Args:
-        path: The file.
-        largest: Allowed number of values; None: any.
-
-    Raises:
-        FileError: No such file, not a `.npy` file, shorter than its header says, of another type, or too large.
+    `largest`: allowed number of values; None: any. Raises `FileError`: no such file, not a `.npy` file, shorter than
+    its header says, of another type, or too large.
     """
     place = existing_file(path)
     try:
@@ -138,13 +130,8 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
 def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
     """Those arrays of a `.npz` archive that have one of the names; real numbers or booleans; pickles are never loaded.
 
-    Args:
-        path: The file.
-        names: What to read; anything else in the archive is passed over.
-        largest: Allowed number of values of an array.
-
-    Raises:
-        FileError: No such file, not a `.npz` archive, shorter than a header says, of another type, or too large.
+    `largest`: allowed number of values of an array. Raises `FileError`: no such file, not a `.npz` archive, shorter
+    than a header says, of another type, or too large.
     """
     place = existing_file(path)
     arrays: dict[str, NDArray[Any]] = {}

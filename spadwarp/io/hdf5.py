@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.errors import FileError
 from spadwarp.io.paths import atomic_path, existing_file, used
 from spadwarp.io.text import parse_json
 from spadwarp.limits import check_integer, check_real
@@ -52,19 +52,14 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 def read_hdf5(path: str | Path, format: str | None = None, *, version: int | None = None) -> Iterator[Hdf5File]:
     """An HDF5 file to read from, for the length of a block that does nothing else.
 
-    Args:
-        path: The file.
-        format: What its attribute `format` has to be, such as "spadwarp result"; None: anything.
-        version: The newest `format_version` that can be read; None: any.
-
-    Raises:
-        FileError: No such file, not HDF5, of another format or a newer version, damaged, or without something that the
-            block looked for (whatever error it raised); says which.
+    `format`: what its attribute of this name has to be, such as "spadwarp result"; `version`: the newest
+    `format_version` that can be read; None: any. Raises `FileError`: no such file, not HDF5, of another format or a
+    newer version, damaged, or without something that the block looked for (whatever error it raised); says which.
     """
     with closing(open_hdf5(path, format, version=version)) as file:
         try:
             yield file
-        except (SpadwarpError, MemoryError):
+        except (FileError, MemoryError):
             raise
         except Exception as error:
             raise FileError(f"{path}: not a whole {file.kind}: {error}") from error
@@ -95,10 +90,7 @@ def open_hdf5(path: str | Path, format: str | None = None, *, version: int | Non
 
 
 def hdf5_format(path: str | Path) -> str | None:
-    """The attribute `format` of an HDF5 file, such as "spadwarp frames"; None without one.
-
-    Raises `FileError`: no such file, or not HDF5.
-    """
+    """The attribute `format` of an HDF5 file, such as "spadwarp frames", or None. Raises `FileError`."""
     with read_hdf5(path) as file:
         value = file.attribute("format", None)
         return value if isinstance(value, str) else None
@@ -481,12 +473,9 @@ def name_dimensions(
 ) -> None:
     """Writes dimension scales, as netCDF-4 has them, to an open file and attaches them to its arrays.
 
-    Args:
-        file: From `write_hdf5`.
-        coordinates: Dimension → its coordinate, or its size alone; None: a size of 0 that grows with its arrays, which
-            the caller resizes.
-        arrays: Name → its dimensions, unit and meaning; those that the file does not hold are passed over. Dimensions
-            that no array has are not written, but arrays that are coordinates of themselves are marked as such.
+    `coordinates`: dimension → its coordinate, or its size alone; None: a size of 0 that grows with its arrays, which
+    the caller resizes. `arrays`: name → its dimensions, unit and meaning; those that the file does not hold are passed
+    over. Dimensions that no array has are not written, but arrays that are coordinates of themselves are marked so.
     """
     held = {name: described for name, described in arrays.items() if name in file}
     needed = {dimension for dimensions, _, _ in held.values() for dimension in dimensions}

@@ -12,7 +12,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -45,13 +45,8 @@ class SparseMatrix(NamedTuple):
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable whose numbers are not yet read.
-
-    Attributes:
-        kind: "dense", "sparse" or "cell".
-        shape: As MATLAB shows it.
-        read: The array; a `SparseMatrix`; or for cells an object array of arrays, one dimension each.
-    """
+    """A variable whose numbers are not yet read, of a shape as MATLAB shows it; `read` gives the array, a
+    `SparseMatrix`, or for cells an object array of arrays, one dimension each."""
 
     kind: Literal["dense", "sparse", "cell"]
     shape: tuple[int, ...]
@@ -98,21 +93,17 @@ def _version_7(file: Hdf5File) -> Iterator[tuple[str, Variable]]:
     arrays = {name: array for name, array in file.arrays().items() if not name.startswith("#")}
     for name, (shape, dtype) in arrays.items():
         if "/" not in name and file.attribute("MATLAB_class", b"", of=name) == b"cell":
-            yield name, Variable("cell", shape[::-1], partial(_cells_7, file, name, shape))
+            yield name, Variable("cell", shape[::-1], partial(_transposed, shape, file.referenced, name))
         elif "/" not in name and dtype.kind in "biuf":
-            yield name, Variable("dense", shape[::-1], partial(_dense_7, file, name, dtype, shape))
+            yield name, Variable("dense", shape[::-1], partial(_transposed, shape, file.array, name, dtype, shape))
         elif name.endswith("/jc") and {f"{name[:-2]}ir", f"{name[:-2]}data"} <= arrays.keys():
             sides = (int(file.attribute("MATLAB_sparse", of=name[:-3])), shape[0] - 1)
             parts = {part: arrays[name[:-2] + part] for part in ("ir", "jc", "data")}
             yield name[:-3], Variable("sparse", sides, partial(_sparse_7, file, name[:-2], sides, parts))
 
 
-def _cells_7(file: Hdf5File, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
-    return file.referenced(name).reshape(shape).T
-
-
-def _dense_7(file: Hdf5File, name: str, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    return file.array(name, dtype, shape).T
+def _transposed(shape: tuple[int, ...], read: Callable[..., NDArray[Any]], *arguments: Any) -> NDArray[Any]:
+    return read(*arguments).reshape(shape).T
 
 
 def _sparse_7(file: Hdf5File, group: str, shape: tuple[int, int], parts: Mapping[str, Any]) -> SparseMatrix:
@@ -153,11 +144,10 @@ def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
         return None
 
     def read() -> Any:
-        whole = _matrix(zlib.decompressobj().decompress(packed, 8 + size)[8:], order, size)
-        assert whole is not None
+        whole: Any = _matrix(zlib.decompressobj().decompress(packed, 8 + size)[8:], order, size)
         return whole[1].read()
 
-    return variable[0], Variable(variable[1].kind, variable[1].shape, read)
+    return variable[0], replace(variable[1], read=read)
 
 
 def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | None:
@@ -178,13 +168,13 @@ def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | Non
         raise ValueError(f"array {name!r} of shape {sides} is not in {size} bytes")
     if class_ == _CELL:
         return name, Variable("cell", sides, partial(_cells_5, content, place, order, sides))
-    kind = "?" if int(flags) & _LOGICAL else _CLASSES[class_]
-    return name, Variable("dense", sides, partial(_dense_5, content, place, order, sides, kind))
 
+    def dense() -> NDArray[Any]:
+        values, _ = _field(content, place, order, _STORED, math.prod(sides))
+        kind = "?" if int(flags) & _LOGICAL else _CLASSES[class_]
+        return values.astype(kind).reshape(sides, order="F")
 
-def _dense_5(content: bytes, place: int, order: str, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
-    values, _ = _field(content, place, order, _STORED, math.prod(shape))
-    return values.astype(kind).reshape(shape, order="F")
+    return name, Variable("dense", sides, dense)
 
 
 def _sparse_5(content: bytes, place: int, order: str, shape: tuple[int, ...]) -> SparseMatrix:
