@@ -9,7 +9,7 @@ import logging
 import math
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -43,17 +43,6 @@ _MOST_VALUES = 1 << 29  # 2 GiB of counts
 _MARKERS = 16  # of T3 records; four today
 # What ptufile says about a damaged file stands in our errors, too.
 logging.getLogger("ptufile").addHandler(logging.NullHandler())
-
-
-class _Facts(NamedTuple):
-    """Facts that the caller states about a file, as in `read_histograms`."""
-
-    dataset: str | None
-    axes: str | None
-    image_size: tuple[int, int] | None
-    tag_unit: float | None
-    bin_width: float | None
-    sum_frames: bool
 
 
 class _Raw(NamedTuple):
@@ -113,15 +102,18 @@ def read_histograms(
             check_real(f"{name} [s]", value, "(0, 0.001)")
     if gate_start is not None:
         check_real("gate_start [s]", gate_start, "[-1, 1]")
-    facts = _Facts(dataset, axes, image_size, tag_unit, bin_width, sum_frames)
     if _is_own(path):
-        arguments = {**facts._asdict(), "gate_start": gate_start, "irf": irf}
-        if clash := [name.replace("_", " ") for name, value in arguments.items() if value]:
+        arguments = {"dataset": dataset, "axes": axes, "image size": image_size, "tag unit": tag_unit, "irf": irf}
+        arguments |= {"bin width": bin_width, "sum frames": sum_frames, "gate start": gate_start}
+        if clash := [name for name, value in arguments.items() if value]:
             raise ArgumentError(f"{path}: the file has its own {', '.join(clash)}")
         return _read_own(path, channel)
     if channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels, not {path}")
-    raw = _read(path, facts)
+    if path.suffix.lower() == ".ptu":
+        raw = _reading(path, _read_ptu, image_size, sum_frames)
+    else:
+        raw = _reading(path, _read_arrays, dataset, image_size, tag_unit, bin_width)
     values, notes = _checked(raw.values, path), list(raw.notes)
     if not raw.ordered:
         values, note = _ordered(values, axes)
@@ -179,12 +171,12 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
     )
 
 
-def _read(path: Path, facts: _Facts) -> _Raw:
-    ending = path.suffix.lower()
-    if ending not in ENDINGS:
+def _reading(path: Path, read: Callable[..., _Raw], *facts: Any) -> _Raw:
+    """What a reader reads from a path; whatever it raises becomes a `FileError`."""
+    if path.suffix.lower() not in ENDINGS:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
     try:
-        return (_read_ptu if ending == ".ptu" else _read_arrays)(path, facts)
+        return read(path, *facts)
     except (SpadwarpError, MemoryError):
         raise
     except ModuleNotFoundError as error:
@@ -292,16 +284,22 @@ def _histograms_in(variables: Mapping[str, Variable]) -> list[str]:
     return sorted(fits, key=lambda name: fits[name])
 
 
-def _read_arrays(path: Path, facts: _Facts) -> _Raw:
+def _read_arrays(
+    path: Path,
+    dataset: str | None,
+    image_size: tuple[int, int] | None,
+    tag_unit: float | None,
+    bin_width: float | None,
+) -> _Raw:
     is_mat = path.suffix.lower() == ".mat"
     with _arrays(path) as variables:
         candidates = [""] if "" in variables else _histograms_in(variables)
-        if facts.dataset is None and not candidates:
+        if dataset is None and not candidates:
             others = ", sparse matrix or cells" if is_mat else ""
             raise FileError(f"{path}: no array of 3 or 4 dimensions{others}; it holds {_listed(variables)}")
-        if facts.dataset is None and len(candidates) > 1 and not is_mat:
+        if dataset is None and len(candidates) > 1 and not is_mat:
             raise _unnamed(path, variables)
-        name = "" if "" in variables else facts.dataset or candidates[0]
+        name = "" if "" in variables else dataset or candidates[0]
         if name not in variables:
             raise FileError(f"{path}: no array {name!r}; it holds {_listed(variables)}")
         chosen = variables[name]
@@ -314,18 +312,18 @@ def _read_arrays(path: Path, facts: _Facts) -> _Raw:
             if is_mat and key in variables and variables[key].kind == "dense" and math.prod(variables[key].shape) == 1
         }
     others = f", not {', '.join(candidates[1:])}" if len(candidates) > 1 else ""
-    notes = [f"reads {name}{others}"] if name and not facts.dataset and (others or not is_mat) else []
+    notes = [f"reads {name}{others}"] if name and not dataset and (others or not is_mat) else []
     if chosen.kind == "cell":
-        if facts.tag_unit is None:
+        if tag_unit is None:
             raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
-        return _of_tags(value, facts.tag_unit, facts.bin_width, notes)
+        return _of_tags(value, tag_unit, bin_width, notes)
     width = numbers.get("bin_size", 0.0)
     known = width if 1e-15 < width < 1e-3 else None
-    if facts.bin_width is None and known is not None:
+    if bin_width is None and known is not None:
         notes.append(f"bin width {known * 1e12:g} ps from bin_size")
     is_sparse = isinstance(value, SparseMatrix)
     if is_sparse:
-        height, across = _image_shape(value.shape[0], facts.image_size, variables)
+        height, across = _image_shape(value.shape[0], image_size, variables)
         notes.append(f"{across} x {height} pixels, column by column")
         value = _dense(value, height, across)
     return _Raw(value, tuple(notes), known, numbers.get("gate_start"), ordered=is_sparse)
@@ -432,16 +430,16 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
 # PicoQuant's files of T3 records: images, and other scans by their markers
 
 
-def _read_ptu(path: Path, facts: _Facts) -> _Raw:
+def _read_ptu(path: Path, image_size: tuple[int, int] | None, sum_frames: bool) -> _Raw:
     """Counts of all channels. Raises `ArgumentError` for a size that is missing or does not fit the markers."""
     import ptufile
 
     with ptufile.PtuFile(path) as file:
         _check_ptu(file, path)
-        if file.is_image and facts.image_size is None:
-            counts, text = _ptu_image(file, facts.sum_frames), "pixels by the image in its header"
+        if file.is_image and image_size is None:
+            counts, text = _ptu_image(file, sum_frames), "pixels by the image in its header"
         else:
-            counts, text = _ptu_scan(file, facts.image_size)
+            counts, text = _ptu_scan(file, image_size)
         if (channels := file.number_channels) > 1:
             text += f"; {channels} channels, added up"
         notes = [text, f"{len(counts)} frames; sum_frames adds them up"][: counts.ndim - 2]

@@ -1,4 +1,4 @@
-"""MATLAB files, versions 4 to 7.3: arrays, sparse matrices and cells of numbers.
+"""MATLAB files, versions 5 and 7.3: arrays, sparse matrices and cells of numbers.
 
 SciPy's reader follows types and sizes of a damaged file into memory that is not its own; here they are compared with
 the file first, and what remains is a view of its bytes. Layout: MATLAB, "MAT-File Format" (R2023a).
@@ -29,7 +29,6 @@ _MATRIX, _COMPRESSED = 14, 15
 _CELL, _SPARSE = 1, 5
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-_OLD_KINDS = ("f8", "f4", "i4", "i2", "u2", "u1")
 _COMPLEX, _LOGICAL = 0x0800, 0x0200
 _HEAD = 1 << 16  # bytes of a compressed array that hold its name and shape
 
@@ -67,7 +66,7 @@ def open_mat(path: Path) -> Iterator[dict[str, Variable]]:
                 yield dict(_version_7(file))
         else:
             with open(path, "rb") as source, mmap.mmap(source.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                yield dict(_version_4(content) if 0 in content[:4] else _version_5(content))
+                yield dict(_version_5(content))
     except (SpadwarpError, MemoryError):
         raise
     except (OSError, ValueError, TypeError, LookupError, struct.error, zlib.error, OverflowError) as error:
@@ -111,12 +110,9 @@ def _sparse_7(file: Hdf5File, group: str, shape: tuple[int, int], parts: Mapping
     return _sparse(shape, row, start.astype(np.int64), value)
 
 
-# Version 5
-
-
 def _version_5(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
     if content[126:128] not in (b"IM", b"MI"):
-        raise ValueError("not a file of MATLAB")
+        raise ValueError("not a file of MATLAB 5 or later")
     order = "<" if content[126:128] == b"IM" else ">"
     place = 128
     while place + 8 <= len(content):
@@ -210,29 +206,3 @@ def _field(
     if size % dtype.itemsize or count not in (None, size // dtype.itemsize):
         raise ValueError(f"{size} bytes of {dtype} where {count} numbers are needed")
     return np.frombuffer(content, dtype, size // dtype.itemsize, start), following
-
-
-# Version 4
-
-
-def _version_4(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
-    order = "<" if struct.unpack_from("<i", content)[0] < 5000 else ">"
-    place = 0
-    while place < len(content):
-        code, rows, columns, imaginary, letters = struct.unpack_from(order + "5i", content, place)
-        kind, type_ = code // 10 % 10, code % 10
-        if min(code, rows, columns) < 0 or kind >= len(_OLD_KINDS) or not 1 <= letters <= 1000:
-            raise ValueError(f"no array of MATLAB at byte {place}")
-        dtype = np.dtype(order + _OLD_KINDS[kind])
-        start = place + 20 + letters
-        place = start + rows * columns * dtype.itemsize * (2 if imaginary else 1)
-        if place > len(content):
-            raise ValueError(f"cut: {place - len(content)} bytes are missing")
-        name = content[start - letters : start].rstrip(b"\0").decode("latin-1")
-        if type_ == 0 and not imaginary:
-            sides = (rows, columns)
-            yield name, Variable("dense", sides, partial(_dense_4, content, start, place, dtype, sides))
-
-
-def _dense_4(content: mmap.mmap, start: int, stop: int, dtype: np.dtype[Any], shape: tuple[int, int]) -> NDArray[Any]:
-    return np.frombuffer(content[start:stop], dtype).reshape(shape, order="F")
