@@ -387,12 +387,8 @@ def _chunks(shape: tuple[int, ...], item_bytes: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameErrors:
-    """How far the depth frames of one estimator are from the truth, over all pixels and frames that have both.
-
-    Attributes:
-        estimate_fraction: Estimates over pixels with a target.
-        median, p90: Median and 90th percentile of the absolute errors [m].
-    """
+    """How far the depth frames of one estimator are from the truth, over all pixels and frames that have both: the
+    estimates over pixels with a target; median and 90th percentile of the absolute errors [m]."""
 
     estimate_fraction: float
     median: float
@@ -403,9 +399,8 @@ class FrameErrors:
         """Of depth `[frames, H, W]` against the truth `[H, W]` [m]."""
         error = np.abs(depth - truth)[:, np.isfinite(truth)]
         known = error[np.isfinite(error)]
-        middle, high = np.quantile(known, (0.5, 0.9)) if known.size else (np.nan, np.nan)
-        fraction = known.size / error.size if error.size else 0.0
-        return cls(estimate_fraction=fraction, median=float(middle), p90=float(high))
+        median, p90 = map(float, np.quantile(known, (0.5, 0.9)) if known.size else (np.nan, np.nan))
+        return cls(estimate_fraction=known.size / max(error.size, 1), median=median, p90=p90)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -498,7 +493,6 @@ def record_frames(
 def _still(result: Result, part: Frames, frames: int, bound: Map) -> dict[str, dict[str, Any]]:
     """What the file of a scene that stands still holds beside its frames: see `_Writer.add`."""
     scene, irf, distance = result.scene, part.irf, result.truth.range.astype(np.float64)
-    noise = {} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}
     attributes = {
         "format": FramesFile.FORMAT,
         "frames": frames,
@@ -507,7 +501,7 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> dict[str, d
         **camera_attributes(scene.camera, result.focus_distance),
         "irf_sigma": irf.sigma,
         "irf_tail": irf.tail,
-        **noise,
+        **({} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}),
         "notes": list(part.notes),
         "photons": result.photons,
         "channel": result.provenance.get("channel", "I"),

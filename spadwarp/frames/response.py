@@ -81,11 +81,11 @@ class InstrumentResponse:
         t = np.asarray(time, np.float64)
         if self.times is not None:
             return np.interp(t, self._knots, self._heights, left=0.0, right=0.0)
-        if self.tail == 0:
-            if self.sigma == 0:
-                raise ArgumentError("a response without width has no density")
-            return np.exp(-0.5 * (t / self.sigma) ** 2) / (self.sigma * math.sqrt(2 * math.pi))
-        return self._tail_density(t)
+        if self.tail > 0:
+            return self._tail_density(t)
+        if self.sigma == 0:
+            raise ArgumentError("a response without width has no density")
+        return np.exp(-0.5 * (t / self.sigma) ** 2) / (self.sigma * math.sqrt(2 * math.pi))
 
     def cumulative(self, time: ArrayLike) -> Floats:
         """Integral of the density up to `time`."""
@@ -145,32 +145,27 @@ class InstrumentResponse:
     @cached_property
     def mean(self) -> float:
         """Mean delay [s]."""
-        if self.times is None:
-            return self.tail
-        return float(self._knots[-1] - self._integral_at[-1])
+        return self.tail if self.times is None else float(self._knots[-1] - self._integral_at[-1])
 
     @cached_property
     def mode(self) -> float:
         """Delay at which the density is largest [s]."""
         if self.times is not None:
             return float(self._knots[self._heights.argmax()])
-        if self.tail == 0 or self.sigma == 0:
-            return 0.0
-        time, density = self._fine()
-        return float(time[density.argmax()])
+        return 0.0 if self.tail == 0 or self.sigma == 0 else self._peak[0]
 
     @cached_property
     def fwhm(self) -> float:
         """Full width at half of the largest density [s]."""
-        if self.times is None and self.tail == 0:
-            return FWHM_PER_SIGMA * self.sigma
-        time, density = self._fine()
-        above = np.flatnonzero(density >= 0.5 * density.max())
-        return float(time[above[-1]] - time[above[0]])
+        return FWHM_PER_SIGMA * self.sigma if self.times is None and self.tail == 0 else self._peak[1]
 
-    def _fine(self) -> tuple[Floats, Floats]:
+    @cached_property
+    def _peak(self) -> tuple[float, float]:
+        """Mode and FWHM on a fine grid."""
         time = np.linspace(*self.support, 20_001)
-        return time, self.density(time)
+        density = self.density(time)
+        above = np.flatnonzero(density >= 0.5 * density.max())
+        return float(time[density.argmax()]), float(time[above[-1]] - time[above[0]])
 
     # The exponential tail
 
@@ -200,9 +195,8 @@ class InstrumentResponse:
     @cached_property
     def _integral_at(self) -> Floats:
         width, height = np.diff(self._knots), self._heights
-        return np.append(
-            0.0, np.cumsum(width * (self._cumulative_at[:-1] + width * (2 * height[:-1] + height[1:]) / 6.0))
-        )
+        pieces = width * (self._cumulative_at[:-1] + width * (2 * height[:-1] + height[1:]) / 6.0)
+        return np.append(0.0, np.cumsum(pieces))
 
     def _segment(self, t: Floats) -> tuple[NDArray[np.intp], Floats]:
         """Index of the piece that holds `t` and the time since its start; outside all pieces, the nearer end."""
@@ -237,12 +231,10 @@ def instrument_response(
     """
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
         check_real(name, value, "[0, 1e6] s")
+    if shape not in ("gaussian", "exponentially_modified_gaussian"):
+        return _read_csv(Path(shape))
     sigma = math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA
-    if shape == "gaussian":
-        return InstrumentResponse(sigma=sigma)
-    if shape == "exponentially_modified_gaussian":
-        return InstrumentResponse(sigma=sigma, tail=tail)
-    return _read_csv(Path(shape))
+    return InstrumentResponse(sigma=sigma, tail=0.0 if shape == "gaussian" else tail)
 
 
 def detector_response(detector: Detector, laser: Laser | None = None) -> InstrumentResponse:
@@ -338,7 +330,7 @@ def response_matrix(
         source_stop = source_start + source_bins * source_width
         first = math.ceil((source_start + lower - e[-1]) / period)
         wraps = range(first, math.floor((source_stop + upper - e[0]) / period) + 1)
-    rows, columns, weights = [], [], []
+    rows, columns, weights = [np.zeros(0, np.intp)], [np.zeros(0, np.int32)], [np.zeros(0)]
     for wrap in wraps:
         shifted = e + (wrap * period if period is not None else 0.0)
         begin = np.clip(np.floor((shifted[:-1] - upper - source_start) / source_width), 0, source_bins)
@@ -353,13 +345,8 @@ def response_matrix(
         rows.append(row)
         columns.append(index[row, tap].astype(np.int32))
         weights.append(weight[keep])
-    if not rows:
-        return SparseResponse(np.zeros(e.size, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
     every_row = np.concatenate(rows)
     order = np.argsort(every_row, kind="stable")
     entries = np.bincount(every_row, minlength=e.size - 1)
-    return SparseResponse(
-        np.append(0, np.cumsum(entries)).astype(np.int32),
-        np.concatenate(columns)[order],
-        np.concatenate(weights)[order].astype(np.float32),
-    )
+    row_start = np.append(0, np.cumsum(entries)).astype(np.int32)
+    return SparseResponse(row_start, np.concatenate(columns)[order], np.concatenate(weights)[order].astype(np.float32))

@@ -90,10 +90,8 @@ class Window(NamedTuple):
 
 
 class Effect(ABC):
-    """An effect of the detector that changes λ, in place; a fit follows it by its slope.
-
-    A new one takes fields in the scene's section `detector`, maybe a kernel, and a class in `EFFECTS`.
-    """
+    """An effect of the detector that changes λ, in place; a fit follows it by its slope. A new one takes fields in the
+    scene's section `detector`, maybe a kernel, and a class in `EFFECTS`."""
 
     @abstractmethod
     def apply(self, receiver: Receiver, hazard: Any) -> None:
@@ -246,14 +244,12 @@ class Receiver:
 
 @dataclass(frozen=True, kw_only=True)
 class MonteCarloNoise:
-    """The standard error of a result against the shot noise of one frame, both of the counts of a pixel.
+    """The standard error of a result against the shot noise of one frame of `pulses`, both of the counts of a pixel.
 
     Attributes:
-        pulses: Of the frame.
         ratio: Standard error over shot noise, at the 95th percentile of the pixels.
         pixels: Part of the pixels in which it is above 0.5.
-        photons: That were traced.
-        photons_needed: That would bring `ratio` to 0.5, from its fall with the square root of their number.
+        photons, photons_needed: That were traced, and that would bring `ratio` to 0.5: it falls with their root.
     """
 
     pulses: int
@@ -261,11 +257,6 @@ class MonteCarloNoise:
     pixels: float
     photons: int
     photons_needed: float
-
-    @property
-    def exceeds(self) -> bool:
-        """Whether the frames show it."""
-        return self.ratio > LIMIT
 
     def __str__(self) -> str:
         return (
@@ -390,9 +381,7 @@ def detect(
             raise ArgumentError(f"{name} = {shown(value)} is not the section {name} of a scene")
     if scene is not None:
         if gate_start is not None or bin_width is not None:
-            raise ArgumentError(
-                "gate_start and bin_width are for arrays: a result has its own; window gives the camera's"
-            )
+            raise ArgumentError("gate_start and bin_width are for arrays: a result has its own; give window instead")
         detector, laser = detector or scene.detector, laser or scene.laser
         gate_start, bin_width = scene.gate.start, scene.gate.bin_width
         detections_per_photon = laser.photons_per_pulse * detection_efficiency(laser, detector)
@@ -438,7 +427,7 @@ def detect(
         expected, known = (to_caller(rows)[:, : seen.recorded].reshape(*image, -1) for rows in (hazard, known))
     notes = seen.missing_light(axis[0]) if detector.wrap else ()
     noise = None if scene is None else monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
-    if noise is not None and noise.exceeds:
+    if noise is not None and noise.ratio > LIMIT:
         warnings.warn(str(noise), SpadwarpWarning, stacklevel=3)
     return Frames(
         counts=counts,
@@ -468,8 +457,8 @@ def _draw(
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
     in_place = out is not None and not add_frames
-    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count}
-    common["counts"] = wp.from_torch(out).flatten() if in_place else None
+    counts = wp.from_torch(out).flatten() if in_place else None
+    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count, "counts": counts}
     events = None
     if by_event:
         counts, events = kernels.event_counts(
