@@ -128,10 +128,8 @@ def _information_of_noise(
     added = np.empty(len(total))
     for i, row in enumerate(total):  # one pixel at a time: cubes are large
         rate = convolve1d(row, taps, mode="constant")
-        if is_variance:
-            squares = convolve1d(noise[i], slope_taps**2, mode="nearest")
-        else:
-            squares = np.square(convolve1d(noise[i], slope_taps, mode="nearest"))
+        squares = convolve1d(noise[i], slope_taps**2 if is_variance else slope_taps, mode="nearest")
+        squares = squares if is_variance else np.square(squares)
         if law == "first_photon":
             squares, rate = squares * np.exp(-np.cumsum(rate)), -np.expm1(-rate)
         added[i] = np.divide(squares, rate, out=np.zeros_like(rate), where=rate > 0).sum()

@@ -247,7 +247,7 @@ class Reduction:
         return self.values[0]
 
     def plot(self, path: str | Path, **options: Any) -> Path:
-        """Draws the first frame beside its intensity; returns the path; `options` as of `spadwarp.viz.draw_depth`."""
+        """Draws the first frame beside its intensity, see `spadwarp.viz.draw_depth`; returns the path."""
         import spadwarp
 
         return spadwarp.viz.draw_depth(self.first, self.intensity[0], path, **options)

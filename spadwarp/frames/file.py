@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from spadwarp.errors import ArgumentError, ConfigError, FileError, SpadwarpWarning
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
-from spadwarp.frames.frames import Frames
 from spadwarp.frames.response import InstrumentResponse, detector_response
-from spadwarp.frames.spad import MonteCarloNoise, detect, monte_carlo_noise
+from spadwarp.frames.spad import Frames, MonteCarloNoise, detect, monte_carlo_noise
 from spadwarp.interop import Variable
 from spadwarp.io.hdf5 import (
     PIXELS,
@@ -161,13 +160,10 @@ class FramesFile(_StoredFrames):
     Attributes:
         path: The file.
         shape: (frames, H, W, T).
-        pulses, seed, gate_start, bin_width, edges, period, irf, expected, background, monte_carlo_noise: As of
-            `Frames`; expected and background are None in a file that does not hold them.
-        scene: Of the result that the counts were drawn from.
-        truth_depth: float32 `[H, W]` [m].
         methods: Estimators whose depth frames the file holds.
+        scene, truth_depth: Of the result that the counts were drawn from; float32 `[H, W]` [m].
         channel: Light that was counted: "I", all of it, or "co" or "cross" behind an analyser.
-        notes: What the simulation could not give, in words.
+        expected, background: As of `Frames`, as all others are; None in a file that does not hold them.
     """
 
     FORMAT = "spadwarp frames"
@@ -241,11 +237,8 @@ class SequenceFile(_StoredFrames):
     """Frames of a scene that moves. Arrays of a frame are read when they are asked for.
 
     Attributes:
-        path, shape, pulses, seed, methods: As of `FramesFile`.
         base: The scene before the trajectory.
-        trajectory: The row of each frame.
-        gate_start, bin_width: [s].
-        period: At which time wraps [s], or None.
+        trajectory: The row of each frame. All others: as of `FramesFile`.
     """
 
     FORMAT = "spadwarp sequence"
@@ -413,8 +406,7 @@ class Recording:
         bound: Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say.
         bound_photons: Photons that would make the noise in the bound a tenth.
         detections: Counts of all frames.
-        monte_carlo: Noise of the simulation against the shot noise of one frame; None if the result keeps no standard
-            errors.
+        monte_carlo: Noise of the simulation against the shot noise of one frame, see `monte_carlo_noise`.
     """
 
     file: FramesFile
@@ -446,15 +438,12 @@ def record_frames(
     Args:
         result: Of `spadwarp.simulate`; its scene has the camera.
         path: The file.
-        pulses, frames, seed, window, device: As of `spadwarp.detect`.
+        pulses, frames, seed, tags, window, device: As of `spadwarp.detect`.
         methods: Estimators of depth, see `spadwarp.arrival_time`. They know background and response.
         undo_pile_up: Estimate from Coates' correction of the counts.
-        tags: Also keep every detection.
         progress: Called with ("frames", done, frames).
 
-    Raises:
-        ArgumentError: An argument out of range.
-        FileError: The file cannot be written.
+    Raises `ArgumentError`, and `FileError` where the file cannot be written.
     """
     frames = check_integer("frames", frames, "[1, 2147483647]")
     scene = result.scene
@@ -558,9 +547,8 @@ def simulate_sequence(
         path: The file, whole or not at all.
         frame_rate: Frames a second, at even times between the rows; None: a frame at each row.
         photons: Traced for each frame; default: the scene's.
-        pulses: Of a frame; default: the detector's.
+        pulses, methods, tags, progress: As of `record_frames`.
         seed: 64 bits; default: the scene's.
-        methods, tags, progress: As of `record_frames`.
         device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
 
     Raises:

@@ -208,10 +208,7 @@ def _check_size(shape: Sequence[int], instead: str) -> None:
 
 
 def _ordered(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], list[str]]:
-    """Histograms `[H, W, T]` or `[frames, H, W, T]` from any order of axes, and a note of what was inferred.
-
-    Raises `ArgumentError` for letters that do not fit, or an order that is missing because two are plausible.
-    """
+    """Histograms `[H, W, T]` or `[frames, H, W, T]` from any order of axes, and a note of what was inferred."""
     letters, notes = "yxt" if values.ndim == 3 else "nyxt", []
     if axes is None:
         axes = _inferred(values.shape, letters)
@@ -256,10 +253,10 @@ def _arrays(path: Path) -> Iterator[dict[str, Variable]]:
         yield {"": Variable("dense", array.shape, lambda: array)}
     else:
         with closing(open_hdf5(path)) as file:
-            numbers = {name: about for name, about in file.arrays().items() if about[1].kind in "biuf"}
             yield {
                 name: Variable("dense", shape, partial(file.array, name, dtype, shape))
-                for name, (shape, dtype) in numbers.items()
+                for name, (shape, dtype) in file.arrays().items()
+                if dtype.kind in "biuf"
             }
 
 
@@ -285,11 +282,7 @@ def _histograms_in(variables: Mapping[str, Variable]) -> list[str]:
 
 
 def _read_arrays(
-    path: Path,
-    dataset: str | None,
-    image_size: tuple[int, int] | None,
-    tag_unit: float | None,
-    bin_width: float | None,
+    path: Path, dataset: str | None, image_size: tuple[int, int] | None, tag_unit: float | None, bin_width: float | None
 ) -> _Raw:
     is_mat = path.suffix.lower() == ".mat"
     with _arrays(path) as variables:
@@ -330,10 +323,7 @@ def _read_arrays(
 
 
 def _image_shape(pixels: int, image_size: tuple[int, int] | None, variables: Mapping[str, Variable]) -> tuple[int, int]:
-    """(height, width) of an image of so many pixels: given, or the only shape of other arrays that has as many.
-
-    Raises `ArgumentError` where none or several do.
-    """
+    """(height, width) of an image of so many pixels: given, or the only shape of other arrays that has as many."""
     if image_size is not None:
         height, width = image_size
         if height * width != pixels:

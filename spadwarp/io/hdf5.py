@@ -467,9 +467,7 @@ _NO_COORDINATE = "This is a netCDF dimension but not a netCDF variable.{:10d}"  
 
 
 def name_dimensions(
-    file: Any,
-    coordinates: Mapping[str, Coordinate | int | None],
-    arrays: Mapping[str, tuple[Sequence[str], str, str]],
+    file: Any, coordinates: Mapping[str, Coordinate | int | None], arrays: Mapping[str, tuple[Sequence[str], str, str]]
 ) -> None:
     """Writes dimension scales, as netCDF-4 has them, to an open file and attaches them to its arrays.
 
