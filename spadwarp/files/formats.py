@@ -186,7 +186,8 @@ def _of_stored(file: FramesFile | SequenceFile) -> FrameSequence:
 
     def frame(number: int) -> SequenceFrame:
         depths = {f"{method}.Z": file.depth(method, number) for method in file.methods}
-        images, of_scene = {"Z": depths[f"{best}.Z"]} if best else {}, facts(number)
+        of_scene = facts(number)
+        images: dict[str, Any] = {"Z": depths[f"{best}.Z"]} if best else {}
         images |= {"intensity": file.intensity(number), **depths, "truth.Z": of_scene["depth"]}
         return SequenceFrame(images=images, counts=file.counts(number), **known, **of_scene)
 
@@ -365,9 +366,9 @@ def _camera_image(frame: SequenceFrame, factor: int) -> dict[str, NDArray[Any]]:
     assert frame.scene is not None and frame.counts is not None
     camera, tables, bins = frame.scene.camera, frame.scene.to_dict(), frame.counts.shape[-1]
     (fx, fy), (column, row) = camera.focal_pixels, camera.principal_point
-    pose = {"position": list(camera.position), "rotation_deg": list(camera.rotation_deg)}
+    pose: dict[str, Any] = {"position": list(camera.position), "rotation_deg": list(camera.rotation_deg)}
     sides = {"width": factor * camera.width, "height": factor * camera.height}
-    lens = {"fx": factor * fx, "fy": factor * fy, "cx": factor * column - 0.5, "cy": factor * row - 0.5}
+    lens: dict[str, Any] = {"fx": factor * fx, "fy": factor * fy, "cx": factor * column - 0.5, "cy": factor * row - 0.5}
     lens |= {"distortion": list(camera.distortion), "pinhole": True, "aperture_diameter": 0.01}
     tables["camera"] = {**sides, **lens, **pose}
     tables.pop("scan", None)

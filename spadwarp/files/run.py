@@ -238,6 +238,8 @@ def write_depth(
 def _write_points(reduction: Reduction, path: str | Path, frame: str, comment: str) -> Path:
     assert reduction.lines is not None
     distance = reduction.range[0]
+    points: Any
+    normals: Any
     points, normals = point_cloud(distance, reduction.lines.directions_to(distance))
     if not len(points):
         raise FileError(f"{path}: nothing returned in any pixel: there are no points to write")

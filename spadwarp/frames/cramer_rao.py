@@ -92,9 +92,9 @@ def information_from_histogram(
     taps, slope_taps = _response_taps(irf, bin_width)
     device = pick_device(device)
     rows = np.ascontiguousarray(background.reshape(-1, bins) if background.ndim else background.reshape(1, 1))
-    cubes = (wp.array(cube, dtype=wp.float32, device=device) for cube in (signal.reshape(-1, bins), rows))
-    weights = (wp.array(weights, dtype=wp.float64, device=device) for weights in (taps, slope_taps))
-    information = kernels.histogram_information(*cubes, *weights, first_photon=law == "first_photon").numpy()
+    inputs: list[Any] = [wp.array(cube, dtype=wp.float32, device=device) for cube in (signal.reshape(-1, bins), rows)]
+    inputs += [wp.array(weights, dtype=wp.float64, device=device) for weights in (taps, slope_taps)]
+    information = kernels.histogram_information(*inputs, first_photon=law == "first_photon").numpy()
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)
     if signal_halves is not None:

@@ -289,7 +289,7 @@ def depth_of(
         # Of all frames together: that of sparse counts would be 0.
         frames = values.reshape(-1, height, width, values.shape[-1])
         known = (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)
-    axis = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width}
+    axis: dict[str, Any] = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width}
     time = arrival_time(values, **axis, method=method, irf=response, background=known, device=device)
     path = path_from_time(time.reshape(-1, height, width), index)
     distance = 0.5 * path if lines is None else lines.range_from_path(path)

@@ -400,6 +400,7 @@ def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[ND
         if name is None:
             sizes = {name: one.shape for name, one in dense.items() if math.prod(one.shape) > 1}
             holds_cubes = any(len(shape) in (3, 4) for shape in sizes.values())
+            sides: tuple[int, ...]
             if ending == ".mat":
                 sides = () if _histograms_in(variables) and not several else (2, 3)
             else:
