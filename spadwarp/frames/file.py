@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ from spadwarp.frames.spad import Frames, MonteCarloNoise, detect, monte_carlo_no
 from spadwarp.interop import Variable
 from spadwarp.io.hdf5 import (
     PIXELS,
-    Coordinate,
     Hdf5File,
     hdf5_format,
     image_coordinates,
@@ -279,35 +278,34 @@ class SequenceFile(_StoredFrames):
 # Recorded
 
 
+class _Layout(NamedTuple):
+    """What a file holds beside counts and depth, with coordinates of `name_dimensions`. Of arrays whose first dimension
+    is the frame the next rows; the rest is written with the first frames."""
+
+    arrays: dict[str, Variable]
+    attributes: dict[str, Any]
+    coordinates: dict[str, Any]
+
+
 class _Writer:
     """Writes frames to an open file of `write_hdf5`, part by part, and all else with the first part."""
 
     def __init__(self, file: Any, frames: int) -> None:
         self._file, self._frames, self._written = file, frames, 0
 
-    def add(
-        self,
-        part: Frames,
-        scene: Scene,
-        depth: Mapping[Method, Map],
-        *,
-        arrays: Mapping[str, Variable],
-        attributes: Mapping[str, Any],
-        coordinates: Mapping[str, Coordinate | int | None],
-    ) -> None:
-        """Writes the next frames, their tags, their depth by each estimator `[frames, H, W]` [m], and of further
-        arrays whose first dimension is the frame these rows; the rest with the first frames (see `name_dimensions`)."""
+    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], layout: _Layout) -> None:
+        """Writes the next frames, their tags, and their depth by each estimator `[frames, H, W]` [m]."""
         every: dict[str, Variable] = {
             "counts": ((*_IMAGES, "time"), part.counts, "1", "detections in the bin"),
             "intensity": (_IMAGES, part.intensity, "1", "counts over all bins"),
-            **arrays,
+            **layout.arrays,
         }
         for method, values in depth.items():
             every[f"depth/{method}"] = (_IMAGES, values.astype(np.float32), "m", f"planar depth by {method}")
         for name, column in ({} if part.tags is None else part.tags._asdict()).items():
             every[f"tags/{name}"] = ((_DETECTION,), column.astype(_TAGS[name]), "1", f"{name} of the detection")
         if not self._written:
-            self._begin(part, scene, every, attributes, coordinates)
+            self._begin(part, scene, layout._replace(arrays=every))
         rows = slice(self._written, self._written + part.frames)
         for name, (dimensions, values, _, _) in every.items():
             stored = self._file[name]
@@ -320,16 +318,9 @@ class _Writer:
                 self._file[_DETECTION].resize(stored.shape)
         self._written = rows.stop
 
-    def _begin(
-        self,
-        part: Frames,
-        scene: Scene,
-        arrays: Mapping[str, Variable],
-        attributes: Mapping[str, Any],
-        coordinates: Mapping[str, Coordinate | int | None],
-    ) -> None:
+    def _begin(self, part: Frames, scene: Scene, layout: _Layout) -> None:
         """Writes what all frames share, reserves space for these, and names the dimensions."""
-        file = self._file
+        file, arrays = self._file, layout.arrays
         common = {
             "format_version": FORMAT_VERSION,
             "pulses": part.pulses,
@@ -341,7 +332,7 @@ class _Writer:
             "source": str(scene.source or ""),
         }
         words = [f"{name} ({', '.join(axes)}): {meaning} [{unit}]" for name, (axes, _, unit, meaning) in arrays.items()]
-        file.attrs.update({**common, **attributes, "read_me": _READ_ME + "; ".join(words)})
+        file.attrs.update({**common, **layout.attributes, "read_me": _READ_ME + "; ".join(words)})
         file.create_dataset("config", data=scene.to_toml())
         for name, (dimensions, values, _, _) in arrays.items():
             array = np.asarray(values)
@@ -354,12 +345,12 @@ class _Writer:
                 chunks = {"chunks": _chunks(shape, array.itemsize), **_PACKED} if packed else {}
                 file.create_dataset(name, shape, array.dtype, **chunks)
         edges, (height, width, _) = part.gate_start + part.edges, part.expected.shape
-        axes: dict[str, Coordinate | int | None] = {
+        axes: dict[str, Any] = {
             "frame": (np.arange(self._frames), "1", "number of the frame"),
             **image_coordinates(height, width),
             "time": (0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
             _DETECTION: None,
-            **coordinates,
+            **layout.coordinates,
         }
         described = {}
         for name, (dimensions, _, unit, meaning) in arrays.items():
@@ -464,7 +455,7 @@ def record_frames(
             for method in methods:
                 time = part.arrival_time(method, undo_pile_up=undo_pile_up, device=device)
                 depth[method] = depth_from_time(time, scene=scene)
-            writer.add(part, scene, depth, **_still(result, part, frames, bound.sigma))
+            writer.add(part, scene, depth, _still(result, part, frames, bound.sigma))
             detections += int(part.intensity.sum())
             errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
             if progress is not None:
@@ -479,8 +470,8 @@ def record_frames(
     )
 
 
-def _still(result: Result, part: Frames, frames: int, bound: Map) -> dict[str, dict[str, Any]]:
-    """What the file of a scene that stands still holds beside its frames: see `_Writer.add`."""
+def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
+    """What the file of a scene that stands still holds beside its frames: see `_Layout`."""
     scene, irf, distance = result.scene, part.irf, result.truth.range.astype(np.float64)
     attributes = {
         "format": FramesFile.FORMAT,
@@ -509,7 +500,7 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> dict[str, d
         curve = np.array([irf.times, irf.values], np.float64)
         arrays["irf"] = (("quantity", "sample"), curve, "1", "measured instrument response")
         coordinates |= {"sample": curve.shape[1], "quantity": (["time [s]", "value"], "1", arrays["irf"][3])}
-    return {"attributes": attributes, "coordinates": coordinates, "arrays": arrays}
+    return _Layout(arrays, attributes, coordinates)
 
 
 def _bound(result: Result, pulses: int, device: Any) -> ResultBound:
@@ -582,14 +573,14 @@ def simulate_sequence(
                 part = detect(result, first_frame=number, pulses=pulses, seed=seed, tags=tags, device=first)
             times = {method: part.arrival_time(method, device=first) for method in methods}
             depth = {method: depth_from_time(time, scene=at) for method, time in times.items()}
-            writer.add(part, base, depth, **_moving(result, part, moves, number, photons))
+            writer.add(part, base, depth, _moving(result, part, moves, number, photons))
             if progress is not None:
                 progress("frames", number + 1, len(scenes))
     return SequenceFile.load(path)
 
 
-def _moving(result: Result, part: Frames, moves: Trajectory, row: int, photons: int) -> dict[str, dict[str, Any]]:
-    """What the file of a scene that moves holds of a frame beside its counts: see `_Writer.add`."""
+def _moving(result: Result, part: Frames, moves: Trajectory, row: int, photons: int) -> _Layout:
+    """What the file of a scene that moves holds of a frame beside its counts: see `_Layout`."""
     fields = list(moves.fields)
     attributes = {"format": SequenceFile.FORMAT, "photons": photons, "fields": fields}
     coordinates = {"camera_axis": (["x", "y", "z"], "1", "of the camera"), "field": (fields, "1", "of the scene")}
@@ -613,5 +604,5 @@ def _moving(result: Result, part: Frames, moves: Trajectory, row: int, photons: 
     for name, unit in _TRUTH.items():
         image = (*_IMAGES, "axis") if name == "normal" else _IMAGES
         arrays[f"truth/{name}"] = (image, getattr(result.truth, name), unit, f"true {name}")
-    rows = {name: (axes, np.asarray(values)[None], *words) for name, (axes, values, *words) in arrays.items()}
-    return {"attributes": attributes, "coordinates": coordinates, "arrays": rows}
+    rows = {name: (axes, np.asarray(values)[None], unit, text) for name, (axes, values, unit, text) in arrays.items()}
+    return _Layout(rows, attributes, coordinates)
