@@ -98,11 +98,9 @@ def information_from_histogram(
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)
     if signal_halves is not None:
-        first, second = (
-            _check_cube("signal_halves", np.asarray(half, np.float64), signal.shape) for half in signal_halves
-        )
+        halves = [_check_cube("signal_halves", np.asarray(half, np.float64), signal.shape) for half in signal_halves]
         # The product of two slopes is the square of their mean less the square of half their difference.
-        noise = _information_of_noise(0.5 * (first - second).reshape(-1, bins), total, taps, slope_taps, law)
+        noise = _information_of_noise(0.5 * (halves[0] - halves[1]).reshape(-1, bins), total, taps, slope_taps, law)
     elif signal_variance is not None:
         variance = _check_cube("signal_variance", np.asarray(signal_variance, np.float64), signal.shape)
         noise = _information_of_noise(variance.reshape(-1, bins), total, taps, slope_taps, law, is_variance=True)
@@ -201,9 +199,8 @@ def crlb(
     """Cramér–Rao bound of a Monte Carlo result's delay per pixel, float64 `[H, W]` [s]; NaN for no information.
 
     The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.
-    The scene's instrument response is applied. The noise of the simulation counts as information and makes the bound
-    too small; it is subtracted where the result keeps standard errors (`simulate(..., uncertainty=True)`): inf where
-    it is all there is.
+    The scene's instrument response is applied. Noise of the simulation, which counts as information, is subtracted
+    where the result keeps standard errors (`simulate(..., uncertainty=True)`): inf where it is all there is.
 
     `result`: of `spadwarp.simulate`, or its path; `pulses`: of one depth frame; default: the scene's,
     `Scene.pulses_per_depth_frame`; `law`, `device`: see `information_from_histogram`. Raises `ArgumentError` where

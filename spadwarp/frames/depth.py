@@ -309,12 +309,12 @@ def _geometry(
 ) -> tuple[float, LinesOfSight | None]:
     """Group index, and lines of sight where they are known."""
     scene = histograms.scene
-    if scene is None and group_index is None:
-        raise ArgumentError("group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
-    if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
-        raise ArgumentError("group index and field of view are those of the file's scene")
     if scene is not None:
+        if group_index is not None or horizontal_fov_deg is not None:
+            raise ArgumentError("group index and field of view are those of the file's scene")
         return scene.medium.group_index, lines_of_sight(scene)
+    if group_index is None:
+        raise ArgumentError("group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
     index = check_real("group index", group_index, field_range(Medium, "group_index"))
     if horizontal_fov_deg is None:
         return index, None

@@ -127,9 +127,8 @@ def read_histograms(
     if values.ndim == 4 and sum_frames:
         values = values.sum(axis=0, dtype=np.int64 if values.dtype.kind in "iu" else np.float64)
     if gate_start is None and raw.gate_start is None:
-        origin = "tag 0" if raw.first else "bin 0"
-        text = f"{path.name}: gate start is not given (gate_start): {origin} is taken for the time of the pulse"
-        warnings.warn(text, SpadwarpWarning, stacklevel=2)
+        origin = f"{'tag' if raw.first else 'bin'} 0 is taken for the time of the pulse"
+        warnings.warn(f"{path.name}: gate start is not given (gate_start): {origin}", SpadwarpWarning, stacklevel=2)
     return Histograms(
         values=np.ascontiguousarray(values),
         bin_width=raw.bin_width if bin_width is None else bin_width,
@@ -316,30 +315,24 @@ def _read_arrays(
         notes.append(f"bin width {known * 1e12:g} ps from bin_size")
     is_sparse = isinstance(value, SparseMatrix)
     if is_sparse:
-        height, across = _image_shape(value.shape[0], image_size, variables)
-        notes.append(f"{across} x {height} pixels, column by column")
-        value = _dense(value, height, across)
+        value = _of_sparse(value, image_size, variables)
+        notes.append(f"{value.shape[1]} x {value.shape[0]} pixels, column by column")
     return _Raw(value, tuple(notes), known, numbers.get("gate_start"), ordered=is_sparse)
 
 
-def _image_shape(pixels: int, image_size: tuple[int, int] | None, variables: Mapping[str, Variable]) -> tuple[int, int]:
-    """(height, width) of an image of so many pixels: given, or the only shape of other arrays that has as many."""
-    if image_size is not None:
-        height, width = image_size
-        if height * width != pixels:
-            raise ArgumentError(f"image size = {width} x {height} has {height * width} pixels, not {pixels}")
-        return image_size
+def _of_sparse(
+    matrix: SparseMatrix, image_size: tuple[int, int] | None, variables: Mapping[str, Variable]
+) -> NDArray[Any]:
+    """`[H, W, T]` of a matrix `[pixels, T]`, pixels column by column as in MATLAB; the size of the image is given, or is
+    the only shape of other arrays with as many pixels."""
+    pixels, bins = matrix.shape
     shapes = {one.shape for one in variables.values() if one.kind == "dense"}
     fitting = [shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and math.prod(shape) == pixels]
-    if len(fitting) != 1:
+    if image_size is None and len(fitting) != 1:
         raise ArgumentError(f"the image's size is missing (image_size): {pixels} pixels, one after the other")
-    height, width = fitting[0]
-    return height, width
-
-
-def _dense(matrix: SparseMatrix, height: int, width: int) -> NDArray[Any]:
-    """`[H, W, T]` of a matrix `[pixels, T]` whose pixels stand column by column, as in MATLAB."""
-    bins = matrix.shape[1]
+    height, width = image_size or fitting[0]
+    if height * width != pixels:
+        raise ArgumentError(f"image size = {width} x {height} has {height * width} pixels, not {pixels}")
     _check_size((height, width, bins), "a part of the image")
     whole = bool((matrix.value == np.rint(matrix.value)).all() and (np.abs(matrix.value) < 2**31).all())
     cube = np.zeros((height, width, bins), np.int32 if whole else np.float32)
@@ -428,7 +421,11 @@ def _read_ptu(path: Path, image_size: tuple[int, int] | None, sum_frames: bool) 
     with ptufile.PtuFile(path) as file:
         _check_ptu(file, path)
         if file.is_image and image_size is None:
-            counts, text = _ptu_image(file, sum_frames), "pixels by the image in its header"
+            frames, height, width, _, bins = file.shape
+            _check_size((1 if sum_frames else frames, height, width, bins), "adding up the frames (sum_frames)")
+            options: Any = {"frame": -1 if sum_frames or frames == 1 else None, "channel": -1}
+            image = file.decode_image(**options, dtype=np.uint32, keepdims=False)
+            counts, text = np.ascontiguousarray(image).view(np.int32), "pixels by the image in its header"
         else:
             counts, text = _ptu_scan(file, image_size)
         if (channels := file.number_channels) > 1:
@@ -456,14 +453,6 @@ def _check_ptu(file: Any, path: Path) -> None:
         raise FileError(f"{path}: cut: of {file.number_records} records {readable} are there")
     if not 1e-15 < (width := float(file.tcspc_resolution)) < 1e-3:
         raise FileError(f"{path}: MeasDesc_Resolution = {width} s is outside (1e-15, 1e-3)")
-
-
-def _ptu_image(file: Any, sum_frames: bool) -> NDArray[np.int32]:
-    frames, height, width, _, bins = file.shape
-    _check_size((1 if sum_frames else frames, height, width, bins), "adding up the frames (sum_frames)")
-    options: dict[str, Any] = {"channel": -1, "dtype": np.uint32, "keepdims": False}
-    counts = file.decode_image(frame=-1 if sum_frames or frames == 1 else None, **options)
-    return np.ascontiguousarray(counts).view(np.int32)
 
 
 def _ptu_scan(file: Any, image_size: tuple[int, int] | None) -> tuple[NDArray[np.int32], str]:

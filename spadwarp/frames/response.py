@@ -232,7 +232,10 @@ def instrument_response(
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
         check_real(name, value, "[0, 1e6] s")
     if shape not in ("gaussian", "exponentially_modified_gaussian"):
-        return _read_csv(Path(shape))
+        if file_problem(shape) is not None:
+            name = repr(str(shape)) if len(str(shape)) < 300 else shown(str(shape))
+            raise ArgumentError(f"irf = {name} is neither a known shape nor a file")
+        return read_response(shape)
     sigma = math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA
     return InstrumentResponse(sigma=sigma, tail=0.0 if shape == "gaussian" else tail)
 
@@ -245,19 +248,6 @@ def detector_response(detector: Detector, laser: Laser | None = None) -> Instrum
         shape=detector.irf,
         tail=detector.irf_tail_ps * 1e-12,
     )
-
-
-def _read_csv(path: Path) -> InstrumentResponse:
-    if file_problem(path) is not None:
-        name = repr(str(path)) if len(str(path)) < 300 else shown(str(path))
-        raise ArgumentError(f"irf = {name} is neither a known shape nor a file")
-    try:
-        times, values = read_columns(path, {"time_ps": "[-1e12, 1e12]", "value": "[0, 1e30]"}).T
-        return InstrumentResponse(times=times * 1e-12, values=values)
-    except (ConfigError, FileError) as error:
-        raise ArgumentError(str(error)) from None
-    except ArgumentError as error:
-        raise ArgumentError(f"{path}: {error}") from None
 
 
 def _near_1(values: Floats) -> Floats:
@@ -277,11 +267,14 @@ def read_response(path: str | Path, *, bin_width: float | None = None) -> Instru
         if place.suffix.lower() == ".npy":
             values = read_npy(place, largest=1 << 20).astype(np.float64)
         elif any("," in line for line in read_text(place).splitlines() if not line.lstrip().startswith("#")):
-            return _read_csv(place)
+            times, values = read_columns(place, {"time_ps": "[-1e12, 1e12]", "value": "[0, 1e30]"}).T
+            return InstrumentResponse(times=times * 1e-12, values=values)
         else:
             values = read_columns(place, {"value": "[0, 1e30]"})[:, 0]
     except (ConfigError, FileError) as error:
         raise ArgumentError(str(error)) from None
+    except ArgumentError as error:
+        raise ArgumentError(f"{path}: {error}") from None
     if values.ndim != 1 or values.size < 2 or not (np.isfinite(values).all() and values.min() >= 0 and values.any()):
         raise ArgumentError(f"{path}: {values.shape} is not a response: two values or more, not negative, not all 0")
     if bin_width is None:

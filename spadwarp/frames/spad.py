@@ -52,12 +52,7 @@ class Window(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        detector: Detector,
-        laser: Laser | None,
-        window: tuple[float, int],
-        bin_width: float,
-        tdc_widths: ArrayLike | None,
+        cls, detector: Detector, laser: Laser | None, window: tuple[float, int], bin_width: float, tdc_widths: Any
     ) -> Self:
         """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
         if not (isinstance(window, tuple | list) and len(window) == 2):
@@ -89,10 +84,8 @@ class Window(NamedTuple):
         wrap = math.ceil((gate_start - self.start) / self.period - 1e-9) - 1
         if gate_start <= 0 or self.start + wrap * self.period + self.edges[-1] <= 0:
             return ()
-        return (
-            f"the source begins at {gate_start * 1e9:.6g} ns: earlier light of later pulses, near-range backscatter "
-            "above all, is missing in the window (start the source at 0 and give `window`)",
-        )
+        text = "earlier light of later pulses, near-range backscatter above all, is missing in the window"
+        return (f"the source begins at {gate_start * 1e9:.6g} ns: {text} (start the source at 0 and give `window`)",)
 
 
 class Effect(ABC):
@@ -143,8 +136,7 @@ class Receiver:
     """The camera before it counts: expected detections of a detector, from expected light.
 
     Attributes:
-        detector: The section of a scene.
-        window: Its bins in time.
+        detector, window: The section of a scene, and its bins in time.
         image: (height, width).
         noise: Dark counts and ambient light of each pixel [1/s], Warp float32 `[pixel]`; where it lies, the others lie.
         matrix: Fraction of the light of each source bin that is detected in each detector bin.
@@ -444,9 +436,6 @@ def to_xarray(frames: Frames) -> xarray.Dataset:
     return labelled(variables, coordinates, attributes)
 
 
-# Noise of the simulation
-
-
 @dataclass(frozen=True, kw_only=True)
 class MonteCarloNoise:
     """The standard error of a result against the shot noise of one frame of `pulses`, both of the counts of a pixel.
@@ -509,9 +498,6 @@ def monte_carlo_noise(
     ratio, share = float(np.quantile(ratios, _PART)), float(np.mean(ratios > LIMIT))
     needed = result.photons * (ratio / LIMIT) ** 2
     return MonteCarloNoise(pulses=pulses, ratio=ratio, pixels=share, photons=result.photons, photons_needed=needed)
-
-
-# Counts
 
 
 _LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]", "seed": SEED}
@@ -627,7 +613,7 @@ def detect(
         if as_torch:
             out_shape = (*(() if summed else (numbers["frames"],)), *image, seen.recorded)
             out = output_tensor(out, name="out", shape=out_shape, device=hazard.device)
-        counts, events = _draw(receiver, hazard, numbers, summed=summed, tags=tags, out=out)
+        counts, found = _draw(receiver, hazard, numbers, summed=summed, tags=tags, out=out)
         to_caller: Any = tensor_of if as_torch else wp.array.numpy
         expected, known = (to_caller(rows)[:, : seen.recorded].reshape(*image, -1) for rows in (hazard, known))
     notes = seen.missing_light(axis[0]) if detector.wrap else ()
@@ -643,7 +629,7 @@ def detect(
         edges=seen.edges[: seen.recorded + 1],
         period=seen.period if detector.wrap else None,
         irf=irf,
-        tags=None if events is None else _time_tags(events, image, first_frame),
+        tags=found,
         notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
         monte_carlo_noise=None if noise is None else noise.ratio,
         **numbers,
@@ -652,7 +638,7 @@ def detect(
 
 def _draw(
     receiver: Receiver, hazard: Any, numbers: dict[str, int], *, summed: bool, tags: bool, out: Any
-) -> tuple[Any, dict[str, NDArray[Any]] | None]:
+) -> tuple[Any, TimeTags | None]:
     """Counts, in the tensor `out` where there is one, and for tags the detections one by one."""
     import warp as wp
 
@@ -662,9 +648,9 @@ def _draw(
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
     in_place = out is not None and not add_frames
-    counts = wp.from_torch(out).flatten() if in_place else None
-    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count, "counts": counts}
-    events = None
+    given = wp.from_torch(out).flatten() if in_place else None
+    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count, "counts": given}
+    found = None
     if by_event:
         counts, events = kernels.event_counts(
             hazard,
@@ -678,18 +664,16 @@ def _draw(
             tags=tags,
             **common,
         )
+        if events is not None:
+            frame, pixel = np.divmod(events["row"], receiver.image[0] * receiver.image[1])
+            y, x = np.divmod(pixel, receiver.image[1])
+            found = TimeTags(frame + numbers["first_frame"], y, x, events["pulse"], events["bin"])
     else:
         counts = kernels.first_photon_counts(hazard, summed=summed, **common)
     if in_place:
-        return out, events
+        return out, found
     every: Any = counts.numpy() if out is None else tensor_of(counts)
     frames = () if summed and not add_frames else (numbers["frames"],)
     every = every.reshape(*frames, *receiver.image, window.recorded)
     every = every.sum(0, dtype=every.dtype) if add_frames else every
-    return (every if out is None else out.copy_(every)), events
-
-
-def _time_tags(events: dict[str, NDArray], image: tuple[int, int], first_frame: int) -> TimeTags:
-    frame, pixel = np.divmod(events["row"], image[0] * image[1])
-    y, x = np.divmod(pixel, image[1])
-    return TimeTags(frame + first_frame, y, x, events["pulse"], events["bin"])
+    return (every if out is None else out.copy_(every)), found
