@@ -186,9 +186,8 @@ def _reading(path: Path, read: Callable[..., _Raw], *facts: Any) -> _Raw:
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
     if values.ndim not in (3, 4) or values.size == 0 or values.dtype.kind not in "biuf":
-        raise FileError(
-            f"{path}: {values.dtype} {values.shape}; real numbers [H, W, T] or [frames, H, W, T] are needed"
-        )
+        needed = "real numbers [H, W, T] or [frames, H, W, T] are needed"
+        raise FileError(f"{path}: {values.dtype} {values.shape}; {needed}")
     if values.dtype.kind == "f" and np.isnan(values).any():
         raise FileError(f"{path}: holds NaN, as depth does; histograms are finite and not negative")
     if values.dtype.kind in "if" and not (values.min() >= 0 and math.isfinite(values.max())):
@@ -323,8 +322,8 @@ def _read_arrays(
 def _of_sparse(
     matrix: SparseMatrix, image_size: tuple[int, int] | None, variables: Mapping[str, Variable]
 ) -> NDArray[Any]:
-    """`[H, W, T]` of a matrix `[pixels, T]`, pixels column by column as in MATLAB; the size of the image is given, or is
-    the only shape of other arrays with as many pixels."""
+    """`[H, W, T]` of a matrix `[pixels, T]`, pixels column by column as in MATLAB; the image's size is given, or is the
+    only shape of other arrays with as many pixels."""
     pixels, bins = matrix.shape
     shapes = {one.shape for one in variables.values() if one.kind == "dense"}
     fitting = [shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and math.prod(shape) == pixels]
