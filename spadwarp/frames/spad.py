@@ -127,8 +127,8 @@ class _Crosstalk(Effect):
         kernels.add_crosstalk(rates, neighbours, image_width=receiver.image[1], probability=probability)
 
 
-EFFECTS: tuple[Effect, ...] = (_Crosstalk(),)
-"""Of the detector on λ, in the order in which they act."""
+EFFECTS: tuple[Effect, ...] = (_Crosstalk(),)  # on λ, in the order in which they act
+DRAWN_EFFECTS = ("afterpulsing_probability", "max_count")  # on single detections, 0 without: a fit refuses them
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.frames.spad import DRAWN_EFFECTS
 from spadwarp.inverse.equations import Equations, Law, Moments, Pooled, Solution, solve, solve_pooled
 from spadwarp.inverse.estimates import NORMAL_95, Estimate, EstimateMap, Fit, Iteration, not_identifiable
 from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposure
@@ -117,12 +118,9 @@ def fit(
 
 def _detector_law(detector: Detector, window: Any) -> Law:
     """How a detector counts in the model. Raises `ConfigError` for what it leaves out."""
-    if detector.afterpulsing_probability > 0:
-        raise ConfigError(
-            f"detector.afterpulsing_probability = {detector.afterpulsing_probability}: a fit does not model it"
-        )
-    if detector.max_count > 0:
-        raise ConfigError(f"detector.max_count = {detector.max_count}: a fit does not model full counters")
+    for name in DRAWN_EFFECTS:
+        if (value := getattr(detector, name)) != 0:
+            raise ConfigError(f"detector.{name} = {value}: a fit does not model it")
     free = detector.mode == "free_running"
     return Law(not free, detector.dead_time_ns * 1e-9 / window.period if free else 0.0, window.recorded)
 
