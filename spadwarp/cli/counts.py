@@ -100,11 +100,11 @@ def detect(
             device=device,
             progress=report,
         )
-    for note in recording.notes:
+    for note in recording.file.notes:
         complain(f"note: {note}")
-    if recording.bound_noise > _NOISE and not _refused(recording):
+    if recording.bound.noise > _NOISE and recording.bound.problem is None:
         complain(f"note: {_bound_noise(recording, result.photons)}")
-    files = [recording.path, spadwarp.viz.draw_recording(recording, result, out / "frame.png")]
+    files = [recording.file.path, spadwarp.viz.draw_recording(recording.file, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 
@@ -131,37 +131,34 @@ def _with_detector(result: Result, overrides: list[str] | None) -> Result:
 def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
     import numpy as np
 
-    first, bound = recording.first, recording.bound_depth[~np.isnan(recording.bound_depth)]
+    file, noise = recording.file, recording.bound.noise
+    bound = file.bound_depth()
+    bound = bound[~np.isnan(bound)]
     median = float(np.median(bound)) if bound.size else math.inf
-    pixels = first.counts.shape[1] * first.counts.shape[2]
+    per_pixel = recording.detections / (frames * file.shape[1] * file.shape[2])
     return {
-        "pulses": first.pulses,
+        "pulses": file.pulses,
         "frames": frames,
-        "seed": first.seed,
-        "detections_per_frame_and_pixel": recording.detections / (frames * pixels),
-        "detections_per_pulse_and_pixel": recording.detections / (frames * pixels * first.pulses),
+        "seed": file.seed,
+        "detections_per_frame_and_pixel": per_pixel,
+        "detections_per_pulse_and_pixel": per_pixel / file.pulses,
         "bound": {
             "pixels": int(bound.size),
             "median_m": median if math.isfinite(median) else None,
-            "noise_fraction": recording.bound_noise if math.isfinite(recording.bound_noise) else None,
+            "noise_fraction": noise if math.isfinite(noise) else None,
         },
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
         "monte_carlo_noise": None if recording.monte_carlo is None else dataclasses.asdict(recording.monte_carlo),
-        "notes": list(recording.notes),
+        "notes": list(file.notes),
     }
-
-
-def _refused(recording: Recording) -> bool:
-    """There is information, but no bound: too few photons were traced, as a note says."""
-    return math.isfinite(recording.bound_noise) and not (recording.bound_time == recording.bound_time).any()
 
 
 def _bound_noise(recording: Recording, photons: int) -> str:
     """How much of the bound's information was noise, and the photons that would leave a tenth."""
     return (
-        f"{percent(recording.bound_noise)} % of the information in the median pixel was noise of the simulation; the "
+        f"{percent(recording.bound.noise)} % of the information in the median pixel was noise of the simulation; the "
         "Cramér–Rao bound is without it"
-        + (", and only roughly known" if recording.bound_noise > 0.3 else "")
+        + (", and only roughly known" if recording.bound.noise > 0.3 else "")
         + f"; about {recording.bound_photons:.1e} photons instead of {photons:.1e} would make that a tenth"
     )
 

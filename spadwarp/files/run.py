@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames import Reduction, detector_response
-from spadwarp.io.arrays import point_cloud, point_normals, write_array, write_exr, write_ply
+from spadwarp.io.arrays import point_cloud, write_array, write_exr, write_ply
 from spadwarp.io.paths import file_within, remove_temporaries
 from spadwarp.io.text import write_text
 from spadwarp.limits import check_choice
@@ -238,18 +238,18 @@ def write_depth(
 def _write_points(reduction: Reduction, path: str | Path, frame: str, comment: str) -> Path:
     assert reduction.lines is not None
     distance = reduction.range[0]
-    view = reduction.lines.directions_to(distance)
-    points, valid = point_cloud(distance, view)
-    normals = point_normals(distance, view)
+    points: Any
+    normals: Any
+    points, normals = point_cloud(distance, reduction.lines.directions_to(distance))
     if not len(points):
         raise FileError(f"{path}: nothing returned in any pixel: there are no points to write")
     if frame == "world":
         assert reduction.camera is not None
-        points = to_world(reduction.camera, points).astype(np.float32)
-        normals = (normals @ rotation_matrix(reduction.camera.rotation_deg).T).astype(np.float32)
-    intensity = reduction.intensity[0][valid].astype(np.float32)
-    properties = {f"n{axis}": normals[:, index] for index, axis in enumerate("xyz")} | {"intensity": intensity}
-    return write_ply(path, points, properties, comment=f"{comment}; frame {_POINT_FRAMES[frame]}")
+        points = to_world(reduction.camera, points)
+        normals = normals @ rotation_matrix(reduction.camera.rotation_deg).T
+    columns = dict(zip(("x", "y", "z", "nx", "ny", "nz"), (*points.T, *normals.T), strict=True))
+    columns["intensity"] = reduction.intensity[0][np.isfinite(distance)]
+    return write_ply(path, columns, comment=f"{comment}; frame {_POINT_FRAMES[frame]}")
 
 
 # A fit

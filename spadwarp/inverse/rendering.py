@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.frames import Receiver, detector_response
-from spadwarp.frames.receiver import Window
+from spadwarp.frames.spad import Window
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, moved, with_values
 from spadwarp.scene import noise_rate
 from spadwarp.scene.sight import lines_of_sight

@@ -11,6 +11,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -138,19 +139,18 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
         for cells in lines:
             if not cells or cells[0].lstrip().startswith("#"):
                 continue
-            try:
+            row: list[float] = []
+            with suppress(ValueError):
                 row = [parse_number(cell) for cell, _ in zip(cells, columns, strict=False)]
-            except ValueError:
-                row = []
-            if len(row) < len(columns):
-                if rows or named:
-                    raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
+            if len(row) == len(columns):
+                for value, (name, within) in zip(row, columns.items(), strict=True):
+                    if value not in Interval.read(within):
+                        raise ValueError(f"{name} = {value:g} is outside {within}")
+                rows.append(row)
+            elif rows or named:
+                raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
+            else:
                 named = True
-                continue
-            for value, (name, within) in zip(row, columns.items(), strict=True):
-                if value not in Interval.read(within):
-                    raise ValueError(f"{name} = {value:g} is outside {within}")
-            rows.append(row)
     except (ValueError, csv.Error) as error:  # the latter: a cell of more than 131 072 characters
         raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
     return np.array(rows, np.float64).reshape(-1, len(columns))

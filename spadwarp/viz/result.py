@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.analytic import AnalyticResult
 from spadwarp.errors import ArgumentError
-from spadwarp.frames import METHODS, Frames, FramesFile, Method, Recording, first_photon_probabilities
+from spadwarp.frames import Frames, FramesFile, Method, first_photon_probabilities
 from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
 from spadwarp.result import COMPONENTS, Result, degree_of_polarisation
@@ -413,18 +413,9 @@ class DepthMaps:
     channel: str = "I"
 
 
-def draw_recording(recording: Recording, result: Result, path: str | Path, *, width: float = PAGE) -> Path:
-    """The first frame, see `frame_figure`; `result` is what the frames were drawn from. Returns the path."""
-    method = max(recording.depth, key=METHODS.index)
-    maps = DepthMaps(
-        scene=result.scene,
-        method=method,
-        depth=recording.depth[method].astype(np.float32),  # as in the file
-        truth=result.truth.depth,
-        bound=recording.bound_depth,
-        channel=result.provenance.get("channel", "I"),
-    )
-    return save(frame_figure(recording.first, maps=maps, width=width), path)
+def draw_recording(file: FramesFile, path: str | Path, *, width: float = PAGE) -> Path:
+    """The first frame of a file, see `frame_figure`; returns the path."""
+    return save(stored_frame_figure(file, 0, width), path)
 
 
 def stored_frame_figure(file: FramesFile, number: int, width: float = PAGE) -> Figure:

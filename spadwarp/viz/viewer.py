@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
+from spadwarp.files.formats import FrameSequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
-from spadwarp.frames.export import FrameSequence
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.spad import noise_caption
 from spadwarp.io.paths import atomic_path, check_apart

@@ -114,26 +114,15 @@ def read_names(name, path):
 
 # Every way with a result; one of each kind with the others, which the same code reads.
 CASES = [("result.h5", way) for way in hostile.WAYS]
-CASES += [
-    (name, way)
-    for name in READERS
-    for way in (hostile.external_storage, hostile.other_shape, hostile.missing)
-    if name != "result.h5"
-]
+OTHERS = (hostile.external_storage, hostile.other_shape, hostile.missing)
+CASES += [(name, way) for name in READERS for way in OTHERS if name != "result.h5"]
 
 
 @pytest.mark.parametrize(("name", "way"), CASES, ids=lambda case: getattr(case, "__name__", case))
 def test_a_dataset_that_is_not_as_it_should_be_is_refused_by_name(name, way, valid, copy, tmp_path):
     path = copy / name
     # Optional ones may be missing.
-    optional = {
-        "expected",
-        "background",
-        "counts",
-        "event_index",
-        "event_start",
-        "event_count",
-    }
+    optional = {"expected", "background", "counts", "event_index", "event_start", "event_count"}
     optional |= {f"depth/{method}" for method in spadwarp.frames.METHODS}
     for dataset in read_names(name, path):
         if way is hostile.missing and dataset in optional:

@@ -161,11 +161,9 @@ PICTURES = {
     "histogram": lambda path, width, result, **_: result.plot("histogram", width=width).savefig(path),
     "narrow": draw_narrow,
     "frames": lambda path, width, frames, **_: frames.plot(width=width).savefig(path),
-    "stored_frames": lambda path, width, recording, **_: spadwarp.load(recording.path).plot(width=width).savefig(path),
+    "stored_frames": lambda path, width, recording, **_: recording.file.plot(width=width).savefig(path),
     "scene": lambda path, width, **_: SCENE.plot(width=width).savefig(path),
-    "recording": lambda path, width, recording, result, **_: spadwarp.viz.draw_recording(
-        recording, result, path, width=width
-    ),
+    "recording": lambda path, width, recording, **_: spadwarp.viz.draw_recording(recording.file, path, width=width),
     "analytic": draw_analytic,
     "depth_alone": lambda path, width, result, **_: draw_depth(
         result.truth.depth.astype(float), result.intensity, path, label="depth z [m]", title="Depth (peak)", width=width
@@ -301,9 +299,9 @@ def test_the_style_is_for_figures_of_ones_own_too():
     assert all(matplotlib.rcParams[name] == value for name, value in before.items() if name != "backend")
 
 
-def test_frames_on_disk_draw_the_picture_that_detect_writes(recording, result, tmp_path):
-    drawn = spadwarp.viz.draw_recording(recording, result, tmp_path / "frame.png").read_bytes()
-    spadwarp.load(recording.path).plot().savefig(tmp_path / "plot.png")
+def test_frames_on_disk_draw_the_picture_that_detect_writes(recording, tmp_path):
+    drawn = spadwarp.viz.draw_recording(recording.file, tmp_path / "frame.png").read_bytes()
+    spadwarp.load(recording.file.path).plot().savefig(tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes() == drawn
 
 
