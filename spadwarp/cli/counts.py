@@ -104,7 +104,7 @@ def detect(
         complain(f"note: {note}")
     if recording.bound_noise > _NOISE and not _refused(recording):
         complain(f"note: {_bound_noise(recording, result.photons)}")
-    files = [recording.path, spadwarp.viz.draw_recording(recording, result, out / "frame.png")]
+    files = [recording.path, spadwarp.viz.draw_recording(recording, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import secrets
 import tempfile
@@ -61,7 +62,8 @@ class _Pictures:
         """A call for each picture of a result."""
         import spadwarp
 
-        return spadwarp.viz.picture_calls(self.of, self.folder, **options)
+        draw = spadwarp.viz.draw_result
+        return [functools.partial(draw, self.of, self.folder, kinds=(kind,), **options) for kind in _KINDS]
 
     def save(self) -> Path:
         """Draws that of a fit; returns its path."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
+from matplotlib.colors import LogNorm, to_rgb
 
 import spadwarp
 from helpers import datasets
@@ -84,33 +84,33 @@ def rows():
     ]
 
 
-def draw_scores(path, width, **_):
+def draw_scores(path, **_):
     names = {"methods": METHODS, "targets": ("staircase", "diver_helmet"), "levels": LEVELS}
-    evaluation.draw_scores(scores(), path, note="64 frames of 256 x 192 pixels; split test", width=width, **names)
+    evaluation.draw_scores(scores(), path, note="64 frames of 256 x 192 pixels; split test", **names)
 
 
-def draw_samples(path, width, **_):
-    evaluation.draw_samples(samples(), path, methods=METHODS, note="split test", rescaled=True, width=width)
+def draw_samples(path, **_):
+    evaluation.draw_samples(samples(), path, methods=METHODS, note="split test", rescaled=True)
 
 
-def draw_ranking(path, width, **_):
+def draw_ranking(path, **_):
     better = {"psnr": True, "ssim": True, "rmse_mm": False, "edge_mm": False}
     means = {name: scores()[name, "staircase", "0.042"] for name in METHODS}
-    evaluation.draw_ranking(means, path, larger_is_better=better, note="split test", width=width)
+    evaluation.draw_ranking(means, path, larger_is_better=better, note="split test")
 
 
-def draw_reliability(path, width, **_):
+def draw_reliability(path, **_):
     table = np.stack([np.full(10, 500), np.linspace(20, 480, 10)], axis=1).astype(np.int64)
     tables = {(name, of): table for name in ("pyramid", "histograms") for of in ("target", "confidence")}
-    evaluation.draw_reliability(tables, path, note="scenes that no training saw", width=width)
+    evaluation.draw_reliability(tables, path, note="scenes that no training saw")
 
 
-def draw_photon_sweep(path, width, **_):
+def draw_photon_sweep(path, **_):
     photons = np.geomspace(1.0, 1000.0, 7)
     error = 0.1 / np.sqrt(photons) * np.ones((3, 1))
     rmse = {name: (2 + k) * error for k, name in enumerate(("input", "median", "pooled", "histograms"))}
     ratios = (0.1, 1.0, 10.0)
-    evaluation.draw_photon_sweep(rmse, error, path, photons=photons, sbr=ratios, note="a wall", width=width)
+    evaluation.draw_photon_sweep(rmse, error, path, photons=photons, sbr=ratios, note="a wall")
 
 
 def draw_curves(path, width, **_):
@@ -137,7 +137,9 @@ def draw_sweep(path, width, of="budget", vary="medium.extinction=0.1:0.4:4", **_
 
 
 def draw_video(path, width, result, **_):
-    viewer._light_figure(result.detections, "detections per pulse, pixel and bin", "log")[0].savefig(path)
+    scale = LogNorm(1e-6, 1e-2)
+    images = [("", scale, style.colour_map(style.LIGHT_MAP), "detections per pulse, pixel and bin")]
+    viewer._screen(result.detections.shape, images, width)[0].savefig(path)
 
 
 def draw_analytic(path, width, **_):
@@ -163,9 +165,7 @@ PICTURES = {
     "frames": lambda path, width, frames, **_: frames.plot(width=width).savefig(path),
     "stored_frames": lambda path, width, recording, **_: spadwarp.load(recording.path).plot(width=width).savefig(path),
     "scene": lambda path, width, **_: SCENE.plot(width=width).savefig(path),
-    "recording": lambda path, width, recording, result, **_: spadwarp.viz.draw_recording(
-        recording, result, path, width=width
-    ),
+    "recording": lambda path, width, recording, **_: spadwarp.viz.draw_recording(recording, path, width=width),
     "analytic": draw_analytic,
     "depth_alone": lambda path, width, result, **_: draw_depth(
         result.truth.depth.astype(float), result.intensity, path, label="depth z [m]", title="Depth (peak)", width=width
@@ -225,13 +225,19 @@ PICTURES_OF_THE_DOCS = {
 }
 
 
-@pytest.mark.parametrize("width", [style.PAGE, style.COLUMN], ids=["page", "column"])
-@pytest.mark.parametrize("kind", PICTURES)
+AS_WIDE_AS_A_PAGE = ("scores", "samples", "ranking", "reliability", "photon_sweep")
+
+
+@pytest.mark.parametrize(
+    ("kind", "width"),
+    [(kind, width) for kind in PICTURES for width in (style.PAGE, style.COLUMN)[: 1 + (kind not in AS_WIDE_AS_A_PAGE)]],
+)
 def test_every_picture_is_drawn_at_both_widths(kind, width, tmp_path, monkeypatch, request):
     draw = PICTURES[kind]
-    wanted = draw.__code__.co_varnames[2 : draw.__code__.co_argcount]
-    given = {name: request.getfixturevalue(name) for name in wanted if name not in ("of", "vary", "truth")}
-    figure = drawn(monkeypatch, lambda: draw(tmp_path / "picture.png", width, **given), f"{kind}_{width:g}")
+    wanted = set(draw.__code__.co_varnames[: draw.__code__.co_argcount])
+    fixtures = wanted & {"result", "frames", "recording", "data", "mesh"}
+    given = {name: request.getfixturevalue(name) for name in fixtures}
+    figure = drawn(monkeypatch, lambda: draw(path=tmp_path / "picture.png", width=width, **given), f"{kind}_{width:g}")
     assert figure.axes and figure.get_figwidth() >= min(width, 3.9)  # wider where there are many panels
 
 
@@ -301,8 +307,8 @@ def test_the_style_is_for_figures_of_ones_own_too():
     assert all(matplotlib.rcParams[name] == value for name, value in before.items() if name != "backend")
 
 
-def test_frames_on_disk_draw_the_picture_that_detect_writes(recording, result, tmp_path):
-    drawn = spadwarp.viz.draw_recording(recording, result, tmp_path / "frame.png").read_bytes()
+def test_frames_on_disk_draw_the_picture_that_detect_writes(recording, tmp_path):
+    drawn = spadwarp.viz.draw_recording(recording, tmp_path / "frame.png").read_bytes()
     spadwarp.load(recording.path).plot().savefig(tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes() == drawn
 
