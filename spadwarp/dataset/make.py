@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from spadwarp.dataset.card import card, croissant
 from spadwarp.dataset.plan import Plan, Shard
@@ -41,32 +41,29 @@ _Count = Annotated[int, Field(ge=0, lt=2**31)]
 _Real = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-
-class _File(_Strict):
+class _File(BaseModel, strict=True):
     bytes: Annotated[int, Field(ge=0)]
     sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 
-class _Split(_Strict):
+class _Split(BaseModel, strict=True):
     seed: str
     targets: list[str]
     shards: list[_ShardName]
     frames: _Count
 
 
-class _Splits(_Strict):
+class _Splits(BaseModel, strict=True):
     train: _Split
     validation: _Split
     test: _Split
 
 
-class _Manifest(_Strict):
+class _Manifest(BaseModel, strict=True):
     name: str
+    description: str
+    license: str
     version: str
-    license: str = ""
     seed: str
     frames: _Count
     scenes: _Count
@@ -133,9 +130,9 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
     return [*wrong, "manifest.json: missing"]
 
 
-def record_path(folder: Path, shard: Shard) -> Path:
+def _record_path(folder: Path, shard: Shard) -> Path:
     """Where the checksums of a shard's files stand."""
-    return folder / "shards" / f"{shard.name}.json"
+    return folder / "shards" / f"{shard.index:05d}.json"
 
 
 def _read_record(path: Path) -> dict[str, Any]:
@@ -153,7 +150,7 @@ def check_shards(plan: Plan, folder: Path, shards: Sequence[Shard]) -> dict[int,
     """By the shards' indices "" (whole), "missing", or what is wrong."""
 
     def state(shard: Shard) -> str:
-        path = record_path(folder, shard)
+        path = _record_path(folder, shard)
         if file_problem(path) == "no such file":
             return "missing"
         try:
@@ -181,45 +178,32 @@ def _compare(folder: Path, name: str, record: dict[str, Any]) -> str:
         return f"{name}: cannot be read: {error.strerror}"
 
 
-def finish(plan: Plan, folder: Path) -> tuple[str, ...]:
+def _finish(plan: Plan, folder: Path) -> tuple[str, ...]:
     """Writes the splits, the index of scenes and, once every shard is made, manifest and card.
 
     Returns the shards that are missing.
     """
+    from spadwarp import __version__
+
     files: dict[str, Any] = {}
     missing = []
     for shard in plan.shards:
         try:
-            files |= _read_record(record_path(folder, shard))
+            files |= _read_record(_record_path(folder, shard))
         except FileError:
             missing.append(shard.frames_file)
-    for split in SPLITS:
-        write_text("".join(f"{name}\n" for name in _shards_of(plan, split)), folder / f"{split}.txt")
+    splits = {split: [item for item in plan.shards if item.split == split] for split in SPLITS}
+    for split, shards in splits.items():
+        write_text("".join(f"{item.frames_file}\n" for item in shards), folder / f"{split}.txt")
     write_scene_index(plan, folder)
-    if not missing:
-        files["scenes.h5"] = checksum(folder / "scenes.h5")
-        manifest = _manifest(plan, files)
-        write_text(card(manifest), folder / "README.md")
-        described = {name: record for name, record in files.items() if name.startswith(("frames-", "histograms-"))}
-        write_json(croissant(manifest, "hdf5", described), folder / "croissant.json", indent=1)
-        write_json(manifest, folder / "manifest.json", indent=1)
-    return tuple(missing)
-
-
-def _shards_of(plan: Plan, split: str) -> list[str]:
-    return [shard.frames_file for shard in plan.shards if shard.split == split]
-
-
-def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
-    from spadwarp import __version__
-
-    return {
+    if missing:
+        return tuple(missing)
+    files["scenes.h5"] = checksum(folder / "scenes.h5")
+    manifest = {
         "format": "spadwarp dataset",
         "format_version": FORMAT_VERSION,
         "version": __version__,
-        "name": plan.recipe.name,
-        "description": plan.recipe.description,
-        "license": plan.recipe.license,
+        **{name: getattr(plan.recipe, name) for name in ("name", "description", "license")},
         "seed": str(plan.recipe.seed),
         "frames": plan.sample_count,
         "scenes": plan.scene_count,
@@ -233,13 +217,18 @@ def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
             split: {
                 "seed": str(plan.split_seeds[split]),
                 "targets": [target.name for target in plan.targets if target.split == split],
-                "shards": _shards_of(plan, split),
-                "frames": sum(shard.scenes for shard in plan.shards if shard.split == split) * plan.frames_per_scene,
+                "shards": [item.frames_file for item in shards],
+                "frames": sum(item.scenes for item in shards) * plan.frames_per_scene,
             }
-            for split in SPLITS
+            for split, shards in splits.items()
         },
         "files": dict(sorted(files.items())),
     }
+    write_text(card(manifest, "hdf5", files), folder / "README.md")
+    described = {name: record for name, record in files.items() if name.startswith(("frames-", "histograms-"))}
+    write_json(croissant(manifest, "hdf5", described), folder / "croissant.json", indent=1)
+    write_json(manifest, folder / "manifest.json", indent=1)
+    return ()
 
 
 Progress = Callable[[str, int, int], None]
@@ -316,7 +305,7 @@ def make_dataset(
         for _, frames in run_jobs(_make_shard, jobs, note=lambda text: report(text, 0, 0), **options):
             done += frames
             report("frames", done, total)
-    others = finish(plan, folder)
+    others = _finish(plan, folder)
     if done < total:
         raise KeyboardInterrupt
     return DatasetReport(
@@ -341,7 +330,7 @@ def _make_shard(job: _Job, worker: Worker) -> int:
     plan = known if known is not None and known.recipe == job.recipe else Plan(job.recipe)
     worker.state["plan"] = plan
     shard = plan.shards[job.shard]
-    record = record_path(job.folder, shard)
+    record = _record_path(job.folder, shard)
     try:
         record.parent.mkdir(exist_ok=True)
     except OSError as error:
