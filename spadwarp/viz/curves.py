@@ -39,10 +39,6 @@ _COLUMNS: dict[str, tuple[str, float, tuple[float, float]]] = {
     "sigma_depth": ("depth error, Cramér–Rao [mm]", 1e3, (1e-3, 1e4)),
     "signal_to_backscatter": ("signal to backscatter", 1.0, (1e-6, 1e6)),
     "pulses_for_1cm": ("pulses for 1 cm", 1.0, (1.0, 1e12)),
-    "alpha": ("detections per pulse α", 1.0, (0.0, math.inf)),
-    "background": ("background [detections per pulse]", 1.0, (0.0, math.inf)),
-    "sigma_time": ("timing error, Cramér–Rao [ps]", 1e12, (0.0, math.inf)),
-    "sigma_depth_p90": ("depth error, 90th percentile [mm]", 1e3, (0.0, math.inf)),
     "outlier_probability": ("outlier probability", 1.0, (0.0, 1.0)),
     "estimate_fraction": ("pixels with an estimate", 1.0, (0.0, 1.0)),
 }
@@ -89,30 +85,23 @@ def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, wi
 
 
 @paper()
-def draw_sweep(
-    curves: Sweep, path: str | Path | None = None, *, columns: Sequence[str] | None = None, width: float = PAGE
-) -> Figure:
-    """One panel for each column over the values of the swept field; returns the matplotlib figure, writes it to `path`.
+def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = PAGE) -> Figure:
+    """Four panels over the values of the swept field, see `spadwarp.sweep`: those of `draw_budget`, or errors.
 
-    Linear axes begin at 0, and a curve that varies by less than a tenth has its span written into the panel.
-
-    Args:
-        curves: From `spadwarp.sweep`.
-        path: The picture.
-        columns: Attributes of the rows; default: what matters most.
-        width: Of the figure [inch].
+    Linear axes begin at 0, and a curve that varies by less than a tenth has its span written into the panel. Returns
+    the matplotlib figure of this width [inch], and writes it where `path` is given.
     """
     budgets = isinstance(curves.rows[0], BudgetRow)
-    names = list(columns or (_OF_BUDGETS if budgets else _OF_ERRORS))
+    names = _OF_BUDGETS if budgets else _OF_ERRORS
     figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.3)
     numeric = all(isinstance(value, (int, float)) for value in curves.values)
     x: Any = np.array(curves.values, np.float64) if numeric else np.arange(len(curves.values))
     for number, (axis, name) in enumerate(zip(axes, names, strict=True)):
-        label, scale, (_, most) = _COLUMNS.get(name, (name, 1.0, (0.0, math.inf)))
+        label, scale, (_, most) = _COLUMNS[name]
         y, colour = curves.column(name) * scale, SERIES[number % 5]
         axis.plot(x, np.where(np.isfinite(y), y, np.nan), "o-", color=colour, label="median")
         if name == "sigma_depth" and not budgets:
-            p90 = curves.column("sigma_depth_p90") * scale
+            p90 = scale * curves.column("sigma_depth_p90")
             axis.plot(x, p90, "--", color=colour, linewidth=0.8, label="90 % of the pixels below")
             axis.legend()
         axis.set(xlabel=curves.field + _unit(curves.field), ylabel=_broken(label))

@@ -47,17 +47,16 @@ def plot(
 
     Args:
         shown: A result: `kind` is "depth" (default), "intensity", "histogram" or "truth". Frames: one of them, from a
-            file with its depth. An analytic result: its maps and a frame. A fit: its counts
-            and residuals. A scene: true depth and reflectance, by ray casting.
+            file with its depth. An analytic result: its maps and a frame. A fit: its counts and residuals. A scene:
+            true depth and reflectance, by ray casting.
         kind: Of a result's figure.
         method: Estimator of a result's depth.
         frame: Number of the frame.
         device: Warp device.
         width: Of the figure [inch]: 7.2 for a journal's page, 3.5 for its column.
 
-    Raises:
-        ArgumentError: Another kind, a frame that is not there, or a width outside [2.5, 50].
-        MeshError: A target of the scene cannot be read.
+    Raises `ArgumentError` for another kind, a frame that is not there, or a width outside [2.5, 50]; `MeshError` where
+    a target of the scene cannot be read.
     """
     if isinstance(shown, Result):
         if kind not in (None, *KINDS):
@@ -117,8 +116,7 @@ def draw_result(
         formats: "png", and "pdf" with vectors, for print.
         width: Of the pictures [inch]: 7.2 for a journal's page, 3.5 for its column.
 
-    Raises:
-        FileError: The folder or a file cannot be written.
+    Raises `FileError` where the folder or a file cannot be written.
     """
     if depth is None and "depth" in kinds:
         depth = result.depth(method=method)
@@ -209,9 +207,11 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     total = parts.sum(axis=0)
     known = result.second_moment is not None and result.photons >= 2 * result.batch_size
     error = pixel_standard_error(result, row, column) * per_pulse if known else None
-    variance = typical_weight(total) * total if error is None else error**2
-    weight = np.divide(variance, total, out=np.zeros_like(total), where=total > 0)
-    edges = merged_edges(total, variance, [int(part.argmax()) for part in parts > 0])  # no light before its time
+    if error is None:
+        weight = typical_weight(total)
+    else:
+        weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
+    edges = merged_edges(total, weight * total, [int(part.argmax()) for part in parts > 0])  # no light before its time
     curves: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
     for name, part in zip(COMPONENTS, parts, strict=True):
         own = np.arange(len(time)) if name == "ballistic" else merged_edges(part, weight * part)
@@ -366,7 +366,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
             raise ArgumentError(f"frame = {number} is outside [0, {1 if frames.summed else frames.frames})")
     counts = np.asarray(shown.counts if shown.summed else shown.counts[index])
     intensity = counts.sum(axis=-1)
-    panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=2.0)
+    panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=(2.0,))
     if file is None:
         edges = 1e9 * (shown.gate_start + shown.edges)
         fullest = np.where(intensity > 0, (0.5 * (edges[:-1] + edges[1:]))[counts.argmax(axis=-1)], np.nan)
@@ -379,9 +379,9 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
         known = "" if np.isfinite(bound).any() else ": unknown"
         panels.show_positive(1e3 * bound, f"Cramér–Rao bound{known}", "standard deviation [mm]")
     panels.show_intensity(intensity, "Intensity", "counts in a frame")
-    axis = panels.below()
-    _plot_counts(shown, counts, file, axis)
-    panels.figure.key([axis], 1.7)
+    axes = panels.below()
+    _plot_counts(shown, counts, file, axes[0])
+    panels.figure.key(axes, 1.7)
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
     noise = noise_caption(shown.monte_carlo_noise)
@@ -509,42 +509,34 @@ _MOST_POINTS = 160  # bins are added up to at most so many
 
 def _fit_figure(fit: Fit, width: float) -> Figure:
     counts, expected = fit.counts.sum(axis=2), fit.expected.sum(axis=2, dtype=np.float64)
-    images = 2 if fit.depth is None else 3
-    panels = Panels(counts.shape, images, width=width, below=2.6)
+    panels = Panels(counts.shape, 2 if fit.depth is None else 3, width=width, below=(1.6, 0.9))
     panels.show_intensity(counts, "Counts", "counts in the exposure")
     residual = (counts - expected) / np.sqrt(np.maximum(expected, 1e-12))
-    panels.show(
-        np.where(expected > 0, residual, np.nan), "Residual", "(counts − fit) / √fit", style.ERROR_MAP, (-3.0, 3.0)
-    )
+    residual[expected <= 0] = np.nan
+    panels.show(residual, "Residual", "(counts − fit) / √fit", style.ERROR_MAP, (-3.0, 3.0))
     if fit.depth is not None:
         panels.show_depth(fit.depth, "Depth", shown_limits(fit.depth))
-    below = panels.below()
-    below.set_axis_off()
-    top = below.inset_axes((0.0, 0.42, 1.0, 0.58))
-    bottom = below.inset_axes((0.0, 0.0, 1.0, 0.32), sharex=top)
-    bins = fit.counts.shape[2]
-    factor = max(1, -(-bins // _MOST_POINTS))
-    starts = np.arange(0, bins, factor)
-    measured = np.add.reduceat(fit.counts.sum(axis=(0, 1)).astype(np.float64), starts)
-    mean = np.add.reduceat(fit.expected.sum(axis=(0, 1), dtype=np.float64), starts)
+    top, bottom = panels.below()
+    starts = np.arange(0, fit.counts.shape[2], -(-fit.counts.shape[2] // _MOST_POINTS))
+    measured, mean = (
+        np.add.reduceat(cubes.sum(axis=(0, 1), dtype=np.float64), starts) for cubes in (fit.counts, fit.expected)
+    )
     edges = 1e9 * np.append(fit.edges[starts], fit.edges[-1])
     top.stairs(measured, edges, fill=True, color="0.72", label="counts, all pixels")
     top.stairs(mean, edges, baseline=None, color=BLUE, linewidth=1.0, label="fit")
-    seen = mean[mean > 0]
-    low = max(0.5, float(seen.min()) if seen.size else 0.5)
-    top.set_ylim(0.5 * low, 3.0 * max(float(measured.max()), 2.0 * low))
+    low = max(0.5, float(mean[mean > 0].min(initial=np.inf))) if mean.any() else 0.5
+    top.set(xlim=edges[[0, -1]], ylim=(0.5 * low, 3.0 * max(float(measured.max()), 2.0 * low)), ylabel="counts")
     log_axis(top, "y", most=5)
-    top.set(xlim=edges[[0, -1]], ylabel="counts")
     top.tick_params(labelbottom=False)
     top.legend(loc="upper right", ncols=2)
     left = (measured - mean) / np.sqrt(np.maximum(mean, 1.0))
+    reach = max(3.5, 1.1 * float(np.abs(left).max()))
     bottom.axhline(0.0, color=TEXT, linewidth=0.6)
     bottom.plot(0.5 * (edges[:-1] + edges[1:]), left, ".", color=style.RED, markersize=2.5)
-    reach = max(3.5, 1.1 * float(np.abs(left).max()))
-    bottom.set(ylim=(-reach, reach), xlabel="time of flight [ns]", ylabel="residual\n/ √fit")
-    values = "; ".join(
+    bottom.set(xlim=edges[[0, -1]], ylim=(-reach, reach), xlabel="time of flight [ns]", ylabel="residual\n/ √fit")
+    values = [
         f"{item.name} = {rounded(item.value, item.standard_error)} ± {item.standard_error:.2g} {item.unit}".rstrip()
         for item in fit.estimates.values()
-    )
-    panels.figure.caption(f"{values}; {spaced(fit.pulses)} pulses" if values else f"{spaced(fit.pulses)} pulses")
+    ]
+    panels.figure.caption("; ".join([*values, f"{spaced(fit.pulses)} pulses"]))
     return panels.figure

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,17 +36,10 @@ _PALE = LinearSegmentedColormap.from_list("pale water", matplotlib.colormaps[BOU
 
 @paper()
 def draw_water(scene: Scene, path: str | Path, mesh: TriangleMesh | None = None, *, width: float = PAGE) -> Path:
-    """Draws the extinction on two planes through the optical axis, from above and from the side, into one picture.
+    """Draws the extinction on two planes through the optical axis, from above and from the side; returns the path.
 
-    Args:
-        scene: With or without a grid of cells.
-        path: The picture.
-        mesh: Of the scene, if the caller has it.
-        width: Of the picture [inch].
-
-    Raises:
-        MeshError: A target that cannot be read.
-        FileError: The picture cannot be written, or the cells cannot be read.
+    `mesh`: of the scene, if the caller has it. `width`: of the picture [inch]. Raises `MeshError` for a target that
+    cannot be read, `FileError` where the picture cannot be written or the cells cannot be read.
     """
     figure = style.new_figure(width, 0.34 * width)
     mesh = build_mesh(scene) if mesh is None else mesh
@@ -137,62 +128,33 @@ _VIEWS = ((0.0, 0.0, 0.0), (0.0, 90.0, 0.0), (90.0, 0.0, 0.0))  # rotations [°]
 _LIGHT = np.array([-0.35, -0.5, -0.79])  # direction to a lamp on the upper left of the camera
 
 
-def describe_targets(names: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Name, faces and extent x, y, z [m] of built-in targets; all if `names` is None. Raises `ArgumentError`."""
-    meshes = {name: make_builtin(name) for name in (builtin_names() if names is None else names)}
-    return [
-        {"name": name, "faces": len(mesh.faces), "extent": [float(side) for side in mesh.extents]}
-        for name, mesh in meshes.items()
-    ]
+def describe_targets() -> list[dict[str, Any]]:
+    """Name, faces and extent x, y, z [m] of the built-in targets."""
+    meshes = {name: make_builtin(name) for name in builtin_names()}
+    return [{"name": name, "faces": len(it.faces), "extent": it.extents.tolist()} for name, it in meshes.items()]
 
 
 @paper()
-def draw_targets(
-    path: str | Path,
-    *,
-    names: Sequence[str] | None = None,
-    pixels: int = 192,
-    width: float = PAGE,
-    device: str | None = None,
-) -> Path:
-    """Draws built-in targets as seen from 15 m, shaded and as depth maps, into one PNG; returns its path.
+def draw_targets(path: str | Path, *, width: float = PAGE, device: str | None = None) -> Path:
+    """Draws the built-in targets as seen from 15 m, shaded and as depth maps, into one picture; returns its path.
 
-    Args:
-        path: The picture.
-        names: Of the targets, in this order; all if None.
-        pixels: Width and height of each view, > 0.
-        width: Of the picture [inch].
-        device: Warp device for the rays.
-
-    Raises:
-        ConfigError: An unknown name.
-        FileError: The picture cannot be written.
+    `width`: of the picture [inch]; `device`: Warp device for the rays. Raises `FileError`.
     """
     targets: dict[str, dict[str, Any]] = {}
-    for name in builtin_names() if names is None else names:
+    for name in builtin_names():
         size = {"size": [_SIDE] * (2 if name == "plane" else 3)} if name in SIZED_BUILTINS else {}
         targets[name] = {"builtin": name, "translation": [0.0, 0.0, DISTANCE], **size}
-    figure = _target_sheet(targets, 1.5, width, pixels, device)
+    figure = _target_sheet(targets, 1.5, width, 192, device)
     _sheet_bar(figure, Normalize(DISTANCE - 1.5, DISTANCE + 1.5), DEPTH_MAP, "depth z [m]")
     return save(figure, path)
 
 
 @paper()
-def draw_mesh(
-    mesh: MeshSummary, path: str | Path, *, pixels: int = 256, width: float = PAGE, device: str | None = None
-) -> Path:
+def draw_mesh(mesh: MeshSummary, path: str | Path, *, width: float = PAGE, device: str | None = None) -> Path:
     """Draws a mesh file as the camera sees it, from its side and from above, shaded, with its depth; returns the path.
 
-    Args:
-        mesh: From `spadwarp.mesh.describe_mesh`.
-        path: The picture.
-        pixels: Width and height of each view, > 0.
-        width: Of the picture [inch].
-        device: Warp device for the rays.
-
-    Raises:
-        MeshError: The file of the mesh is gone.
-        FileError: The picture cannot be written.
+    `mesh`: from `spadwarp.mesh.describe_mesh`; `width`: of the picture [inch]; `device`: Warp device for the rays.
+    Raises `MeshError` if the file of the mesh is gone, `FileError` where the picture cannot be written.
     """
     shown = _SIDE / max(mesh.extent)  # scale that fills the view
     targets = {}
@@ -201,9 +163,8 @@ def draw_mesh(
         translation = (np.array([0.0, 0.0, DISTANCE]) - centre).tolist()
         target = {"mesh": str(mesh.path), "scale": shown, "rotation_deg": list(rotation), "translation": translation}
         targets[f"rotation_deg = {[round(angle) for angle in rotation]}"] = target
-    figure = _target_sheet(targets, 0.5 * _SIDE, width, pixels, device)
-    own = Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest)
-    _sheet_bar(figure, own, DEPTH_MAP, "depth from the centre [m]")
+    figure = _target_sheet(targets, 0.5 * _SIDE, width, 256, device)
+    _sheet_bar(figure, Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest), DEPTH_MAP, "depth from the centre [m]")
     metres = " x ".join(f"{mesh.scale * side:.3g}" for side in mesh.extent)
     figure.caption(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}")
     return save(figure, path)
@@ -212,14 +173,19 @@ def draw_mesh(
 def _target_sheet(
     targets: dict[str, dict[str, Any]], reach: float, width: float, pixels: int, device: str | None
 ) -> PaperFigure:
-    """Targets by title, at 15 m before a camera of 17°, shaded and as depth maps; means of 2 × 2 pixels."""
+    """Targets by title, at 15 m before a camera of 17°, shaded by one lamp and an even sky, and as depth maps."""
     figure, axes = _sheet(len(targets), width, least=1.7, ratio=0.5, title=0.2)
-    scale = Normalize(DISTANCE - reach, DISTANCE + reach)
+    scale, lamp = Normalize(DISTANCE - reach, DISTANCE + reach), _LIGHT / np.linalg.norm(_LIGHT)
     camera = {"width": 2 * pixels, "height": 2 * pixels, "horizontal_fov_deg": FIELD_OF_VIEW, "aperture_diameter": 0.01}
     rest = {"medium": {"extinction": 0.1, "albedo": 0.8}, "gate": {"bin_width_ps": 100.0, "bins": 1}}
     for axis, (title, target) in zip(axes, targets.items(), strict=True):
         truth = truth_maps(Scene.from_dict({**rest, "camera": camera, "targets": [target]}), device=device)
-        views = np.concatenate([_shaded(truth.normal), coloured_depth(truth.depth, scale)], axis=1)
+        normal = truth.normal.astype(np.float64)
+        grey = 0.16 + 0.62 * np.clip(normal @ lamp, 0.0, None) + 0.2 * np.clip(-normal[..., 2], 0.0, 1.0)
+        matt = (grey[..., None] * np.array([1.0, 0.97, 0.92])).clip(0.0, 1.0)
+        matt = np.where(np.isnan(matt), to_rgb(style.BACKGROUND), matt)
+        views = np.concatenate([matt, coloured_depth(truth.depth, scale)], axis=1)
+        # Means of 2 × 2 pixels.
         axis.imshow(views.reshape(pixels, 2, 2 * pixels, 2, 3).mean(axis=(1, 3)), interpolation="lanczos")
         axis.set_title(title, pad=2)
     return figure
@@ -238,33 +204,17 @@ def _sheet_bar(figure: PaperFigure, scale: Normalize, colours: str, label: str) 
     """A colour bar below all images."""
     axes = [axis for axis in figure.axes if axis.images]
     figure.grow(0.5)
-    aspect = 0.8 * figure.get_figwidth() / 0.09
-    shown = ScalarMappable(scale, colours)
+    aspect, shown = 0.8 * figure.get_figwidth() / 0.09, ScalarMappable(scale, colours)
     bar = figure.colorbar(shown, ax=axes, location="bottom", label=label, shrink=0.8, aspect=aspect, pad=0.04)
     bar.outline.set_visible(False)  # type: ignore[operator]
     bar.ax.xaxis.minorticks_on()
 
 
-def _shaded(normal: NDArray[np.float32]) -> NDArray[np.float64]:
-    """RGB of a matt surface under one lamp and an even sky, `[H, W, 3]`."""
-    n = normal.astype(np.float64)
-    lamp = np.clip(n @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, None)
-    facing = np.clip(-n[..., 2], 0.0, 1.0)
-    grey = 0.16 + 0.62 * lamp + 0.2 * facing
-    image = grey[..., None] * np.array([1.0, 0.97, 0.92])
-    return np.where(np.isfinite(grey)[..., None], image, to_rgb(style.BACKGROUND)).clip(0.0, 1.0)
-
-
 @paper()
 def draw_dataset(
-    folder: str | os.PathLike[str],
-    path: str | os.PathLike[str],
-    *,
-    split: str = "all",
-    frames: int = 20,
-    width: float = PAGE,
+    folder: str | Path, path: str | Path, *, split: str = "all", frames: int = 20, width: float = PAGE
 ) -> Path:
-    """Draws frames that lie evenly over a split into one PNG: true depth, measured depth, recorded photons.
+    """Draws frames that lie evenly over a split: true depth, measured depth, recorded photons; returns the path.
 
     Photons are shown relative to the brightest 0.5 % of each frame, which the frame's title gives.
 
@@ -275,9 +225,7 @@ def draw_dataset(
         frames: At most so many, 1 to 1000.
         width: Of the picture [inch].
 
-    Raises:
-        FileError: No dataset, or the picture cannot be written.
-        ArgumentError: An argument out of range.
+    Raises `FileError` where there is no dataset or the picture cannot be written, `ArgumentError`.
     """
     frames = check_integer("frames", frames, "[1, 1000]")
     reader = FrameReader(folder, split, fields=("clean", "noisy", "intensity"))

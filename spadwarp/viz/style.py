@@ -196,7 +196,7 @@ def power_text(value: float) -> str:
     """A number by its power of ten, such as 3·10⁻⁴."""
     digits, power = f"{value:.2e}".split("e")
     exponent = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return ("" if float(digits) == 1.0 else f"{float(digits):g}·") + f"10{exponent}"
+    return f"{float(digits):g}·10{exponent}".removeprefix("1·")
 
 
 def middle_text(axis: Axes, text: str, **style: Any) -> None:
@@ -261,25 +261,27 @@ def mark_pixels(axis: Axes, missed: NDArray[np.bool_], invented: NDArray[np.bool
 class Panels:
     """A figure of `count` images of `shape` (height, width), as many in a line as fit, each with its colour bar below.
 
-    `width`: of the figure [inch]. `below`: height of one more axis over the whole width, `self.below()` [inch].
+    `width`: of the figure [inch]. `below`: heights of more axes over the whole width, `self.below()` [inch].
     """
 
-    def __init__(self, shape: tuple[int, ...], count: int, *, width: float = PAGE, below: float = 0.0) -> None:
+    def __init__(
+        self, shape: tuple[int, ...], count: int, *, width: float = PAGE, below: tuple[float, ...] = ()
+    ) -> None:
         lines, columns = arranged(count, width, 1.7)
         self._cell = min(width / columns, 3.4)
         self._line = self._cell - 0.4  # of a label: its middle is that of the bar, which numbers and margins narrow
         height = float(np.clip((self._cell - 0.35) * shape[0] / shape[1], 0.5, 5.0))
-        # Titles, numbers and labels; more below for its labels.
-        self.figure = new_figure(width, lines * (height + 1.1) + (below + 0.45) * bool(below))
+        # Titles, numbers and labels.
+        self.figure = new_figure(width, lines * (height + 1.1) + sum(below) + 0.45 * bool(below))
         self.figure.get_layout_engine().set(wspace=0.05, h_pad=0.05)  # type: ignore[call-arg,union-attr]
-        ratios = [height, 0.1] * lines + [below] * bool(below)
+        ratios = [*[height, 0.1] * lines, *below]
         grid = self.figure.add_gridspec(len(ratios), columns, height_ratios=ratios)
         self._free = iter([(grid[2 * k, c], grid[2 * k + 1, c]) for k in range(lines) for c in range(columns)])
-        self._last = grid[-1, :]
+        self._below = [grid[row, :] for row in range(2 * lines, len(ratios))]
 
-    def below(self) -> Axes:
-        """The axis below the images."""
-        return self.figure.add_subplot(self._last)
+    def below(self) -> list[Axes]:
+        """The axes below the images."""
+        return [self.figure.add_subplot(place) for place in self._below]
 
     def place(self, title: str) -> tuple[Axes, Axes]:
         """The axis of the next image, and that of its colour bar."""

@@ -156,6 +156,12 @@ def draw_case(path, width, **_):
     curves.draw_validation(rows(), path, title="moments: where photons are after n collisions", width=width)
 
 
+def draw_targets(path, width, **_):
+    with pytest.MonkeyPatch.context() as some:
+        some.setattr("spadwarp.viz.scenes.builtin_names", lambda: ["staircase", "naval_mine", "plane", "diver_helmet"])
+        spadwarp.viz.draw_targets(path, width=width, device="cpu")
+
+
 PICTURES = {
     "depth": lambda path, width, result, **_: result.plot("depth", width=width).savefig(path),
     "intensity": lambda path, width, result, **_: result.plot("intensity", width=width).savefig(path),
@@ -180,10 +186,8 @@ PICTURES = {
         path, width, vary="medium.preset=uwoc-clear,uwoc-coastal,jerlov-1C-williamson,uwoc-harbour"
     ),
     "dataset": lambda path, width, data, **_: spadwarp.viz.draw_dataset(data, path, frames=6, width=width),
-    "targets": lambda path, width, **_: spadwarp.viz.draw_targets(
-        path, names=["staircase", "naval_mine", "plane", "diver_helmet"], pixels=32, width=width, device="cpu"
-    ),
-    "mesh": lambda path, width, mesh, **_: spadwarp.viz.draw_mesh(mesh, path, pixels=32, width=width, device="cpu"),
+    "targets": draw_targets,
+    "mesh": lambda path, width, mesh, **_: spadwarp.viz.draw_mesh(mesh, path, width=width, device="cpu"),
     "learning_curves": draw_curves,
     "validation": draw_case,
     "scores": draw_scores,
