@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -125,7 +126,7 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
         with ThreadPoolExecutor(core_count()) as pool:
             return [text for text in pool.map(lambda name: _compare(place, name, files[name]), files) if text]
     plan = Plan(load_recipe(recipe))
-    states = zip(plan.shards, check_shards(plan, place, plan.shards).values(), strict=True)
+    states = zip(plan.shards, _states(plan, place, plan.shards), strict=True)
     wrong = [f"{shard.frames_file}: missing" if text == "missing" else text for shard, text in states if text]
     return [*wrong, "manifest.json: missing"]
 
@@ -146,23 +147,23 @@ def _read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def check_shards(plan: Plan, folder: Path, shards: Sequence[Shard]) -> dict[int, str]:
-    """By the shards' indices "" (whole), "missing", or what is wrong."""
+def _state(plan: Plan, folder: Path, shard: Shard) -> str:
+    """Nothing for a shard that is whole, else "missing" or what is wrong."""
+    path = _record_path(folder, shard)
+    if file_problem(path) == "no such file":
+        return "missing"
+    try:
+        files = _read_record(path)
+    except FileError as error:
+        return str(error)
+    if set(files) != set(plan.files_of(shard)):
+        return f"{path}: not the record of this shard"
+    return next((text for name, file in files.items() if (text := _compare(folder, name, file))), "")
 
-    def state(shard: Shard) -> str:
-        path = _record_path(folder, shard)
-        if file_problem(path) == "no such file":
-            return "missing"
-        try:
-            files = _read_record(path)
-        except FileError as error:
-            return str(error)
-        if set(files) != set(plan.files_of(shard)):
-            return f"{path}: not the record of this shard"
-        return next((text for name, file in files.items() if (text := _compare(folder, name, file))), "")
 
+def _states(plan: Plan, folder: Path, shards: Sequence[Shard]) -> list[str]:
     with ThreadPoolExecutor(core_count()) as pool:
-        return dict(zip((shard.index for shard in shards), pool.map(state, shards), strict=True))
+        return list(pool.map(partial(_state, plan, folder), shards))
 
 
 def _compare(folder: Path, name: str, record: dict[str, Any]) -> str:
@@ -288,9 +289,9 @@ def make_dataset(
     processes = check_integer("processes", processes, "[1, 1000]")
     folder = Path(out).absolute()
     _claim(plan, folder)
-    shards = [item for item in plan.shards if item.index % parts == number - 1]
-    state = check_shards(plan, folder, shards)
-    missing = [item for item in shards if state[item.index]]
+    shards = plan.shards[number - 1 :: parts]
+    states = _states(plan, folder, shards)
+    missing = [item for item, text in zip(shards, states, strict=True) if text]
     total = sum(item.scenes for item in missing) * plan.frames_per_scene
     _check_space(plan, folder, total)
     report = progress or (lambda *_: None)
@@ -311,9 +312,9 @@ def make_dataset(
     return DatasetReport(
         folder=Path(out),
         made=tuple(item.frames_file for item in missing),
-        kept=tuple(item.frames_file for item in shards if not state[item.index]),
+        kept=tuple(item.frames_file for item in shards if item not in missing),
         missing=others,
-        broken=tuple(text for text in state.values() if text not in ("", "missing")),
+        broken=tuple(text for text in states if text not in ("", "missing")),
         frames=total,
     )
 
@@ -326,9 +327,9 @@ class _Job(NamedTuple):
 
 def _make_shard(job: _Job, worker: Worker) -> int:
     """Makes a shard and its record, unless another process does; returns its frames."""
-    known = worker.state.get("plan")
-    plan = known if known is not None and known.recipe == job.recipe else Plan(job.recipe)
-    worker.state["plan"] = plan
+    plan = worker.state.get("plan")
+    if plan is None or plan.recipe != job.recipe:
+        plan = worker.state["plan"] = Plan(job.recipe)
     shard = plan.shards[job.shard]
     record = _record_path(job.folder, shard)
     try:
@@ -338,7 +339,7 @@ def _make_shard(job: _Job, worker: Worker) -> int:
     with lock(record.with_suffix(".lock"), wait=lambda: not worker.stopped.is_set()) as obtained:
         if not obtained:  # interrupted while another process was making it
             return 0
-        if check_shards(plan, job.folder, [shard])[shard.index]:
+        if _state(plan, job.folder, shard):
             try:
                 record.unlink(missing_ok=True)
             except OSError as error:
