@@ -26,7 +26,7 @@ from spadwarp.dataset.recipe import SPLITS, Recipe, load_recipe
 from spadwarp.dataset.shards import FORMAT_VERSION, checksum, write_scene_index, write_shard
 from spadwarp.device import core_count, pick_devices
 from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.paths import atomic_path, file_problem, lock, remove_temporaries
+from spadwarp.io.paths import file_problem, lock, remove_temporaries
 from spadwarp.io.text import parse_json, parse_toml, read_text, read_toml, write_json, write_text
 from spadwarp.limits import check_integer, check_part, shown
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
@@ -370,8 +370,7 @@ def _claim(plan: Plan, folder: Path) -> None:
                 return
             if any(not path.name.startswith(".") for path in folder.iterdir()):
                 raise FileError(f"{folder}: is not empty and holds no dataset; give another folder")
-            with atomic_path(folder / "recipe.toml") as temporary:
-                temporary.write_text(plan.recipe.to_toml(), encoding="utf-8")
+            write_text(plan.recipe.to_toml(), folder / "recipe.toml")
     except FileExistsError:
         raise FileError(f"{folder}: is a file; a folder is needed") from None
     except OSError as error:
