@@ -229,10 +229,10 @@ def log_ticks(line: Axis, most: float) -> None:
         values = np.outer(10.0 ** exponents[exponents % step == 0], list(digits)).ravel()
         return values[(values > low * (1 - 1e-9)) & (values < high * (1 + 1e-9))].tolist()
 
-    choices = [*map(ticks, _DIGITS), ticks((1.0,), stride)]
+    plain = low >= 1e-3 and high <= 2e4
+    choices = [ticks(digits) for digits in _DIGITS if plain or digits != (1.0, 3.0)] + [ticks((1.0,), stride)]
     line.set_major_locator(FixedLocator(next((values for values in choices if len(values) <= most), choices[-1])))
     line.set_minor_locator(FixedLocator(ticks((1.0,) if stride > 1 else range(1, 10))))
-    plain = low >= 1e-3 and high <= 2e4
     line.set_major_formatter(lambda value, _: f"{value:g}" if plain else power_text(value))
     line.set_minor_formatter(NullFormatter())
 
