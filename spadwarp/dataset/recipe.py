@@ -161,15 +161,11 @@ class Plume(Table):
         ("cloud", "plume", "sediment"), description="shapes of medium.grid, equally likely"
     )
     optical_depth: Positive = Field(constant(1.0), description="that it adds on the optical axis, one way")
-    place: Share = Field(
-        Distribution(low=0.3, high=0.8), description="of its middle, as part of the distance of the target's centre"
-    )
+    place: Share = Field(Distribution(low=0.3, high=0.8), description="of its middle, as part of the target's distance")
     shift: Real = Field(constant(0.0), description="sideways, drawn for x and for y [m]")
     size: Positive = Field(constant(1.0), description="edge of its box [m]")
     albedo: Share = Field(constant(0.8), description="single-scattering albedo of its matter")
-    turbulence: NotNegative = Field(
-        constant(0.5), description="standard deviation of the logarithm of its density, up to 3"
-    )
+    turbulence: NotNegative = Field(constant(0.5), description="deviation of the logarithm of its density, up to 3")
     cells: Whole = Field(32, ge=1, le=256, description="cells along the edges of its box")
 
 
@@ -186,10 +182,7 @@ class Targets(Table):
     )
     meshes: Names = Field((), description="mesh files, or folders of them, relative to the recipe")
     mesh_size: float | None = Field(
-        None,
-        ge=1e-6,
-        le=1e6,
-        description="longest side that meshes are scaled to [m]; if not given they stay as they are",
+        None, ge=1e-6, le=1e6, description="longest side that meshes are scaled to [m]; else they stay as they are"
     )
     mesh_scale: float = Field(1.0, ge=1e-9, le=1e9, description="metres per unit of the mesh files; 0.001 for mm")
     orientation: Literal["camera", "y_up", "z_up"] = Field(
@@ -243,9 +236,7 @@ class Exposure(Table):
     """Exposure of a frame: its pulses, or the photons that the median pixel records from the target."""
 
     signal_photons: Positive | None = Field(None, description="recorded from the target by the median pixel of it")
-    pulses_per_depth_frame: PulseCount | None = Field(
-        None, description="pulses of a frame; the scene's if neither is given"
-    )
+    pulses_per_depth_frame: PulseCount | None = Field(None, description="of a frame; the scene's if neither is given")
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -259,8 +250,7 @@ class Frames(Table):
 
     per_scene: Whole = Field(20, ge=1, le=1_000_000, description="frames of each scene")
     backscatter_fraction: Literal["rates"] | Share = Field(
-        constant(0.183),
-        description='part of the pixels that report backscatter; "rates": the photon rates decide',
+        constant(0.183), description='part of the pixels that report backscatter; "rates": the photon rates decide'
     )
     compression: Literal["none", "gzip"] = Field("none", description='of the frames; "none" reads fastest')
 
@@ -294,9 +284,7 @@ class Recipe(Table):
 
     name: str = Field(..., min_length=1, description="what the dataset is called")
     description: str = Field("", description="one or two sentences for its card")
-    license: str = Field(
-        "", max_length=200, description='licence of the dataset, an SPDX identifier such as "CC-BY-4.0"; for its card'
-    )
+    license: str = Field("", max_length=200, description='SPDX identifier, such as "CC-BY-4.0", for its card')
     seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of every draw; one seed gives the same dataset")
     scenes_per_target: Whole = Field(50, ge=1, le=1_000_000, description="scenes, each with its own pose and water")
     scenes_per_shard: Whole = Field(25, ge=1, le=1_000_000, description="scenes in one file, all of one target")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import functools
 import secrets
 import tempfile
 import warnings
@@ -57,11 +57,11 @@ class _Pictures:
     of: Any
     folder: Path
 
-    def plot(self, **options: Any) -> list[Callable[[], list[Path]]]:
-        """A call for each picture of a result."""
+    def plot(self, **options: Any) -> list[Path]:
+        """Draws those of a result; returns their paths."""
         import spadwarp
 
-        return spadwarp.viz.picture_calls(self.of, self.folder, **options)
+        return spadwarp.viz.draw_result(self.of, self.folder, **options)
 
     def save(self) -> Path:
         """Draws that of a fit; returns its path."""
@@ -116,7 +116,7 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
             if output.exr:
                 written.append(save_depth_exr(result, depth, folder / "depth.exr"))
                 written.append(save_truth_maps(result, folder / "truth.exr"))
-            written += itertools.chain.from_iterable(pictures.results())
+            written += [path for paths in pictures.results() for path in paths]
     finally:
         for name in _PICTURES:  # of processes that were ended
             remove_temporaries(folder / name)
@@ -137,8 +137,8 @@ def _depth(result: Result, device: str | None) -> NDArray[np.float64]:
 def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[Callable[[], list[Path]]]:
     output = result.scene.output
     formats = [ending for ending in _ENDINGS if getattr(output, ending)]
-    pictures = _Pictures(result, folder)
-    return pictures.plot(depth=depth, method=output.depth_method, formats=formats) if formats else []
+    draw = functools.partial(_Pictures(result, folder).plot, depth=depth, method=output.depth_method, formats=formats)
+    return [functools.partial(draw, kinds=(kind,)) for kind in _KINDS] if formats else []
 
 
 def _save(result: Result, path: Path) -> Path:
