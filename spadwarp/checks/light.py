@@ -19,7 +19,7 @@ from spadwarp.scene import (
     spectral_lines,
     water_lines,
 )
-from spadwarp.scene.tables import WATER_INDICES
+from spadwarp.scene.medium import WATER_INDICES
 from spadwarp.water import group_index
 
 _FRESH, _SEA = WATER_INDICES["fresh"][1], WATER_INDICES["seawater"][1]

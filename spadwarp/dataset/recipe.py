@@ -30,9 +30,8 @@ from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
 from spadwarp.limits import check_real, shown
 from spadwarp.scene import Scene, parse_override
-from spadwarp.scene.messages import describe
+from spadwarp.scene.document import describe, toml_text
 from spadwarp.scene.sections import Whole, listed
-from spadwarp.scene.tables import toml_text
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 

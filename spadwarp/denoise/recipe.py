@@ -13,9 +13,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from spadwarp.errors import ConfigError
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.scene.messages import describe
+from spadwarp.scene.document import describe, parse_override
 from spadwarp.scene.sections import Whole
-from spadwarp.scene.tables import parse_override
 
 __all__ = ["LEAST_CROP", "MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
 

@@ -11,7 +11,8 @@ from pydantic import BaseModel
 from spadwarp.dataset import Recipe
 from spadwarp.mesh import builtin_names
 from spadwarp.scene import Scene, presets
-from spadwarp.scene.tables import COEFFICIENTS, ENERGIES
+from spadwarp.scene.grid import COEFFICIENTS
+from spadwarp.scene.laser import ENERGIES
 
 __all__ = ["json_schema"]
 

@@ -17,18 +17,29 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.text import parse_json, read_text, write_text
 from spadwarp.limits import check_integer, read_real, shown
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.sections import AnyFile, Brown, Coordinate, Infinite, Section, Vector, Whole, field_range
+from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field_range, listed
 
 __all__ = ["Camera", "load_calibration", "save_calibration"]
 
 Points = NDArray[np.float64]
+
+_INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
+
+
+def _padded(value: Any) -> Any:
+    """Four coefficients of distortion lack k3, as OpenCV allows."""
+    value = listed(value)
+    return (*value, 0.0) if isinstance(value, tuple) and len(value) == 4 else value
+
+
+Brown = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(_padded)]
 
 
 class Camera(Section):
@@ -40,6 +51,14 @@ class Camera(Section):
     """
 
     section: ClassVar[str] = "camera"
+    displaces: ClassVar = {
+        "horizontal_fov_deg": ("pixel_pitch_um", *_INTRINSICS),
+        "pixel_pitch_um": ("horizontal_fov_deg", *_INTRINSICS),
+        "fx": ("horizontal_fov_deg", "pixel_pitch_um"),
+        "calibration": ("horizontal_fov_deg", "pixel_pitch_um", *_INTRINSICS, "distortion"),
+        "aperture_diameter": ("f_number",),
+        "f_number": ("aperture_diameter",),
+    }
     preset: str | None = None
     """a named camera, see `spadwarp list presets camera`"""
     width: Whole = Field(..., ge=1, le=16384)

@@ -19,9 +19,11 @@ from spadwarp.io.paths import existing_file
 from spadwarp.limits import Interval
 from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field_range
-from spadwarp.scene.tables import COEFFICIENTS
 
 __all__: list[str] = []
+
+COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
+"""Of water; two of them determine all."""
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.floating]
@@ -43,7 +45,7 @@ class Grid(Section):
     density 1. A file with coefficients gives the water itself.
     """
 
-    section: ClassVar[str] = "grid"
+    displaces: ClassVar = {"file": ("shape", "cells", "turbulence", "eddy_size", "seed"), "shape": ("file",)}
     file: AnyFile = None
     """path of a .npz, .h5 or .nvdb file with cells, relative to the scene file"""
     shape: Literal["cloud", "plume", "sediment", "gradient"] | None = None

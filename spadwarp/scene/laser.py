@@ -1,27 +1,45 @@
-"""Lasers: the section `laser`, and measured beam profiles."""
+"""Lasers: the section `laser`, measured beam profiles, and which part of the spectrum passes the detector's filter.
+
+A laser without `linewidth_nm` and `spectrum` is one line at `wavelength_nm`.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.errors import ConfigError, FileError, SpadwarpError
 from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file
 from spadwarp.limits import Interval
 from spadwarp.scene.port import Port
-from spadwarp.scene.sections import AnyFile, CsvFile, Direction, Section, Vector, field_range, unit_vector
-from spadwarp.scene.tables import ENERGIES
+from spadwarp.scene.sections import (
+    AnyFile,
+    CsvFile,
+    Direction,
+    Section,
+    Vector,
+    field_range,
+    read_table,
+    unit_vector,
+)
+from spadwarp.scene.settings import Detector
 from spadwarp.units import PLANCK, SPEED_OF_LIGHT
 from spadwarp.water.seawater import RANGES
 
-__all__ = ["Laser"]
+__all__ = ["Laser", "SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]
+
+Floats = NDArray[np.float64]
+
+ENERGIES = ("pulse_energy", "average_power", "peak_power")
+"""How the energy of a pulse is given."""
 
 _GAUSSIAN_AREA = math.sqrt(math.pi / (4.0 * math.log(2.0)))  # of a Gaussian of unit height, over its FWHM
 _LARGEST = 1 << 25  # pixels of a profile: more than cameras for beams have, and little beside a computer's memory
@@ -31,7 +49,12 @@ class Laser(Section):
     """The pulsed source. Photons leave it at the middle of the pulse, time 0."""
 
     section: ClassVar[str] = "laser"
-    alternatives: ClassVar[tuple[str, ...]] = ENERGIES
+    alternatives: ClassVar = ENERGIES
+    displaces: ClassVar = {
+        **{name: tuple(set(ENERGIES) - {name}) for name in ENERGIES},
+        "linewidth_nm": ("spectrum",),
+        "spectrum": ("linewidth_nm",),
+    }
     preset: str | None = None
     """a named laser, see `spadwarp list presets laser`"""
     position: Vector = (0.0, 0.0, 0.0)
@@ -132,7 +155,7 @@ class Laser(Section):
         return self.pulse_energy * self.wavelength_nm * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
 
 
-def load_profile(laser: Laser) -> NDArray[np.float64]:
+def load_profile(laser: Laser) -> Floats:
     """The image of `laser.profile_image`: irradiance on a plane across the beam, `[H, W]`, any unit.
 
     `.npy` as it is; `.exr` and `.png` with the mean of their colours, taken as linear; alpha is left out.
@@ -166,7 +189,7 @@ def profile_extent(laser: Laser) -> tuple[float, float]:
     return wide, wide * height / width
 
 
-def profile_axes(axis: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def profile_axes(axis: ArrayLike) -> tuple[Floats, Floats]:
     """Directions of a measured beam's columns (to the right) and rows (down) for the unit vector of its axis.
 
     Those of the camera for a beam along z; "right" has no y component.
@@ -196,3 +219,119 @@ def _read_image(path: Path) -> NDArray[np.generic]:
     pixels = np.asarray(imread(path))
     without_alpha = {2: 1, 4: 3}.get(pixels.shape[-1], pixels.shape[-1])
     return pixels if pixels.ndim == 2 else pixels[..., :without_alpha].mean(axis=-1)
+
+
+# The spectrum and the filter
+
+_WAVELENGTHS = str(field_range(Laser, "wavelength_nm"))
+SPECTRUM_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "power": "[0, 1e30]"}
+"""Columns of a laser's spectrum: vacuum wavelength [nm] and power per nm of any scale."""
+FILTER_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "transmission": "[0, 1]"}
+"""Columns of a filter: vacuum wavelength [nm] and transmission."""
+
+_MOST_LINES = 32
+_REACH = 2.0  # FWHM to either side, where a Gaussian has fallen to 1.5e-5 of its height
+_NODES = 513  # of a Gaussian
+
+
+class SpectralLine(NamedTuple):
+    """A part of a pulse's spectrum.
+
+    Attributes:
+        wavelength_nm: Mean over its photons [nm].
+        share: Photons that pass the filter, over those of a pulse of one line at `laser.wavelength_nm`.
+    """
+
+    wavelength_nm: float
+    share: float
+
+
+def filter_transmission(laser: Laser, detector: Detector, wavelength_nm: ArrayLike) -> Floats:
+    """Transmission of the detector's filter at vacuum wavelengths [nm]; 1 without a filter.
+
+    Raises `FileError` or `ConfigError` if its table cannot be read.
+    """
+    wavelength = np.asarray(wavelength_nm, np.float64)
+    if detector.filter_table is not None:
+        at, value = _table("detector.filter_table", detector.filter_table, FILTER_COLUMNS)
+        return np.interp(wavelength, at, value, left=0.0, right=0.0)
+    if detector.filter_fwhm_nm is None:
+        return np.ones_like(wavelength)
+    centre = laser.wavelength_nm if detector.filter_centre_nm is None else detector.filter_centre_nm
+    return detector.filter_peak * _gaussian((wavelength - centre) / detector.filter_fwhm_nm)
+
+
+def filter_band(laser: Laser, detector: Detector) -> Floats | None:
+    """Wavelengths [nm] between which the filter's transmission is as good as straight; None without a filter."""
+    if detector.filter_table is not None:
+        return _table("detector.filter_table", detector.filter_table, FILTER_COLUMNS)[0]
+    if detector.filter_fwhm_nm is None:
+        return None
+    centre = laser.wavelength_nm if detector.filter_centre_nm is None else detector.filter_centre_nm
+    nodes = centre + detector.filter_fwhm_nm * np.linspace(-_REACH, _REACH, _NODES)
+    return nodes[nodes > 0.0]
+
+
+def spectral_lines(laser: Laser, detector: Detector) -> tuple[SpectralLine, ...]:
+    """Lines of a pulse's photons that pass the filter, up to 32; one for a laser of one line.
+
+    Raises `FileError` or `ConfigError` if a table cannot be read.
+    """
+    if laser.spectrum is None and laser.linewidth_nm == 0.0:
+        return (SpectralLine(laser.wavelength_nm, float(filter_transmission(laser, detector, laser.wavelength_nm))),)
+    wavelength, photons = _passed(laser, detector)
+    total = float(photons.sum())
+    if not total > 0.0:
+        return (SpectralLine(laser.wavelength_nm, 0.0),)
+    reached = np.cumsum(photons) / total
+    low, high = wavelength[np.searchsorted(reached, [1e-6, 1.0 - 1e-6])]
+    group = np.clip((wavelength - low) / max(high - low, 1e-300) * _MOST_LINES, 0, _MOST_LINES - 1).astype(int)
+    share = np.bincount(group, photons, _MOST_LINES)
+    moment = np.bincount(group, photons * wavelength, _MOST_LINES)
+    return tuple(SpectralLine(float(m / s), float(s)) for s, m in zip(share, moment, strict=True) if s > 0.0)
+
+
+def detection_efficiency(laser: Laser, detector: Detector) -> float:
+    """Detections for each photon of the laser that reaches a pixel: PDE, times what the filter passes of the spectrum.
+
+    Photons are counted as if the pulse had the one wavelength `laser.wavelength_nm`. Raises as `spectral_lines` does.
+    """
+    return detector.pde * math.fsum(line.share for line in spectral_lines(laser, detector))
+
+
+def _passed(laser: Laser, detector: Detector) -> tuple[Floats, Floats]:
+    """Wavelengths [nm] and the photons about each that pass the filter, over those of a pulse of one line."""
+    if laser.spectrum is not None:
+        at, power = _table("laser.spectrum", laser.spectrum, SPECTRUM_COLUMNS)
+    else:
+        at = laser.wavelength_nm + laser.linewidth_nm * np.linspace(-_REACH, _REACH, _NODES)
+        power = _gaussian((at - laser.wavelength_nm) / laser.linewidth_nm)
+    band = filter_band(laser, detector)
+    nodes = np.unique(np.concatenate([at, np.empty(0) if band is None else band]))
+    # Both may be steep between the nodes of a coarse table.
+    nodes = np.unique(np.concatenate([np.linspace(a, b, 9) for a, b in itertools.pairwise(nodes)]))
+    density = np.interp(nodes, at, power, left=0.0, right=0.0) / np.trapezoid(power, at)
+    passed = filter_transmission(laser, detector, nodes)
+    return nodes, density * widths_of(nodes) * passed * nodes / laser.wavelength_nm
+
+
+def widths_of(nodes: Floats) -> Floats:
+    """Widths that ascending wavelengths stand for, half of what is between it and its neighbours."""
+    widths = np.gradient(nodes)
+    widths[0], widths[-1] = 0.5 * (nodes[1] - nodes[0]), 0.5 * (nodes[-1] - nodes[-2])
+    return widths
+
+
+def _gaussian(offset: Any) -> Any:
+    """A Gaussian of unit height and unit full width at half maximum."""
+    return np.exp(-4.0 * math.log(2.0) * np.square(offset))
+
+
+def _table(field: str, path: str, columns: dict[str, str]) -> tuple[Floats, Floats]:
+    """Two columns of rising wavelengths and what is not all 0."""
+    at, values = read_table(field, path, columns)
+    if len(at) < 2 or (np.diff(at) <= 0.0).any():
+        raise ConfigError(f"{field}: {path}: two rows or more with rising wavelengths are needed")
+    if not values.max() > 0.0:
+        raise ConfigError(f"{field}: {path}: holds no {next(reversed(columns))} above 0")
+    return at, values

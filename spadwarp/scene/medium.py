@@ -1,20 +1,26 @@
-"""Water: the section `medium`, its layers, and what it is along a line."""
+"""Water: the section `medium`, its layers, what it is along a line, and how it scatters."""
 
 from __future__ import annotations
 
 import bisect
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
+from spadwarp.errors import ConfigError
 from spadwarp.limits import bounds
-from spadwarp.scene.grid import Grid, GridCells, cells_of
+from spadwarp.scene.grid import COEFFICIENTS, Grid, GridCells, cells_of
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.sections import (
+    PRESETS,
     Coordinate,
     CsvFile,
     Direction,
@@ -22,28 +28,102 @@ from spadwarp.scene.sections import (
     Section,
     field_range,
     listed,
-    with_units,
-)
-from spadwarp.scene.tables import (
-    COEFFICIENTS,
-    PHASE_FIELDS,
-    PHASE_TABLES,
-    PRESETS,
-    WATER_INDICES,
-    complete_coefficients,
-    merge_section,
+    read_table,
 )
 from spadwarp.units import pulse_speed
+from spadwarp.water import (
+    molecular_density,
+    rayleigh_matrix,
+    read_matrix_table,
+    scaled_rayleigh_matrix,
+    voss_fry_matrix,
+)
 from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, water_optics
 
-__all__ = ["Layer", "Medium"]
+__all__ = ["Layer", "Matrix", "Medium", "PhaseFunction", "phase_function", "scattering_matrix"]
+
+Floats = NDArray[np.float64]
+
+# (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`).
+# Time of flight uses the group index.
+WATER_INDICES: dict[str, tuple[float, float]] = {"seawater": (1.3415, 1.3638), "fresh": (1.3350, 1.3566)}
+
+# Overriding one coefficient of a complete medium keeps this other one.
+_KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
+
+
+def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
+    """All four coefficients from exactly two of them, the given ones as they are.
+
+    With `albedo = "lu2024"` absorption and scattering are the means (ω is uniform in (0, 0.97): mean 0.485).
+    Raises `ValueError` whose text names the fields, without the section.
+    """
+    if len(pair) != 2:
+        given = ", ".join(pair) or "none"
+        raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}, or chlorophyll; given: {given}")
+    a, b, c, albedo = (pair.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
+    if albedo == "lu2024":
+        if c is None:
+            raise ValueError("albedo = 'lu2024' goes with extinction only")
+        return {"absorption": c * (1.0 - 0.485), "scattering": c * 0.485, "extinction": c, "albedo": albedo}
+    if albedo is not None:
+        if c is None:
+            rest = albedo if a is None else 1.0 - albedo
+            if rest <= 0.0:
+                raise ValueError(f"albedo = {albedo} leaves the extinction undetermined; give extinction and albedo")
+            c = (b if a is None else a) / rest
+        a = c * (1.0 - albedo) if a is None else a
+        b = c * albedo if b is None else b
+    elif c is None:
+        c = a + b
+    else:
+        part, value = ("scattering", b) if a is None else ("absorption", a)
+        if value > c:
+            raise ValueError(f"{part} = {value} is outside [0, {c}], {c} being the extinction")
+        a = c - b if a is None else a
+        b = c - a if b is None else b
+    share = (b / c if c else 0.0) if albedo is None else albedo
+    return {"absorption": a, "scattering": b, "extinction": c, "albedo": share}
+
+
+class PhaseFields(NamedTuple):
+    """Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and
+    those with a default, which phase functions may share."""
+
+    needed: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+
+
+PHASE_FIELDS = {
+    "henyey_greenstein": PhaseFields(optional=("anisotropy",)),
+    "two_term_henyey_greenstein": PhaseFields(needed=("g1", "g2", "alpha")),
+    "fournier_forand": PhaseFields(optional=("particle_index", "junge_slope")),
+    "rayleigh": PhaseFields(optional=("depolarisation_ratio",)),
+    "tabulated": PhaseFields(needed=("phase_table",)),
+}
+
+# Tabulated phase functions: name -> (file in spadwarp/water/tables, source).
+PHASE_TABLES: dict[str, tuple[str, str]] = {
+    "petzold-average-particle": (
+        "petzold_average_particle.csv",
+        "Petzold 1972 (SIO Ref. 72-78), mean of three stations in San Diego harbour without the water's own "
+        "scattering, as tabulated by Mobley et al., Appl. Opt. 32, 7484 (1993)",
+    )
+}
 
 
 class Water(Section):
     """Coefficients of water: two of four coefficients, or chlorophyll, from which they follow."""
 
     section: ClassVar[str] = "medium"
-    alternatives: ClassVar[tuple[str, ...]] = COEFFICIENTS
+    alternatives: ClassVar = COEFFICIENTS
+    displaces: ClassVar = {
+        **dict.fromkeys(COEFFICIENTS, ("chlorophyll",)),
+        "chlorophyll": (*COEFFICIENTS, "preset"),
+        "temperature": ("phase_index", "group_index"),
+        "salinity": ("phase_index", "group_index"),
+        "phase_function": tuple(name for fields in PHASE_FIELDS.values() for name in fields.needed),
+    }
     preset: str | None = None
     """a named water, see `spadwarp list presets medium`"""
     absorption: float = Field(0.0, ge=0, le=1e6)
@@ -56,6 +136,22 @@ class Water(Section):
     """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
     chlorophyll: float | None = Field(None, **bounds(RANGES["chlorophyll"]))
     """chlorophyll of the open ocean, in place of coefficients [mg/m³]"""
+
+    @classmethod
+    def _kept(cls, base: Mapping[str, Any], layer: Mapping[str, Any]) -> dict[str, Any]:
+        """Of coefficients what completes those of the layer; a clash is left for validation to report."""
+        kept, new = super()._kept(base, layer), [name for name in COEFFICIENTS if layer.get(name) is not None]
+        old = {name: kept[name] for name in COEFFICIENTS if name in kept}
+        keep = {}
+        if len(new) == 1:
+            other = _KEEPS[new[0]]
+            if len(old) < 2 or (old.get("albedo") == "lu2024" and other not in old and new[0] not in old):
+                return kept
+            try:
+                keep = {other: old[other] if other in old else complete_coefficients(old)[other]}
+            except (TypeError, ValueError):
+                return kept
+        return {name: value for name, value in kept.items() if name not in old} | keep if new else kept
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -81,15 +177,6 @@ class Layer(Water):
     """where it begins along `layer_axis`, the world's z if not given [m]"""
     anisotropy: float | None = Field(None, gt=-1, lt=1)
     """henyey_greenstein: mean cosine of the scattering angle; default: the medium's"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _expand_preset(cls, fields: Any) -> Any:
-        if not isinstance(fields, Mapping):
-            return fields
-        whole = merge_section(cls.section, {}, with_units(cls, fields))
-        # A preset has indices, but one pair of them holds for all layers: the medium's.
-        return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}
 
 
 class WaterRange(NamedTuple):
@@ -337,3 +424,112 @@ def grid_cells(medium: Medium) -> GridCells:
         except OSError:
             stamp = None  # the reader says why
     return cells_of(grid, (medium.extinction, albedo, medium.anisotropy), medium.has_phase_table, stamp)
+
+
+# Scattering
+
+PHASE_COLUMNS = {"angle_deg": "[0, 180]", "value": "[0, 1e30]"}
+"""Columns of a phase table: scattering angle [°] and value of any scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseFunction:
+    """Probability density of the direction of scattered light, of unit integral over the sphere.
+
+    Attributes:
+        name: `medium.phase_function`.
+        parameters: The medium's fields that it takes.
+        molecular_share: Part of the scattering that is the water's own and not of that name.
+        over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
+        first_angle: Of a table [rad]; below it the table is continued.
+    """
+
+    name: str
+    parameters: dict[str, float | str]
+    molecular_share: float
+    over_t: Callable[[Floats], Floats]
+    first_angle: float = 0.0
+
+    def density(self, angle: ArrayLike) -> Floats:
+        """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""
+        return self.over_t(2.0 * np.sin(0.5 * np.asarray(angle, np.float64)) ** 2)
+
+    @cached_property
+    def mean_cosine(self) -> float:
+        """⟨cosθ⟩, the asymmetry parameter g."""
+        if self.name == "henyey_greenstein":
+            return (1.0 - self.molecular_share) * float(self.parameters["anisotropy"])
+        return _sphere_integral(lambda t: self.over_t(t) * (1.0 - t))
+
+    @cached_property
+    def backscatter_fraction(self) -> float:
+        """Part of the light that is scattered by more than 90°."""
+        return _sphere_integral(lambda t: self.over_t(t) * (t > 1.0))
+
+    def fraction_below(self, angle: float) -> float:
+        """Part of the light that is scattered by less than an angle [rad] in (0, π]."""
+        share = math.sin(0.5 * angle) ** 2
+        return share * _sphere_integral(lambda t: self.over_t(share * t))
+
+
+def _sphere_integral(density: Callable[[Floats], Floats]) -> float:
+    from spadwarp_kernels import sphere_integral
+
+    return sphere_integral(density)
+
+
+def phase_function(medium: Medium) -> PhaseFunction:
+    """The phase function of a scene's medium, `phase_function(scene.medium)`.
+
+    Raises `FileError` if its table cannot be read, `ConfigError` if the table is not a phase function.
+    """
+    import spadwarp_kernels as sk
+
+    density: Callable[[Floats], Floats]
+    first_angle = 0.0
+    name, parameters = medium.phase_function, medium.phase_parameters
+    if name == "tabulated":
+        path = Path(str(medium.phase_table))
+        if str(path) in PHASE_TABLES:
+            path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)][0]
+        angles, values = read_table("medium.phase_table", path, PHASE_COLUMNS)
+        try:
+            density = sk.interpolated_density(np.radians(angles), values)
+            first_angle = math.radians(float(angles[0]))
+        except ValueError as error:
+            raise ConfigError(f"medium.phase_table: {path}: {error}") from None
+    else:
+        numbers: dict[str, Any] = {"g": medium.anisotropy} if name == "henyey_greenstein" else dict(parameters)
+        density = partial(getattr(sk, f"{name}_density"), **numbers)
+    share = medium.molecular_share
+    if share > 0.0:
+        of_particles = density
+
+        def density(t: Floats) -> Floats:
+            return (1.0 - share) * of_particles(t) + share * molecular_density(t)
+
+    return PhaseFunction(name, parameters, share, density, first_angle)
+
+
+Matrix = Callable[[Floats], Floats]
+"""Cosines of the scattering angle `[n]` → m12, m22, m33, m34 and m44, each over m11, `[n, 5]`: I′ = I + m12 Q,
+Q′ = m12 I + m22 Q, U′ = m33 U + m34 V, V′ = −m34 U + m44 V with respect to the plane of scattering (Bohren & Huffman
+1983, eq 4.77)."""
+
+
+def scattering_matrix(medium: Medium) -> Matrix | None:
+    """The scattering matrix of a scene's medium, over its phase function, `scattering_matrix(scene.medium)`; None for
+    "none".
+
+    Raises `FileError` or `ConfigError` if its table cannot be read.
+    """
+    if medium.scattering_matrix == "rayleigh":
+        return partial(rayleigh_matrix, depolarisation_ratio=medium.depolarisation_ratio)
+    if medium.scattering_matrix == "scaled_rayleigh":
+        return partial(scaled_rayleigh_matrix, largest=medium.largest_polarisation)
+    if medium.scattering_matrix == "tabulated":
+        try:
+            return read_matrix_table(str(medium.matrix_table))
+        except ConfigError as error:
+            raise ConfigError(f"medium.matrix_table: {error}") from None
+    return voss_fry_matrix if medium.scattering_matrix == "voss_fry" else None

@@ -94,6 +94,11 @@ class Port(Section):
     """A flat or dome port between the air of a housing and the water; without thickness and material a calm surface."""
 
     section: ClassVar[str] = "port"
+    displaces: ClassVar = {
+        "shape": ("distance", "normal", "radius", "offset"),
+        "material": ("index", "group_index"),
+        "index": ("material",),
+    }
     preset: str | None = None
     """a named port, see `spadwarp list presets port`"""
     shape: Literal["flat", "dome"] = "flat"

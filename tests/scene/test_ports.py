@@ -12,8 +12,8 @@ from spadwarp.errors import ConfigError
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.scene import Scene
 from spadwarp.scene.port import air_indices, window_indices
+from spadwarp.scene.sections import PRESETS
 from spadwarp.scene.sight import depth_from_time, lines_of_sight, pixel_directions
-from spadwarp.scene.tables import PRESETS
 
 SEAWATER = WATER | {"phase_index": "seawater", "group_index": "seawater"}
 WINDOW = {"distance": 0.05, "thickness": 0.01, "material": "BK7"}

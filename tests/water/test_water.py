@@ -8,7 +8,7 @@ import pytest
 import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.scene import Medium, Scene
-from spadwarp.scene.tables import WATER_INDICES
+from spadwarp.scene.medium import WATER_INDICES
 from spadwarp.water import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
 
 TABLES = {
