@@ -163,10 +163,10 @@ def _check_plausible(survey: Survey) -> None:
         survey.warn("laser.pulse_energy", text, average_power=laser.average_power)
     places = {"laser.position": laser.position, "camera.position": scene.camera.position}
     places |= {f"targets[{i}].translation": target.translation for i, target in enumerate(scene.targets)}
-    for field, place in places.items():
-        if (farthest := max(map(abs, place))) > _FARTHEST:
-            text = f"{list(place)} m is {farthest:.4g} m away; in mm it would be {[1e-3 * x for x in place]} m"
-            survey.warn(field, text, farthest=farthest)
+    for name, point in places.items():
+        if (farthest := max(map(abs, point))) > _FARTHEST:
+            text = f"{list(point)} m is {farthest:.4g} m away; in mm it would be {[1e-3 * x for x in point]} m"
+            survey.warn(name, text, farthest=farthest)
     for index, (target, triangles) in enumerate(zip(scene.targets, survey.targets, strict=True)):
         if target.mesh is not None and len(triangles):
             _check_mesh(survey, f"targets[{index}].scale", target.scale, np.ptp(triangles.reshape(-1, 3), axis=0))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 from xml.etree import ElementTree
@@ -24,7 +24,7 @@ from spadwarp.io.text import parse_json, read_text, write_text
 from spadwarp.limits import check_integer, read_real, shown
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field_range, listed
+from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field, field_range, listed
 
 __all__ = ["Camera", "load_calibration", "save_calibration"]
 
@@ -59,44 +59,29 @@ class Camera(Section):
         "aperture_diameter": ("f_number",),
         "f_number": ("aperture_diameter",),
     }
-    preset: str | None = None
-    """a named camera, see `spadwarp list presets camera`"""
-    width: Whole = Field(..., ge=1, le=16384)
-    """pixels in a row"""
-    height: Whole = Field(..., ge=1, le=16384)
-    """rows"""
-    horizontal_fov_deg: float | None = Field(None, ge=1e-6, lt=180)
-    """full horizontal field of view [°]"""
-    focal_length: float | None = Field(None, ge=1e-6, le=1e6)
-    """focal length [m]"""
-    pixel_pitch_um: float | None = Field(None, ge=1e-9, le=1e6)
-    """side of a pixel [µm]"""
-    fx: float | None = Field(None, ge=1e-3, le=1e9)
-    """focal length along rows [pixels], as OpenCV writes it"""
-    fy: float | None = Field(None, ge=1e-3, le=1e9)
-    """focal length along columns [pixels]; fx if not given"""
+    preset: str | None = field(None, "a named camera, see `spadwarp list presets camera`")
+    width: Whole = field(..., "pixels in a row", "[1, 16384]")
+    height: Whole = field(..., "rows", "[1, 16384]")
+    horizontal_fov_deg: float | None = field(None, "full horizontal field of view [°]", "[1e-6, 180)")
+    focal_length: float | None = field(None, "focal length [m]", "[1e-6, 1e6]")
+    pixel_pitch_um: float | None = field(None, "side of a pixel [µm]", "[1e-9, 1e6]")
+    fx: float | None = field(None, "focal length along rows [pixels], as OpenCV writes it", "[0.001, 1e9]")
+    fy: float | None = field(None, "focal length along columns [pixels]; fx if not given", "[0.001, 1e9]")
     cx: Coordinate | None = None
-    """column of the optical axis, 0 at the first pixel's centre as in OpenCV; default: the middle"""
-    cy: Coordinate | None = None
-    """row of the optical axis, likewise"""
-    distortion: Brown = (0.0,) * 5
-    """Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order"""
-    calibration: AnyFile = None
-    """OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place"""
-    aperture_diameter: float | None = Field(None, ge=1e-9, le=1e6)
-    """diameter of the entrance aperture [m]"""
-    f_number: float | None = Field(None, ge=1e-3, le=1e6)
-    """focal length over aperture diameter"""
+    """column of the optical axis, 0 at the first pixel's centre; default: the middle"""
+    cy: Coordinate | None = field(None, "row of the optical axis, likewise")
+    distortion: Brown = field((0.0,) * 5, "Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
+    calibration: AnyFile = field(None, "OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place")
+    aperture_diameter: float | None = field(None, "diameter of the entrance aperture [m]", "[1e-9, 1e6]")
+    f_number: float | None = field(None, "focal length over aperture diameter", "[0.001, 1e6]")
     focus_distance: Annotated[
         Annotated[float, Field(ge=1e-6, le=math.inf, allow_inf_nan=True)] | Literal["target"], Infinite
     ] = "target"
     """depth that is imaged sharply [m], inf or "infinity"; "target": that of the first target on the optical axis"""
     pinhole: bool = False
     """whether the lens is a point, which images all depths sharply and collects the light of the aperture's area"""
-    position: Vector = (0.0, 0.0, 0.0)
-    """lens centre in the world [m]"""
-    rotation_deg: Vector = (0.0, 0.0, 0.0)
-    """rotations from the world's axes about x, then the new y, then the new z [°]"""
+    position: Vector = field((0.0, 0.0, 0.0), "lens centre in the world [m]")
+    rotation_deg: Vector = field((0.0, 0.0, 0.0), "rotations from the world's axes about x, the new y, the new z [°]")
     polarisation: Literal["none", "analyser", "stokes"] = "none"
     """what it records of polarisation: nothing; light through an analyser and one across; the Stokes vector"""
     analyser_angle_deg: float = Field(0.0, ge=-180, le=180)
@@ -104,7 +89,7 @@ class Camera(Section):
     analyser_extinction_ratio: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True), Infinite] = math.inf
     """analyser: light that it lets through along its direction over light across; inf or "infinity" is ideal"""
     port: Port | None = None
-    """what it looks through; view and focus are those in the air behind it. Without one it is in the water"""
+    """what it looks through; view and focus are those in air. Without one it is in water"""
 
     @model_validator(mode="before")
     @classmethod
@@ -286,21 +271,21 @@ def view_box(camera: Camera) -> tuple[float, float, float, float]:
     columns, rows = np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)
     if not any(camera.distortion):
         columns, rows = columns[[0, -1]], rows[[0, -1]]
-    border = np.concatenate(
-        [_grid(columns, rows[[0, -1]]).reshape(-1, 2), _grid(columns[[0, -1]], rows).reshape(-1, 2)]
-    )
-    tangents = image_tangents(camera, border)
-    margin = _MARGIN / np.array(camera.focal_pixels)
-    (left, top), (right, bottom) = tangents.min(axis=0) - margin, tangents.max(axis=0) + margin
-    return float(left), float(top), float(right), float(bottom)
+    border = [_grid(columns, rows[[0, -1]]).reshape(-1, 2), _grid(columns[[0, -1]], rows).reshape(-1, 2)]
+    left, top, right, bottom = _boxes(camera, image_tangents(camera, np.concatenate(border))).tolist()
+    return left, top, right, bottom
 
 
 def pixel_views(camera: Camera) -> Points:
     """As `view_box` for each pixel alone: `[H, W, 4]`."""
     corners = image_tangents(camera, _grid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)))
-    four = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]])
+    return _boxes(camera, np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]]))
+
+
+def _boxes(camera: Camera, tangents: Points) -> Points:
+    """Boxes `[..., 4]` that hold tangents `[N, ..., 2]`."""
     margin = _MARGIN / np.array(camera.focal_pixels)
-    return np.concatenate([four.min(axis=0) - margin, four.max(axis=0) + margin], axis=-1)
+    return np.concatenate([tangents.min(axis=0) - margin, tangents.max(axis=0) + margin], axis=-1)
 
 
 def camera_attributes(camera: Camera, focus_distance: float | None) -> dict[str, NDArray[np.float64] | float]:
@@ -330,13 +315,8 @@ def _distort(tangents: Points, coefficients: tuple[float, ...]) -> Points:
     x, y = tangents[..., 0], tangents[..., 1]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    column = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    return np.stack([column, y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y], axis=-1)
 
 
 def _jacobian(tangents: Points, coefficients: tuple[float, ...]) -> tuple[Points, Points, Points]:
@@ -361,21 +341,13 @@ CALIBRATION_ENDINGS = (".xml", ".yml", ".yaml", ".json")
 _COORDINATE = field_range(Camera, "cx")
 _LARGEST = 1 << 19  # bytes; one with all corners of 100 views has 300 kB
 
-# What programs call the same thing.
-_NAMES = {
-    "camera_matrix": ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "mtx", "K", "M"),
-    "distortion": (
-        "distortion_coefficients",
-        "dist_coeffs",
-        "dist_coeff",
-        "distCoeffs",
-        "distortion",
-        "dist",
-        "D",
-    ),
-    "width": ("image_width", "width"),
-    "height": ("image_height", "height"),
-}
+# What programs call the same thing, OpenCV's name first.
+_NAMES = (
+    ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "mtx", "K", "M"),
+    ("distortion_coefficients", "dist_coeffs", "dist_coeff", "distCoeffs", "distortion", "dist", "D"),
+    ("image_width", "width"),
+    ("image_height", "height"),
+)
 
 
 def load_calibration(path: str | Path) -> dict[str, Any]:
@@ -392,11 +364,9 @@ def load_calibration(path: str | Path) -> dict[str, Any]:
         ConfigError: It holds no calibration, one of a lens model other than Brown's, or numbers that are not finite.
     """
     try:
-        text = read_text(path, largest=_LARGEST)
+        return _fields(_entries(read_text(path, largest=_LARGEST)))
     except FileError as error:
         raise FileError(f"camera.calibration = {error}") from None
-    try:
-        return _fields(_entries(text))
     except ValueError as error:
         raise ConfigError(f"camera.calibration = {str(path)!r}: {error}") from None
 
@@ -415,34 +385,52 @@ def save_calibration(camera: Camera, path: str | Path) -> Path:
     if (ending := path.suffix.lower()) not in CALIBRATION_ENDINGS:
         raise ArgumentError(f"{path}: ending {path.suffix!r} is not one of {', '.join(CALIBRATION_ENDINGS)}")
     numbers: Any = camera_attributes(camera, None)
-    size = {"image_width": camera.width, "image_height": camera.height}
-    matrices: dict[str, dict[str, Any]] = {
-        "camera_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": numbers["camera_matrix"].tolist()},
-        "distortion_coefficients": {"rows": 1, "cols": 5, "dt": "d", "data": numbers["camera_distortion"].tolist()},
-    }
+    entries: dict[str, Any] = {"image_width": camera.width, "image_height": camera.height}
+    for name, rows, values in (
+        ("camera_matrix", 3, "camera_matrix"),
+        ("distortion_coefficients", 1, "camera_distortion"),
+    ):
+        data = numbers[values].tolist()
+        entries[name] = {"type_id": "opencv-matrix", "rows": rows, "cols": len(data) // rows, "dt": "d", "data": data}
     if ending == ".json":
-        tables = {name: {"type_id": "opencv-matrix", **matrix} for name, matrix in matrices.items()}
-        return write_text(json.dumps({**size, **tables}, indent=1) + "\n", path)
-    is_xml = ending == ".xml"
-    lines = ['<?xml version="1.0"?>', "<opencv_storage>"] if is_xml else ["%YAML:1.0", "---"]
-    lines += [f"<{name}>{value}</{name}>" if is_xml else f"{name}: {value}" for name, value in size.items()]
-    for name, matrix in matrices.items():
-        data = map(repr, matrix["data"])
-        matrix["data"] = " ".join(data) if is_xml else f"[ {', '.join(data)} ]"
-        lines += [f'<{name} type_id="opencv-matrix">' if is_xml else f"{name}: !!opencv-matrix"]
-        lines += [f"  <{key}>{value}</{key}>" if is_xml else f"   {key}: {value}" for key, value in matrix.items()]
-        lines += [f"</{name}>"] if is_xml else []
-    return write_text("\n".join([*lines, "</opencv_storage>", ""] if is_xml else [*lines, ""]), path)
+        return write_text(json.dumps(entries, indent=1) + "\n", path)
+    write = _xml_lines if ending == ".xml" else _yaml_lines
+    return write_text("\n".join([*write(entries), ""]), path)
+
+
+def _xml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
+    yield from ('<?xml version="1.0"?>', "<opencv_storage>")
+    for name, value in entries.items():
+        if not isinstance(value, Mapping):
+            yield f"<{name}>{value}</{name}>"
+            continue
+        yield f'<{name} type_id="opencv-matrix">'
+        for key in ("rows", "cols", "dt", "data"):
+            text = " ".join(map(repr, value[key])) if key == "data" else value[key]
+            yield f"  <{key}>{text}</{key}>"
+        yield f"</{name}>"
+    yield "</opencv_storage>"
+
+
+def _yaml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
+    yield from ("%YAML:1.0", "---")
+    for name, value in entries.items():
+        yield f"{name}: {'!!opencv-matrix' if isinstance(value, Mapping) else value}"
+        if isinstance(value, Mapping):
+            yield from (f"   {key}: {value[key]}" for key in ("rows", "cols", "dt"))
+            yield f"   data: [ {', '.join(map(repr, value['data']))} ]"
 
 
 def _entries(text: str) -> dict[str, Any]:
-    if text.lstrip().startswith("<"):
-        return _xml_entries(text)
-    is_json = text.lstrip().startswith("{")
+    """Names and values of a file in XML, JSON or YAML. Raises `ValueError`."""
+    start = text.lstrip()[:1]
+    kind = {"<": "XML", "{": "JSON"}.get(start, "YAML")
     try:  # OpenCV's first line is no YAML
-        entries = parse_json(text) if is_json else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
-    except (ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"not valid {'JSON' if is_json else 'YAML'}: {' '.join(str(error).split())}") from None
+        if kind == "XML":
+            return _xml_entries(text)
+        entries = parse_json(text) if kind == "JSON" else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
+    except (ValueError, yaml.YAMLError, ElementTree.ParseError) as error:
+        raise ValueError(f"not valid {kind}: {' '.join(str(error).split())}") from None
     except RecursionError:
         raise ValueError("not valid YAML: lists or tables are nested too deeply") from None
     return entries if isinstance(entries, dict) else {}
@@ -451,24 +439,15 @@ def _entries(text: str) -> dict[str, Any]:
 def _xml_entries(text: str) -> dict[str, Any]:
     """The entries of OpenCV's XML, its matrices as `_numbers` takes them."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # with entities a small file can be huge
-        raise ValueError("not OpenCV's XML: it declares a document type")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(f"not valid XML: {error}") from None
-    entries: dict[str, Any] = {}
-    for element in root:
-        if element.find("data") is not None:  # a matrix
-            parts = {part.tag: (part.text or "").split() for part in element}
-            entries[element.tag] = {**parts, "rows": _one(parts.get("rows")), "cols": _one(parts.get("cols"))}
-        else:
-            entries[element.tag] = _one((element.text or "").split())
-    return entries
+        raise ValueError("it declares a document type, which OpenCV's does not")
 
+    def words(element: ElementTree.Element) -> Any:
+        if len(element):
+            return {part.tag: words(part) for part in element}
+        found = (element.text or "").split()
+        return found[0] if len(found) == 1 else found
 
-def _one(words: list[str] | None) -> list[str] | str | None:
-    """The word of a list of one, else the list."""
-    return words[0] if words is not None and len(words) == 1 else words
+    return {element.tag: words(element) for element in ElementTree.fromstring(text)}
 
 
 class _Loader(yaml.BaseLoader):
@@ -481,32 +460,25 @@ class _Loader(yaml.BaseLoader):
 
 
 def _fields(entries: Mapping[str, Any]) -> dict[str, Any]:
-    def find(key: str) -> list[float] | None:
-        name = next((name for name in _NAMES[key] if name in entries), None)
-        return None if name is None else _numbers(name, entries[name])
-
     model = entries.get("distortion_model", entries.get("camera_model", "plumb_bob"))
     if str(model).lower() not in ("plumb_bob", "brown", "pinhole", "opencv", "radtan"):
         raise ValueError(f"the lens model {shown(model)} is not Brown's (k1, k2, p1, p2, k3)")
-    matrix = find("camera_matrix")
-    if matrix is None or len(matrix) != 9:
+    matrix, distortion, *size = (
+        next((_numbers(name, entries[name]) for name in names if name in entries), []) for names in _NAMES
+    )
+    if len(matrix) != 9:
         raise ValueError("holds no camera_matrix of 3 x 3 numbers")
     fx, skew, cx, zero, fy, cy, *last = matrix
     if skew or zero or last != [0, 0, 1] or fx <= 0 or fy <= 0:
         raise ValueError(f"camera_matrix = {shown(matrix)} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
-    distortion = find("distortion") or []
     if any(distortion[5:]) or len(distortion) not in (0, 4, 5, 8, 12, 14):
-        raise ValueError(
-            f"distortion_coefficients = {shown(distortion)}: k1, k2, p1, p2, k3 are known, no rational, prism or tilt"
-            " terms"
-        )
-    coefficients = tuple([*distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5])
-    fields: dict[str, Any] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": coefficients}
-    for name in ("width", "height"):
-        if (pixels := find(name)) is not None:
-            fields[name] = check_integer(
-                f"image_{name}", pixels[0] if len(pixels) == 1 else pixels, field_range(Camera, name)
-            )
+        known = "k1, k2, p1, p2, k3 are known, no rational, prism or tilt terms"
+        raise ValueError(f"distortion_coefficients = {shown(distortion)}: {known}")
+    fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": tuple([*distortion, *[0.0] * 5][:5])}
+    for name, pixels in zip(("width", "height"), size, strict=True):
+        if pixels:
+            number = pixels[0] if len(pixels) == 1 else pixels
+            fields[name] = check_integer(f"image_{name}", number, field_range(Camera, name))
     return fields
 
 

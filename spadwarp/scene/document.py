@@ -90,9 +90,14 @@ class Document(Section):
     @property
     def files(self) -> list[Path]:
         """Files that it refers to: meshes, tables and images, all that `to_dict` names."""
-        found: list[str] = []
-        with_paths(type(self), self.to_dict(), lambda path: found.append(path) or path)
-        return [Path(path) for path in found if Path(path).suffix]
+        found: list[Path] = []
+
+        def noted(path: str) -> str:
+            found.append(Path(path))
+            return path
+
+        with_paths(type(self), self.to_dict(), noted)
+        return [path for path in found if path.suffix]
 
     def to_toml(self, *, folder: str | os.PathLike[str] | None = None) -> str:
         """The full text that is read back to an equal document.

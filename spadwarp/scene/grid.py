@@ -18,7 +18,7 @@ from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
 from spadwarp.limits import Interval
 from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field_range
+from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range
 
 __all__: list[str] = []
 
@@ -46,36 +46,27 @@ class Grid(Section):
     """
 
     displaces: ClassVar = {"file": ("shape", "cells", "turbulence", "eddy_size", "seed"), "shape": ("file",)}
-    file: AnyFile = None
-    """path of a .npz, .h5 or .nvdb file with cells, relative to the scene file"""
+    file: AnyFile = field(None, "path of a .npz, .h5 or .nvdb file with cells, relative to the scene file")
     shape: Literal["cloud", "plume", "sediment", "gradient"] | None = None
     """in place of a file: a round cloud, a plume that rises, matter stirred up from the bottom, a rise from top to
     bottom; the box's y points down"""
-    size: Size | None = None
-    """edges of the box, one or three; default: those of the file [m]"""
-    cells: Counts = (64,)
-    """shape: number of cells along the edges; one number: along the longest"""
-    extinction: float = Field(1.0, ge=0, le=1e6)
-    """what density 1 adds to the medium's extinction [1/m]"""
-    albedo: float = Field(0.8, ge=0, le=1)
-    """single-scattering albedo of what is added"""
+    size: Size | None = field(None, "edges of the box, one or three; default: those of the file [m]")
+    cells: Counts = field((64,), "shape: number of cells along the edges; one number: along the longest")
+    extinction: float = field(1.0, "what density 1 adds to the medium's extinction [1/m]", "[0, 1e6]")
+    albedo: float = field(0.8, "single-scattering albedo of what is added", "[0, 1]")
     anisotropy: float | None = Field(None, gt=-1, lt=1)
     """henyey_greenstein: mean cosine of the scattering by what is added; default: the medium's"""
     turbulence: float = Field(0.0, ge=0, le=3)
     """shape: standard deviation of the logarithm of the density about the shape, by eddies of von Kármán's spectrum"""
     eddy_size: float | None = Field(None, ge=1e-6, le=1e9)
     """shape: size of the largest eddies; default: a third of the box's shortest edge [m]"""
-    seed: Whole = Field(0, ge=0, le=2**63 - 1)
-    """shape: of the turbulence"""
+    seed: Whole = field(0, "shape: of the turbulence", "[0, 9223372036854775807]")
     frame: float = Field(0.0, ge=0, le=1e9)
     """time, for what moves: in a file's frames, between which cells are interpolated; in turnovers of a shape's largest
     eddies"""
-    scale: Scale = (1.0, 1.0, 1.0)
-    """factor on the size, one or three"""
-    rotation_deg: Vector = (0.0, 0.0, 0.0)
-    """rotations about the box's own x, then its new y, then its new z [°]"""
-    translation: Vector = (0.0, 0.0, 0.0)
-    """shift in the world [m], the camera's frame if it has no pose"""
+    scale: Scale = field((1.0, 1.0, 1.0), "factor on the size, one or three")
+    rotation_deg: Vector = field((0.0, 0.0, 0.0), "rotations about the box's own x, then its new y, then its new z [°]")
+    translation: Vector = field((0.0, 0.0, 0.0), "shift in the world [m], the camera's frame if it has no pose")
     tracking: Literal["auto", "regular", "delta"] = "auto"
     """how photons fly through cells: "regular" from cell to cell, exact; "delta" by chance and without bias, faster
     where cells are many; "auto": the latter for more than 32 768 cells"""

@@ -26,6 +26,7 @@ from spadwarp.scene.sections import (
     Direction,
     Section,
     Vector,
+    field,
     field_range,
     read_table,
     unit_vector,
@@ -55,24 +56,19 @@ class Laser(Section):
         "linewidth_nm": ("spectrum",),
         "spectrum": ("linewidth_nm",),
     }
-    preset: str | None = None
-    """a named laser, see `spadwarp list presets laser`"""
-    position: Vector = (0.0, 0.0, 0.0)
-    """where the beam begins [m]"""
-    direction: Direction = (0.0, 0.0, 1.0)
-    """axis of the beam; any length but 0; a scan sets it"""
+    preset: str | None = field(None, "a named laser, see `spadwarp list presets laser`")
+    position: Vector = field((0.0, 0.0, 0.0), "where the beam begins [m]")
+    direction: Direction = field((0.0, 0.0, 1.0), "axis of the beam; any length but 0; a scan sets it")
     frame: Literal["camera", "world"] = "camera"
     """frame of position and direction: a laser moves with the camera, or is fixed in the world"""
     port: Port | Literal["camera"] | None = None
     """what it shines through: a port of its own, whose lengths start at `position`, or that of the camera"""
     profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = "uniform_cone"
     """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
-    profile_image: AnyFile = None
-    """irradiance across a measured beam: .npy, .exr or .png (linear), rows downwards"""
+    profile_image: AnyFile = field(None, "irradiance across a measured beam: .npy, .exr, .png (linear), rows downwards")
     half_angle_deg: float = Field(15.0, ge=1e-6, le=180)
     """half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]"""
-    beam_radius: float = Field(0.0, ge=0, le=1e6)
-    """radius of the collimated beam [m]; 0 is a pencil beam"""
+    beam_radius: float = field(0.0, "radius of the collimated beam [m]; 0 is a pencil beam", "[0, 1e6]")
     wavelength_nm: float = Field(532.0, ge=1e-9, le=1e6)
     """vacuum wavelength [nm]; with a spectrum that at which photons and water are counted"""
     linewidth_nm: float = Field(0.0, ge=0, le=1e5)
@@ -83,16 +79,12 @@ class Laser(Section):
     """of the light; right is clockwise for who looks towards the laser"""
     polarisation_angle_deg: float = Field(0.0, ge=-180, le=180)
     """linear: direction of the field, from the beam's right towards its down, in the image from +x towards +y [°]"""
-    pulse_energy: float = Field(37.5e-9, ge=1e-30, le=1e6)
-    """energy of one pulse [J]"""
-    average_power: float = Field(0.0, ge=1e-30, le=1e15)
-    """mean power, in place of pulse_energy: pulse_energy times repetition_rate [W]"""
+    pulse_energy: float = field(37.5e-9, "energy of one pulse [J]", "[1e-30, 1e6]")
+    average_power: float = field(0.0, "mean power, in place of pulse_energy [W]", "[1e-30, 1e15]")
     peak_power: float = Field(0.0, ge=1e-30, le=1e21)
     """power at the peak of the pulse, in place of pulse_energy: for a Gaussian pulse pulse_energy/(1.0645 FWHM) [W]"""
-    repetition_rate: float = Field(20e6, ge=1e-6, le=1e15)
-    """pulses per second [Hz]"""
-    pulse_fwhm_ps: float = Field(85.0, ge=0, le=1e12)
-    """pulse duration, full width at half maximum [ps]"""
+    repetition_rate: float = field(20e6, "pulses per second [Hz]", "[1e-6, 1e15]")
+    pulse_fwhm_ps: float = field(85.0, "pulse duration, full width at half maximum [ps]", "[0, 1e12]")
 
     @model_validator(mode="after")
     def _has_a_beam(self) -> Self:

@@ -26,6 +26,7 @@ from spadwarp.scene.sections import (
     Direction,
     FilePath,
     Section,
+    field,
     field_range,
     listed,
     read_table,
@@ -124,18 +125,14 @@ class Water(Section):
         "salinity": ("phase_index", "group_index"),
         "phase_function": tuple(name for fields in PHASE_FIELDS.values() for name in fields.needed),
     }
-    preset: str | None = None
-    """a named water, see `spadwarp list presets medium`"""
-    absorption: float = Field(0.0, ge=0, le=1e6)
-    """absorption coefficient a [1/m]"""
-    scattering: float = Field(0.0, ge=0, le=1e6)
-    """scattering coefficient b [1/m]"""
-    extinction: float = Field(0.0, ge=1e-12, le=1e6)
-    """extinction (beam attenuation) coefficient c = a + b [1/m]"""
+    preset: str | None = field(None, "a named water, see `spadwarp list presets medium`")
+    absorption: float = field(0.0, "absorption coefficient a [1/m]", "[0, 1e6]")
+    scattering: float = field(0.0, "scattering coefficient b [1/m]", "[0, 1e6]")
+    extinction: float = field(0.0, "extinction (beam attenuation) coefficient c = a + b [1/m]", "[1e-12, 1e6]")
     albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = 0.0
     """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
     chlorophyll: float | None = Field(None, **bounds(RANGES["chlorophyll"]))
-    """chlorophyll of the open ocean, in place of coefficients [mg/m³]"""
+    """of the open ocean, in place of coefficients [mg/m³]"""
 
     @classmethod
     def _kept(cls, base: Mapping[str, Any], layer: Mapping[str, Any]) -> dict[str, Any]:
@@ -173,10 +170,8 @@ class Water(Section):
 class Layer(Water):
     """Water from a plane on, up to the next layer; given as a medium is."""
 
-    start: Coordinate
-    """where it begins along `layer_axis`, the world's z if not given [m]"""
-    anisotropy: float | None = Field(None, gt=-1, lt=1)
-    """henyey_greenstein: mean cosine of the scattering angle; default: the medium's"""
+    start: Coordinate = field(..., "where it begins along `layer_axis`, the world's z if not given [m]")
+    anisotropy: float | None = field(None, "henyey_greenstein: mean cosine; default: the medium's", "(-1, 1)")
 
 
 class WaterRange(NamedTuple):
@@ -208,18 +203,12 @@ class Medium(Water):
         "henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "rayleigh", "tabulated"
     ] = "henyey_greenstein"
     """law of the scattering angle"""
-    anisotropy: float = Field(0.924, gt=-1, lt=1)
-    """henyey_greenstein: mean cosine g of the scattering angle"""
-    g1: float | None = Field(None, gt=-1, lt=1)
-    """two_term_henyey_greenstein: g of the first term"""
-    g2: float | None = Field(None, gt=-1, lt=1)
-    """two_term_henyey_greenstein: g of the second term"""
-    alpha: float | None = Field(None, ge=0, le=1)
-    """two_term_henyey_greenstein: weight of the first term"""
-    particle_index: float = Field(1.10, gt=1, le=1.35)
-    """fournier_forand: index n of the particles over that of the water"""
-    junge_slope: float = Field(3.5835, ge=3.05, lt=5)
-    """fournier_forand: slope µ of the size distribution"""
+    anisotropy: float = field(0.924, "henyey_greenstein: mean cosine g of the scattering angle", "(-1, 1)")
+    g1: float | None = field(None, "two_term_henyey_greenstein: g of the first term", "(-1, 1)")
+    g2: float | None = field(None, "two_term_henyey_greenstein: g of the second term", "(-1, 1)")
+    alpha: float | None = field(None, "two_term_henyey_greenstein: weight of the first term", "[0, 1]")
+    particle_index: float = field(1.10, "fournier_forand: index n of the particles over that of the water", "(1, 1.35]")
+    junge_slope: float = field(3.5835, "fournier_forand: slope µ of the size distribution", "[3.05, 5)")
     phase_table: Annotated[str | None, FilePath(".csv", tuple(PHASE_TABLES))] = None
     """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
     scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
@@ -235,16 +224,12 @@ class Medium(Water):
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
     """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
-    temperature: float | None = Field(None, **bounds(RANGES["temperature"]))
-    """gives the indices that are not given, with salinity 35 [°C]"""
-    salinity: float | None = Field(None, **bounds(RANGES["salinity"]))
-    """the same, with temperature 20 [g/kg]"""
+    temperature: float | None = field(None, "gives missing indices, with salinity 35 [°C]", RANGES["temperature"])
+    salinity: float | None = field(None, "the same, with temperature 20 [g/kg]", RANGES["salinity"])
     layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = ()
-    """other waters further along `layer_axis`, in its order"""
-    layer_axis: Direction = (0.0, 0.0, 1.0)
-    """direction across the layers, in the world; not 0"""
-    grid: Grid | None = None
-    """water that varies within a box, cell by cell; not with layers"""
+    """waters further along `layer_axis`, in order"""
+    layer_axis: Direction = field((0.0, 0.0, 1.0), "direction across the layers, in the world; not 0")
+    grid: Grid | None = field(None, "water that varies within a box, cell by cell; not with layers")
     _molecular_share: float = PrivateAttr(0.0)
 
     @field_validator("phase_index", "group_index", mode="before")

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from spadwarp.scene.pose import vector_of
-from spadwarp.scene.sections import Direction, Section, Vector, unit_vector
+from spadwarp.scene.sections import Direction, Section, Vector, field, unit_vector
 
 __all__: list[str] = []
 
@@ -99,30 +99,22 @@ class Port(Section):
         "material": ("index", "group_index"),
         "index": ("material",),
     }
-    preset: str | None = None
-    """a named port, see `spadwarp list presets port`"""
-    shape: Literal["flat", "dome"] = "flat"
-    """a plane window, or a spherical one"""
+    preset: str | None = field(None, "a named port, see `spadwarp list presets port`")
+    shape: Literal["flat", "dome"] = field("flat", "a plane window, or a spherical one")
     distance: float | None = Field(None, ge=1e-6, le=1e6)
     """flat: from the lens centre along `normal` to the window; above a calm surface the altitude [m]"""
     normal: Direction = (0.0, 0.0, 1.0)
     """flat: direction into the water, any length but 0; in the frame of the camera, or of the laser's direction"""
-    radius: float | None = Field(None, ge=1e-6, le=1e6)
-    """dome: of its inner face [m]"""
-    offset: Vector = (0.0, 0.0, 0.0)
-    """dome: from the lens centre to the dome's centre [m]"""
-    thickness: float = Field(0.0, ge=0, le=1e3)
-    """of the window [m]; 0: there is none"""
+    radius: float | None = field(None, "dome: of its inner face [m]", "[1e-6, 1e6]")
+    offset: Vector = field((0.0, 0.0, 0.0), "dome: from the lens centre to the dome's centre [m]")
+    thickness: float = field(0.0, "of the window [m]; 0: there is none", "[0, 1000]")
     material: Literal["BK7", "fused silica", "sapphire", "acrylic", "PMMA", "polycarbonate"] | None = None
     """of the window: its indices at the laser's wavelength"""
-    index: float | None = Field(None, ge=1, le=4)
-    """phase index of the window, in place of material"""
-    group_index: float | None = Field(None, ge=1, le=4)
-    """group index of the window; default: its phase index"""
-    inside_index: float | None = Field(None, ge=1, le=4)
-    """phase index inside the housing; default: that of air"""
+    index: float | None = field(None, "phase index of the window, in place of material", "[1, 4]")
+    group_index: float | None = field(None, "group index of the window; default: its phase index", "[1, 4]")
+    inside_index: float | None = field(None, "phase index inside the housing; default: that of air", "[1, 4]")
     inside_group_index: float | None = Field(None, ge=1, le=4)
-    """group index inside the housing; default: that of air, or inside_index"""
+    """group index inside; default: that of air, or inside_index"""
 
     @model_validator(mode="after")
     def _determined(self) -> Self:

@@ -34,7 +34,7 @@ from pydantic.fields import FieldInfo
 
 from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.text import read_columns
-from spadwarp.limits import Interval, shown
+from spadwarp.limits import Interval, bounds, shown
 from spadwarp.units import UNITS, quantity
 
 __all__ = ["Preset", "presets"]
@@ -56,6 +56,14 @@ class FilePath(NamedTuple):
 def file_path(info: FieldInfo) -> FilePath | None:
     """The metadata of a field with the path of a file."""
     return next((item for item in info.metadata if isinstance(item, FilePath)), None)
+
+
+def field(default: Any, text: str, within: str | None = None) -> Any:
+    """A field, what it is, and its range, such as "(0, 1]"; a longer text stands in a docstring below the field."""
+    if within is None:
+        return Field(default, description=text)
+    limits = bounds(within)
+    return Field(default, description=text, allow_inf_nan=math.inf in limits.values() or None, **limits)
 
 
 def listed(value: Any) -> Any:
