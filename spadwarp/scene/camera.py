@@ -441,13 +441,12 @@ def _xml_entries(text: str) -> dict[str, Any]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # with entities a small file can be huge
         raise ValueError("it declares a document type, which OpenCV's does not")
 
-    def words(element: ElementTree.Element) -> Any:
-        if len(element):
-            return {part.tag: words(part) for part in element}
-        found = (element.text or "").split()
+    def words(text: str | None) -> Any:
+        found = (text or "").split()
         return found[0] if len(found) == 1 else found
 
-    return {element.tag: words(element) for element in ElementTree.fromstring(text)}
+    root = ElementTree.fromstring(text)
+    return {one.tag: {part.tag: words(part.text) for part in one} if len(one) else words(one.text) for one in root}
 
 
 class _Loader(yaml.BaseLoader):
