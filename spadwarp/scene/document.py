@@ -15,16 +15,7 @@ from pydantic.fields import FieldInfo
 from spadwarp.errors import ConfigError
 from spadwarp.io.text import parse_toml
 from spadwarp.limits import parse_number, shown, suggestion
-from spadwarp.scene.sections import (
-    PRESETS,
-    Section,
-    field_unit,
-    interval_of,
-    models_of,
-    parts_of,
-    table_of,
-    with_paths,
-)
+from spadwarp.scene.sections import PRESETS, Section, field_unit, interval_of, models_of, parts_of, table_of, with_paths
 from spadwarp.units import quantity
 
 __all__ = ["parse_override"]

@@ -27,40 +27,30 @@ _STEPS = 30
 
 
 class Material(NamedTuple):
-    """Sellmeier's n² = 1 + Σ B λ²/(λ² − C), λ in µm, within a range [µm]."""
+    """Sellmeier's n² = 1 + Σ B λ²/(λ² − C), λ in µm, within a range [µm], and its source."""
 
-    terms: tuple[tuple[float, float], ...]
+    b: tuple[float, ...]
+    c: tuple[float, ...]
     low: float
     high: float
     source: str
 
 
-_PMMA = Material(((1.1819, 0.011313),), 0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C")
+_SULTANOVA = (0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C")
+_SAPPHIRE = "ordinary ray; Malitson (1962), as in Weber, Handbook of optical materials (2003)"
+_BK7_C, _SAPPHIRE_B = (0.00600069867, 0.0200179144, 103.560653), (1.4313493, 0.65054713, 5.3414021)
+_SILICA_C, _SAPPHIRE_C = ((0.0684043**2, 0.1162414**2, 9.896161**2), (0.0726631**2, 0.1193242**2, 18.028251**2))
+_PMMA = Material((1.1819,), (0.011313,), *_SULTANOVA)
 
-MATERIALS: dict[str, Material] = {
-    "BK7": Material(
-        ((1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)),
-        0.3,
-        2.5,
-        "SCHOTT, data sheet of N-BK7",
-    ),
+MATERIALS = {
+    "BK7": Material((1.03961212, 0.231792344, 1.01046945), _BK7_C, 0.3, 2.5, "SCHOTT, data sheet of N-BK7"),
     "fused silica": Material(
-        ((0.6961663, 0.0684043**2), (0.4079426, 0.1162414**2), (0.8974794, 9.896161**2)),
-        0.21,
-        6.7,
-        "Malitson, J. Opt. Soc. Am. 55, 1205 (1965)",
+        (0.6961663, 0.4079426, 0.8974794), _SILICA_C, 0.21, 6.7, "Malitson, J. Opt. Soc. Am. 55, 1205 (1965)"
     ),
-    "sapphire": Material(
-        ((1.4313493, 0.0726631**2), (0.65054713, 0.1193242**2), (5.3414021, 18.028251**2)),
-        0.2,
-        5.0,
-        "ordinary ray; Malitson (1962), as in Weber, Handbook of optical materials (2003)",
-    ),
+    "sapphire": Material(_SAPPHIRE_B, _SAPPHIRE_C, 0.2, 5.0, _SAPPHIRE),
     "acrylic": _PMMA,
     "PMMA": _PMMA,
-    "polycarbonate": Material(
-        ((1.4182, 0.021304),), 0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C"
-    ),
+    "polycarbonate": Material((1.4182,), (0.021304,), *_SULTANOVA),
 }
 """Materials of windows; the coefficients as refractiveindex.info lists them."""
 
@@ -74,9 +64,9 @@ def window_indices(material: str, wavelength_nm: float) -> tuple[float, float]:
     if not glass.low <= micrometres <= glass.high:
         low, high = 1e3 * glass.low, 1e3 * glass.high
         raise ValueError(f"material = {material!r} is known for [{low:g}, {high:g}] nm, not for {wavelength_nm:g} nm")
-    square = micrometres**2
-    index = math.sqrt(1.0 + sum(b * square / (square - c) for b, c in glass.terms))
-    slope = -sum(b * c * micrometres / (square - c) ** 2 for b, c in glass.terms) / index
+    square, terms = micrometres**2, list(zip(glass.b, glass.c, strict=True))
+    index = math.sqrt(1.0 + sum(b * square / (square - c) for b, c in terms))
+    slope = -sum(b * c * micrometres / (square - c) ** 2 for b, c in terms) / index
     return index, index - micrometres * slope
 
 
@@ -153,19 +143,11 @@ class Port(Section):
     ) -> PortGeometry:
         """The port with its lengths from `origin` and its normal in the frame of the camera; `water`: (phase, group)
         index of the water. Raises as `indices` does."""
-        (n_inside, g_inside), (n_window, g_window) = self.indices(wavelength_nm)
+        index, group_index = zip(*self.indices(wavelength_nm), water, strict=True)
         normal = np.asarray(normal, np.float64)
-        centre = origin + np.array(self.offset)
-        return PortGeometry(
-            shape=self.shape,
-            distance=(self.distance or 0.0) + float(origin @ normal),
-            normal=vector_of(normal),
-            radius=self.radius or 0.0,
-            centre=vector_of(centre),
-            thickness=self.thickness,
-            index=(n_inside, n_window, water[0]),
-            group_index=(g_inside, g_window, water[1]),
-        )
+        distance, centre = (self.distance or 0.0) + float(origin @ normal), origin + np.array(self.offset)
+        radius, ends = self.radius or 0.0, (vector_of(normal), vector_of(centre))
+        return PortGeometry(self.shape, distance, ends[0], radius, ends[1], self.thickness, index, group_index)
 
 
 @dataclass(frozen=True)
@@ -191,12 +173,6 @@ class PortGeometry:
     group_index: tuple[float, float, float]
 
     @property
-    def delays(self) -> tuple[float, float]:
-        """Group indices inside and in the window over that of the water."""
-        inside, window, water = self.group_index
-        return inside / water, window / water
-
-    @property
     def nearest(self) -> float:
         """Distance from the lens centre to the water [m]."""
         if self.shape == "flat":
@@ -208,10 +184,8 @@ class PortGeometry:
         if self.shape == "flat":
             ahead = self.distance - float(np.asarray(x) @ np.array(self.normal))
             return "" if ahead > 0.0 else f"it is {-ahead:.4g} m beyond the window's inner face"
-        away = math.dist(np.ravel(x), self.centre)
-        return (
-            "" if away < self.radius else f"it is {away:.4g} m from the dome's centre, the radius is {self.radius:g} m"
-        )
+        away, radius = math.dist(np.ravel(x), self.centre), self.radius
+        return "" if away < radius else f"it is {away:.4g} m from the dome's centre, the radius is {radius:g} m"
 
     def enter(self, x: ArrayLike, u: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
         """Rays from x inside along unit vectors u, `[..., 3]`, up to where they enter the water.
@@ -222,7 +196,8 @@ class PortGeometry:
         with np.errstate(invalid="ignore"):
             (inside, _, _, _, _), (window, _, _, y, v) = self._faces(x, u)
             inside = np.where(inside > 0.0, inside, np.nan)
-        return y, v, inside + window, self.delays[0] * inside + self.delays[1] * window
+        g_inside, g_window, g_water = self.group_index
+        return y, v, inside + window, g_inside / g_water * inside + g_window / g_water * window
 
     def transmission(self, x: ArrayLike, u: ArrayLike) -> Floats:
         """Fraction of unpolarised light that gets through, of rays from x inside along unit vectors u; 0: none."""
