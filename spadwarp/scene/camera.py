@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -102,24 +102,22 @@ class Camera(Section):
                 raise ValueError(f"{name} = {fields[name]} is not {read[name]}, the image's of the calibration")
         return {**read, **{name: value for name, value in fields.items() if name != "calibration"}}
 
-    @model_validator(mode="after")
-    def _determined(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         given = [name for name in ("horizontal_fov_deg", "pixel_pitch_um", "fx") if getattr(self, name) is not None]
         if len(given) != 1:
             hint = f"; given: {', '.join(given)}" if given else ""
-            raise ValueError(f"needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length{hint}")
+            yield f"needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length{hint}"
         if (self.aperture_diameter is None) == (self.f_number is None):
-            raise ValueError("needs either aperture_diameter or f_number with focal_length")
+            yield "needs either aperture_diameter or f_number with focal_length"
         needs_it = [name for name in ("f_number", "pixel_pitch_um") if getattr(self, name) is not None]
         if self.focal_length is None and needs_it:
-            raise ValueError(f"focal_length is missing; {needs_it[0]} needs it")
-        self._only_with("fx", self.fx is not None, "fy", "cx", "cy")
+            yield f"focal_length is missing; {needs_it[0]} needs it"
+        yield from self._only_with("fx", self.fx is not None, "fy", "cx", "cy")
         if self.focus_distance != "target" and self.focus_distance <= (self.focal_length or 0.0):
-            self._refuse("focus_distance", f"is outside ({self.focal_length}, inf], beyond the focal length")
+            yield self._that("focus_distance", f"is outside ({self.focal_length}, inf], beyond the focal length")
         if not is_invertible(self):
             size = f"{self.width} x {self.height}"
-            self._refuse("distortion", f"is not one-to-one: some of its {size} pixels show no direction, or two")
-        return self
+            yield self._that("distortion", f"is not one-to-one: some of its {size} pixels show no direction, or two")
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from spadwarp.errors import ConfigError, FileError, SpadwarpError
 from spadwarp.io.arrays import read_npz
@@ -71,23 +71,21 @@ class Grid(Section):
     """how photons fly through cells: "regular" from cell to cell, exact; "delta" by chance and without bias, faster
     where cells are many; "auto": the latter for more than 32 768 cells"""
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         if (self.file is None) == (self.shape is None):
-            raise ValueError("needs either file or shape")
+            yield "needs either file or shape"
         if self.file is not None and Path(self.file).suffix.lower() not in GRID_ENDINGS:
             is_vdb = self.file.lower().endswith(".vdb")
             hint = "; `nanovdb_convert` of OpenVDB makes a .nvdb file of it" if is_vdb else ""
-            self._refuse("file", f"does not end in {', '.join(GRID_ENDINGS)}{hint}")
+            yield self._that("file", f"does not end in {', '.join(GRID_ENDINGS)}{hint}")
         if self.shape is not None and self.size is None:
-            raise ValueError(f"needs size with shape = {self.shape!r}")
+            yield f"needs size with shape = {self.shape!r}"
         for name in ("size", "cells"):
             if len(getattr(self, name) or ()) == 2:
-                self._refuse(name, "has two numbers; one or three are needed")
+                yield self._that(name, "has two numbers; one or three are needed")
         if min(self.scale) <= 0.0:
-            self._refuse("scale", "is not positive")
-        self._only_with("shape", self.shape is not None, *_OF_SHAPES)
-        return self
+            yield self._that("scale", "is not positive")
+        yield from self._only_with("shape", self.shape is not None, *_OF_SHAPES)
 
     @property
     def edges(self) -> tuple[float, float, float] | None:

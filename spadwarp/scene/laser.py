@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
@@ -86,19 +87,17 @@ class Laser(Section):
     repetition_rate: float = field(20e6, "pulses per second [Hz]", "[1e-6, 1e15]")
     pulse_fwhm_ps: float = field(85.0, "pulse duration, full width at half maximum [ps]", "[0, 1e12]")
 
-    @model_validator(mode="after")
-    def _has_a_beam(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         if self.profile in ("gaussian", "measured") and self.half_angle_deg >= 90:
-            self._refuse("half_angle_deg", f"is outside (0, 90), the range of a {self.profile} profile")
+            yield self._that("half_angle_deg", f"is outside (0, 90), the range of a {self.profile} profile")
         if self.profile == "measured" and self.profile_image is None:
-            raise ValueError("needs profile_image with profile = 'measured': the path of an image of the beam")
-        self._only_with("profile = 'measured'", self.profile == "measured", "profile_image")
+            yield "needs profile_image with profile = 'measured': the path of an image of the beam"
+        yield from self._only_with("profile = 'measured'", self.profile == "measured", "profile_image")
         if self.linewidth_nm > (most := 0.2 * self.wavelength_nm):
             reason = f"is outside [0, {most:g}], a fifth of wavelength_nm; a broader source needs spectrum"
-            self._refuse("linewidth_nm", reason)
+            yield self._that("linewidth_nm", reason)
         if self.spectrum is not None and self.linewidth_nm > 0.0:
-            self._refuse("linewidth_nm", "cannot be combined with spectrum")
-        return self
+            yield self._that("linewidth_nm", "cannot be combined with spectrum")
 
     @model_validator(mode="after")
     def _has_one_energy(self) -> Self:
@@ -108,14 +107,14 @@ class Laser(Section):
         (given,) = self.given
         duration, rate = _GAUSSIAN_AREA * self.pulse_fwhm_ps * 1e-12, self.repetition_rate
         if given == "peak_power" and duration == 0.0:
-            self._refuse("peak_power", "needs pulse_fwhm_ps > 0, from which the energy follows")
+            raise ValueError(self._that("peak_power", "needs pulse_fwhm_ps > 0, from which the energy follows"))
         energy = self.pulse_energy
         if given == "average_power":
             energy = self.average_power / rate
         elif given == "peak_power":
             energy = self.peak_power * duration
         if energy not in (allowed := field_range(Laser, "pulse_energy")):
-            self._refuse(given, f"makes pulses of {energy:.3g} J, outside {allowed}")
+            raise ValueError(self._that(given, f"makes pulses of {energy:.3g} J, outside {allowed}"))
         powers = {"average_power": energy * rate, "peak_power": energy / duration if duration else math.inf}
         derived = {"pulse_energy": energy} | powers
         self.__dict__.update({name: value for name, value in derived.items() if name != given})

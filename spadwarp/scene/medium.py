@@ -5,7 +5,8 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -158,7 +159,9 @@ class Water(Section):
             if self.extinction not in (allowed := field_range(type(self), "extinction")):
                 raise ValueError(f"extinction = {self.extinction} is outside {allowed}")
         elif self.given or self.preset is not None:
-            self._refuse("chlorophyll", f"cannot be combined with {', '.join(self.given or ['preset'])}")
+            raise ValueError(
+                self._that("chlorophyll", f"cannot be combined with {', '.join(self.given or ['preset'])}")
+            )
         return self
 
     @property
@@ -175,21 +178,13 @@ class Layer(Water):
 
 
 class WaterRange(NamedTuple):
-    """Extremes over all water of a scene.
+    """Extremes over all water of a scene."""
 
-    Attributes:
-        extinction: The largest [1/m].
-        scattering: The largest [1/m].
-        absorption: The least [1/m].
-        albedo: The largest, of "lu2024" none.
-        anisotropies: Mean cosines beside the medium's own, the least and the largest of a grid.
-    """
-
-    extinction: float
-    scattering: float
-    absorption: float
-    albedo: float
-    anisotropies: tuple[float, ...]
+    extinction: float  # the largest [1/m]
+    scattering: float  # the largest [1/m]
+    absorption: float  # the least [1/m]
+    albedo: float  # the largest, of "lu2024" none
+    anisotropies: tuple[float, ...]  # mean cosines beside the medium's own, the least and the largest of a grid
 
 
 class Medium(Water):
@@ -239,41 +234,35 @@ class Medium(Water):
             raise ValueError(f"is neither a number nor one of {', '.join(map(repr, WATER_INDICES))}")
         return WATER_INDICES[value][info.field_name == "group_index"] if isinstance(value, str) else value
 
-    @model_validator(mode="after")
-    def _tables_of_scattering(self) -> Self:
-        for law, (needed, _) in PHASE_FIELDS.items():
+    def _problems(self) -> Iterator[str]:
+        law, own_law = self.phase_function, "goes with phase_function = 'henyey_greenstein' only"
+        for other, (needed, _) in PHASE_FIELDS.items():
             missing = [name for name in needed if getattr(self, name) is None]
-            if law == self.phase_function and missing:
-                raise ValueError(f"needs {', '.join(missing)} with phase_function = {law!r}")
-            self._only_with(f"phase_function = {law!r}", law == self.phase_function, *needed)
+            if other == law and missing:
+                yield f"needs {', '.join(missing)} with phase_function = {law!r}"
+            yield from self._only_with(f"phase_function = {other!r}", other == law, *needed)
         has_table = self.scattering_matrix == "tabulated"
         if has_table and self.matrix_table is None:
-            raise ValueError("needs matrix_table with scattering_matrix = 'tabulated'")
-        self._only_with("scattering_matrix = 'tabulated'", has_table, "matrix_table")
-        return self
-
-    @model_validator(mode="after")
-    def _resolved(self) -> Self:
-        own_law = "goes with phase_function = 'henyey_greenstein' only"
+            yield "needs matrix_table with scattering_matrix = 'tabulated'"
+        yield from self._only_with("scattering_matrix = 'tabulated'", has_table, "matrix_table")
         for i, layer in enumerate(self.layers):
             if i and layer.start <= (before := self.layers[i - 1].start):
-                raise ValueError(f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it")
+                yield f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it"
             if (layer.albedo == "lu2024") != (self.albedo == "lu2024"):
-                raise ValueError(
-                    f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
-                )
+                yield f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
             # A preset may bring one with it, which is no more than what the medium's own preset may.
             own = PRESETS["medium"][layer.preset].values.get("anisotropy") if layer.preset else None
-            if self.phase_function != "henyey_greenstein" and layer.anisotropy not in (None, own):
-                raise ValueError(f"layers[{i}].anisotropy = {layer.anisotropy} {own_law}; layers share any other")
-        if self.grid is not None:
-            if self.layers:
-                count = len(self.layers)
-                raise ValueError(f"grid does not go with layers, {count} given; cells can repeat them, from a file")
-            if self.albedo == "lu2024":
-                raise ValueError("grid does not go with albedo = 'lu2024', which has no cells; give it a number")
-            if self.grid.anisotropy is not None and self.phase_function != "henyey_greenstein":
-                raise ValueError(f"grid.anisotropy = {self.grid.anisotropy} {own_law}; cells share any other")
+            if law != "henyey_greenstein" and layer.anisotropy not in (None, own):
+                yield f"layers[{i}].anisotropy = {layer.anisotropy} {own_law}; layers share any other"
+        if self.grid is not None and self.layers:
+            yield f"grid does not go with layers, {len(self.layers)} given; cells can repeat them, from a file"
+        if self.grid is not None and self.albedo == "lu2024":
+            yield "grid does not go with albedo = 'lu2024', which has no cells; give it a number"
+        if self.grid is not None and self.grid.anisotropy is not None and law != "henyey_greenstein":
+            yield f"grid.anisotropy = {self.grid.anisotropy} {own_law}; cells share any other"
+
+    @model_validator(mode="after")
+    def _at_default_wavelength(self) -> Self:
         self._follow(Laser.model_fields["wavelength_nm"].default)
         return self
 
@@ -350,18 +339,15 @@ class Medium(Water):
     @property
     def range(self) -> WaterRange:
         """Extremes over the medium, its layers and its grid. Raises what `grid_cells` raises."""
-        extinction = [water.extinction for water in self.waters]
-        scattering = [water.scattering for water in self.waters]
-        absorption = [water.extinction - water.scattering for water in self.waters]
-        albedo = [water.scattering / max(water.extinction, 1e-30) for water in self.waters]
+        rows = [(water.extinction, water.scattering) for water in self.waters]
+        extremes = [(c, b, c - b, b / max(c, 1e-30)) for c, b in rows]
         g = [layer.anisotropy for layer in self.layers if layer.anisotropy is not None]
         if self.grid is not None:
             cells = grid_cells(self)
-            extinction.append(float(cells.extinction.max()))
-            scattering.append(float(cells.scattering.max()))
-            absorption.append(float((cells.extinction - cells.scattering).min()))
-            albedo.append(float(cells.albedo.max()))
-            g += [] if cells.anisotropy is None else [float(cells.anisotropy.min()), float(cells.anisotropy.max())]
+            c, b, own = cells.extinction, cells.scattering, cells.anisotropy
+            extremes.append((float(c.max()), float(b.max()), float((c - b).min()), float(cells.albedo.max())))
+            g += [] if own is None else [float(own.min()), float(own.max())]
+        extinction, scattering, absorption, albedo = zip(*extremes, strict=True)
         return WaterRange(max(extinction), max(scattering), max(0.0, min(absorption)), max(albedo), tuple(g))
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
@@ -401,13 +387,10 @@ def grid_cells(medium: Medium) -> GridCells:
     """
     grid, albedo = medium.grid, medium.albedo
     assert grid is not None and not isinstance(albedo, str)  # see Medium
-    stamp: tuple[int, int] | None = None
-    if grid.file is not None:
-        try:
-            status = Path(grid.file).stat()
-            stamp = status.st_mtime_ns, status.st_size
-        except OSError:
-            stamp = None  # the reader says why
+    stamp = None
+    with suppress(OSError):  # the reader says why
+        status = Path(grid.file or "").stat()
+        stamp = status.st_mtime_ns, status.st_size
     return cells_of(grid, (medium.extinction, albedo, medium.anisotropy), medium.has_phase_table, stamp)
 
 
@@ -487,13 +470,11 @@ def phase_function(medium: Medium) -> PhaseFunction:
         numbers: dict[str, Any] = {"g": medium.anisotropy} if name == "henyey_greenstein" else dict(parameters)
         density = partial(getattr(sk, f"{name}_density"), **numbers)
     share = medium.molecular_share
-    if share > 0.0:
-        of_particles = density
 
-        def density(t: Floats) -> Floats:
-            return (1.0 - share) * of_particles(t) + share * molecular_density(t)
+    def mixed(t: Floats) -> Floats:
+        return (1.0 - share) * density(t) + share * molecular_density(t)
 
-    return PhaseFunction(name, parameters, share, density, first_angle)
+    return PhaseFunction(name, parameters, share, mixed if share > 0.0 else density, first_angle)
 
 
 Matrix = Callable[[Floats], Floats]
@@ -508,13 +489,14 @@ def scattering_matrix(medium: Medium) -> Matrix | None:
 
     Raises `FileError` or `ConfigError` if its table cannot be read.
     """
-    if medium.scattering_matrix == "rayleigh":
-        return partial(rayleigh_matrix, depolarisation_ratio=medium.depolarisation_ratio)
-    if medium.scattering_matrix == "scaled_rayleigh":
-        return partial(scaled_rayleigh_matrix, largest=medium.largest_polarisation)
     if medium.scattering_matrix == "tabulated":
         try:
             return read_matrix_table(str(medium.matrix_table))
         except ConfigError as error:
             raise ConfigError(f"medium.matrix_table: {error}") from None
-    return voss_fry_matrix if medium.scattering_matrix == "voss_fry" else None
+    return {
+        "none": None,
+        "rayleigh": partial(rayleigh_matrix, depolarisation_ratio=medium.depolarisation_ratio),
+        "scaled_rayleigh": partial(scaled_rayleigh_matrix, largest=medium.largest_polarisation),
+        "voss_fry": voss_fry_matrix,
+    }[medium.scattering_matrix]

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from spadwarp.scene.pose import vector_of
 from spadwarp.scene.sections import Direction, Section, Vector, field, unit_vector
@@ -106,20 +106,18 @@ class Port(Section):
     inside_group_index: float | None = Field(None, ge=1, le=4)
     """group index inside; default: that of air, or inside_index"""
 
-    @model_validator(mode="after")
-    def _determined(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         needed = "distance" if self.shape == "flat" else "radius"
         if getattr(self, needed) is None:
-            raise ValueError(f"needs {needed} with shape = {self.shape!r}")
-        self._only_with("shape = 'flat'", self.shape == "flat", "distance", "normal")
-        self._only_with("shape = 'dome'", self.shape == "dome", "radius", "offset")
+            yield f"needs {needed} with shape = {self.shape!r}"
+        yield from self._only_with("shape = 'flat'", self.shape == "flat", "distance", "normal")
+        yield from self._only_with("shape = 'dome'", self.shape == "dome", "radius", "offset")
         if self.material is not None and self.index is not None:
-            raise ValueError(f"needs either material or index; given: {self.material!r} and {self.index}")
+            yield f"needs either material or index; given: {self.material!r} and {self.index}"
         if (self.thickness > 0.0) != (self.material is not None or self.index is not None):
-            raise ValueError(f"needs material or index and a thickness > 0, or neither; thickness = {self.thickness}")
-        self._only_with("index", self.index is not None, "group_index")
-        self._only_with("inside_index", self.inside_index is not None, "inside_group_index")
-        return self
+            yield f"needs material or index and a thickness > 0, or neither; thickness = {self.thickness}"
+        yield from self._only_with("index", self.index is not None, "group_index")
+        yield from self._only_with("inside_index", self.inside_index is not None, "inside_group_index")
 
     def indices(self, wavelength_nm: float) -> tuple[tuple[float, float], tuple[float, float]]:
         """(phase, group) index of what is inside, and of the window.

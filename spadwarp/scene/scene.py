@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import itertools
 import math
 import os
 import re
@@ -12,11 +11,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, model_validator
+from pydantic import BeforeValidator
 
 from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
@@ -54,15 +53,13 @@ class Scene(Document):
     output: Output = Output()
     analytic: Analytic = Analytic()
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        try:
+    def _problems(self) -> Iterator[str]:
+        try:  # the water that the laser's light meets
             self.__dict__["medium"] = self.medium.at_wavelength(self.laser.wavelength_nm)
         except ValueError as error:
-            raise ValueError(f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold") from None
-        for problem in itertools.chain(self._exclusions(), self._blocked_ports()):
-            raise ValueError(problem)
-        return self
+            yield f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold"
+        yield from self._exclusions()
+        yield from self._blocked_ports()
 
     def _exclusions(self) -> Iterator[str]:
         """Why sections exclude each other."""

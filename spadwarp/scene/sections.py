@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,16 +240,26 @@ class Section(BaseModel):
         hidden = set(self.alternatives) - set(self.given)
         return {name: plain(value) for name, value in self if value not in (None, ()) and name not in hidden}
 
-    def _refuse(self, name: str, reason: str) -> None:
-        """Raises `ValueError` for a field of a value that others exclude."""
-        value = getattr(self, name)
-        raise ValueError(f"{name} = {list(value) if isinstance(value, tuple) else value!r} {reason}")
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for problem in self._problems():
+            raise ValueError(problem)
+        return self
 
-    def _only_with(self, other: str, holds: bool, *names: str) -> None:
-        """Refuses fields off their defaults where what they need does not hold, such as `shape = 'dome'`."""
+    def _problems(self) -> Iterator[str]:
+        """Why fields exclude each other."""
+        yield from ()
+
+    def _that(self, name: str, reason: str) -> str:
+        """A problem of a field: `half_angle_deg = 95.0 is outside (0, 90)`."""
+        value = getattr(self, name)
+        return f"{name} = {list(value) if isinstance(value, tuple) else value!r} {reason}"
+
+    def _only_with(self, other: str, holds: bool, *names: str) -> Iterator[str]:
+        """Problems of fields off their defaults where what they need does not hold, such as `shape = 'dome'`."""
         for name in names:
             if not holds and getattr(self, name) != type(self).model_fields[name].default:
-                self._refuse(name, f"goes with {other} only")
+                yield self._that(name, f"goes with {other} only")
 
 
 def plain(value: Any) -> Any:

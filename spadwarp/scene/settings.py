@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from spadwarp.limits import SEED, bounds
 from spadwarp.scene.sections import (
@@ -51,24 +52,22 @@ class Target(Section):
     roughness: float = field(0.2, "width of that lobe: GGX parameter α", "[0.01, 1]")
     specular_index: float = field(1.5, "phase index of its facets; for polarised light alone", "[1, 10]")
 
-    @model_validator(mode="after")
-    def _one_mesh(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         if (self.builtin is None) == (self.mesh is None):
-            raise ValueError("needs either builtin or mesh")
+            yield "needs either builtin or mesh"
         if not all(self.scale):
-            self._refuse("scale", "holds a zero")
+            yield self._that("scale", "holds a zero")
         if self.size is not None and self.builtin is None:
-            self._refuse("size", "goes with builtin only; a mesh file takes scale")
+            yield self._that("size", "goes with builtin only; a mesh file takes scale")
         if self.reflectance == "from_file":
             if self.mesh is None:
-                self._refuse("reflectance", "goes with mesh only; a builtin takes a number")
+                yield self._that("reflectance", "goes with mesh only; a builtin takes a number")
         elif self.reflectance + self.specular > 1:
-            raise ValueError(
+            yield (
                 f"specular = {self.specular:g} and reflectance = {self.reflectance:g} reflect more than arrives:"
                 " their sum is outside [0, 1]"
             )
-        self._only_with("reflectance = 'from_file'", self.reflectance == "from_file", "reflectance_scale")
-        return self
+        yield from self._only_with("reflectance = 'from_file'", self.reflectance == "from_file", "reflectance_scale")
 
 
 Index = Annotated[float, Field(ge=1, le=1e9)]
@@ -100,19 +99,17 @@ class Domain(Section):
     max_reflections: Whole = Field(2, ge=0, le=8)
     """longest chain of reflections on the way from a scattering to the lens; light by longer ones is left out"""
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         for axis, low, high in zip("xyz", *self.bounds, strict=True):
             if not low < high:
-                raise ValueError(f"lower = {low} is outside (-inf, {high}), {high} being upper in {axis}")
+                yield f"lower = {low} is outside (-inf, {high}), {high} being upper in {axis}"
         for name in self.reflecting:
             bound = self.bounds[name.endswith("high")]["xyz".index(name[0])]
             if math.isinf(bound):
-                raise ValueError(
+                yield (
                     f"outside_index.{name}: the domain has no such face with shape = {self.shape!r}; a slab has z_low "
                     "and z_high, a box all six, each where lower or upper is finite"
                 )
-        return self
 
     @property
     def reflecting(self) -> dict[str, float]:
@@ -193,16 +190,14 @@ class Detector(Section):
     pulses_per_frame: Whole = field(20_000, "laser pulses in one frame of counts", "[1, 9223372036854775807]")
     max_count: Whole = field(0, "largest count a histogram bin holds; 0 is unlimited", "[0, 2147483647]")
 
-    @model_validator(mode="after")
-    def _one_filter(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         for name in ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"):
             if getattr(self, name) == Detector.model_fields[name].default:
                 continue
             if self.filter_table is not None:
-                self._refuse(name, "cannot be combined with filter_table")
+                yield self._that(name, "cannot be combined with filter_table")
             if self.filter_fwhm_nm is None:
-                self._refuse(name, "needs filter_fwhm_nm")
-        return self
+                yield self._that(name, "needs filter_fwhm_nm")
 
     @property
     def has_filter(self) -> bool:
