@@ -42,22 +42,14 @@ class CheckMessage:
 
 @dataclass(frozen=True)
 class OnAxis:
-    """Unscattered light on the beam's axis at the range of the nearest illuminated point.
+    """Unscattered light on the beam's axis at the range of the nearest illuminated point."""
 
-    Attributes:
-        distance: That range [m].
-        optical_depth: To it, one way.
-        irradiance: Mean over time [W/m²].
-        samples_per_pixel: Traced photons that reach one pixel's part of the target.
-        photons_per_pixel, signal_per_pulse: Photons from the target that a pixel receives, and detects, from a pulse.
-    """
-
-    distance: float
-    optical_depth: float
-    irradiance: float
-    samples_per_pixel: float
-    photons_per_pixel: float
-    signal_per_pulse: float
+    distance: float  # that range [m]
+    optical_depth: float  # to it, one way
+    irradiance: float  # mean over time [W/m²]
+    samples_per_pixel: float  # traced photons that reach one pixel's part of the target
+    photons_per_pixel: float  # from the target, of a pulse
+    signal_per_pulse: float  # detected of these
 
 
 class Survey:

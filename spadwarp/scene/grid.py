@@ -306,23 +306,14 @@ def _checked(found: Mapping[str, NDArray[Any]]) -> GridFile:
 
 @dataclass(frozen=True, eq=False)
 class GridCells:
-    """Cells of water in a box, and what light loses on straight lines through it.
+    """Cells of water in a box, and what light loses on straight lines through it."""
 
-    Attributes:
-        extinction: c [1/m], `[x, y, z]` along the box's own axes.
-        albedo: b/c.
-        anisotropy: g; None: the medium's everywhere.
-        size: Edges of the box [m].
-        centre: Its middle in the world [m].
-        rotation: Its own axes in the world, as columns.
-    """
-
-    extinction: NDArray[np.float32]
-    albedo: NDArray[np.float32]
-    anisotropy: NDArray[np.float32] | None
-    size: Place
-    centre: Place
-    rotation: Floats
+    extinction: NDArray[np.float32]  # c [1/m], `[x, y, z]` along the box's own axes
+    albedo: NDArray[np.float32]  # b/c
+    anisotropy: NDArray[np.float32] | None  # g; None: the medium's everywhere
+    size: Place  # edges of the box [m]
+    centre: Place  # its middle in the world [m]
+    rotation: Floats  # its own axes in the world, as columns
 
     @property
     def scattering(self) -> NDArray[np.float32]:

@@ -159,9 +159,8 @@ class Water(Section):
             if self.extinction not in (allowed := field_range(type(self), "extinction")):
                 raise ValueError(f"extinction = {self.extinction} is outside {allowed}")
         elif self.given or self.preset is not None:
-            raise ValueError(
-                self._that("chlorophyll", f"cannot be combined with {', '.join(self.given or ['preset'])}")
-            )
+            others = ", ".join(self.given or ["preset"])
+            raise ValueError(self._that("chlorophyll", f"cannot be combined with {others}"))
         return self
 
     @property

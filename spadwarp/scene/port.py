@@ -150,24 +150,15 @@ class Port(Section):
 
 @dataclass(frozen=True)
 class PortGeometry:
-    """A port: a window between two planes across `normal`, or between two spheres about `centre`.
+    """A port: a window between two planes across `normal`, or between two spheres about `centre`."""
 
-    Attributes:
-        shape: "flat" or "dome".
-        distance: flat: from the camera's lens centre along the normal to the inner face [m].
-        normal: flat: unit vector into the water.
-        radius, centre: dome: of the inner face [m].
-        thickness: Of the window [m].
-        index, group_index: Of what is inside, of the window, of the water.
-    """
-
-    shape: str
-    distance: float
-    normal: tuple[float, float, float]
-    radius: float
-    centre: tuple[float, float, float]
-    thickness: float
-    index: tuple[float, float, float]
+    shape: str  # "flat" or "dome"
+    distance: float  # flat: from the camera's lens centre along the normal to the inner face [m]
+    normal: tuple[float, float, float]  # flat: unit vector into the water
+    radius: float  # dome: of the inner face [m]
+    centre: tuple[float, float, float]  # dome [m]
+    thickness: float  # of the window [m]
+    index: tuple[float, float, float]  # phase index of what is inside, of the window, of the water
     group_index: tuple[float, float, float]
 
     @property

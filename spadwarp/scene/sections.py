@@ -176,7 +176,9 @@ class Section(BaseModel):
     def _over_preset(cls, fields: Any) -> Any:
         if not isinstance(fields, Mapping):
             return fields
-        return with_units(cls, fields) if cls._preset(fields) is None else cls.merged({}, fields)
+        if cls._preset(fields) is not None:
+            return cls.merged({}, fields)
+        return {name: value for name, value in with_units(cls, fields).items() if value is not None}
 
     @field_validator("*", mode="before")
     @classmethod

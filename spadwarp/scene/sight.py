@@ -71,22 +71,14 @@ class LinesOfSight:
 
     A range is the length along the bent ray from the lens centre, a path the length in water that light needs as long
     for as from the laser by the point to the lens.
-
-    Attributes:
-        start: Where the lines begin: the lens centre, or where they leave the port [m], `[..., 3]`.
-        direction: Unit vectors, `[..., 3]`.
-        lead: Length of the way from the lens centre to the start [m].
-        delay: Length in water that takes as long [m].
-        laser: Position of the laser [m].
-        laser_port: What it shines through.
     """
 
-    start: Floats
-    direction: Floats
-    lead: Floats
-    delay: Floats
-    laser: Floats
-    laser_port: PortGeometry | None = None
+    start: Floats  # where the lines begin: the lens centre, or where they leave the port [m], `[..., 3]`
+    direction: Floats  # unit vectors, `[..., 3]`
+    lead: Floats  # length of the way from the lens centre to the start [m]
+    delay: Floats  # length in water that takes as long [m]
+    laser: Floats  # position of the laser [m]
+    laser_port: PortGeometry | None = None  # what it shines through
 
     @classmethod
     def in_water(cls, view: Floats, laser: Floats, port: PortGeometry | None = None) -> LinesOfSight:
