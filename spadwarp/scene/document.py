@@ -7,7 +7,7 @@ import re
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, PrivateAttr, ValidationError
 from pydantic.fields import FieldInfo
@@ -15,7 +15,17 @@ from pydantic.fields import FieldInfo
 from spadwarp.errors import ConfigError
 from spadwarp.io.text import parse_toml
 from spadwarp.limits import parse_number, shown, suggestion
-from spadwarp.scene.sections import PRESETS, Section, field_unit, interval_of, models_of, parts_of, table_of, with_paths
+from spadwarp.scene.sections import (
+    PRESETS,
+    Section,
+    field_unit,
+    interval_of,
+    models_of,
+    parts_of,
+    table_of,
+    takes_any_table,
+    with_paths,
+)
 from spadwarp.units import quantity
 
 __all__ = ["parse_override"]
@@ -27,6 +37,8 @@ Overrides = Mapping[str, Any] | Sequence[str]
 class Document(Section):
     """What a TOML file holds. Documents are equal in every field; where they came from does not matter."""
 
+    overrides_beside_file: ClassVar[bool] = False
+    """Whether relative paths in overrides start at the file's folder too, not at the working directory."""
     _source: Path | None = PrivateAttr(None)
 
     @classmethod
@@ -35,15 +47,15 @@ class Document(Section):
 
         Raises `ConfigError` with a line for each problem.
         """
-        return cls._built(tables, source=source)
+        return cls.read(tables, source=source)
 
     @classmethod
     def from_toml(cls, text: str, *, source: str | os.PathLike[str] | None = None) -> Self:
         """From the text that `to_toml` made, in a file of results or frames. Raises `ConfigError`."""
-        return cls._built(parse_toml(text), source=source)
+        return cls.read(parse_toml(text), source=source)
 
     @classmethod
-    def _built(
+    def read(
         cls,
         tables: Mapping[str, Any],
         *,
@@ -51,20 +63,23 @@ class Document(Section):
         source: str | os.PathLike[str] | None = None,
         is_absolute: bool = False,
     ) -> Self:
+        """From tables and overrides; `is_absolute`: their paths are already. Raises `ConfigError`."""
         layer: dict[str, Any] = {}
         try:
-            if source is not None and not is_absolute:
-                tables = _absolute(cls, tables, Path(source).absolute().parent)
+            folder = None if source is None else Path(source).absolute().parent
+            tables = tables if is_absolute else _absolute(cls, tables, folder)
+            here = folder if cls.overrides_beside_file else Path.cwd()
             items: dict[str, Any] = {}
             for key, value in override_pairs(overrides or {}):
                 # Items of lists that may be defaults, or follow from other fields, are set in what is complete.
                 _insert(cls, items if any(isinstance(part, int) for part in key[2:]) else layer, key, value)
             if layer:
-                tables = cls.merged(tables, _absolute(cls, layer, Path.cwd()))
+                tables = cls.merged(tables, _absolute(cls, layer, here))
             made = cls.model_validate(tables)
             if items:
                 layer = items
-                made = cls.model_validate(cls.merged(made.to_dict(), _absolute(cls, items, Path.cwd())))
+                made = cls.model_validate(cls.merged(made.to_dict(), _absolute(cls, items, here)))
+            made._check()
         except ConfigError as error:
             raise ConfigError(error.problems, source=None if source is None else str(source)) from None
         except ValidationError as error:
@@ -72,6 +87,9 @@ class Document(Section):
             raise ConfigError(lines, source=None if source is None else str(source)) from None
         made._source = None if source is None else Path(source)
         return made
+
+    def _check(self) -> None:
+        """Raises `ConfigError` for what its tables cannot show."""
 
     @property
     def source(self) -> Path | None:
@@ -107,7 +125,7 @@ class Document(Section):
         changed = self
         for layer in (overrides, sections):
             if layer:
-                changed = self._built(changed.to_dict(), overrides=layer, source=self.source, is_absolute=True)
+                changed = self.read(changed.to_dict(), overrides=layer, source=self.source, is_absolute=True)
         return changed
 
     def __eq__(self, other: object) -> bool:
@@ -122,8 +140,10 @@ def toml_text(tables: Mapping[str, Any]) -> str:
     return re.sub(r"\n +", " ", re.sub(r",\n *(?=\])|(?<=\[)\n +", "", tomli_w.dumps(tables)))
 
 
-def _absolute(model: type[BaseModel], tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _absolute(model: type[BaseModel], tables: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
     """The tables with paths that are relative to a folder made absolute."""
+    if folder is None:
+        return dict(tables)
 
     def placed(name: str) -> str:
         path = folder / os.path.expanduser(name)
@@ -227,7 +247,8 @@ def _insert(model: type[BaseModel], layer: dict[Any, Any], key: Key, value: Any)
             raise ConfigError(f"{whole} does not name a field; write section.field or targets[0].field")
         if table is not None and isinstance(part, str):
             origins = [typing.get_origin(one) for one in parts_of(table.model_fields.get(part))]
-            is_known, table = part in table.model_fields and dict not in origins, table_of(table, part)
+            is_known = part in table.model_fields and not takes_any_table(table, part)
+            table = table_of(table, part)
             is_list = table is not None and tuple in origins
         else:
             is_list = False

@@ -366,7 +366,8 @@ def cells_of(grid: Grid, water: tuple[float, float, float], has_table: bool, sta
 
     `has_table`: whether scattering is drawn from a table, which all cells share. `stamp` changes when the file does.
     """
-    edges, origin, found = grid.edges, None, {}
+    edges, origin = grid.edges, None
+    found: dict[str, Any]
     if grid.file is None:
         found = {"density": shape_density(grid)}
     else:

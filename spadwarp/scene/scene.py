@@ -229,7 +229,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     tables = read_toml(path)
     if "scene" in tables and "laser" not in tables:
         raise ConfigError("a recipe of a dataset, for `spadwarp dataset`, not a scene", source=str(path))
-    return Scene._built(tables, overrides=overrides, source=path)
+    return Scene.read(tables, overrides=overrides, source=path)
 
 
 def template() -> str:

@@ -268,6 +268,8 @@ def plain(value: Any) -> Any:
     """The value of a field as TOML has it: tables and lists."""
     if isinstance(value, tuple) and value and isinstance(value[0], Section):
         return [item.to_dict() for item in value]
+    if isinstance(value, dict):
+        return {name: plain(item) for name, item in value.items()}
     return value.to_dict() if isinstance(value, Section) else value
 
 
@@ -325,6 +327,12 @@ def table_of(model: type[BaseModel], name: str) -> type[Section] | None:
     """The model of a field's table, or of the tables of its list."""
     info = model.model_fields.get(name)
     return next((one for one in models_of(info) if issubclass(one, Section)), None)
+
+
+@cache
+def takes_any_table(model: type[BaseModel], name: str) -> bool:
+    """Whether a field is a table without a model."""
+    return any(typing.get_origin(part) is dict for part in parts_of(model.model_fields.get(name)))
 
 
 def field_unit(info: FieldInfo) -> str | None:

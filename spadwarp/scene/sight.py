@@ -88,8 +88,8 @@ class LinesOfSight:
 
     def __getitem__(self, index: Any) -> LinesOfSight:
         """The lines of some pixels."""
-        parts = (part[index] for part in (self.start, self.direction, self.lead, self.delay))
-        return LinesOfSight(*parts, self.laser, self.laser_port)
+        lines = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
+        return LinesOfSight(*lines, self.laser, self.laser_port)
 
     def flat(self) -> LinesOfSight:
         """The lines of all pixels in one row, `[P, 3]`."""
