@@ -67,8 +67,7 @@ class Camera(Section):
     pixel_pitch_um: float | None = field(None, "side of a pixel [µm]", "[1e-9, 1e6]")
     fx: float | None = field(None, "focal length along rows [pixels], as OpenCV writes it", "[0.001, 1e9]")
     fy: float | None = field(None, "focal length along columns [pixels]; fx if not given", "[0.001, 1e9]")
-    cx: Coordinate | None = None
-    """column of the optical axis, 0 at the first pixel's centre; default: the middle"""
+    cx: Coordinate | None = field(None, "column of the optical axis, 0 at the first pixel's centre; default: middle")
     cy: Coordinate | None = field(None, "row of the optical axis, likewise")
     distortion: Brown = field((0.0,) * 5, "Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
     calibration: AnyFile = field(None, "OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place")
@@ -78,8 +77,7 @@ class Camera(Section):
         Annotated[float, Field(ge=1e-6, le=math.inf, allow_inf_nan=True)] | Literal["target"], Infinite
     ] = "target"
     """depth that is imaged sharply [m], inf or "infinity"; "target": that of the first target on the optical axis"""
-    pinhole: bool = False
-    """whether the lens is a point, which images all depths sharply and collects the light of the aperture's area"""
+    pinhole: bool = field(False, "whether the lens is a point: all depths sharp, the light of the aperture's area")
     position: Vector = field((0.0, 0.0, 0.0), "lens centre in the world [m]")
     rotation_deg: Vector = field((0.0, 0.0, 0.0), "rotations from the world's axes about x, the new y, the new z [°]")
     polarisation: Literal["none", "analyser", "stokes"] = "none"
@@ -88,8 +86,7 @@ class Camera(Section):
     """analyser: direction of the field that it lets through, in the image from +x towards +y [°]"""
     analyser_extinction_ratio: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True), Infinite] = math.inf
     """analyser: light that it lets through along its direction over light across; inf or "infinity" is ideal"""
-    port: Port | None = None
-    """what it looks through; view and focus are those in air. Without one it is in water"""
+    port: Port | None = field(None, "what it looks through; view and focus are those in air; without it in water")
 
     @model_validator(mode="before")
     @classmethod

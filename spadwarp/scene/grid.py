@@ -54,12 +54,11 @@ class Grid(Section):
     cells: Counts = field((64,), "shape: number of cells along the edges; one number: along the longest")
     extinction: float = field(1.0, "what density 1 adds to the medium's extinction [1/m]", "[0, 1e6]")
     albedo: float = field(0.8, "single-scattering albedo of what is added", "[0, 1]")
-    anisotropy: float | None = Field(None, gt=-1, lt=1)
-    """henyey_greenstein: mean cosine of the scattering by what is added; default: the medium's"""
+    anisotropy: float | None = field(None, "henyey_greenstein: g of what is added; default: the medium's", "(-1, 1)")
     turbulence: float = Field(0.0, ge=0, le=3)
     """shape: standard deviation of the logarithm of the density about the shape, by eddies of von Kármán's spectrum"""
     eddy_size: float | None = Field(None, ge=1e-6, le=1e9)
-    """shape: size of the largest eddies; default: a third of the box's shortest edge [m]"""
+    """shape: the largest; default: a third of the shortest edge [m]"""
     seed: Whole = field(0, "shape: of the turbulence", "[0, 9223372036854775807]")
     frame: float = Field(0.0, ge=0, le=1e9)
     """time, for what moves: in a file's frames, between which cells are interpolated; in turnovers of a shape's largest

@@ -60,22 +60,17 @@ class Laser(Section):
     preset: str | None = field(None, "a named laser, see `spadwarp list presets laser`")
     position: Vector = field((0.0, 0.0, 0.0), "where the beam begins [m]")
     direction: Direction = field((0.0, 0.0, 1.0), "axis of the beam; any length but 0; a scan sets it")
-    frame: Literal["camera", "world"] = "camera"
-    """frame of position and direction: a laser moves with the camera, or is fixed in the world"""
+    frame: Literal["camera", "world"] = field("camera", "of position and direction: moves with the camera, or stays")
     port: Port | Literal["camera"] | None = None
     """what it shines through: a port of its own, whose lengths start at `position`, or that of the camera"""
     profile: Literal["uniform_cone", "gaussian", "collimated", "measured"] = "uniform_cone"
     """even over a cone; exp(-2 tan²α/tan²θ); parallel; or an image"""
     profile_image: AnyFile = field(None, "irradiance across a measured beam: .npy, .exr, .png (linear), rows downwards")
-    half_angle_deg: float = Field(15.0, ge=1e-6, le=180)
-    """half angle θ of the cone, 1/e² half angle of the gaussian, half the image's width [°]"""
+    half_angle_deg: float = field(15.0, "θ of the cone, 1/e² of the gaussian, half the image [°]", "[1e-6, 180]")
     beam_radius: float = field(0.0, "radius of the collimated beam [m]; 0 is a pencil beam", "[0, 1e6]")
-    wavelength_nm: float = Field(532.0, ge=1e-9, le=1e6)
-    """vacuum wavelength [nm]; with a spectrum that at which photons and water are counted"""
-    linewidth_nm: float = Field(0.0, ge=0, le=1e5)
-    """full width at half maximum of a Gaussian spectrum about wavelength_nm [nm]; 0: one line"""
-    spectrum: CsvFile = None
-    """a measured spectrum in place of linewidth_nm: .csv file of wavelength [nm] and power per nm of any scale"""
+    wavelength_nm: float = field(532.0, "in vacuum [nm]; with a spectrum that of photons and water", "[1e-9, 1e6]")
+    linewidth_nm: float = field(0.0, "of a Gaussian spectrum, width at half maximum [nm]; 0: one line", "[0, 100000]")
+    spectrum: CsvFile = field(None, "a measured spectrum: .csv file of wavelength [nm] and power per nm of any scale")
     polarisation: Literal["none", "linear", "right_circular", "left_circular"] = "none"
     """of the light; right is clockwise for who looks towards the laser"""
     polarisation_angle_deg: float = Field(0.0, ge=-180, le=180)

@@ -132,8 +132,7 @@ class Water(Section):
     extinction: float = field(0.0, "extinction (beam attenuation) coefficient c = a + b [1/m]", "[1e-12, 1e6]")
     albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = 0.0
     """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
-    chlorophyll: float | None = Field(None, **bounds(RANGES["chlorophyll"]))
-    """of the open ocean, in place of coefficients [mg/m³]"""
+    chlorophyll: float | None = field(None, "of open ocean, in place of coefficients [mg/m³]", RANGES["chlorophyll"])
 
     @classmethod
     def _kept(cls, base: Mapping[str, Any], layer: Mapping[str, Any]) -> dict[str, Any]:
@@ -212,16 +211,14 @@ class Medium(Water):
     """
     depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
     """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
-    largest_polarisation: float = Field(0.66, **bounds(RANGES["largest"]))
-    """scaled_rayleigh: polarisation of unpolarised light that is scattered by 90°"""
+    largest_polarisation: float = field(0.66, "scaled_rayleigh: polarisation of light at 90°", RANGES["largest"])
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
     """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
     temperature: float | None = field(None, "gives missing indices, with salinity 35 [°C]", RANGES["temperature"])
     salinity: float | None = field(None, "the same, with temperature 20 [g/kg]", RANGES["salinity"])
-    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = ()
-    """waters further along `layer_axis`, in order"""
+    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = field((), "waters further along `layer_axis`")
     layer_axis: Direction = field((0.0, 0.0, 1.0), "direction across the layers, in the world; not 0")
     grid: Grid | None = field(None, "water that varies within a box, cell by cell; not with layers")
     _molecular_share: float = PrivateAttr(0.0)

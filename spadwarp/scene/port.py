@@ -103,8 +103,7 @@ class Port(Section):
     index: float | None = field(None, "phase index of the window, in place of material", "[1, 4]")
     group_index: float | None = field(None, "group index of the window; default: its phase index", "[1, 4]")
     inside_index: float | None = field(None, "phase index inside the housing; default: that of air", "[1, 4]")
-    inside_group_index: float | None = Field(None, ge=1, le=4)
-    """group index inside; default: that of air, or inside_index"""
+    inside_group_index: float | None = field(None, "group index inside; default: air's, or inside_index", "[1, 4]")
 
     def _problems(self) -> Iterator[str]:
         needed = "distance" if self.shape == "flat" else "radius"

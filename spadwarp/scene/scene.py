@@ -6,7 +6,6 @@ import csv
 import io
 import math
 import os
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -296,7 +295,6 @@ def _placed(scene: Scene, port: Port, origin: Any, normal: Any) -> PortGeometry:
 # Scenes that move
 
 _MOST_ROWS = 1_000_000
-_ANGLES = re.compile(r"^(.*rotation_deg)\[([012])\]$")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -394,11 +392,10 @@ def _names(cells: list[str]) -> tuple[str, ...]:
 
 def _rotations(fields: tuple[str, ...]) -> Iterator[list[int]]:
     """Columns of the angles of each rotation of which all three are given."""
-    found: dict[str, dict[str, int]] = {}
-    for column, name in enumerate(fields):
-        if match := _ANGLES.match(name):
-            found.setdefault(match[1], {})[match[2]] = column
-    return ([columns[axis] for axis in "012"] for columns in found.values() if len(columns) == 3)
+    for name in fields:
+        angles = [f"{name[:-3]}[{axis}]" for axis in range(3)]
+        if name.endswith("rotation_deg[0]") and set(angles) <= set(fields):
+            yield [fields.index(angle) for angle in angles]
 
 
 def _turned(times: NDArray[np.float64], known: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:

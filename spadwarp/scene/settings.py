@@ -243,10 +243,8 @@ class Gate(Section):
 class Scan(Section):
     """How the beam moves over the scene."""
 
-    mode: Literal["none", "confocal"] = "none"
-    """confocal: the beam visits the pixels, each sees its own light alone"""
-    distance: float = Field(math.inf, ge=1e-6, le=math.inf, allow_inf_nan=True)
-    """range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel"""
+    mode: Literal["none", "confocal"] = field("none", "confocal: the beam visits the pixels, each sees its own light")
+    distance: float = field(math.inf, "where beam and line of sight cross [m]; inf is parallel", "[1e-6, inf]")
 
 
 class Transport(Section):
@@ -261,11 +259,9 @@ class Transport(Section):
     """points at which `guided` scores a flight; more leave less noise in the bins of a pixel and take longer"""
     termination: Literal["cutoff", "roulette"] = field("cutoff", "drop light photons (biased), or Russian roulette")
     weight_cutoff: float = field(2e-4, "analog weight below which a photon ends; 0 is never", "[0, 1)")
-    max_collisions: Whole = Field(64, ge=1, le=2**31 - 1)
-    """events of one photon at most, surfaces included; the light of the last one still counts"""
+    max_collisions: Whole = field(64, "events of one photon, surfaces included; the last counts", "[1, 2147483647]")
     max_path: float | None = field(None, "longest geometric path [m]; the gate's end if not given", "(0, 1e12]")
-    lateral_limit: float = Field(math.inf, gt=0, le=math.inf, allow_inf_nan=True)
-    """photons end where |x| or |y| in the camera frame reaches this [m]"""
+    lateral_limit: float = field(math.inf, "photons end where |x| or |y| of the camera frame is this [m]", "(0, inf]")
     axis_threshold: float = field(0.9998, "|u_z| from which the near-axis rule acts; 1 turns it off (exact)", "(0, 1]")
 
 
@@ -275,10 +271,8 @@ class Analytic(Section):
     form: Literal["radiometric", "lu2024"] = field("radiometric", "constants of the lidar equation, or eq 7 as printed")
     backscatter: Literal["constant", "single_scatter", "monte_carlo"] = field("single_scatter", "its time course")
     backscatter_rate: float = field(0.0, "constant backscatter, detections per second in the gate [1/s]", "[0, 1e15]")
-    backscatter_fraction: float | None = Field(None, ge=0, le=1)
-    """part of the pixels that report backscatter (BS); from the rates if not given"""
-    count_law: Literal["per_pulse", "per_frame_lu2024", "per_frame"] = "per_pulse"
-    """at most one a pulse, or a frame"""
+    backscatter_fraction: float | None = field(None, "of pixels that report it (BS); default: by the rates", "[0, 1]")
+    count_law: Literal["per_pulse", "per_frame_lu2024", "per_frame"] = field("per_pulse", "one at most: pulse or frame")
     pulses_per_depth_frame: Whole | None = Field(None, ge=1, le=2**63 - 1)
     """pulses of one depth frame, for per_pulse; if not given those of one frame of the detector, pulses_per_frame"""
     frames: Whole = field(1000, "detector frames of one depth frame, for per_frame", "[1, 9223372036854775807]")
