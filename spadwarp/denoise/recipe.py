@@ -182,4 +182,4 @@ def load_training_recipe(path: str | os.PathLike[str], overrides: Sequence[str] 
     Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
     """
     path = example_or_path(path, "training")
-    return TrainingRecipe.read(read_toml(path), overrides=overrides, source=path)
+    return TrainingRecipe.from_dict(read_toml(path), overrides=overrides, source=path)

@@ -32,6 +32,7 @@ __all__ = ["parse_override"]
 
 Key = tuple[str | int, ...]
 Overrides = Mapping[str, Any] | Sequence[str]
+FileName = str | os.PathLike[str]
 
 
 class Document(Section):
@@ -42,34 +43,20 @@ class Document(Section):
     _source: Path | None = PrivateAttr(None)
 
     @classmethod
-    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Self:
-        """From tables as TOML gives them; relative paths in them start at `source`'s folder.
+    def from_dict(
+        cls, tables: Mapping[str, Any], *, source: FileName | None = None, overrides: Overrides | None = None
+    ) -> Self:
+        """From tables as TOML gives them, and what lies over them; relative paths start at `source`'s folder.
 
         Raises `ConfigError` with a line for each problem.
         """
-        return cls.read(tables, source=source)
-
-    @classmethod
-    def from_toml(cls, text: str, *, source: str | os.PathLike[str] | None = None) -> Self:
-        """From the text that `to_toml` made, in a file of results or frames. Raises `ConfigError`."""
-        return cls.read(parse_toml(text), source=source)
-
-    @classmethod
-    def read(
-        cls,
-        tables: Mapping[str, Any],
-        *,
-        overrides: Overrides | None = None,
-        source: str | os.PathLike[str] | None = None,
-        is_absolute: bool = False,
-    ) -> Self:
-        """From tables and overrides; `is_absolute`: their paths are already. Raises `ConfigError`."""
+        file = None if source is None else Path(source)
+        folder = None if file is None else file.absolute().parent
+        here = folder if cls.overrides_beside_file else Path.cwd()
         layer: dict[str, Any] = {}
+        items: dict[str, Any] = {}
         try:
-            folder = None if source is None else Path(source).absolute().parent
-            tables = tables if is_absolute else _absolute(cls, tables, folder)
-            here = folder if cls.overrides_beside_file else Path.cwd()
-            items: dict[str, Any] = {}
+            tables = _absolute(cls, tables, folder)
             for key, value in override_pairs(overrides or {}):
                 # Items of lists that may be defaults, or follow from other fields, are set in what is complete.
                 _insert(cls, items if any(isinstance(part, int) for part in key[2:]) else layer, key, value)
@@ -81,12 +68,16 @@ class Document(Section):
                 made = cls.model_validate(cls.merged(made.to_dict(), _absolute(cls, items, here)))
             made._check()
         except ConfigError as error:
-            raise ConfigError(error.problems, source=None if source is None else str(source)) from None
+            raise ConfigError(error.problems, source=file) from None
         except ValidationError as error:
-            lines = describe(error, cls, layer)
-            raise ConfigError(lines, source=None if source is None else str(source)) from None
-        made._source = None if source is None else Path(source)
+            raise ConfigError(describe(error, cls, layer), source=file) from None
+        made._source = file
         return made
+
+    @classmethod
+    def from_toml(cls, text: str, *, source: FileName | None = None) -> Self:
+        """From the text that `to_toml` made, in a file of results or frames. Raises `ConfigError`."""
+        return cls.from_dict(parse_toml(text), source=source)
 
     def _check(self) -> None:
         """Raises `ConfigError` for what its tables cannot show."""
@@ -108,7 +99,7 @@ class Document(Section):
         with_paths(type(self), self.to_dict(), noted)
         return [path for path in found if path.suffix]
 
-    def to_toml(self, *, folder: str | os.PathLike[str] | None = None) -> str:
+    def to_toml(self, *, folder: FileName | None = None) -> str:
         """The full text that is read back to an equal document.
 
         `folder`: of the file that the text is for. Paths of files in it or in the folder above it, with the folders in
@@ -125,7 +116,7 @@ class Document(Section):
         changed = self
         for layer in (overrides, sections):
             if layer:
-                changed = self.read(changed.to_dict(), overrides=layer, source=self.source, is_absolute=True)
+                changed = self.from_dict(changed.to_dict(), overrides=layer, source=self.source)
         return changed
 
     def __eq__(self, other: object) -> bool:

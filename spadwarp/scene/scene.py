@@ -228,7 +228,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     tables = read_toml(path)
     if "scene" in tables and "laser" not in tables:
         raise ConfigError("a recipe of a dataset, for `spadwarp dataset`, not a scene", source=str(path))
-    return Scene.read(tables, overrides=overrides, source=path)
+    return Scene.from_dict(tables, overrides=overrides, source=path)
 
 
 def template() -> str:
