@@ -140,18 +140,13 @@ def daylight_radiance(
     """Spectral radiance that comes to the lens along lines of sight [W/m²/nm/sr].
 
     Behind a port that is the transmission times (n_0/n_w)² of the radiance in the water, n_0 being the index inside.
+    Raises `ConfigError` for a scene without `[daylight]`, `ArgumentError` outside 400 to 700 nm.
 
     Args:
-        scene: With `[daylight]`.
-        wavelength_nm: 400 to 700 [nm].
+        scene, wavelength_nm: With `[daylight]`; 400 to 700 [nm].
         view: Unit vectors in the camera frame in which the lens sees `[..., 3]`.
         distance: Range of a surface `[...]` [m]; NaN or 0 for open water; default: open water.
-        normal: Of the surface, unit vectors towards the camera `[..., 3]`.
-        reflectance: Of it, Lambertian `[...]`.
-
-    Raises:
-        ConfigError: A scene without `[daylight]`.
-        ArgumentError: A wavelength out of range.
+        normal, reflectance: Of the surface: unit vectors towards the camera `[..., 3]`, Lambertian `[...]`.
     """
     view = np.asarray(view, np.float64)
     seen = _seen(scene, view, distance, normal, reflectance)

@@ -349,14 +349,9 @@ def load_calibration(path: str | Path) -> dict[str, Any]:
     """Fields of the scene's `camera` section from a calibration file.
 
     Reads `camera_matrix` (3 × 3), `distortion_coefficients` (k1, k2, p1, p2[, k3]) and, if there, `image_width` and
-    `image_height`, under these or the other usual names.
-
-    Returns:
-        `fx`, `fy`, `cx`, `cy`, `distortion` [pixels, 1], and `width` and `height` if the file has them.
-
-    Raises:
-        FileError: The file cannot be read.
-        ConfigError: It holds no calibration, one of a lens model other than Brown's, or numbers that are not finite.
+    `image_height`, under these or the other usual names, as `fx`, `fy`, `cx`, `cy`, `distortion` [pixels, 1], and
+    `width` and `height`. Raises `FileError` if the file cannot be read, `ConfigError` if it holds no calibration, one
+    of a lens model other than Brown's, or numbers that are not finite.
     """
     try:
         return _fields(_entries(read_text(path, largest=_LARGEST)))
@@ -370,11 +365,8 @@ def save_calibration(camera: Camera, path: str | Path) -> Path:
     """Writes a camera's calibration as OpenCV's `cv::FileStorage` reads it: XML, YAML or JSON by the ending.
 
     Holds `image_width`, `image_height`, `camera_matrix` and `distortion_coefficients` (k1, k2, p1, p2, k3), as
-    `cv2.calibrateCamera` gives them: 0 is the centre of the first pixel.
-
-    Raises:
-        ArgumentError: Another ending.
-        FileError: The file cannot be written.
+    `cv2.calibrateCamera` gives them: 0 is the centre of the first pixel. Raises `ArgumentError` for another ending,
+    `FileError` if the file cannot be written.
     """
     path = Path(path)
     if (ending := path.suffix.lower()) not in CALIBRATION_ENDINGS:

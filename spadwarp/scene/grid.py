@@ -144,14 +144,8 @@ def turbulent_field(
     counts: tuple[int, int, int], edges: tuple[float, float, float], eddy_size: float, seed: int, time: float = 0.0
 ) -> Floats:
     """A Gaussian random field of mean 0 and variance 1 with von Kármán's spectrum, (k² + k0²)^(-11/6), k0 = 2π over
-    eddy_size.
-
-    Args:
-        counts: Cells along the edges.
-        edges: Of the box [m].
-        eddy_size: Of the largest eddies [m].
-        seed: Same seed, same field.
-        time: In turnovers of the largest eddies; a mode changes at the rate of its own, as k^(2/3).
+    `eddy_size` [m], in cells along the edges of a box [m]. `time` is in turnovers of the largest eddies; a mode changes
+    at the rate of its own, as k^(2/3).
     """
     rng = np.random.default_rng(seed)
     waves = [2.0 * np.pi * np.fft.fftfreq(n, edge / n) for n, edge in zip(counts, edges, strict=True)]
@@ -199,9 +193,7 @@ def read_grid(path: str | Path) -> GridFile:
 
     `.npz` and `.h5`: arrays by these names, `[x, y, z]` or `[frame, x, y, z]`, and `size` (3 edges) or `cell_size` (one
     or 3) and `origin` [m]. `.nvdb`: grids of these names, or one grid of any name, which is the density; the box holds
-    the voxels that are set.
-
-    Raises `FileError`.
+    the voxels that are set. Raises `FileError`.
     """
     place, names = existing_file(path), (*GRID_ARRAYS, *_PLACES)
     try:

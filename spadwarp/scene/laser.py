@@ -144,10 +144,8 @@ class Laser(Section):
 def load_profile(laser: Laser) -> Floats:
     """The image of `laser.profile_image`: irradiance on a plane across the beam, `[H, W]`, any unit.
 
-    `.npy` as it is; `.exr` and `.png` with the mean of their colours, taken as linear; alpha is left out.
-
-    Raises:
-        FileError: The file cannot be read, or holds no image of finite values ≥ 0 with light in it.
+    `.npy` as it is; `.exr` and `.png` with the mean of their colours, taken as linear; alpha is left out. Raises
+    `FileError` if the file cannot be read, or holds no image of finite values ≥ 0 with light in it.
     """
     path = Path(laser.profile_image or "")
     where = f"laser.profile_image = {str(path)!r}"
@@ -221,12 +219,8 @@ _NODES = 513  # of a Gaussian
 
 
 class SpectralLine(NamedTuple):
-    """A part of a pulse's spectrum.
-
-    Attributes:
-        wavelength_nm: Mean over its photons [nm].
-        share: Photons that pass the filter, over those of a pulse of one line at `laser.wavelength_nm`.
-    """
+    """A part of a pulse's spectrum: the mean wavelength of its photons [nm], and their number that passes the filter
+    over that of a pulse of one line at `laser.wavelength_nm`."""
 
     wavelength_nm: float
     share: float

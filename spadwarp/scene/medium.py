@@ -375,12 +375,8 @@ class Medium(Water):
 
 
 def grid_cells(medium: Medium) -> GridCells:
-    """The cells of a medium with a grid.
-
-    Raises:
-        FileError: The file cannot be read, or has no cells.
-        ConfigError: `medium.grid` does not say how large the box is, or its frame is not in the file.
-    """
+    """The cells of a medium with a grid. Raises `FileError` if its file cannot be read or has no cells, `ConfigError`
+    if `medium.grid` does not say how large the box is, or its frame is not in the file."""
     grid, albedo = medium.grid, medium.albedo
     assert grid is not None and not isinstance(albedo, str)  # see Medium
     stamp = None

@@ -349,11 +349,8 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """Reads a .csv file: a line of names, `time` [s] first and then fields of the scene, and a row for each pose.
 
     Fields are named as `--set` names them, with one number each: `camera.position[0]`, `camera.rotation_deg[1]`,
-    `laser.position[2]`, `targets[0].translation[2]`. Lines that begin with # are passed over.
-
-    Raises:
-        FileError: The file cannot be read.
-        ConfigError: No such table, a number that is not finite, or times that do not ascend.
+    `laser.position[2]`, `targets[0].translation[2]`. Lines that begin with # are passed over. Raises `FileError` if the
+    file cannot be read, `ConfigError` for no such table, a number that is not finite, or times that do not ascend.
     """
     lines = csv.reader(io.StringIO(read_text(path), newline=""))
     names: tuple[str, ...] = ()

@@ -33,12 +33,7 @@ _ALBEDO_400, _ALBEDO_SLOPE, _ASYMMETRY = 0.945, 0.095, 0.65
 
 
 class Skylight(NamedTuple):
-    """Irradiance on a horizontal surface [W/m²/nm].
-
-    Attributes:
-        direct: Of the sun's disc.
-        diffuse: Of the sky.
-    """
+    """Irradiance on a horizontal surface [W/m²/nm]: `direct` of the sun's disc, `diffuse` of the sky."""
 
     direct: Any
     diffuse: Any

@@ -83,13 +83,8 @@ class ParticleOptics(Coefficients):
 
 @dataclass(frozen=True, eq=False)
 class SizeDistribution:
-    """How many particles have which diameter: numbers of any scale at diameters [m] in equal steps of the logarithm.
-
-    Attributes:
-        text: In words.
-        diameters: Ascending `[n]` [m].
-        numbers: Of particles about each of them `[n]`.
-    """
+    """How many particles have which diameter: its `text` in words, ascending diameters `[n]` [m] in equal steps of the
+    logarithm, and numbers of particles about each of them `[n]`, of any scale."""
 
     text: str
     diameters: Floats
@@ -259,12 +254,8 @@ def save_phase_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Pa
 
 
 def save_matrix_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Path:
-    """Writes the scattering matrix as a .csv file for `medium.matrix_table`, 0° to 180°.
-
-    Raises:
-        ArgumentError: The matrix is not known.
-        FileError: The file cannot be written.
-    """
+    """Writes the scattering matrix as a .csv file for `medium.matrix_table`, 0° to 180°. Raises `ArgumentError` if it
+    is not known, `FileError` if the file cannot be written."""
     if optics.matrix is None:
         raise ArgumentError("optics.matrix: not known; measured phase functions come without a scattering matrix")
     # Straight on, symmetry leaves m12 = m34 = 0.
