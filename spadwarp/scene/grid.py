@@ -313,9 +313,9 @@ class GridCells:
 
     def at(self, points: ArrayLike, outside: float) -> Floats:
         """Extinction [1/m] at points of the world `[..., 3]`, with that outside the box."""
-        return self._at(self._in_cells(points), outside)
+        return self._at(self.in_cells(points), outside)
 
-    def _in_cells(self, points: ArrayLike) -> Floats:
+    def in_cells(self, points: ArrayLike) -> Floats:
         """Points of the world `[..., 3]` [m] in cells: the box has 0 ... shape there."""
         own = (np.asarray(points, np.float64) - self.centre) @ self.rotation
         return (own / self.size + 0.5) * np.array(self.extinction.shape)
@@ -340,7 +340,7 @@ class GridCells:
         return np.concatenate([np.zeros(0), *parts]).reshape(shape)
 
     def _depths(self, begin: Floats, end: Floats, outside: float) -> Floats:
-        first, along = self._in_cells(begin), self._in_cells(end) - self._in_cells(begin)
+        first, along = self.in_cells(begin), self.in_cells(end) - self.in_cells(begin)
         cuts = [np.zeros((len(begin), 1)), np.ones((len(begin), 1))]
         for axis, count in enumerate(self.extinction.shape):
             with np.errstate(divide="ignore", invalid="ignore"):
