@@ -28,8 +28,8 @@ from spadwarp.cli import app
 from spadwarp.dataset import Distribution, Recipe
 from spadwarp.limits import Interval
 from spadwarp.scene import Scene
+from spadwarp.scene.grid import COEFFICIENTS
 from spadwarp.scene.sections import interval_of, parts_of
-from spadwarp.scene.tables import COEFFICIENTS
 
 FOLDER = Path(__file__).parent / "reference"
 MADE = "<!-- Made by docs/reference.py from the code. -->\n\n"

@@ -22,10 +22,9 @@ from spadwarp.io.text import parse_toml
 from spadwarp.limits import check_choice, check_integer, check_real, parse_number, shown
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
-from spadwarp.scene.messages import locate
+from spadwarp.scene.document import locate, parse_key
 from spadwarp.scene.sections import field_unit, takes_integers
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight, pixel_directions
-from spadwarp.scene.tables import parse_key
 from spadwarp.transport import truth_maps
 from spadwarp.units import quantity
 

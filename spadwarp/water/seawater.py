@@ -65,12 +65,8 @@ class Coefficients:
 
 @dataclass(frozen=True)
 class WaterOptics(Coefficients):
-    """Optical properties of one water at one wavelength; `absorption` and `scattering` are of all that is in it.
-
-    Attributes:
-        water_absorption, water_scattering: The part of the water itself [1/m].
-        phase_index, group_index: Refractive index, and the index for the time of flight.
-    """
+    """Optical properties of one water at one wavelength; `absorption` and `scattering` are of all that is in it,
+    `water_absorption` and `water_scattering` of the water itself [1/m]; the group index is for the time of flight."""
 
     water_absorption: float
     water_scattering: float

@@ -209,10 +209,6 @@ def test_ambient_of_the_caller():
 
 
 def test_refused():
-    with pytest.raises(ConfigError, match=r"daylight\.sun_elevation_deg = 91"):
-        lit({"sun_elevation_deg": 91.0})
-    with pytest.raises(ConfigError, match=r"daylight\.depth is missing"):
-        spadwarp.load_scene("plane_5m", {"daylight.sun_elevation_deg": 40.0})
     with pytest.raises(ConfigError, match="daylight takes one water"):
         spadwarp.load_scene("layers_5m", {"daylight": SUN})
     with pytest.raises(ConfigError, match="no such section"):
