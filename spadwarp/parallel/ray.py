@@ -97,6 +97,7 @@ class RayWorkers:
         self._value_bytes, self._note = value_bytes, note or (lambda text: None)
         self._pending: dict[Any, tuple[Literal["joined", "returned"], RayWorker]] = {}
         self.workers: list[RayWorker] = []
+        self.joined: list[dict[str, Any]] = []
         self._losses = 0  # since something was returned
         self._patience = math.inf
 
@@ -194,6 +195,7 @@ class RayWorkers:
             return Event("lost", worker)
         if kind == "joined":
             worker.metadata = value
+            self.joined.append(value)
             self._note(f"worker {_description(worker)}")
         else:
             self._losses = 0

@@ -12,9 +12,8 @@ import numpy as np
 from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.limits import shown
 from spadwarp.result.file import ResultLike, as_result
-from spadwarp.result.photon_ids import Range, joined
-from spadwarp.result.result import Result, Truth, physics_of
-from spadwarp.result.tallies import total_of
+from spadwarp.result.result import Result, Truth, difference
+from spadwarp.result.tallies import Range, added, joined, total_of
 
 __all__ = ["merge"]
 
@@ -38,46 +37,32 @@ def merge(results: Iterable[ResultLike]) -> Result:
         raise ConfigError("merge: no results given")
     first = parts[0]
     for other in parts[1:]:
+        if problem := difference(first, other):
+            raise ConfigError(f"merge: {problem}")
         for name, a, b in (
-            ("scene", physics_of(first.scene), physics_of(other.scene)),
-            ("seed", first.seed, other.seed),
-            ("tally unit", first.unit, other.unit),
-            ("batch size", first.batch_size, other.batch_size),
             ("list of derivatives", tuple(first.derivatives), tuple(other.derivatives)),
             ("channel", first.provenance.get("channel"), other.provenance.get("channel")),
         ):
             if a != b:
-                detail = f" ({a} and {b})"
-                if name == "scene":
-                    sections = [key for key in type(first.scene).model_fields if getattr(a, key) != getattr(b, key)]
-                    detail = f" in {', '.join(sections)}: only photons and output may differ"
-                raise ConfigError(f"merge: the {name} of the results differs{detail}")
+                raise ConfigError(f"merge: the {name} of the results differs ({a} and {b})")
+        check_targets(first.truth, other.truth, "merge")
     try:
-        ranges = joined(r for part in parts for r in part.photon_ranges)
+        ranges = joined(ids for part in parts for ids in part.photon_ranges)
     except ConfigError as error:
         raise ConfigError(f"merge: {error}") from error
-    for other in parts[1:]:
-        check_targets(first.truth, other.truth, "merge")
-        check_focus(first.focus_distance, other.focus_distance, "merge")
     return replace(
         first,
         **vars(total_of(*parts)),
         photons=sum(part.photons for part in parts),
-        timing=add_timing(part.timing for part in parts),
-        provenance=join_provenance((part.provenance, part.photon_ranges) for part in parts),
+        timing=added(*(part.timing for part in parts)),
+        provenance=_joined_provenance((part.provenance, part.photon_ranges) for part in parts),
         partial=any(part.partial for part in parts),
         photon_ranges=ranges,
         requested=(min(part.requested[0] for part in parts), max(part.requested[1] for part in parts)),
     )
 
 
-def add_timing(timings: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Seconds of each stage, of all parts together."""
-    parts = list(timings)
-    return {name: sum(part.get(name, 0.0) for part in parts) for name in parts[0]}
-
-
-def join_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) -> dict[str, Any]:
+def _joined_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) -> dict[str, Any]:
     """The first provenance, and under `parts` each with its photon ids."""
     each: list[dict[str, Any]] = []
     for provenance, ranges in parts:
@@ -91,9 +76,3 @@ def check_targets(a: Truth, b: Truth, action: str) -> None:
     """Raises `ConfigError` where two truth maps are not of the same targets."""
     if not np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True):
         raise ConfigError(f"{action}: the targets of the results differ, by their truth maps: was a mesh file changed?")
-
-
-def check_focus(a: float | None, b: float | None, action: str) -> None:
-    """Raises `ConfigError` where two lenses are not focused at the same depth [m], or one images all depths sharply."""
-    if a != b and (a is None or b is None or not np.isclose(a, b, rtol=1e-4, atol=0.0)):
-        raise ConfigError(f"{action}: the lenses of the results differ: focus_distance is {a} and {b} m")

@@ -12,7 +12,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from spadwarp.device import pick_devices
 from spadwarp.result import Truth
-from spadwarp.result.photon_ids import photons_per_position
+from spadwarp.result.tallies import photons_per_position
 from spadwarp.scene import Scene
 from spadwarp.transport.plan import RunOptions, make_plan
 from spadwarp.transport.workers import LocalWorkers
@@ -58,8 +58,8 @@ class LightTracer:
         plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=derivatives or None)
         workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)
         self._scene, self._separate_targets, self._unit = scene, separate_targets, 1.0 / plan.scale
-        self._names, self._worker = plan.derivatives, workers.workers[0]
-        self.truth: Truth = workers.truth()
+        self._names, self._worker = plan.derivatives, workers.tracers[0]
+        self.truth: Truth = workers.truth
 
     @property
     def tally(self) -> Any:
@@ -75,7 +75,7 @@ class LightTracer:
         per_photon = scene.laser.photons_per_pulse * scene.detections_per_photon
         value = per_photon / photons_per_position(scene, ((first, first + photons),)).reshape(-1)
         slopes = {}
-        for p, (name, unit) in enumerate(zip(self._names, worker.derivative_units, strict=True)):
+        for p, (name, unit) in enumerate(zip(self._names, worker.signed_units, strict=True)):
             slopes[name] = self._light(data.gradients, value * unit, len(self._names), p)
         return self._light(data.tally, value * self._unit, 1, 0), slopes
 

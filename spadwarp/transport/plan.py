@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import spadwarp_kernels as sk
 from spadwarp.errors import ConfigError
 from spadwarp.limits import SEED, check_integer, check_part, check_real
-from spadwarp.mesh import build_mesh
+from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Result, ResultLike
-from spadwarp.result.photon_ids import Range, count, shard_of
-from spadwarp.result.result import physics_of
+from spadwarp.result.result import ResultHead, difference
+from spadwarp.result.tallies import count, shard_of
 from spadwarp.scene import Scene, Transport
 from spadwarp.scene.sections import field_range
 from spadwarp.transport.derivatives import resolve_derivatives
@@ -67,38 +68,34 @@ class RunOptions:
     checkpoint_every: float = 60.0
 
     def __post_init__(self) -> None:
-        checked: dict[str, Any] = {}
-        checked["checkpoint_every"] = check_real("checkpoint_every", self.checkpoint_every, "[0, inf]")
+        checked: dict[str, Any] = {
+            "checkpoint_every": check_real("checkpoint_every", self.checkpoint_every, "[0, inf]")
+        }
         for name, within in _RANGES.items():
             value = getattr(self, name)
             checked[name] = None if value is None and name != "first_photon" else check_integer(name, value, within)
         checked["shard"] = None if self.shard is None else check_part("shard", self.shard)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(checked)
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A run, in a form that can be sent to other processes.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan(ResultHead):
+    """The head of a run's result, in a form that can be sent to other processes, and how it is traced.
 
     Attributes:
-        scene, mesh: What to simulate; the mesh from `spadwarp.mesh.build_mesh`.
-        seed: 64-bit.
-        ids: Of the photons, [start, stop).
-        scale: Tally units per emitted photon.
-        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
-        launch_size: Photons in one launch; None: what suits the device.
+        mesh: From `spadwarp.mesh.build_mesh`.
         derivatives: Full names of the parameters by which the histogram is differentiated.
+        launch_size: Photons in one launch; None: what suits the device.
     """
 
-    scene: Scene
     mesh: TriangleMesh | None
-    seed: int
-    ids: Range
-    scale: float
-    batch_size: int = 0
-    launch_size: int | None = None
     derivatives: tuple[str, ...] = ()
+    launch_size: int | None = None
+
+    @property
+    def scale(self) -> float:
+        """Tally units per emitted photon."""
+        return 1.0 / self.unit
 
 
 def make_plan(
@@ -119,35 +116,32 @@ def make_plan(
     """
     photons = None if photons is None else check_integer("photons", photons, _PHOTONS)
     seed = None if seed is None else check_integer("seed", seed, SEED)
-    first_photon, shard = run.first_photon, run.shard
+    first_photon, shard, batch_size = run.first_photon, run.shard, 0
     if relative_error is not None:
         check_real("relative_error", relative_error, "(0, 1)")
         if shard is not None:
             raise ConfigError("relative_error cannot be combined with shard: no part knows the error of the whole")
     batches = batches or relative_error is not None
+    names = () if derivatives is None else resolve_derivatives(scene, derivatives, blocks)
     if resume is not None:
-        _check_resumed(resume, run, scene, seed, batches)
-        seed, first_photon = resume.seed, resume.requested[0]
+        _check_resumed(resume, run, seed, batches)
+        seed, first_photon, batch_size = resume.seed, resume.requested[0], resume.batch_size
         photons = count([resume.requested]) if photons is None else photons
         if photons <= resume.photons:
             raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
-    resumed = () if resume is None else tuple(resume.derivatives)
-    names = resumed if derivatives is None else resolve_derivatives(scene, derivatives, blocks)
-    if resume is not None and names != resumed:
-        raise ConfigError(f"derivatives: the run to resume has {', '.join(resumed) or 'none'}, not {', '.join(names)}")
+        had = tuple(resume.derivatives)
+        if derivatives is not None and names != had:
+            text = f"the run to resume has {', '.join(had) or 'none'}, not {', '.join(names)}"
+            raise ConfigError(f"derivatives: {text}")
+        names = had
     photons = scene.transport.photons if photons is None else photons
-    seed = scene.transport.seed if seed is None else seed
-    batch_size = 0
-    if resume is not None:
-        batch_size = resume.batch_size
-    elif batches:
+    if batches and resume is None:
         batch_size = _batch_size(scene, photons, relative_error, shard)
     if batch_size:
         photons = -(-photons // batch_size) * batch_size
         if first_photon % batch_size:
-            raise ConfigError(
-                f"first_photon = {first_photon} is not a multiple of {batch_size}, the photons of a batch"
-            )
+            text = f"is not a multiple of {batch_size}, the photons of a batch"
+            raise ConfigError(f"first_photon = {first_photon} {text}")
     mesh = build_mesh(scene)
     scale, capacity = scale_and_capacity(scene, mesh)
     if photons > capacity:
@@ -157,9 +151,24 @@ def make_plan(
             "instead, or start the gate later"
         )
     ids = first_photon, first_photon + photons
-    if shard is not None:
-        ids = shard_of(ids, shard, batch_size or 1)
-    return Plan(scene, mesh, seed, ids, scale, batch_size, run.launch_size, names)
+    ids = ids if shard is None else shard_of(ids, shard, batch_size or 1)
+    plan = Plan(
+        scene=scene,
+        unit=1.0 / scale,
+        photons=count([ids]),
+        seed=scene.transport.seed if seed is None else seed,
+        energy_balance_unit=sk.LEDGER_UNIT,
+        photon_ranges=(ids,),
+        batch_size=batch_size,
+        requested=ids,
+        focus_distance=focus_distance(scene, mesh),
+        mesh=mesh,
+        derivatives=names,
+        launch_size=run.launch_size,
+    )
+    if resume is not None and (problem := difference(resume, plan)):
+        raise ConfigError(f"resume: {problem}")
+    return plan
 
 
 def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
@@ -175,12 +184,10 @@ def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard:
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
 
 
-def _check_resumed(resume: Result, run: RunOptions, scene: Scene, seed: int | None, batches: bool) -> None:
+def _check_resumed(resume: Result, run: RunOptions, seed: int | None, batches: bool) -> None:
     for name in ("first_photon", "shard"):
         if value := getattr(run, name):
             raise ConfigError(f"{name} = {value} cannot be combined with resume, which has the photon ids of its run")
-    if physics_of(scene) != physics_of(resume.scene):
-        raise ConfigError("resume: the result is of another scene; only photons and output may differ")
     if seed not in (None, resume.seed):
         raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
     if batches and not resume.batch_size:

@@ -127,7 +127,7 @@ def trace(
     spec = transport_spec(scene, mesh, derivatives=names, estimator="none", records=True)
     arrays = [name for name in _ARRAYS if name != "id"] + (["log_derivatives"] if names else [])
     size = LAUNCH_SIZE["cuda" if model.device.is_cuda else "cpu"]
-    worker = DeviceWorker(model, spec, seed=seed, launch_size=size, histogram=False)
+    worker = DeviceWorker(model, spec, seed=seed, launch_size=size)
     parts: list[dict[str, NDArray[Any]]] = []
     for first in range(0, photons, size):
         stop = min(first + size, photons)

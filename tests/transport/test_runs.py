@@ -19,7 +19,7 @@ from helpers.scenes import PLATE, TREE, scene
 from helpers.statistics_of_samples import DEVICES
 from spadwarp import ConfigError, DeviceError, RunOptions, merge, simulate
 from spadwarp.result import component_errors
-from spadwarp.result.photon_ids import IdQueue, count, joined, shard_of, without
+from spadwarp.result.tallies import IdQueue, count, joined, shard_of, without
 from spadwarp.transport import LightTracer
 from spadwarp_kernels.tally import tally as tally_module
 
