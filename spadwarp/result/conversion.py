@@ -36,7 +36,7 @@ class TorchTruth(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorchResult:
-    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`.
+    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`. Methods as of `Result`, of float64.
 
     Attributes:
         scene, unit, photons: As in `Result`.
@@ -54,25 +54,23 @@ class TorchResult:
 
     @cached_property
     def histogram(self) -> torch.Tensor:
-        """Expected fraction of emitted photons that arrive in each pixel and bin, float64 `[H, W, T]`."""
-        return self._fraction(self.tallies.sum(dim=0))
+        """`[H, W, T]`."""
+        return self.tallies.sum(dim=0) * self.tally_value[..., None]
 
     def component(self, name: Component) -> torch.Tensor:
-        """One part of the histogram, float64 `[H, W, T]`; see `Result.component`."""
-        return self._fraction(self.tallies[COMPONENTS.index(check_choice("component", name, COMPONENTS))])
+        """`[H, W, T]`."""
+        chosen = COMPONENTS.index(check_choice("component", name, COMPONENTS))
+        return self.tallies[chosen] * self.tally_value[..., None]
 
     @property
     def detections(self) -> torch.Tensor:
-        """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
+        """`[H, W, T]`."""
         return self.histogram * (self.scene.laser.photons_per_pulse * self.scene.detections_per_photon)
 
     @property
     def intensity(self) -> torch.Tensor:
-        """Expected fraction of emitted photons that arrive in each pixel within the gate, float64 `[H, W]`."""
+        """`[H, W]`."""
         return self.histogram.sum(dim=-1)
-
-    def _fraction(self, tallies: torch.Tensor) -> torch.Tensor:
-        return tallies.double() * self.tally_value.unsqueeze(-1)
 
 
 @overload

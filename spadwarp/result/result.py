@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -296,7 +296,21 @@ class Result(ResultHead, Tallies):
 
         They show in results with batches (`uncertainty=True`, or `relative_error`).
         """
-        return tuple(_dominance_warnings(self))
+        transport, ways = self.scene.transport, ["more photons"]
+        if transport.estimator != "guided":
+            ways.append('estimator = "guided"')
+        elif self.scene.targets:
+            ways.append('in clear water between bright surfaces estimator = "next_event"')
+        if transport.termination == "roulette":
+            ways.append('termination = "cutoff"')
+        batches = self.photons // max(self.batch_size, 1)
+        return tuple(
+            f"{name}: one of {batches} batches has {100 * share:.0f} % of the variance of its light (relative standard "
+            f"error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "
+            f"helps: {', '.join(ways)}"
+            for name, (error, share) in component_errors(self).items()
+            if error > _SMALL_ERROR and share > _threshold(batches)
+        )
 
     @property
     def rounding_error(self) -> dict[str, float]:
@@ -333,8 +347,6 @@ class Result(ResultHead, Tallies):
     def pulse_speed(self) -> float:
         """Speed of a pulse, c0 over the group index [m/s]."""
         return self.scene.medium.pulse_speed
-
-    # Depth
 
     def depth(
         self, *, method: Any = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
@@ -402,7 +414,7 @@ class Result(ResultHead, Tallies):
             "counters": dict(self.counters),
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "warnings": list(self.warnings),
-            **({"derivatives": _short_names(tuple(self.derivatives))} if self.derivatives else {}),
+            **({"derivatives": _short_names(self.derivatives)} if self.derivatives else {}),
             **_polarisation_summary(self),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
@@ -492,39 +504,53 @@ def difference(a: ResultHead, b: ResultHead) -> str:
 _BLOCK = re.compile(r"\[(\d+),(\d+),(\d+)\]")
 
 
+class _Cube(NamedTuple):
+    """Tallies of light or of a derivative by component, their unit, and their second moment, if there is one."""
+
+    tallies: NDArray[np.int64]
+    unit: float
+    second_moment: NDArray[np.uint64] | None
+
+
+def _cubes_of(result: Result, group: str) -> dict[str, _Cube]:
+    """Of derivatives or of the camera's channels, by name; the channel "I" is the histogram."""
+    found, cubes = signed_of(result).get(group), dict[str, _Cube]()
+    if group == "channels" and "I" in result.scene.camera.channels:
+        cubes["I"] = _Cube(result.tallies, result.unit, result.second_moment)
+    if found is not None:
+        moments = [None] * len(found.names) if found.second_moment is None else found.second_moment.swapaxes(0, 1)
+        parts = zip(found.names, found.tallies, found.units, moments, strict=True)
+        cubes |= {name: _Cube(*cube) for name, *cube in parts}
+    return cubes
+
+
 class _SignedValues(Mapping[str, Floats]):
     """Name → array, made from integers when it is asked for; that of a derivative without its block stands for all of
     them, `[x, y, z, ...]`. With `errors` standard errors of the sum over components."""
 
     def __init__(self, result: Result, group: str, *, errors: bool = False) -> None:
         self._result, self._group, self._errors = result, group, errors
-        self._tallies = signed_of(result).get(group)
-        self._names = () if self._tallies is None else self._tallies.names
-        if group == "channels":
-            self._names = result.scene.camera.channels
+        self._cubes = _cubes_of(result, group)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
+        return iter(self._cubes)
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self._cubes)
 
     def __getitem__(self, name: str) -> Floats:
-        result, tallies = self._result, self._tallies
-        if blocks := _blocks(self._names, name):
+        if blocks := _blocks(self, name):
             parts = np.stack([self[f"{name}[{','.join(map(str, block))}]"] for block in blocks])
             return parts.reshape(*_shape(blocks), *parts.shape[1:])
-        if name not in self._names:
+        if name not in self._cubes:
             raise KeyError(f"{name!r} is not one of the {self._group}: {', '.join(self) or 'none were asked for'}")
-        if tallies is None or name not in tallies.names:  # the intensity, which is the histogram
-            return result.standard_error if self._errors else result.tallies * result.tally_value[..., None]
-        p = tallies.names.index(name)
-        value = (tallies.units[p] / result.unit * result.tally_value)[..., None]
+        result, (tallies, unit, moments) = self._result, self._cubes[name]
+        value = (unit / result.unit * result.tally_value)[..., None]
         if not self._errors:
-            return tallies.tallies[p] * value
+            return tallies * value
         _, batches = _batches_of(result)
-        assert tallies.second_moment is not None
-        return standard_error(tallies.tallies[p], tallies.second_moment[:, p], batches) * value
+        assert moments is not None
+        return standard_error(tallies, moments, batches) * value
 
     def __repr__(self) -> str:
         return f"{{{', '.join(map(repr, self))}}}"
@@ -534,13 +560,13 @@ def _shape(blocks: list[tuple[int, ...]]) -> list[int]:
     return [max(indices) + 1 for indices in zip(*blocks, strict=True)]
 
 
-def _blocks(names: Sequence[str], name: str) -> list[tuple[int, ...]]:
+def _blocks(names: Iterable[str], name: str) -> list[tuple[int, ...]]:
     """Indices of the blocks by whose coefficient `name` a histogram is differentiated."""
     matches = [_BLOCK.fullmatch(other.removeprefix(name)) for other in names if other.startswith(f"{name}[")]
     return [tuple(map(int, match.groups())) for match in matches if match is not None]
 
 
-def _short_names(names: Sequence[str]) -> list[str]:
+def _short_names(names: Iterable[str]) -> list[str]:
     """For a reader: one text for all blocks, such as "medium.grid.absorption of 4 x 4 x 2 blocks"."""
     texts = dict[str, None]()
     for name in names:
@@ -553,28 +579,22 @@ def _short_names(names: Sequence[str]) -> list[str]:
 # Errors
 
 
-class ComponentError(NamedTuple):
-    """How well a component's total is known: the relative standard error of its light, all pixels and bins together;
-    the squared deviation of the batch furthest from the mean, over the largest that it could have at the same variance,
-    in [0, 1], about 5/batches where many photons matter equally, near 1 where one decides; the number of batches."""
+def component_errors(result: Result) -> dict[str, tuple[float, float]]:
+    """How well the total of each component is known; empty without batches, and for components without light.
 
-    relative_error: float
-    largest_share: float
-    batches: int
-
-
-def component_errors(result: Result) -> dict[str, ComponentError]:
-    """By component; empty without batches, and for components without light."""
+    Returns:
+        By component the relative standard error of its light, all pixels and bins together, and the squared deviation
+        of the batch furthest from the mean, over the largest that it could have at the same variance, in [0, 1]: about
+        5/batches where many photons matter equally, near 1 where one decides.
+    """
     return {
-        name: ComponentError(
-            math.sqrt(spread / (batches - 1)) / total, furthest * furthest / ((batches - 1) * spread), batches
-        )
-        for name, (batches, total, spread, furthest) in _spreads(result).items()
+        name: (math.sqrt(spread / (n - 1)) / total, furthest * furthest / ((n - 1) * spread))
+        for name, (n, total, spread, furthest) in _spreads(result).items()
     }
 
 
 def largest_share(result: Result) -> float:
-    """As `ComponentError.largest_share`, of the variance of all components together; 1 where nothing is known."""
+    """As the second of `component_errors`, of the variance of all components together; 1 where nothing is known."""
     spreads = list(_spreads(result).values())
     together = sum(spread for _, _, spread, _ in spreads)
     return max((furthest * furthest / ((n - 1) * together) for n, _, _, furthest in spreads), default=1.0)
@@ -610,24 +630,6 @@ def pixel_standard_error(result: Result, row: int, column: int) -> Floats:
     moments, batches = _batches_of(result)
     error = standard_error(result.tallies[:, row, column], moments[:, row, column], batches)
     return np.asarray(error * result.tally_value[row, column])
-
-
-def _dominance_warnings(result: Result) -> Iterator[str]:
-    """A sentence for each component whose standard error rests on one batch."""
-    transport, ways = result.scene.transport, ["more photons"]
-    if transport.estimator != "guided":
-        ways.append('estimator = "guided"')
-    elif result.scene.targets:
-        ways.append('in clear water between bright surfaces estimator = "next_event"')
-    if transport.termination == "roulette":
-        ways.append('termination = "cutoff"')
-    for name, (error, share, batches) in component_errors(result).items():
-        if error > _SMALL_ERROR and share > _threshold(batches):
-            yield (
-                f"{name}: one of {batches} batches has {100 * share:.0f} % of the variance of its light (relative "
-                f"standard error {percent(error)} %): few heavy photons decide it, and errors may be larger than they "
-                f"seem; what helps: {', '.join(ways)}"
-            )
 
 
 def _threshold(batches: int) -> float:
@@ -666,9 +668,8 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
         problem = f"the result holds {own!r} alone; take that of the run" if own else f"the result has none; {_CAMERAS}"
         raise ConfigError(f"channel = {channel!r}: {problem}", source=result.scene.source)
     tallies, unit = _channel_tallies(result, channel)
-    stored, moments = result.channel_tallies, None
-    if stored is not None and stored.second_moment is not None and channel in stored.names:
-        moments = stored.second_moment[:, stored.names.index(channel)].copy()
+    cube = _cubes_of(result, "channels").get(channel)
+    moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
     return replace(
         result,
         scene=_behind_analyser(result.scene),
@@ -691,17 +692,14 @@ def pixel_channel(result: Result, channel: Channel, row: int, column: int) -> Fl
 
 def _channel_tallies(result: Result, channel: Channel, at: tuple[Any, ...] = ()) -> tuple[NDArray[np.int64], float]:
     """Tallies of co- or cross-polarised light, or a part of them, and their unit."""
-    stored, camera = result.channel_tallies, result.scene.camera
-    assert stored is not None
-    if channel in stored.names:
-        k = stored.names.index(channel)
-        return np.maximum(stored.tallies[(k, *at)], 0), stored.units[k]
+    cubes, camera = _cubes_of(result, "channels"), result.scene.camera
+    if channel in cubes:
+        return np.maximum(cubes[channel].tallies[at], 0), cubes[channel].unit
     leak, angle = 1.0 / camera.analyser_extinction_ratio, 2.0 * math.radians(camera.analyser_angle_deg)
     sign = 1.0 if channel == "co" else -1.0
     light = (1.0 + leak) * result.tallies[at]
     for name, share in {"Q": math.cos(angle), "U": math.sin(angle)}.items():
-        k = stored.names.index(name)
-        light += sign * (1.0 - leak) * share * (stored.units[k] / result.unit) * stored.tallies[(k, *at)]
+        light += sign * (1.0 - leak) * share * (cubes[name].unit / result.unit) * cubes[name].tallies[at]
     # In halves of a unit.
     return np.rint(np.maximum(light, 0.0)).astype(np.int64), 0.5 * result.unit
 
@@ -717,7 +715,7 @@ def degree_of_polarisation(result: Result, *, gated: bool = False) -> Floats:
     """
     if not result.channels:
         raise ConfigError(f"the degree of polarisation needs channels; {_CAMERAS}")
-    return _degree(_sums(result, (0, 3) if gated else (0,)), 1.0 / result.scene.camera.analyser_extinction_ratio)
+    return _degree(result, _sums(result, (0, 3) if gated else (0,)))
 
 
 def _polarisation_summary(result: Result) -> dict[str, Any]:
@@ -728,22 +726,19 @@ def _polarisation_summary(result: Result) -> dict[str, Any]:
     if not result.channels:
         return {}
     sums = _sums(result, (0, 1, 2, 3))
-    degree = float(_degree(sums, 1.0 / result.scene.camera.analyser_extinction_ratio))
-    light = {name: float(sums[name]) / result.photons for name in result.channels}
+    degree = float(_degree(result, sums))
+    light = {name: float(total) / result.photons for name, total in sums.items()}
     return {"channels": light, "degree_of_polarisation": degree if math.isfinite(degree) else None}
 
 
 def _sums(result: Result, axes: tuple[int, ...]) -> dict[str, Floats]:
     """Channel → its light, times the photons."""
-    stored = result.channel_tallies
-    assert stored is not None
-    sums = {"I": result.tallies.sum(axis=axes, dtype=np.float64) * result.unit}
-    for name, tallies, unit in zip(stored.names, stored.tallies, stored.units, strict=True):
-        sums[name] = tallies.sum(axis=axes, dtype=np.float64) * unit
-    return sums
+    cubes = _cubes_of(result, "channels").items()
+    return {name: cube.tallies.sum(axis=axes, dtype=np.float64) * cube.unit for name, cube in cubes}
 
 
-def _degree(sums: dict[str, Floats], leak: float) -> Floats:
+def _degree(result: Result, sums: dict[str, Floats]) -> Floats:
+    leak = 1.0 / result.scene.camera.analyser_extinction_ratio
     with np.errstate(divide="ignore", invalid="ignore"):
         if "Q" in sums:
             return np.minimum(np.sqrt(sums["Q"] ** 2 + sums["U"] ** 2 + sums["V"] ** 2) / sums["I"], 1.0)
