@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_integer, shown
 
-__all__ = ["Ray", "Worker", "interruptible"]
+__all__ = ["Event", "Ray", "Worker", "interruptible"]
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Worker:
 
 
 class Event(NamedTuple):
-    """Something that a worker did."""
+    """Something that a worker did; see `RayWorkers.wait`."""
 
     kind: str
     worker: Any

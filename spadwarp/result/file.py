@@ -25,7 +25,6 @@ from spadwarp.result.result import (
     coordinates_of,
     shape_of,
     signed_of,
-    sizes_of,
     water_of,
 )
 from spadwarp.result.tallies import SignedTallies, joined, moments_of
@@ -124,10 +123,10 @@ def load_result(path: str | Path) -> Result:
         head = _head(file)
         names = {group: _names(file, group) for group in ("derivatives", "channels")}
         counts = {"parameter": len(names["derivatives"]), "channel": len(names["channels"])}
-        sizes = sizes_of(head.scene, **counts)
+        camera, counts["time"] = head.scene.camera, head.scene.gate.bins
 
         def array(name: str) -> Any:
-            return file.array(name, ARRAYS[name][0], shape_of(name, sizes))
+            return file.array(name, ARRAYS[name][0], shape_of(name, camera.height, camera.width, **counts))
 
         def moment(name: str) -> Any:
             return array(name) if head.batch_size else None

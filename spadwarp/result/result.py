@@ -79,19 +79,14 @@ for _group, (_dimension, _meaning) in _SIGNED.items():
     }
 
 
-def sizes_of(scene: Scene, **counts: int) -> dict[str, int]:
-    """Sizes of the dimensions of `ARRAYS`; `counts`: those of parameter and channel."""
-    sizes = {"y": scene.camera.height, "x": scene.camera.width, "time": scene.gate.bins}
-    return {**sizes, "component": len(COMPONENTS), "word": 2, "axis": 3, **counts}
-
-
-def shape_of(name: str, sizes: Mapping[str, int]) -> tuple[int, ...]:
-    """Of an array, from the sizes of its dimensions."""
+def shape_of(name: str, height: int, width: int, **counts: int) -> tuple[int, ...]:
+    """Of an array, from the size of the image and those of time, parameter and channel."""
+    sizes = {"component": len(COMPONENTS), "word": 2, "axis": 3, "y": height, "x": width, **counts}
     return tuple(sizes[dimension] for dimension in ARRAYS[name][1])
 
 
-def _check_array(name: str, array: NDArray[Any], sizes: Mapping[str, int]) -> None:
-    kind, shape = np.dtype(ARRAYS[name][0]), shape_of(name, sizes)
+def _check_array(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    kind = np.dtype(ARRAYS[name][0])
     if array.dtype != kind or array.shape != shape:
         raise ArgumentError(f"{name.replace('/', '.')}: {array.dtype} {array.shape}; {kind} {shape} is needed")
 
@@ -116,7 +111,7 @@ class Truth:
         if self.depth.ndim != 2:
             raise ArgumentError(f"truth.depth has {self.depth.ndim} dimensions; 2 are needed")
         for name, array in vars(self).items():
-            _check_array(f"truth/{name}", array, {**dict(zip(PIXELS, self.depth.shape, strict=True)), "axis": 3})
+            _check_array(f"truth/{name}", array, shape_of(f"truth/{name}", *self.depth.shape))
 
     def __repr__(self) -> str:
         height, width = self.depth.shape
@@ -184,8 +179,9 @@ class Result(ResultHead, Tallies):
             text = f"channels are {', '.join(channels) or 'none'}; those of the scene's camera are"
             raise ArgumentError(f"{text} {', '.join(expected) or 'none'}")
         counts = {_SIGNED[group][0]: len(found.names) for group, found in signed.items()}
+        camera, counts["time"] = self.scene.camera, self.scene.gate.bins
         for name, array in arrays_of(self).items():
-            _check_array(name, array, sizes_of(self.scene, **counts))
+            _check_array(name, array, shape_of(name, camera.height, camera.width, **counts))
         units = {"unit": self.unit, "energy_balance_unit": self.energy_balance_unit}
         for group, found in signed.items():
             if (found.second_moment is None) != (self.second_moment is None):

@@ -28,14 +28,9 @@ _BLOCK_NAME = re.compile(r"medium\.grid\.(\w+)(?:\[(\d+),(\d+),(\d+)\])?")
 
 
 class Parameter(NamedTuple):
-    """A number of a scene, or a coefficient of a grid's cells.
+    """A number of a scene, of waters or of a target (-1: of none), or a coefficient of a grid's cells (without value).
 
-    Attributes:
-        kind: One of `spadwarp_kernels.DERIVATIVES`, or of cells of `spadwarp_kernels.BLOCK_DERIVATIVES`.
-        value: The number; None for cells.
-        problem: Why there is no derivative; empty if there is.
-        waters: Indices into `scene.medium.waters`: where it holds.
-        target: Index into `scene.targets`, else -1.
+    Its kind is one of the kernels' `DERIVATIVES` or `BLOCK_DERIVATIVES`; `problem` says why there is no derivative.
     """
 
     kind: str
@@ -249,7 +244,7 @@ def make_derivatives(
         blocks = sk.make_blocks(grid, of_blocks.shape, scales)
     return sk.make_derivatives(
         [parameter.kind for parameter in chosen],
-        [parameter.value for parameter in chosen],
+        [parameter.value or 0.0 for parameter in chosen],
         [_coarser(scale, parameter.kind, parameter.value or 0.0, scene.path_limit) for parameter in chosen],
         waters=[bits(lambda parameter, k=k: k in parameter.waters) for k in range(len(scene.medium.waters))],
         faces=() if mesh is None else np.array(of_targets, dtype=np.int32)[mesh.target],

@@ -55,17 +55,11 @@ def build_model(
     mesh_cache: MeshCache | None = None,
     derivatives: Sequence[str] = (),
 ) -> sk.Model:
-    """The scene on a device.
+    """The scene on a device; the mesh is that of `spadwarp.mesh.build_mesh`.
 
-    Args:
-        scene: What to simulate.
-        device: From `spadwarp.device.pick_device`.
-        mesh: From `spadwarp.mesh.build_mesh`.
-        copies: Histograms that the run will hold on the device, for the check of its memory.
-        scale: Tally units per emitted photon; None: `tally_scale(scene, mesh)`.
-        mesh_cache: Meshes of earlier scenes on their devices; one of the same faces is refitted and not built anew.
-        camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
-        derivatives: Full names of parameters, from `resolve_derivatives`.
+    Without a `camera` a history's path is limited by `transport.max_path` alone, not by the end of the gate. The run
+    will hold so many `copies` of the histogram on the device, for the check of its memory. `mesh_cache` has meshes of
+    earlier scenes; one of the same faces is refitted and not built anew. `derivatives` are full names.
 
     Raises:
         ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
@@ -318,8 +312,9 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
     if (port := laser_port(scene)) is not None:
         laser.port = port_parameters(scene, port, beam.position, 0.0, 0.0)
     if beam.profile == "measured":
-        rows, columns = (wp.array(t, dtype=float, device=device) for t in sk.profile_tables(load_profile(beam)))
-        return _filled(laser, rows=rows, columns=columns, extent=wp.vec2(*profile_extent(beam)))
+        for name, table in zip(("rows", "columns"), sk.profile_tables(load_profile(beam)), strict=True):
+            setattr(laser, name, wp.array(table, dtype=float, device=device))
+        return _filled(laser, extent=wp.vec2(*profile_extent(beam)))
     if beam.profile == "gaussian":
         laser.tan2 = math.tan(beam.half_angle) ** 2
     else:
@@ -530,7 +525,7 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
         passes, lead = np.isfinite(lines.direction).all(axis=-1, keepdims=True), lines.lead
         origins = np.where(passes, lines.start, 1e9)
         directions = np.where(passes, lines.direction, [0.0, 0.0, 1.0])
-    rays = [wp.array(part.astype(np.float32), dtype=wp.vec3, device=device) for part in (origins, directions)]
+    rays: Any = [wp.array(part.astype(np.float32), dtype=wp.vec3, device=device) for part in (origins, directions)]
     depth, distance, reflectance = (wp.empty(shape, dtype=float, device=device) for _ in range(3))
     normal = wp.empty(shape, dtype=wp.vec3, device=device)
     inputs, outputs = [model.camera, model.surfaces, *rays], [depth, distance, normal, reflectance]

@@ -80,13 +80,8 @@ class RunOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plan(ResultHead):
-    """The head of a run's result, in a form that can be sent to other processes, and how it is traced.
-
-    Attributes:
-        mesh: From `spadwarp.mesh.build_mesh`.
-        derivatives: Full names of the parameters by which the histogram is differentiated.
-        launch_size: Photons in one launch; None: what suits the device.
-    """
+    """The head of a run's result, in a form that can be sent to other processes, and how it is traced: with which mesh
+    and derivatives by their full names; None as `launch_size` is what suits the device."""
 
     mesh: TriangleMesh | None
     derivatives: tuple[str, ...] = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,7 +129,7 @@ def trace(
     for first in range(0, photons, size):
         stop = min(first + size, photons)
         worker.data.records = sk.make_records(stop - first, device=model.device, derivatives=len(names))
-        worker.launch(first, stop)
+        worker.trace((first, stop), stopped=threading.Event())
         parts.append([getattr(worker.data.records, name).numpy() for name in arrays])
         if progress is not None:
             progress("trace", stop, photons)

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_devices, processor_name
 from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning
 from spadwarp.limits import shown
-from spadwarp.parallel import Ray, interruptible
-from spadwarp.parallel.worker import Event
+from spadwarp.parallel import Event, Ray, interruptible
 from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
 from spadwarp.result.merging import check_targets
 from spadwarp.result.result import ResultHead, largest_share
@@ -245,11 +244,7 @@ class _Run:
             goal = min(goal + (wanted - batches) * size, stop)
 
     def _trace(self, span: Range) -> None:
-        """Traces the ids of a span that are not done; fewer where the run is stopped.
-
-        Raises:
-            DeviceError: A device failed, or has no memory left.
-        """
+        """Traces the ids of a span that are not done; fewer where the run is stopped."""
         self._waiting = IdQueue(without(span, joined([*self._earlier, *self._done])))
         stop_sent = False
         try:
@@ -371,22 +366,14 @@ class StoppingRule:
     bright photons have not come yet: too dark, with an error that is too small. So it goes on by a part of these
     photons that is fixed there and then, and ends whatever the last of them bring. The part is small where many photons
     matter equally, 40 to 80 batches; where few decide it is as many photons again, so that half had no say in it.
-
-    Args:
-        goal: Relative error.
     """
 
     def __init__(self, goal: float) -> None:
         self._goal, self._found = goal, False
 
     def next_look(self, batches: int, error: float, share: Callable[[], float]) -> int | None:
-        """Batches at the next look; None if the run ends.
-
-        Args:
-            batches: So far.
-            error: Relative error after these, infinite if it is not known.
-            share: Gives the part of the variance between batches that one of them has, in [0, 1].
-        """
+        """Batches at the next look, None if the run ends; from those so far, the relative error after these (infinite:
+        not known) and the part of the variance between batches that one of them has, in [0, 1]."""
         if self._found:
             return None
         if error <= self._goal:

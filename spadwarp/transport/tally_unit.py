@@ -62,19 +62,17 @@ def scale_and_capacity(scene: Scene, mesh: TriangleMesh | None) -> tuple[float, 
 Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
+def _own_anisotropies(scene: Scene) -> list[float]:
+    """Of layers and cells that share the phase function's form alone."""
+    return [] if scene.medium.has_phase_table else list(scene.medium.range.anisotropies)
+
+
 def _phase_density(scene: Scene) -> Density:
     """Largest density [1/sr] of the phase functions of a scene's waters over t = 1 - cos(angle) in (0, 2]."""
     import spadwarp_kernels as sk
 
-    medium = scene.medium
-    common = phase_function(medium).over_t
-    own = _own_anisotropies(scene)
+    common, own = phase_function(scene.medium).over_t, _own_anisotropies(scene)
     return lambda t: np.max([common(t), *(sk.henyey_greenstein_density(t, g) for g in own)], axis=0)
-
-
-def _own_anisotropies(scene: Scene) -> list[float]:
-    """Of layers and cells that share the phase function's form alone."""
-    return [] if scene.medium.has_phase_table else list(scene.medium.range.anisotropies)
 
 
 def _backward(scene: Scene, density: Density) -> float:
@@ -87,16 +85,12 @@ def _backward(scene: Scene, density: Density) -> float:
 def _faintest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> float:
     """Next event of a photon of full weight at the far end of the scene: on the furthest target, or in the water."""
     furthest = 0.5 * scene.path_limit
-    scattered = max(_largest_albedo(scene), 1e-3) * float(density(np.array([2.0]))[0])
+    scattered = max(scene.medium.range.albedo, 1e-3) * float(density(np.array([2.0]))[0])
     if mesh is not None:
         furthest = min(furthest, float(np.linalg.norm(np.abs(mesh.bounds).max(axis=0))))
         scattered = max(float(mesh.reflectance.max()), 1e-3) / math.pi
     through = math.exp(-scene.optical_depth([0.0, 0.0, 0.0], [0.0, 0.0, furthest]))
     return scattered * through * scene.camera.aperture_area / furthest**2
-
-
-def _largest_albedo(scene: Scene) -> float:
-    return scene.medium.range.albedo
 
 
 def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> float:
@@ -125,8 +119,7 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
     nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
     if (port := camera_port(scene)) is not None:
         nearest = max(nearest, port.nearest)
-    scattering = medium.range.scattering
-    absorption = _absorption(scene)
+    scattering, absorption = medium.range.scattering, medium.range.absorption
     reach = 0.5 * gate.bin_width * speed
     # The integral of 1/r^2 over the bin.
     backward = scattering * _backward(scene, density) * reach
@@ -152,10 +145,6 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
         aside = min(scattering * baseline, 1.0) * backward * view * math.exp(-absorption * longest) / baseline**2
         aside /= share if share > 1 else pixels
     return 16.0 * camera.aperture_area * max(coaxial, bistatic, aside)
-
-
-def _absorption(scene: Scene) -> float:
-    return scene.medium.range.absorption
 
 
 def _distance(point: NDArray[np.float64], mesh: TriangleMesh) -> float:
@@ -185,29 +174,28 @@ def _spread(laser: Laser) -> float:
 def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float], density: Density) -> float:
     """Largest share of the light per area of the lens [1/m^2] that one bin of one pixel gets where the beam's axis is
     in view, by single scattering; 0 if it never is, or starts at the lens."""
-    camera, laser, gate = scene.camera, scene.beam, scene.gate
+    camera, laser, gate, medium, speed = (
+        scene.camera,
+        scene.beam,
+        scene.gate,
+        scene.medium.range,
+        scene.medium.pulse_speed,
+    )
     exit_point = np.array(laser.position)
     if np.linalg.norm(exit_point) < camera.aperture_radius or scene.scan_positions > 1:
         return 0.0
-    speed = scene.medium.pulse_speed
     along = np.geomspace(1e-3, max(scene.path_limit, 2e-3), 400)
     points = exit_point + along[:, None] * np.array(laser.axis)
     away = np.linalg.norm(points, axis=1)
     planes = view_planes(camera)
     seen = (points @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)
     seen &= (along + away >= gate.start * speed) & (along + away <= gate.stop * speed)
-    brightest = 0.0
-    scattering = scene.medium.range.scattering
-    absorption = _absorption(scene)
-    for distance, point, r in zip(along[seen], points[seen], away[seen], strict=True):
-        one_minus_cosine = 1.0 + float(point @ laser.axis) / r
-        # A peak that is narrower than half the lens lights a part of it.
-        narrowest = 0.5 * (0.25 * camera.aperture_radius / r) ** 2
-        phase = float(density(np.array([np.clip(one_minus_cosine, narrowest, 2.0)]))[0])
-        # The part of the beam that arrives within a bin; light that comes straight at the lens arrives all at once.
-        part = min(gate.bin_width * speed / max(one_minus_cosine, 1e-6), distance + r)
-        r = max(r, camera.aperture_radius, 0.01)
-        value = scattering * part * phase * math.exp(-absorption * (distance + r)) / r**2
-        value /= illuminated_pixels(distance / r)
-        brightest = max(brightest, value)
-    return brightest
+    points, away, along = points[seen], away[seen], along[seen]
+    one_minus_cosine = 1.0 + points @ np.array(laser.axis) / away
+    # A peak that is narrower than half the lens lights a part of it.
+    phase = density(np.clip(one_minus_cosine, 0.5 * (0.25 * camera.aperture_radius / away) ** 2, 2.0))
+    # The part of the beam that arrives within a bin; light that comes straight at the lens arrives all at once.
+    part = np.minimum(gate.bin_width * speed / np.maximum(one_minus_cosine, 1e-6), along + away)
+    away = np.maximum(away, max(camera.aperture_radius, 0.01))
+    light = medium.scattering * part * phase * np.exp(-medium.absorption * (along + away)) / away**2
+    return float((light / [illuminated_pixels(scale) for scale in along / away]).max(initial=0.0))

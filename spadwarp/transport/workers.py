@@ -1,4 +1,4 @@
-"""Workers that trace photons into tallies of their own: devices of this host, and workers of Ray."""
+"""Workers that trace photons into tallies of their own: devices of this host, workers of Ray, a tracer of light."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -21,9 +21,7 @@ from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, pick_device, pick_devices, processor_name
 from spadwarp.errors import ConfigError, DeviceError, SpadwarpError, address_space, kernel_errors
 from spadwarp.limits import check_integer
-from spadwarp.parallel import Ray, Worker
-from spadwarp.parallel.ray import RayWorkers
-from spadwarp.parallel.worker import Event
+from spadwarp.parallel import Event, Ray, RayWorkers, Worker
 from spadwarp.result import COMPONENTS, SignedTallies, Tallies, Truth
 from spadwarp.result.tallies import (
     OVERFLOW,
@@ -34,12 +32,14 @@ from spadwarp.result.tallies import (
     joined,
     joined_moments,
     moments_of,
+    photons_per_position,
     total_of,
 )
+from spadwarp.scene import Scene
 from spadwarp.transport.model import MeshCache, build_model, trace_truth, transport_spec
-from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan
+from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan, RunOptions, make_plan
 
-__all__ = ["prepare_kernels"]
+__all__ = ["ExpectedLight", "LightTracer", "prepare_kernels"]
 
 # Photons of the first block of a worker of Ray, which shows how fast it is.
 _FIRST_BLOCK = {"cpu": 1 << 14, "cuda": 1 << 24}
@@ -49,12 +49,7 @@ _FIRST_BLOCK = {"cpu": 1 << 14, "cuda": 1 << 24}
 
 
 class _Histogram:
-    """A tally on the device, `[voxel * parts]`, and where there are any its batches, whose total may be the caller's.
-
-    Attributes:
-        array: What photons are added to.
-        total: Of all batches; the array itself without them.
-    """
+    """A tally on the device, `[voxel * parts]`, and its batches, if any; `total` may be the caller's."""
 
     def __init__(self, array: wp.array, *, signed: bool, batched: bool, total: wp.array | None = None) -> None:
         self.array, self._signed = array, signed
@@ -84,16 +79,10 @@ class _Histogram:
 
 
 class DeviceWorker:
-    """A device with a model and tallies of its own.
+    """A device with a model and tallies of its own, or the caller's.
 
-    Args:
-        model, spec: From `build_model` and `transport_spec`; records of photons have no histogram.
-        seed: 64-bit.
-        launch_size: Photons in one launch at most.
-        threads: Launches at a time. On a CPU all of them add to one tally, with atomics of their own.
-        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
-        signed: Names of the spec's derivatives, or else of its channels.
-        tallies: The caller's own, to be filled.
+    Its threads launch at a time; on a CPU all of them add to one tally, with atomics of their own. A batch has
+    `batch_size` photons; 0: no batches. `signed` names the spec's derivatives, or else its channels.
     """
 
     def __init__(
@@ -124,11 +113,6 @@ class DeviceWorker:
             sk.load_transport_kernel(spec, model.device, model=model, photon_count=most)
         self._closed: tuple[dict[str, int], dict[str, int], dict[str, int]] | None = None  # of batches
 
-    def launch(self, first: int, stop: int) -> None:
-        """Traces the photons of one launch to their end."""
-        for _ in self._launched([(first, stop)]):
-            pass
-
     def _launched(self, spans: Iterable[Range]) -> Iterator[Range]:
         """Traces a launch for each span and yields it when that has ended; a GPU has the next before."""
         device, running = self.model.device, list[tuple[Range, Any]]()
@@ -157,10 +141,7 @@ class DeviceWorker:
     ) -> Ranges:
         """Traces photons; returns the ids that were done before `stopped` was set, with batches those of whole ones.
 
-        Args:
-            block: The ids; with batches whole batches.
-            stopped: Once set, no further launch begins.
-            report: Called with the photons of each launch, from the thread that ran it.
+        `report` gets the photons of each launch, from the thread that ran it.
         """
         done, size = list[Range](), self._batch_size or block[1] - block[0]
         for first in range(*block, size):
@@ -354,19 +335,8 @@ def prepare_kernels(device: str | None = None) -> None:
 class LocalWorkers:
     """Workers of this process, one a device, each with a thread of Python for the length of a block.
 
-    Args:
-        plan: Of the run.
-        devices: From `spadwarp.device.pick_devices`.
-        threads: CPU threads in all; by default one a core. A GPU takes one.
-        tallies: The caller's own, for one device.
-        mesh_cache: Meshes of earlier runs, as `build_model` takes them.
-
-    Attributes:
-        workers: Each with its `DeviceWorker` in its state.
-        first_block: Photons of a worker's first block, which shows how fast it is.
-        must_rest: Whether `tallies` changes while any of them traces.
-        timing: Seconds of "setup", "compile" and "truth".
-        truth: Truth maps.
+    A worker's first block, of `first_block` photons, shows how fast it is; `must_rest`: `tallies` changes while any
+    traces. `threads` are those of the CPU in all, by default one a core; a GPU takes one.
 
     Raises:
         ConfigError: CPU and GPU together, caller's tallies with several devices, or a number out of range.
@@ -484,16 +454,10 @@ class LocalWorkers:
 
 
 class ClusterWorkers(RayWorkers):
-    """Workers of Ray for the length of a `with` block, on this machine or many; attributes as of `LocalWorkers`.
+    """Workers of Ray for the length of a `with` block, on this machine or many; as `LocalWorkers`.
 
     A worker adds its blocks up where it is, since a histogram can take longer to send than a block to trace, and hands
     its tallies over for a checkpoint or at the end, while the others continue.
-
-    Args:
-        plan: Of the run.
-        engine: Which cluster, how many workers.
-        device: "cpu" or "cuda"; None: GPUs if the cluster has any.
-        note: Called with remarks: which workers have joined, which were lost.
     """
 
     must_rest = False
@@ -501,10 +465,10 @@ class ClusterWorkers(RayWorkers):
     def __init__(
         self, plan: Plan, engine: Ray, device: str | None = None, *, note: Callable[[str], None] | None = None
     ) -> None:
-        camera, gate = plan.scene.camera, plan.scene.gate
-        histograms = len(COMPONENTS) + (2 if plan.batch_size else 0)
-        signed = len(plan.derivatives) + len(camera.tallied_channels)
-        size = 8 * histograms * (1 + signed) * camera.width * camera.height * gate.bins
+        camera = plan.scene.camera
+        voxels = camera.width * camera.height * plan.scene.gate.bins
+        histograms = 1 + len(plan.derivatives) + len(camera.tallied_channels)
+        size = 8 * (len(COMPONENTS) + (2 if plan.batch_size else 0)) * histograms * voxels
         super().__init__(engine, device, prepare=functools.partial(_prepare, plan), value_bytes=size, note=note)
         self._total: Tallies | None = None
         self.timing: dict[str, float] = {}
@@ -584,3 +548,73 @@ def _collect(worker: Worker) -> Tallies:
     tallies = total_of(tracer.tallies()) if worker.device == "cpu" else tracer.tallies()
     tracer.clear()
     return tallies
+
+
+# Light that stays on its device, for programs that render a scene again and again
+
+
+class ExpectedLight(NamedTuple):
+    """Expected detections per pulse, Warp float32 `[pixel, bin]`; of all light, and of the targets' alone, or None."""
+
+    total: Any
+    target: Any
+
+
+class LightTracer:
+    """Traces photons of one scene on one device, part after part, without copies to the host.
+
+    Args:
+        scene: What to trace.
+        photons: Of a part at most.
+        seed: 64 bits.
+        device: As in `simulate`; the first of several.
+        derivatives: Names, as in `simulate`.
+        separate_targets: Whether the light of the targets alone is wanted, too.
+        mesh_cache: As in `simulate`.
+        tally: That of another tracer of as many pixels and bins, to save memory: a call empties it.
+
+    Raises what `simulate` raises.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        photons: int,
+        seed: int,
+        device: str | None = None,
+        derivatives: Sequence[str] = (),
+        separate_targets: bool = False,
+        mesh_cache: dict[str, Any] | None = None,
+        tally: Any = None,
+    ) -> None:
+        plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=derivatives or None)
+        workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)
+        self._scene, self._separate_targets, self._unit = scene, separate_targets, 1.0 / plan.scale
+        self._names, self._worker = plan.derivatives, workers.tracers[0]
+        self.truth: Truth = workers.truth
+
+    @property
+    def tally(self) -> Any:
+        """Warp int64, of the photons traced last."""
+        return self._worker.data.tally
+
+    def __call__(self, first: int, photons: int) -> tuple[ExpectedLight, dict[str, ExpectedLight]]:
+        """Light of the photons `first` … `first + photons`, and its derivatives by name with the same photons."""
+        worker = self._worker
+        worker.clear()
+        worker.trace((first, first + photons), stopped=threading.Event())
+        scene, data, names = self._scene, worker.data, self._names
+        per_photon = scene.laser.photons_per_pulse * scene.detections_per_photon
+        value = per_photon / photons_per_position(scene, ((first, first + photons),)).reshape(-1)
+        slopes = {
+            name: self._light(data.gradients, value * unit, len(names), p)
+            for p, (name, unit) in enumerate(zip(names, worker.signed_units, strict=True))
+        }
+        return self._light(data.tally, value * self._unit, 1, 0), slopes
+
+    def _light(self, tally: Any, value: Any, parameters: int, parameter: int) -> ExpectedLight:
+        scale: Any = wp.array(np.asarray(value, np.float64), dtype=wp.float64, device=tally.device)
+        which: Any = {"bins": self._scene.gate.bins, "parameters": parameters, "parameter": parameter}
+        target = sk.tally_rates(tally, scale, components=(0, 2), **which) if self._separate_targets else None
+        return ExpectedLight(sk.tally_rates(tally, scale, **which), target)
