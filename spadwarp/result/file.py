@@ -1,16 +1,18 @@
-"""A result as one HDF5 file; its depth and truth as EXR."""
+"""A result as one HDF5 file; results added up; depth and truth as EXR."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
@@ -23,15 +25,16 @@ from spadwarp.result.result import (
     Truth,
     arrays_of,
     coordinates_of,
+    difference,
     shape_of,
     signed_of,
     water_of,
 )
-from spadwarp.result.tallies import SignedTallies, joined, moments_of
+from spadwarp.result.tallies import Range, SignedTallies, added, joined, moments_of, total_of
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes
 
-__all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps"]
+__all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps", "merge"]
 __all__ += ["save_depth_exr", "save_result", "save_truth_maps"]
 
 FORMAT = "spadwarp result"
@@ -251,6 +254,59 @@ def _attributes(result: Result) -> dict[str, Any]:
         "detector_irf": detector.irf,
     }
     return values if scene.source is None else {**values, "source": str(scene.source)}
+
+
+# Results added up: tallies are integers, so that the order and the devices make no difference
+
+
+def merge(results: Iterable[ResultLike]) -> Result:
+    """Adds results of the same scene, seed and unit with disjoint photon ids; bit-identical to one run of all the ids.
+
+    `results` are results or their paths.
+
+    The ids may leave gaps, which `simulate(resume=)` fills. Each part's provenance is in `provenance["parts"]`,
+    with its ids.
+
+    Raises:
+        ArgumentError: No list of results.
+        ConfigError: Different scenes (photons and output aside), seeds, units or batches, or ids that overlap.
+    """
+    if isinstance(results, str | os.PathLike | Result) or not isinstance(results, Iterable):
+        raise ArgumentError(f"results = {shown(results)} is not a list of results or of their paths")
+    parts = [as_result(item, "results: an item") for item in results]
+    if not parts:
+        raise ConfigError("merge: no results given")
+    first = parts[0]
+    for other in parts[1:]:
+        if problem := difference(first, other):
+            raise ConfigError(f"merge: {problem}")
+    try:
+        ranges = joined(ids for part in parts for ids in part.photon_ranges)
+    except ConfigError as error:
+        raise ConfigError(f"merge: {error}") from error
+    return replace(
+        first,
+        **vars(total_of(*parts)),
+        photons=sum(part.photons for part in parts),
+        timing=added(*(part.timing for part in parts)),
+        provenance=_joined_provenance((part.provenance, part.photon_ranges) for part in parts),
+        partial=any(part.partial for part in parts),
+        photon_ranges=ranges,
+        requested=(min(part.requested[0] for part in parts), max(part.requested[1] for part in parts)),
+    )
+
+
+def _joined_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) -> dict[str, Any]:
+    """The first provenance, and under `parts` each with its photon ids."""
+    each: list[dict[str, Any]] = []
+    for provenance, ranges in parts:
+        made = dict(provenance)
+        each += made.pop("parts", None) or [{**made, "photon_ranges": [list(ids) for ids in ranges]}]
+    head = {name: value for name, value in each[0].items() if name != "photon_ranges"}
+    return head if len(each) == 1 else {**head, "parts": each}
+
+
+# Images
 
 
 def save_truth_maps(result: Result, path: str | Path) -> Path:

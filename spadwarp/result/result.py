@@ -485,14 +485,27 @@ def difference(a: ResultHead, b: ResultHead) -> str:
     if one != other:
         sections = [name for name in type(one).model_fields if getattr(one, name) != getattr(other, name)]
         return f"the scene of the results differs in {', '.join(sections)}: only photons and output may differ"
-    for name in ("seed", "unit", "batch_size"):
-        if getattr(a, name) != getattr(b, name):
-            title = {"unit": "tally unit"}.get(name, name.replace("_", " "))
-            return f"the {title} of the results differs ({getattr(a, name)} and {getattr(b, name)})"
-    focus = a.focus_distance, b.focus_distance
-    if focus[0] != focus[1] and (None in focus or not np.isclose(*focus, rtol=1e-4, atol=0.0)):  # type: ignore[arg-type]
-        return f"the lenses of the results differ: focus_distance is {focus[0]} and {focus[1]} m"
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit", "batch_size")}
+    if isinstance(a, Result) and isinstance(b, Result):
+        pairs["list of derivatives"] = tuple(a.derivatives), tuple(b.derivatives)
+        pairs["channel"] = a.provenance.get("channel"), b.provenance.get("channel")
+        if not same_targets(a.truth, b.truth):
+            return TARGETS_DIFFER
+    for name, (mine, its) in pairs.items():
+        if mine != its:
+            return f"the {name.replace('_', ' ')} of the results differs ({mine} and {its})"
+    mine, its = a.focus_distance, b.focus_distance
+    if mine != its and (mine is None or its is None or not np.isclose(mine, its, rtol=1e-4, atol=0.0)):
+        return f"the lenses of the results differ: focus_distance is {mine} and {its} m"
     return ""
+
+
+TARGETS_DIFFER = "the targets of the results differ, by their truth maps: was a mesh file changed?"
+
+
+def same_targets(a: Truth, b: Truth) -> bool:
+    """Whether two truth maps are of the same targets."""
+    return np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True)
 
 
 # Derivatives and channels

@@ -109,9 +109,7 @@ def _signed_total(parts: Sequence[SignedTallies | None]) -> SignedTallies | None
     return replace(first, tallies=tallies, second_moment=second_moment)
 
 
-def _added_arrays(
-    parts: Sequence[Tallies | SignedTallies],
-) -> tuple[NDArray[np.int64], NDArray[np.uint64] | None]:
+def _added_arrays(parts: Sequence[Tallies | SignedTallies]) -> tuple[NDArray[np.int64], NDArray[np.uint64] | None]:
     """The sum of the tallies, and of the second moments where all have one: 128-bit integers, low and high halves."""
     total = parts[0].tallies.copy()
     for part in parts[1:]:

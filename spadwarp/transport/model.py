@@ -68,7 +68,6 @@ def build_model(
         DeviceError: The device has too little memory.
     """
     _check_domain(scene, camera)
-    _check_discs(scene, camera)
     if camera:
         _check_gate(scene)
     if scale is None:
@@ -428,44 +427,35 @@ def _channel_rows(camera: Camera) -> list[list[float]]:
 
 
 def _check_domain(scene: Scene, camera: bool) -> None:
-    """Refuses a camera or a laser, or the way out of its port, outside the domain."""
-    beam = scene.beam
-    ways = {"laser.position": (laser_port(scene), beam.position, beam.axis)}
+    """Refuses a camera or a laser, or the way out of its port, outside the domain; and a lens or a beam that reaches
+    through a face that reflects: beyond it nothing is mirrored."""
+    beam, lens, domain = scene.beam, scene.camera, scene.domain
+    radius = beam.beam_radius if beam.profile == "collimated" else 0.0
+    ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)]
     if camera:
-        ways["camera.position"] = (camera_port(scene), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    for name, (port, position, axis_of) in ways.items():
-        point, slack = np.asarray(position, np.float64), 0.0
+        radius, origin = 0.0 if lens.pinhole else lens.aperture_radius, (0.0, 0.0, 0.0)
+        ends.append(("camera", camera_port(scene), origin, (0.0, 0.0, 1.0), "aperture_diameter", radius))
+    for section, port, position, axis, field, radius in ends:
+        name, point, slack = f"{section}.position", np.asarray(position, np.float64), 0.0
         if port is not None:
             # The water begins behind the port, which may be a face of the domain.
-            name, slack = f"{name}, its axis behind the port", 1e-6
-            point = port.enter(position, axis_of)[0]
+            name, slack, radius = f"{name}, its axis behind the port", 1e-6, 0.0
+            point = port.enter(position, axis)[0]
             if not np.isfinite(point).all():
                 text = f"{name}: light along the axis does not get through the port: turn the axis or the port"
                 raise ConfigError(text, source=scene.source)
-        for axis, value, low, high in zip(
-            "xyz", to_world(scene.camera, point).tolist(), *scene.domain.bounds, strict=True
-        ):
+        centre = to_world(lens, point).tolist()
+        for letter, value, low, high in zip("xyz", centre, *domain.bounds, strict=True):
             if not low - slack <= value <= high + slack:
-                text = f"{name}: {axis} = {value} is outside [{low}, {high}], the domain"
+                text = f"{name}: {letter} = {value} is outside [{low}, {high}], the domain"
                 raise ConfigError(text, source=scene.source)
-
-
-def _check_discs(scene: Scene, camera: bool) -> None:
-    """Refuses a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
-    beam, discs = scene.beam, {}
-    if beam.profile == "collimated" and laser_port(scene) is None:
-        discs["laser.beam_radius"] = (beam.position, beam.axis, beam.beam_radius)
-    if camera and camera_port(scene) is None and not scene.camera.pinhole:
-        discs["camera.aperture_diameter"] = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), scene.camera.aperture_radius)
-    for name, (position, axis, radius) in discs.items():
-        centre = to_world(scene.camera, np.asarray(position, np.float64))
-        across = rotation_matrix(scene.camera.rotation_deg) @ np.asarray(axis, np.float64)
-        for face in scene.domain.reflecting:
-            k, high = "xyz".index(face[0]), face.endswith("high")
-            beyond = radius * math.sqrt(max(1.0 - across[k] ** 2, 0.0)) - abs(scene.domain.bounds[high][k] - centre[k])
+        across = rotation_matrix(lens.rotation_deg) @ np.asarray(axis, np.float64)
+        for face in domain.reflecting:
+            k, upper = "xyz".index(face[0]), face.endswith("high")
+            beyond = radius * math.sqrt(max(1.0 - across[k] ** 2, 0.0)) - abs(domain.bounds[upper][k] - centre[k])
             if beyond > 0.0:
-                text = f"{name}: reaches {beyond:.4g} m through {face} of the domain, which has an outside_index"
-                raise ConfigError(text, source=scene.source)
+                text = f"reaches {beyond:.4g} m through {face} of the domain, which has an outside_index"
+                raise ConfigError(f"{section}.{field}: {text}", source=scene.source)
 
 
 def _check_gate(scene: Scene) -> None:

@@ -23,8 +23,7 @@ from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, 
 from spadwarp.limits import shown
 from spadwarp.parallel import Event, Ray, interruptible
 from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
-from spadwarp.result.merging import check_targets
-from spadwarp.result.result import ResultHead, largest_share
+from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
@@ -190,8 +189,8 @@ class _Run:
         options: RunOptions,
         stopped: threading.Event,
     ) -> None:
-        if resumed is not None:
-            check_targets(resumed.truth, workers.truth, "resume")
+        if resumed is not None and not same_targets(resumed.truth, workers.truth):
+            raise ConfigError(f"resume: {TARGETS_DIFFER}")
         self._plan, self._workers, self._resumed, self._stopped = plan, workers, resumed, stopped
         self._report = (lambda stage, done, total: None) if progress is None else progress
         self._began = time.perf_counter()

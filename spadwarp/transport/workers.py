@@ -121,16 +121,14 @@ class DeviceWorker:
         def ended() -> Range:
             span, end = running.pop(0)
             if end is not None:
-                with device_errors(device):
-                    wp.synchronize_event(end)
+                wp.synchronize_event(end)
             return span
 
         for first, stop in spans:
-            with device_errors(device):
-                sk.launch_transport(
-                    self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
-                )
-                running.append(((first, stop), device.stream.record_event() if device.is_cuda else None))
+            sk.launch_transport(
+                self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
+            )
+            running.append(((first, stop), device.stream.record_event() if device.is_cuda else None))
             if len(running) > ahead:
                 yield ended()
         while running:
@@ -144,26 +142,25 @@ class DeviceWorker:
         `report` gets the photons of each launch, from the thread that ran it.
         """
         done, size = list[Range](), self._batch_size or block[1] - block[0]
-        for first in range(*block, size):
-            part = first, first + size
-            traced = self._trace(part, stopped, report)
-            if not self._batch_size:
-                done += traced
-            elif traced == (part,):
-                self._close_batch()
-                done.append(part)
-            else:
-                for array in (self.data.ledger, *(histogram.array for histogram in self._histograms)):
-                    array.zero_()
-                break
-        self._check_overflow()
+        with device_errors(self.model.device):
+            for first in range(*block, size):
+                part = first, first + size
+                traced = self._trace(part, stopped, report)
+                if not self._batch_size:
+                    done += traced
+                elif traced == (part,):
+                    self._close_batch()
+                    done.append(part)
+                else:
+                    for array in (self.data.ledger, *(histogram.array for histogram in self._histograms)):
+                        array.zero_()
+                    break
+            self._check_overflow()
         return joined(done)
 
     def _check_overflow(self) -> None:
         """After every block of photons, long before an integer could wrap around and look right again."""
-        with device_errors(self.model.device):
-            overflowed = any(histogram.has_overflowed() for histogram in self._histograms)
-        if overflowed:
+        if any(histogram.has_overflowed() for histogram in self._histograms):
             raise SpadwarpError(OVERFLOW)
 
     def _trace(self, ids: Range, stopped: threading.Event, report: Callable[[int], None]) -> Ranges:
@@ -201,15 +198,13 @@ class DeviceWorker:
 
     def _close_batch(self) -> None:
         """Adds a batch whose photons are all done to the totals."""
-        with device_errors(self.model.device):
-            for histogram in self._histograms:
-                assert histogram.batches is not None
-                histogram.batches.close(histogram.array, threads=self._threads)
-            assert self._histograms[0].batches is not None
-            moments = moments_of(COMPONENTS, self._histograms[0].batches.take_sums())
-            closed = *sk.read_ledger(self.data), moments
-            self.data.ledger.zero_()
-        self._add_closed(closed)
+        for histogram in self._histograms:
+            assert histogram.batches is not None
+            histogram.batches.close(histogram.array, threads=self._threads)
+        assert self._histograms[0].batches is not None
+        moments = moments_of(COMPONENTS, self._histograms[0].batches.take_sums())
+        self._add_closed((*sk.read_ledger(self.data), moments))
+        self.data.ledger.zero_()
 
     def _add_closed(self, more: tuple[dict[str, int], dict[str, int], dict[str, int]]) -> None:
         """Energy balance, counters and moments of closed batches."""
@@ -223,10 +218,10 @@ class DeviceWorker:
             for mine, more in zip(self._histograms, other._histograms, strict=True):
                 mine.take_over(more)
             sk.add_tallies(self.data.ledger, other.data.ledger)
-        if other._closed is not None:
-            self._add_closed(other._closed)
-        self._check_overflow()
-        other.clear()
+            if other._closed is not None:
+                self._add_closed(other._closed)
+            self._check_overflow()
+            other.clear()
 
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
