@@ -65,16 +65,15 @@ def run_jobs(
         Whatever `work` raises.
     """
     stopped = threading.Event() if stopped is None else stopped
+    devices = [] if engine is not None else [found.alias for found in pick_devices(device)]
     if engine is not None:
-        yield from _run_on_ray(work, jobs, engine=engine, device=device, stopped=stopped, note=note)
-        return
-    devices = [found.alias for found in pick_devices(device)]
-    if len(devices) > 1:
+        with RayWorkers(engine, device, note=note) as workers:
+            yield from _run_on_ray(work, jobs, workers, stopped)
+    elif len(devices) > 1:
         yield from _run_in_processes(work, jobs, devices, stopped)
-        return
-    worker = Worker(devices[0], stopped=stopped)
-    for job in _until(stopped, jobs):
-        yield job, work(job, worker)
+    else:
+        worker = Worker(devices[0], stopped=stopped)
+        yield from ((job, work(job, worker)) for job in _until(stopped, jobs))
 
 
 def _until(stopped: threading.Event, jobs: Iterable[Job]) -> Iterator[Job]:
@@ -142,42 +141,33 @@ def _end_with_parent() -> None:
 
 
 def _run_on_ray(
-    work: Callable[[Job, Worker], Value],
-    jobs: Iterable[Job],
-    *,
-    engine: Ray,
-    device: str | None,
-    stopped: threading.Event,
-    note: Callable[[str], None] | None,
+    work: Callable[[Job, Worker], Value], jobs: Iterable[Job], workers: RayWorkers, stopped: threading.Event
 ) -> Iterator[tuple[Job, Value]]:
-    """`run_jobs` on Ray. A job whose worker was lost is run again."""
-    queue, again = _until(stopped, jobs), list[tuple[Job, int]]()
-    running: dict[Any, tuple[Job, int]] = {}
+    """A job whose worker was lost is run again."""
+    queue = ((job, RETRIES) for job in _until(stopped, jobs))
+    again, running = list[tuple[Job, int]](), dict[Any, tuple[Job, int]]()
     stop_sent = False
-    with RayWorkers(engine, device, note=note) as workers:
-        while True:
-            for worker in workers.idle if not stopped.is_set() else ():
-                try:
-                    job, retries = again.pop() if again else (next(queue), RETRIES)
-                except StopIteration:
-                    break
-                running[worker] = job, retries
-                workers.send(worker, work, job)
-            if stopped.is_set() and not stop_sent:
-                workers.stop()
-                stop_sent = True
-            if not running and (stopped.is_set() or workers.idle):
-                return
-            for event in workers.wait(0.2):
-                if event.worker not in running:  # it has joined, or was lost before
-                    continue
-                job, retries = running.pop(event.worker)
-                if event.kind == "returned":
-                    yield job, event.value
-                elif retries:
-                    again.append((job, retries - 1))
-                else:
-                    raise DeviceError(f"a job is given up: {RETRIES + 1} workers were lost while they ran it")
+    while True:
+        for worker in workers.idle if not stopped.is_set() else ():
+            if (item := again.pop() if again else next(queue, None)) is None:
+                break
+            running[worker] = item
+            workers.send(worker, work, item[0])
+        if stopped.is_set() and not stop_sent:
+            workers.stop()
+            stop_sent = True
+        if not running and (stopped.is_set() or workers.idle):
+            return
+        for event in workers.wait(0.2):
+            if event.worker not in running:  # it has joined, or was lost before
+                continue
+            job, retries = running.pop(event.worker)
+            if event.kind == "returned":
+                yield job, event.value
+            elif retries:
+                again.append((job, retries - 1))
+            else:
+                raise DeviceError(f"a job is given up: {RETRIES + 1} workers were lost while they ran it")
 
 
 # Calls in copies of this process, which cost no import and no transfer of what they read

@@ -20,15 +20,12 @@ from spadwarp.device import core_count, physical_memory, pick_device, processor_
 from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.parallel.worker import Event, Ray, Worker
 
-Note = Callable[[str], None]
-
 __all__ = ["RayWorkers"]
 
 RETRIES = 3
 """How often a job whose worker was lost runs again; a job that loses more is likely what kills them."""
 
 _PATIENCE = 30.0  # seconds without any worker after which a remark says so
-_MIB = 1 << 20
 
 
 class _Actor:
@@ -82,11 +79,10 @@ class RayWorkers:
         *,
         prepare: Callable[[Worker], None] | None = None,
         value_bytes: int = 0,
-        note: Note | None = None,
+        note: Callable[[str], None] | None = None,
     ) -> None:
         if device not in (None, "cpu", "cuda", "cuda:all"):
-            text = "cannot be combined with Ray, which gives each worker its GPU: cpu or cuda"
-            raise ConfigError(f"device = {device!r} {text}")
+            raise ConfigError(f"device = {device!r} cannot be combined with Ray, which gives each worker its GPU")
         self._engine, self._device, self._prepare = engine, device, prepare
         self._value_bytes, self._note = value_bytes, note or (lambda text: None)
         self._pending: dict[Any, tuple[Literal["joined", "returned"], RayWorker]] = {}
@@ -217,7 +213,7 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
     if address is None:
         _require_token()
         # For a value of each worker and what is being written; a third of the memory is Ray's own default.
-        reserve = max(256 * _MIB, int(1.25 * value_bytes * ((engine.workers or 8) + 2)))
+        reserve = max(256 << 20, int(1.25 * value_bytes * ((engine.workers or 8) + 2)))
         reserve = min(reserve, (physical_memory() or 3 * reserve) // 3)
         options = {
             "address": "local",
@@ -255,9 +251,8 @@ def _require_token() -> None:
 
 
 def _description(worker: RayWorker) -> str:
-    if worker.metadata is None:
-        return "that had not joined yet"
-    return "{host} {device} ({device_name}), process {pid}".format_map(worker.metadata)
+    text = "that had not joined yet" if worker.metadata is None else "{host} {device} ({device_name}), process {pid}"
+    return text.format_map(worker.metadata or {})
 
 
 def _first_line(error: BaseException) -> str:

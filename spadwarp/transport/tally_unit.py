@@ -174,13 +174,8 @@ def _spread(laser: Laser) -> float:
 def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float], density: Density) -> float:
     """Largest share of the light per area of the lens [1/m^2] that one bin of one pixel gets where the beam's axis is
     in view, by single scattering; 0 if it never is, or starts at the lens."""
-    camera, laser, gate, medium, speed = (
-        scene.camera,
-        scene.beam,
-        scene.gate,
-        scene.medium.range,
-        scene.medium.pulse_speed,
-    )
+    camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium.range
+    speed = scene.medium.pulse_speed
     exit_point = np.array(laser.position)
     if np.linalg.norm(exit_point) < camera.aperture_radius or scene.scan_positions > 1:
         return 0.0
