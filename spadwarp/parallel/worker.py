@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from spadwarp.errors import ArgumentError
 from spadwarp.limits import check_integer, shown
 
-__all__ = ["Event", "Ray", "Worker", "interruptible"]
+__all__ = ["Ray", "Worker", "interruptible"]
 
 
 @dataclass(frozen=True)

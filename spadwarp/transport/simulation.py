@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_devices, processor_name
 from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning
 from spadwarp.limits import shown
-from spadwarp.parallel import Event, Ray, interruptible
+from spadwarp.parallel import Ray, interruptible
+from spadwarp.parallel.worker import Event
 from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
 from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without

@@ -21,7 +21,9 @@ from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, pick_device, pick_devices, processor_name
 from spadwarp.errors import ConfigError, DeviceError, SpadwarpError, address_space, kernel_errors
 from spadwarp.limits import check_integer
-from spadwarp.parallel import Event, Ray, RayWorkers, Worker
+from spadwarp.parallel import Ray, Worker
+from spadwarp.parallel.ray import RayWorkers
+from spadwarp.parallel.worker import Event
 from spadwarp.result import COMPONENTS, SignedTallies, Tallies, Truth
 from spadwarp.result.tallies import (
     OVERFLOW,
