@@ -1,7 +1,6 @@
 """Independent jobs on devices of this host or workers of Ray, and calls in copies of this process.
 
-for job, value in run_jobs(work, jobs, device="cuda:all"): ...
-for job, value in run_jobs(work, jobs, engine=Ray(address="auto")): ...
+for job, value in run_jobs(work, jobs, device="cuda:all"): ...  # or engine=Ray(address="auto")
 
 `work(job, worker)` is a function of a module, which is sent by name and runs where the worker is. Which worker runs a
 job is not defined, so that a job must hold all that its value depends on, its seed above all.

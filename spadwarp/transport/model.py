@@ -25,7 +25,7 @@ from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
-from spadwarp.transport.tally_unit import tally_scale
+from spadwarp.transport.plan import tally_scale
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh

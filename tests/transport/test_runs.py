@@ -215,6 +215,10 @@ def test_what_cannot_be_merged_is_refused():
             simulate(one.with_overrides({"medium.extinction": 0.6}), **later, seed=5),
             "scene of the results differs in medium: only photons",
         ),
+        (
+            simulate(one.with_overrides({"transport.termination": "roulette"}), **later, seed=5),
+            "scene of the results differs in transport: only photons",
+        ),
     ):
         with pytest.raises(ConfigError, match=text):
             merge([a, other])
