@@ -24,6 +24,7 @@ from spadwarp.limits import check_choice
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
 from spadwarp.result.file import read_head
+from spadwarp.result.result import difference
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_matrix
@@ -165,7 +166,8 @@ def load_resumable(path: str | Path) -> tuple[Result, Path]:
         return load_result(file), file
     try:
         checkpoint, result = map(read_head, files)
-        if checkpoint.is_of_run(result) and result.photons >= checkpoint.photons:
+        one_run = not difference(checkpoint, result) and checkpoint.requested[0] == result.requested[0]
+        if one_run and result.photons >= checkpoint.photons:
             files.reverse()
         return load_result(files[0]), files[0]
     except FileError as error:

@@ -54,7 +54,7 @@ class Worker:
 
 
 class Event(NamedTuple):
-    """Something that a worker did."""
+    """Something that a worker did; see `RayWorkers.wait`."""
 
     kind: str
     worker: Any
