@@ -5,9 +5,8 @@ import warp as wp
 from spadwarp_kernels.base.philox import u01
 from spadwarp_kernels.optics.port import PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, TOO_LONG, Contribution, tally_index
+from spadwarp_kernels.photon.state import TOO_LONG, Contribution, PhotonState, World, tally_index
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
 
 from .estimator import Estimator
 
@@ -17,7 +16,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
     if spec.port is not None:
         return Estimator(cross=_make_cross_port(spec, spec.port))
     reflecting = spec.reflecting
-    image_of, scatterings = spec.lens.image or spec.lens.project, _make_scatterings(spec.reflecting)
+    image_of, scatterings = spec.image_of, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:
@@ -74,7 +73,7 @@ def _component(s: wp.ref[PhotonState]) -> int:
 def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
     """As `cross` of `make_analog`, for a photon that is refracted by a port and must hit the aperture behind it."""
     reflecting = spec.reflecting
-    image_of, leave, scatterings = spec.lens.image or spec.lens.project, port.leave, _make_scatterings(spec.reflecting)
+    image_of, leave, scatterings = spec.image_of, port.leave, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross_port(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:
