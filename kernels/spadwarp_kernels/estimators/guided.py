@@ -20,7 +20,7 @@ from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import reflection_pdf, sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
-from spadwarp_kernels.water.limits import exit_distance, exit_distance_rotated
+from spadwarp_kernels.water.limits import make_domain
 from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import (
     HENYEY_GREENSTEIN,
@@ -65,7 +65,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
     view_of = spec.lens.view
     varies, bounded, has_phase_guide = spec.varies, spec.bounded, spec.phase.guide is not None
-    to_exit = exit_distance_rotated if spec.rotated_domain else exit_distance
+    to_exit = make_domain(spec.rotated_domain).exit_distance
     clip_to_view, _, clip_to_gate = port_view(spec.port)
     sample_lens = make_sample_lens(spec.port)
 

@@ -12,17 +12,7 @@ from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.ray_cast import offset_from_surface
 from spadwarp_kernels.tally.ledger import EXIT, MAX_PATH
 from spadwarp_kernels.tally.tally import TOO_LONG
-from spadwarp_kernels.water.limits import (
-    exit_distance,
-    exit_distance_rotated,
-    exit_face,
-    exit_face_rotated,
-    face_index,
-    first_exit,
-    first_exit_rotated,
-    is_outside,
-    is_outside_rotated,
-)
+from spadwarp_kernels.water.limits import face_index, make_domain
 
 
 @wp.struct
@@ -50,11 +40,8 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     bounded = spec.bounded and not reflecting
     local_albedo = spec.varies and not spec.random_albedo
     water_at, fly_carried = spec.water.at, make_rider(spec).fly
-    to_exit, face_of_exit, exit_of, outside = (
-        (exit_distance_rotated, exit_face_rotated, first_exit_rotated, is_outside_rotated)
-        if spec.rotated_domain
-        else (exit_distance, exit_face, first_exit, is_outside)
-    )
+    domain = make_domain(spec.rotated_domain)
+    outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
 
     @wp.func
     def end_of_flight(s: wp.ref[PhotonState], world: wp.ref[World]) -> Collision:
@@ -76,7 +63,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
             if exit < c.distance:
                 c.distance = exit
                 c.reason = -1
-                face = face_of_exit(world.limits, s.x, s.u)
+                face = exit_of(world.limits, s.x, s.u).face
                 if face_index(world.limits.boundary, face) > 0.0:
                     c.mirror = face
                 else:

@@ -19,7 +19,7 @@ from spadwarp_kernels.surface.reflectance import (
     unshadowed,
 )
 from spadwarp_kernels.tally.ledger import DIRECTED, EXIT, MAX_COLLISIONS, ROULETTE, WEIGHT_CUTOFF
-from spadwarp_kernels.water.limits import face_index, flipped, fresnel_reflectance
+from spadwarp_kernels.water.limits import face_index, flipped, fresnel_reflectance, make_domain
 
 
 @wp.struct
@@ -142,6 +142,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
     """
     rotated, terminate, continues = spec.rotated_domain, make_terminate(spec), make_continues(flies_on)
+    turn, turn_back = make_domain(rotated).turn, make_domain(rotated).turn_back
     mirror_carried = make_rider(spec).mirror
 
     @wp.func
@@ -149,13 +150,11 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
         face = s.bounces.face
         axis = (face - 1) // 2
         index = face_index(world.limits.boundary, face)
-        u = s.u
-        if wp.static(rotated):
-            u = world.limits.rotation * u
+        u = turn(world.limits, s.u)
         part = fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), index)
-        u = flipped(u, axis)
+        u = turn_back(world.limits, flipped(u, axis))
         if wp.static(rotated):
-            u = wp.normalize(wp.transpose(world.limits.rotation) * u)
+            u = wp.normalize(u)
         new = Outcome()
         new.reason = s.reason
         new.weight = s.weight
