@@ -1,5 +1,7 @@
 """What a photon adds to a pixel by a next event: from where it scatters, or from a sampled point of its flight."""
 
+from typing import NamedTuple
+
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
@@ -7,6 +9,7 @@ from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import Camera, lens_point
+from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
 from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -29,23 +32,14 @@ __all__ = ["next_event_value"]
 
 @wp.struct
 class Link:
-    """A way to the lens.
+    """A way to the lens."""
 
-    Attributes:
-        to_lens: Unit direction at the point.
-        image: A point that the lens sees in the same direction, in air alone [m].
-        end: Where the way leaves the water [m].
-        water: Its length in the water [m].
-        path: Length in water that takes as long as all of it [m].
-        gather: What the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2];
-            through a port.
-    """
-
-    to_lens: wp.vec3
-    image: wp.vec3
-    end: wp.vec3
-    water: float
-    path: float
+    to_lens: wp.vec3  # unit direction at the point
+    image: wp.vec3  # a point that the lens sees in the same direction, in air alone [m]
+    end: wp.vec3  # where the way leaves the water [m]
+    water: float  # its length in the water [m]
+    path: float  # length in water that takes as long as all of it [m]
+    # what the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2]; by a port
     gather: float
 
 
@@ -56,114 +50,78 @@ def next_event_value(
     """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
     unit vector."""
     cos_lens = wp.max(-to_lens[2], 0.0)
-    return (
-        # Times -1: Warp's unary minus is 0 - x, an addition.
-        weight
-        * scattering
-        * wp.exp((-1.0 * extinction) * distance)
-        * camera.aperture_area
-        * cos_lens
-        / (distance * distance)
-    )
+    # Times -1: Warp's unary minus is 0 - x, an addition.
+    passed = wp.exp((-1.0 * extinction) * distance)
+    return weight * scattering * passed * camera.aperture_area * cos_lens / (distance * distance)
 
 
-@wp.func
-def _link_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
-    link = Link()
-    to_lens = o - x
-    r = wp.length(to_lens)
-    link.to_lens = to_lens / r
-    link.image = x
-    link.end = o
-    link.water = r
-    link.path = r
-    return link
+class LensWay(NamedTuple):
+    """Warp functions of the way from x in the water to the point o of the lens."""
 
-
-@wp.func
-def _value_in_water(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
-    return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
-
-
-@wp.func
-def _value_behind_port(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
-    return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
+    link: wp.Function  # ``(camera, x, o) -> Link``
+    value: wp.Function  # ``(camera, extinction, weight, scattering, link) -> float``, part of the photon that arrives
+    apparent: wp.Function  # ``(camera, x, o) -> vec3``, from where the light of o seems to come at x
+    toward: wp.Function  # ``(camera, x, o) -> vec3``, unit direction of the way at x; straight where there is no way
+    toward_centre: wp.Function  # ``(camera, x) -> vec3``, about that to the lens's centre
 
 
 @memoised
-def make_link(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions: ``(camera, x, o) -> Link`` from x to the lens point o, and ``(camera, extinction, weight,
-    scattering, link) -> float``, the fraction of the photon that arrives."""
-    if spec.port is None:
-        return _link_in_water, _value_in_water
-    connect = spec.port.connect
+def make_lens_way(port: PortKind | None) -> LensWay:
+    """The ways behind a kind of port; None: without one."""
+    has_port, kind = port is not None, port or FLAT_PORT
+    connect, apparent_of, apparent_centre = kind.connect, kind.apparent, kind.apparent_centre
 
     @wp.func
-    def link_behind_port(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
-        way = connect(camera.port, x, o)
+    def link_to(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
         link = Link()
-        link.to_lens = way.to_port
-        link.image = o - way.inside
-        link.end = way.exit
-        link.water = way.water
-        link.path = way.path
-        link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            link.to_lens = way.to_port
+            link.image = o - way.inside
+            link.end = way.exit
+            link.water = way.water
+            link.path = way.path
+            link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+        else:
+            to_lens = o - x
+            r = wp.length(to_lens)
+            link.to_lens = to_lens / r
+            link.image = x
+            link.end = o
+            link.water = r
+            link.path = r
         return link
 
-    return link_behind_port, _value_behind_port
-
-
-@wp.func
-def _lens_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-    return o
-
-
-@memoised
-def make_apparent_lens(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(camera, x, o) -> vec3``: from where the light of the lens point o seems to come at x."""
-    if spec.port is None:
-        return _lens_in_water
-    connect, apparent = spec.port.connect, spec.port.apparent
+    @wp.func
+    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
+        if wp.static(has_port):
+            return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
+        return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
 
     @wp.func
-    def apparent_lens(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        way = connect(camera.port, x, o)
+    def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         seen = wp.vec3(o)
-        if way.density > 0.0:
-            seen = apparent(camera.port, x, o, way)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            if way.density > 0.0:
+                seen = apparent_of(camera.port, x, o, way)
         return seen
 
-    return apparent_lens
-
-
-@wp.func
-def _toward_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-    return wp.normalize(o - x)
-
-
-@wp.func
-def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
-    return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
-
-
-@memoised
-def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions: ``(camera, x, o) -> vec3``, the unit direction at x in which light gets to the lens point o,
-    and ``(camera, x) -> vec3`` about that to the lens's centre; the straight one where there is no way."""
-    if spec.port is None:
-        return _toward_in_water, _toward_centre_in_water
-    connect, apparent_centre = spec.port.connect, spec.port.apparent_centre
+    @wp.func
+    def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        straight = wp.normalize(o - x)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            straight = wp.where(way.density > 0.0, way.to_port, straight)
+        return straight
 
     @wp.func
-    def toward_port(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        way = connect(camera.port, x, o)
-        return wp.where(way.density > 0.0, way.to_port, wp.normalize(o - x))
+    def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
+        if wp.static(has_port):
+            return wp.normalize(apparent_centre(camera.port) - x)
+        return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
 
-    @wp.func
-    def toward_centre_behind_port(camera: Camera, x: wp.vec3) -> wp.vec3:
-        return wp.normalize(apparent_centre(camera.port) - x)
-
-    return toward_port, toward_centre_behind_port
+    return LensWay(link_to, value_of, apparent, toward, toward_centre)
 
 
 # ---- Requests, and what they come to.
@@ -171,27 +129,21 @@ def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
 
 @wp.struct
 class Scored:
-    """What a request comes to.
+    """What a request comes to."""
 
-    Attributes:
-        contribution: To the tally, if nothing stands between the scored point and the lens.
-        origin, lens: The scored point, and where its light leaves the water: the point of the lens, or of a port [m].
-    """
-
-    contribution: Contribution
-    origin: wp.vec3
-    lens: wp.vec3
+    contribution: Contribution  # to the tally, if nothing stands between the scored point and the lens
+    origin: wp.vec3  # the scored point [m]
+    lens: wp.vec3  # where its light leaves the water: the point of the lens, or of a port [m]
 
 
 @wp.struct
 class ScoredPoint:
-    """The point of a request: where it is [m], the photon's weight there, and the path up to it [m]; with
-    `scores_collisions` the length of the flight up to there that the weight does not account for yet [m]."""
+    """The point of a request."""
 
-    x: wp.vec3
-    weight: float
-    path: float
-    ahead: float
+    x: wp.vec3  # where it is [m]
+    weight: float  # the photon's weight there
+    path: float  # up to it [m]
+    ahead: float  # of `scores_collisions`, length of the flight up to there that the weight does not account for [m]
 
 
 @memoised
@@ -256,7 +208,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
     has_profile, collides = profile is not None, spec.scores_collisions
     depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
-    apparent_lens = make_apparent_lens(spec)
+    apparent_lens = make_lens_way(spec.port).apparent
 
     @wp.func
     def flight_point(request: Request, world: wp.ref[World]) -> ScoredPoint:
@@ -371,9 +323,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """
     confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
-    image_of = spec.lens.image or spec.lens.project
+    image_of = spec.lens.project
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    link_to, value_of = make_link(spec)
+    link_to, value_of, *_ = make_lens_way(spec.port)
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, _mirror, deliver) = rider is not NOTHING, rider
 

@@ -8,7 +8,7 @@ import warp as wp
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import cos_sin_turn, cotangent
 from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.port import PortKind
+from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
 from spadwarp_kernels.water.medium import Layers, Medium, Profile
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
 
@@ -32,50 +32,41 @@ class LensSample:
     weight: float
 
 
-@wp.func
-def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
-    """A point of the lens through which the flight x + s u is scored.
-
-    The score goes with 1/D, D its distance from the flight's line. Where this passes the lens, the point is drawn with
-    that density, uniform in angle and distance about the place: even draws would have no finite variance.
-    """
-    s = -x[2] / u[2]
-    return lens_about(camera, wp.vec2(x[0] + s * u[0], x[1] + s * u[1]), xi1, xi2)
-
-
-@wp.func
-def lens_about(camera: Camera, p: wp.vec2, xi1: float, xi2: float) -> LensSample:
-    """A point of the lens: about p with a density that falls with the distance from it, or even if p is outside."""
-    sample = LensSample()
-    sample.point = lens_point(camera, xi1, xi2)
-    sample.weight = 1.0
-    radius2 = camera.aperture_radius * camera.aperture_radius
-    if wp.dot(p, p) < radius2:
-        turn = cos_sin_turn(xi2)
-        aside = p[0] * turn[1] - p[1] * turn[0]
-        to_rim = wp.sqrt(wp.max(radius2 - aside * aside, 0.0)) - wp.dot(p, turn)
-        distance = xi1 * to_rim
-        sample.point = wp.vec3(p[0] + distance * turn[0], p[1] + distance * turn[1], 0.0)
-        sample.weight = 2.0 * to_rim * distance / radius2
-    return sample
-
-
 @memoised
 def make_sample_lens(port: PortKind | None) -> wp.Function:
-    """`sample_lens` for a lens behind a port: it is where the flight's line, refracted, passes the lens."""
-    if port is None:
-        return sample_lens
-    leave = port.leave
+    """The Warp function ``(camera, x, u, xi1, xi2) -> LensSample``: a point of the lens by which the flight x + s u is
+    scored.
+
+    The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the lens,
+    the point is drawn with that density, uniform in angle and distance about the place: even draws would have no finite
+    variance. Else it is even.
+    """
+    has_port, leave = port is not None, (port or FLAT_PORT).leave
 
     @wp.func
-    def sample_lens_behind_port(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
-        passage = leave(camera.port, x, wp.where(u[2] < 0.0, u, -u))
-        place = wp.vec2(1.0e30, 0.0)
-        if passage.transmission > 0.0:
-            place = wp.vec2(passage.x[0], passage.x[1])
-        return lens_about(camera, place, xi1, xi2)
+    def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
+        p = wp.vec2(1.0e30, 0.0)
+        if wp.static(has_port):
+            ray = leave(camera.port, x, wp.where(u[2] < 0.0, u, -u))
+            if ray.transmission > 0.0:
+                p = wp.vec2(ray.x[0], ray.x[1])
+        else:
+            s = -x[2] / u[2]
+            p = wp.vec2(x[0] + s * u[0], x[1] + s * u[1])
+        sample = LensSample()
+        sample.point = lens_point(camera, xi1, xi2)
+        sample.weight = 1.0
+        radius2 = camera.aperture_radius * camera.aperture_radius
+        if wp.dot(p, p) < radius2:
+            turn = cos_sin_turn(xi2)
+            aside = p[0] * turn[1] - p[1] * turn[0]
+            to_rim = wp.sqrt(wp.max(radius2 - aside * aside, 0.0)) - wp.dot(p, turn)
+            distance = xi1 * to_rim
+            sample.point = wp.vec3(p[0] + distance * turn[0], p[1] + distance * turn[1], 0.0)
+            sample.weight = 2.0 * to_rim * distance / radius2
+        return sample
 
-    return sample_lens_behind_port
+    return sample_lens
 
 
 @wp.func
@@ -87,35 +78,31 @@ def _turn(d: float, along: float, r: float) -> wp.vec2:
     return wp.where(along < 0.0, wp.vec2(small, large), wp.vec2(large, small))
 
 
-@wp.func
-def _angle_of_turn(d: float, along: float, r: float) -> float:
-    return wp.atan2(d, -along)
+@memoised
+def _make_variable(chord: bool) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """The variable of a guide, angle or chord: at a point of the flight ``(d, along, r)``, the point that has it
+    ``(d, value)``, and its derivative along the flight ``(d, along, r)``."""
 
+    @wp.func
+    def turn_of(d: float, along: float, r: float) -> float:
+        if wp.static(chord):
+            return wp.sqrt(2.0 * _turn(d, along, r)[0])
+        return wp.atan2(d, -along)
 
-@wp.func
-def _chord_of_turn(d: float, along: float, r: float) -> float:
-    return wp.sqrt(2.0 * _turn(d, along, r)[0])
+    @wp.func
+    def along_of(d: float, value: float) -> float:
+        if wp.static(chord):
+            h = 0.25 * value * value
+            return -d * (1.0 - 2.0 * h) / (value * wp.sqrt(wp.max(1.0 - h, 1.0e-12)))
+        return -d * cotangent(value)
 
+    @wp.func
+    def slope(d: float, along: float, r: float) -> float:
+        if wp.static(chord):
+            return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
+        return d / (r * r)
 
-@wp.func
-def _along_angle(d: float, angle: float) -> float:
-    return -d * cotangent(angle)
-
-
-@wp.func
-def _along_chord(d: float, chord: float) -> float:
-    h = 0.25 * chord * chord
-    return -d * (1.0 - 2.0 * h) / (chord * wp.sqrt(wp.max(1.0 - h, 1.0e-12)))
-
-
-@wp.func
-def _angle_slope(d: float, along: float, r: float) -> float:
-    return d / (r * r)
-
-
-@wp.func
-def _chord_slope(d: float, along: float, r: float) -> float:
-    return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
+    return turn_of, along_of, slope
 
 
 @memoised
@@ -125,12 +112,9 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
     is the distance to the collision unless the point is to be drawn from the angle, and the density is that of the
     angle alone."""
     has_profile, draws = profile is not None, profile is not None and profile.draw is not None
-    draw = profile.draw if profile is not None and profile.draw is not None else sample_lens  # any: it is not called
+    draw = profile.draw if profile is not None and profile.draw is not None else _turn  # any: it is not called
     complement, inverse, guide_density = guide.complement, guide.angle, guide.density
-    # The guide's variable, angle or chord: at a point of the flight, the point that has it, its derivative along it.
-    turn_of, along_of, slope = (
-        (_chord_of_turn, _along_chord, _chord_slope) if guide.chord else (_angle_of_turn, _along_angle, _angle_slope)
-    )
+    turn_of, along_of, slope = _make_variable(guide.chord)
 
     @wp.func
     def sample_flight(

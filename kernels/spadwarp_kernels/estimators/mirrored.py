@@ -27,7 +27,7 @@ from spadwarp_kernels.water.limits import (
     to_next_face,
 )
 
-from .contribution import make_link, make_scattering
+from .contribution import make_lens_way, make_scattering
 
 
 @wp.struct
@@ -111,9 +111,9 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, world) -> Mirrored`` of an event by way of one of `Boundary.images`."""
     confocal, measured = spec.confocal, spec.mesh or spec.varies
     followed = measured or make_rider(spec) is not NOTHING
-    image_of = spec.lens.image or spec.lens.project
+    image_of = spec.lens.project
     scattering_density, follow = make_scattering(spec), _make_follow(spec, brute_force)
-    link_to, value_of = make_link(spec)
+    link_to, value_of, *_ = make_lens_way(spec.port)
     domain = make_domain(spec.rotated_domain)
     point, point_back, turn, turn_back = domain.point, domain.point_back, domain.turn, domain.turn_back
 

@@ -10,8 +10,10 @@ from scipy import stats
 from helpers.launch import Floats, Vectors, launched
 from spadwarp_kernels import TABULATED, Camera, Medium, fournier_forand_density, make_phase_tables, random_block, u01
 from spadwarp_kernels.base.philox import u01_fine
-from spadwarp_kernels.estimators.flight_sampling import make_sample_flight, sample_lens
+from spadwarp_kernels.estimators.flight_sampling import make_sample_flight, make_sample_lens
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
+
+sample_lens = make_sample_lens(None)
 
 G = 0.924
 A2 = (1 - G) ** 2 / G
