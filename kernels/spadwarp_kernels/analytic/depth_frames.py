@@ -23,6 +23,7 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.binomial import count_quantile
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.philox import STREAM_ANALYTIC, STREAM_FRAMES, random_block, u01, u01_open
+from spadwarp_kernels.optics.laser import first_above
 
 from .optics import IN_WATER, Optics, Ports, check_ports, point_at
 
@@ -53,20 +54,13 @@ def path_at_share(paths: wp.array2d[float], cumulative: wp.array2d[float], pixel
     """The path [m] at which a pixel's cumulative distribution of backscatter reaches u."""
     row = pixel % cumulative.shape[0]
     edges = pixel % paths.shape[0]
-    low = wp.int32(0)
-    high = wp.int32(cumulative.shape[1] - 1)
-    while high - low > 1:
-        middle = (low + high) / 2
-        if cumulative[row, middle] <= u:
-            low = middle
-        else:
-            high = middle
-    below = cumulative[row, low]
-    width = cumulative[row, high] - below
+    k = wp.max(first_above(cumulative[row], u), 1)
+    below = cumulative[row, k - 1]
+    width = cumulative[row, k] - below
     w = wp.float32(0.5)
     if width > 0.0:
         w = wp.clamp((u - below) / width, 0.0, 1.0)
-    return paths[edges, low] + w * (paths[edges, high] - paths[edges, low])
+    return paths[edges, k - 1] + w * (paths[edges, k] - paths[edges, k - 1])
 
 
 @wp.func
@@ -251,19 +245,30 @@ def sample_frames(
 
 @wp.struct
 class FrameCoding:
-    """What is drawn, and how it is written."""
+    """What is drawn, and how it is written.
 
-    laser: wp.vec3  # position of the laser [m]
-    nearest: float  # path at which the gate opens [m]
-    farthest: float  # path at which it closes [m]
-    width: int  # pixels of a row
-    pixels: int  # pixels of a frame
+    Attributes:
+        laser: Position of the laser [m].
+        nearest, farthest: Paths at which the gate opens and closes [m].
+        width, pixels: Of a row, of a frame.
+        seed: Of the random numbers.
+        first_sample: Id of the first frame; the others follow.
+        depth_offset, depth_step: depth = offset + step · code [m]; code 0 is no return.
+        pulses: Pulses of a frame.
+        intensity_step: Recorded photons per unit of the intensity code.
+    """
+
+    laser: wp.vec3
+    nearest: float
+    farthest: float
+    width: int
+    pixels: int
     seed: wp.uint64
-    first_sample: wp.int64  # id of the first frame; the others follow
-    depth_offset: float  # depth = offset + step · code [m]; code 0 is no return
+    first_sample: wp.int64
+    depth_offset: float
     depth_step: float
-    pulses: float  # of a frame
-    intensity_step: float  # recorded photons per unit of the intensity code
+    pulses: float
+    intensity_step: float
 
 
 @memoised

@@ -10,7 +10,7 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
-from spadwarp_kernels.optics.camera import lens_point
+from spadwarp_kernels.optics.camera import clip_to_gate, lens_point
 from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -31,9 +31,8 @@ from spadwarp_kernels.water.phase_functions import (
     sample_henyey_greenstein,
 )
 
-from .contribution import make_event_request, make_lens_way, make_score, scores_collision
+from .contribution import make_event_request, make_lens_way, make_sample_lens, make_score, scores_collision
 from .estimator import Direction, Estimator, FlightPlan
-from .flight_sampling import make_sample_lens
 
 # A photon's weight is at most this times its analog weight, see `guided_part`.
 LARGEST_WEIGHT_RATIO = wp.constant(64.0)
@@ -66,7 +65,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     view_of = spec.lens.view
     varies, bounded, has_phase_guide = spec.varies, spec.bounded, spec.phase.guide is not None
     to_exit = make_domain(spec.rotated_domain).exit_distance
-    clip_to_view, _, clip_to_gate = port_view(spec.port)
+    clip_to_view, _, gate_of = port_view(spec.port)
     sample_lens = make_sample_lens(spec.port)
 
     @wp.func
@@ -84,7 +83,8 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
         if wp.static(bounded):
             limit = wp.min(limit, to_exit(world.limits, s.x, s.u))
         plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), s.x, s.u, plan.lens, limit)
-        plan.interval = clip_to_gate(world.camera, world.gate, s.x, s.u, s.path, plan.lens, plan.interval)
+        gate = gate_of(world.camera, world.gate)
+        plan.interval = clip_to_gate(gate, s.x, s.u, s.path, plan.lens, plan.interval)
         if not (wp.static(varies) or world.medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
         return plan

@@ -132,17 +132,6 @@ def lens_point(camera: Camera, xi1: float, xi2: float) -> wp.vec3:
 
 
 @wp.func
-def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.vec2:
-    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, between the side planes through the origin with the
-    given tangents (left, top, right, bottom), which meet there: all of it has z > 0; empty where s0 >= s1."""
-    interval = wp.vec2(0.0, limit)
-    interval = clip_half_space(planes[2] * x[2] - x[0], planes[2] * u[2] - u[0], interval)
-    interval = clip_half_space(x[0] - planes[0] * x[2], u[0] - planes[0] * u[2], interval)
-    interval = clip_half_space(planes[3] * x[2] - x[1], planes[3] * u[2] - u[1], interval)
-    return clip_half_space(x[1] - planes[1] * x[2], u[1] - planes[1] * u[2], interval)
-
-
-@wp.func
 def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     """The part of the interval of s in which value + slope s > 0."""
     # Selected rather than branched to: half the lanes of a warp go either way. For a flight along the plane the
@@ -180,9 +169,13 @@ def clip_to_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.ve
     # Sheared so that the side planes, which go through o and the view on the focus plane, go through the origin.
     slope_x = camera.inverse_focus * o[0]
     slope_y = camera.inverse_focus * o[1]
-    start = wp.vec3(x[0] - o[0] + slope_x * x[2], x[1] - o[1] + slope_y * x[2], x[2])
-    along = wp.vec3(u[0] + slope_x * u[2], u[1] + slope_y * u[2], u[2])
-    return clip_to_planes(view, start, along, limit)
+    y = wp.vec3(x[0] - o[0] + slope_x * x[2], x[1] - o[1] + slope_y * x[2], x[2])
+    v = wp.vec3(u[0] + slope_x * u[2], u[1] + slope_y * u[2], u[2])
+    # The planes meet at the origin: all of what is between them has z > 0.
+    part = clip_half_space(view[2] * y[2] - y[0], view[2] * v[2] - v[0], wp.vec2(0.0, limit))
+    part = clip_half_space(y[0] - view[0] * y[2], v[0] - view[0] * v[2], part)
+    part = clip_half_space(view[3] * y[2] - y[1], view[3] * v[2] - v[1], part)
+    return clip_half_space(y[1] - view[1] * y[2], v[1] - view[1] * v[2], part)
 
 
 @wp.func

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_integer, check_items, check_number, check_struct
-from spadwarp_kernels.water.grid import Grid
+from spadwarp_kernels.water.medium import Grid
 
 __all__ = ["BLOCK_DERIVATIVES", "MOST_BLOCK_DERIVATIVES", "Blocks", "make_blocks"]
 

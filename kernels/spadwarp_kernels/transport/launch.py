@@ -59,9 +59,8 @@ from spadwarp_kernels.tally.tally import (
     fold_kernel,
     splitting_pays,
 )
-from spadwarp_kernels.water.grid import Grid
 from spadwarp_kernels.water.limits import Limits, ready_limits
-from spadwarp_kernels.water.medium import Layers, Medium, ready_medium
+from spadwarp_kernels.water.medium import Grid, Layers, Medium, ready_medium
 from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
 
 from .loops import make_transport_kernel

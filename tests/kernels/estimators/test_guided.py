@@ -8,9 +8,18 @@ import warp as wp
 from scipy import stats
 
 from helpers.launch import Floats, Vectors, launched
-from spadwarp_kernels import TABULATED, Camera, Medium, fournier_forand_density, make_phase_tables, random_block, u01
+from spadwarp_kernels import (
+    TABULATED,
+    Camera,
+    Layers,
+    Medium,
+    fournier_forand_density,
+    make_phase_tables,
+    random_block,
+    u01,
+)
 from spadwarp_kernels.base.philox import u01_fine
-from spadwarp_kernels.estimators.flight_sampling import make_sample_flight, make_sample_lens
+from spadwarp_kernels.estimators.contribution import make_sample_flight, make_sample_lens
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
 
 sample_lens = make_sample_lens(None)
@@ -59,7 +68,8 @@ def _flights(guide):
     def flights(x: wp.vec3, u: wp.vec3, interval: wp.vec2, c: float, medium: Medium, s: Floats, p: Floats):
         i = wp.tid()
         block = random_block(wp.uint64(2), wp.uint64(i), wp.uint32(0), wp.uint32(2))
-        sample = sample_flight(x, u, interval, c, medium, u01(block[0]), u01_fine(block[1]))
+        xi_choice, xi = u01(block[0]), u01_fine(block[1])
+        sample = sample_flight(x, u, interval, c, medium, xi_choice, xi, Layers(), wp.vec3())
         s[i] = sample.s
         p[i] = sample.density
 
