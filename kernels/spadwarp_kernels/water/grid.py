@@ -93,6 +93,11 @@ def grid_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> GridLine:
 
 
 @wp.func
+def _sign(x: float) -> float:
+    return wp.where(x > 0.0, 1.0, -1.0)
+
+
+@wp.func
 def first_place(line: GridLine, size: wp.vec3i) -> GridPlace:
     """Where a line that meets the box enters it."""
     place = GridPlace()
@@ -116,9 +121,9 @@ def next_place(line: GridLine, here: GridPlace) -> GridPlace:
     x = here.at[0] <= here.leave
     y = not x and here.at[1] <= here.leave
     place.ahead = wp.vec3(
-        wp.where(x, here.ahead[0] + wp.sign(line.inverse[0]), here.ahead[0]),
-        wp.where(y, here.ahead[1] + wp.sign(line.inverse[1]), here.ahead[1]),
-        wp.where(x or y, here.ahead[2], here.ahead[2] + wp.sign(line.inverse[2])),
+        wp.where(x, here.ahead[0] + _sign(line.inverse[0]), here.ahead[0]),
+        wp.where(y, here.ahead[1] + _sign(line.inverse[1]), here.ahead[1]),
+        wp.where(x or y, here.ahead[2], here.ahead[2] + _sign(line.inverse[2])),
     )
     place.at = wp.cw_mul(place.ahead, line.inverse) + line.shift
     place.leave = wp.min(place.at[0], wp.min(place.at[1], place.at[2]))

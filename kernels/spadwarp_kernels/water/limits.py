@@ -215,13 +215,10 @@ def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
 @wp.func
 def to_next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
     """Distance [m] from x along u to a face of the domain; both in its own axes."""
-    return wp.min(
-        _to_plane(x[0], u[0], limits.lower[0], limits.upper[0]),
-        wp.min(
-            _to_plane(x[1], u[1], limits.lower[1], limits.upper[1]),
-            _to_plane(x[2], u[2], limits.lower[2], limits.upper[2]),
-        ),
-    )
+    distance = float(1.0e30)
+    for i in range(3):
+        distance = wp.min(distance, _to_plane(x[i], u[i], limits.lower[i], limits.upper[i]))
+    return distance
 
 
 @wp.struct
@@ -282,11 +279,16 @@ def make_domain(rotated: bool) -> Domain:
         return wp.transpose(limits.rotation) * u if wp.static(rotated) else u
 
     @wp.func
+    def outside_faces(limits: Limits, y: wp.vec3) -> bool:
+        outside = bool(False)
+        for i in range(3):
+            outside = outside or y[i] < limits.lower[i] or y[i] > limits.upper[i]
+        return outside
+
+    @wp.func
     def is_outside(limits: Limits, x: wp.vec3) -> bool:
-        y = point(limits, x)
-        beyond = wp.abs(x[0]) > limits.lateral or wp.abs(x[1]) > limits.lateral
-        low = y[0] < limits.lower[0] or y[1] < limits.lower[1] or y[2] < limits.lower[2]
-        return beyond or low or y[0] > limits.upper[0] or y[1] > limits.upper[1] or y[2] > limits.upper[2]
+        aside = wp.abs(x[0]) > limits.lateral or wp.abs(x[1]) > limits.lateral
+        return aside or outside_faces(limits, point(limits, x))
 
     @wp.func
     def to_sides(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
