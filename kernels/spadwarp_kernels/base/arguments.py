@@ -8,13 +8,17 @@ import math
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 __all__ = ["ArgumentError"]
+
+
+# What a field of a struct must be, see `check_fields`.
+Need: TypeAlias = str | tuple[int | None, ...]
 
 
 class ArgumentError(ValueError):
@@ -86,10 +90,21 @@ def check_struct(name: str, value: Any, struct: Any) -> None:
         raise ArgumentError(f"{name} is {_kind(value)}; a {struct.key.rsplit('.')[-1]} is needed")
 
 
-def check_fields(name: str, value: Any, intervals: Mapping[str, str]) -> None:
-    """Numbers of a struct."""
-    for field, interval in intervals.items():
-        check_number(f"{name}.{field}", getattr(value, field), interval)
+def check_fields(name: str, struct: Any, needs: Mapping[str, Need], device: Any = None) -> None:
+    """Fields of a struct, each by what it must be: numbers, also those of a vector, in an interval such as `"[0, 1)"`;
+    `"unit"`, a unit vector or a matrix of them; a shape: an array of the field's dtype, see `check_array`."""
+    for field, need in needs.items():
+        path, value = f"{name}.{field}", getattr(struct, field)
+        if isinstance(need, tuple):
+            check_array(path, value, struct._cls.vars[field].type.dtype, need, device)
+        elif need == "unit":
+            for row in np.reshape(value, (-1, 3)):
+                check_vector(path, row, unit=True)
+        elif hasattr(value, "__len__"):
+            for k, number in enumerate(value):
+                check_number(f"{path}[{k}]", number, need)
+        else:
+            check_number(path, value, need)
 
 
 def check_vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
@@ -147,13 +162,6 @@ def check_array(
         kinds = " or ".join(map(_dtype_name, allowed))
         raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape {_shape_text(shape)}, is needed")
     return array
-
-
-def check_attributes(name: str, struct: Any, device: wp.Device, **shapes: tuple[int | None, ...]) -> None:
-    """Arrays of a Warp struct, each with the dtype of its attribute and of such a shape, see `check_array`."""
-    for attribute, shape in shapes.items():
-        dtype = struct._cls.vars[attribute].type.dtype
-        check_array(f"{name}.{attribute}", getattr(struct, attribute), dtype, shape, device)
 
 
 def check_arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **arrays: Any) -> None:

@@ -5,9 +5,8 @@ import warp as wp
 from spadwarp_kernels.base.philox import u01
 from spadwarp_kernels.optics.port import PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, TOO_LONG, Contribution, tally_index
+from spadwarp_kernels.photon.state import TOO_LONG, Contribution, PhotonState, World, tally_index
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
 
 from .estimator import Estimator
 

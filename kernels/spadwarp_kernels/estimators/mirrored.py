@@ -6,15 +6,13 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import join_words, u01, u01_high, u01_low
 from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.photon.queue import Request
-from spadwarp_kernels.photon.sink import Sink, make_deposit
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import Contribution, PhotonState, Sink, World, make_deposit, tally_index
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
-from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
+from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED
 from spadwarp_kernels.water.limits import (
     Limits,
     face_index,

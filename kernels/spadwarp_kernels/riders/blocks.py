@@ -13,10 +13,9 @@ that the thread keeps a list of them.
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.photon.derivatives import NOT_MET, Blocks, met_count, met_entry, score_entry
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.tally.blocks import NOT_MET, Blocks, met_count, met_entry, score_entry
+from spadwarp_kernels.photon.state import Carried, World
 from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
 
 from .rider import NOTHING, Rider

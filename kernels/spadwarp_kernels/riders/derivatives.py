@@ -8,12 +8,11 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
+from spadwarp_kernels.photon.derivatives import LogDerivatives
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import Carried, Contribution, World
 from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
 from spadwarp_kernels.surface.triangle import face_in, face_normal
-from spadwarp_kernels.tally.tally import Contribution, LogDerivatives
 from spadwarp_kernels.water.medium import boundary_ahead, layer_index
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
 

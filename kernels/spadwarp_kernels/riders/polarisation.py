@@ -14,11 +14,9 @@ from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis,
 from spadwarp_kernels.optics.laser import beam_frame
 from spadwarp_kernels.optics.port import Port, PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import Carried, Contribution, World
 from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
 from spadwarp_kernels.surface.triangle import face_in, face_normal
-from spadwarp_kernels.tally.tally import Contribution
 
 from .rider import NOTHING, Rider
 

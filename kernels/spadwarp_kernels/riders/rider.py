@@ -9,9 +9,7 @@ from typing import NamedTuple
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.tally.tally import Contribution
+from spadwarp_kernels.photon.state import Carried, Contribution, World
 
 
 @wp.func

@@ -3,7 +3,8 @@
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
-from spadwarp_kernels.water.limits import EXIT_FACES
+
+from .tally import atomic_add_int64
 
 __all__ = ["LEDGER_ENTRIES", "LEDGER_UNIT"]
 
@@ -16,6 +17,9 @@ LEDGER_SLOTS = 4096
 
 # Light outside the gate is counted in 2^8 tally units.
 OUTSIDE_SHIFT = wp.constant(wp.int64(8))
+
+# Where a history may leave the domain, in the order of `water.limits.exit_face`.
+EXIT_FACES = ("lateral_limit", "exit_x_low", "exit_x_high", "exit_y_low", "exit_y_high", "exit_z_low", "exit_z_high")
 
 LEDGER_ENTRIES = (
     "absorbed_water",
@@ -63,20 +67,6 @@ ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT,
     INVALID,
     BELOW_UNIT,
 ) = (wp.constant(len(LEDGER_ENTRIES) + i) for i in range(len(COUNTERS) - 2))
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
-#else
-    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, static_cast<long long>(value),
-    __ATOMIC_RELAXED);
-#endif
-""")
-def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
-    """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the
-    CPU)."""
-    ...
 
 
 @wp.func
