@@ -11,16 +11,8 @@ from spadwarp_kernels.optics.polarisation import Polarisation
 from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
-from spadwarp_kernels.tally.ledger import (
-    AFTER_GATE,
-    BEFORE_GATE,
-    BELOW_UNIT,
-    CLIPPED,
-    INVALID,
-    OUTSIDE_SHIFT,
-    add_to_ledger,
-    to_ledger,
-)
+from spadwarp_kernels.tally import ledger
+from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
 from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64
 from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Layers, Medium
@@ -324,7 +316,7 @@ def _deposit(account: wp.ref[Account], sink: wp.ref[Sink], c: Contribution):
     exact = c.value * sink.scale
     units = to_fixed_point(exact, c.rounding_sample)
     if not exact <= DEPOSIT_LIMIT:
-        book(account, sink, wp.where(exact > DEPOSIT_LIMIT, CLIPPED, INVALID), wp.int64(1))
+        book(account, sink, wp.where(exact > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
     elif c.index >= 0:
         if exact >= 1.0:
             account.pending = add_pending(sink.tally, account.pending, c.index, units)
@@ -333,11 +325,11 @@ def _deposit(account: wp.ref[Account], sink: wp.ref[Sink], c: Contribution):
                 account.pending = add_pending(sink.tally, account.pending, c.index, units)
             voxels = sink.tally.shape[0] // wp.static(len(COMPONENTS))
             component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
-            book(account, sink, BELOW_UNIT + component, wp.int64(1))
+            book(account, sink, ledger.BELOW_UNIT + component, wp.int64(1))
     else:
         # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
-        entry = wp.where(c.index == BEFORE, BEFORE_GATE, AFTER_GATE)
-        book(account, sink, entry, (units + wp.int64(128)) >> OUTSIDE_SHIFT)
+        entry = wp.where(c.index == BEFORE, ledger.BEFORE_GATE, ledger.AFTER_GATE)
+        book(account, sink, entry, (units + wp.int64(128)) >> ledger.OUTSIDE_SHIFT)
 
 
 @wp.func
@@ -348,7 +340,7 @@ def _deposit_signed(account: wp.ref[Account], sink: wp.ref[Sink], index: int, un
         if whole != wp.int64(0):
             atomic_add_int64(sink.gradients, index, whole)
     else:
-        book(account, sink, wp.where(wp.abs(units) > DEPOSIT_LIMIT, CLIPPED, INVALID), wp.int64(1))
+        book(account, sink, wp.where(wp.abs(units) > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
 
 
 @memoised

@@ -2,8 +2,6 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import memoised
-
 from .tally import atomic_add_int64
 
 __all__ = ["LEDGER_ENTRIES", "LEDGER_UNIT"]
@@ -85,16 +83,3 @@ def add_to_ledger(ledger: wp.array[wp.int64], thread: int, entry: int, value: wp
 def slot_of_core(first_id: wp.uint64) -> int:
     """A thread's number on the CPU: launches on several cores write to cache lines of their own."""
     return 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
-
-
-@memoised
-def make_ledger_slot(cuda: bool) -> wp.Function:
-    """The Warp function ``(thread, first_id) -> int``: what `add_to_ledger` takes as its thread."""
-
-    @wp.func
-    def ledger_slot(thread: int, first_id: wp.uint64) -> int:
-        if wp.static(cuda):
-            return thread
-        return slot_of_core(first_id)
-
-    return ledger_slot

@@ -112,7 +112,7 @@ class WarpStatus:
 
 
 def _make_renew(stages: Stages) -> wp.Function:
-    """The Warp function ``(s, world, sink, draws, launch, memory, lane)`` that finishes the photons of a warp that have
+    """The Warp function ``(s, world, sink, base, launch, memory, lane)`` that finishes the photons of a warp that have
     ended and gives the next to their lanes. All lanes take part."""
 
     @wp.func
@@ -120,7 +120,7 @@ def _make_renew(stages: Stages) -> wp.Function:
         s: wp.ref[PhotonState],
         world: wp.ref[World],
         sink: wp.ref[Sink],
-        draws: wp.ref[Draws],
+        base: wp.uint64,
         launch: wp.ref[Launch],
         memory: int,
         lane: int,
@@ -135,7 +135,7 @@ def _make_renew(stages: Stages) -> wp.Function:
         if s.taken >= 32:
             s.first = take_photons(launch.cursor)
             s.taken = 0
-            exchange(memory, True, lane, stages.emit(world, draws.base + wp.uint64(s.first + lane)))
+            exchange(memory, True, lane, stages.emit(world, base + wp.uint64(s.first + lane)))
         entry += s.taken
         s.taken += votes[1]
         if wanting and entry < 32:
@@ -143,7 +143,7 @@ def _make_renew(stages: Stages) -> wp.Function:
             s.stage = DONE
             if s.photon < launch.photon_count:
                 emitted = exchange(memory, False, entry, wp.spatial_vector())
-                stages.begin(s, world, sink, emitted, draws.base + wp.uint64(s.photon))
+                stages.begin(s, world, sink, emitted, base + wp.uint64(s.photon))
 
     return renew
 
@@ -201,7 +201,7 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
             if wp.static(not fused) and s.stage == SCATTER:
                 stages.scatter(s, world, sink, draws)
             if count_lanes(s.stage >= START) >= wp.static(stages.start_lanes):
-                renew(s, world, sink, draws, launch, memory, lane)
+                renew(s, world, sink, draws.base, launch, memory, lane)
                 done = count_lanes(s.stage == DONE)
                 status.enough = wp.where(done == 32, 1, 32)
                 status.waiting = wp.where(queued > 0, 0, done)
@@ -333,7 +333,7 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
                 if wp.static(not scatter_first) and s.stage == SCATTER:
                     stages.scatter(s, world, sink, draws)
                 if count_lanes(s.stage >= START) >= wp.static(stages.start_lanes):
-                    renew(s, world, sink, draws, launch, memory, lane)
+                    renew(s, world, sink, draws.base, launch, memory, lane)
                     status.enough = wp.where(count_lanes(s.stage == DONE) == 32, 1, 32)
                 status.waiting = count_lanes(s.stage != FLIGHT)
 

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import (
     STREAM_FLIGHT_SAMPLE,
     STREAM_ROULETTE,
@@ -52,26 +51,8 @@ from spadwarp_kernels.surface.reflectance import (
     sample_reflection,
     unshadowed,
 )
-from spadwarp_kernels.tally.ledger import (
-    ABSORBED_SURFACE,
-    ABSORBED_WATER,
-    BEYOND_MAX_REFLECTIONS,
-    CONTRIBUTIONS,
-    DIRECTED,
-    EXIT,
-    LASER_PORT,
-    MAX_COLLISIONS,
-    MAX_PATH,
-    REFLECTIONS,
-    ROULETTE,
-    SHADOW_QUERIES,
-    SURFACE_EVENTS,
-    SURFACE_QUERIES,
-    WATER_COLLISIONS,
-    WEIGHT_CUTOFF,
-    slot_of_core,
-    to_ledger,
-)
+from spadwarp_kernels.tally import ledger
+from spadwarp_kernels.tally.ledger import slot_of_core, to_ledger
 from spadwarp_kernels.tally.tally import atomic_add_int64
 from spadwarp_kernels.water.limits import (
     exit_distance,
@@ -90,7 +71,6 @@ from spadwarp_kernels.water.limits import (
 # ---- The begin and the end of a history, and the account of a thread.
 
 
-@memoised
 def make_prepare(spec: TransportSpec, cuda: bool) -> wp.Function:
     """The Warp function ``(draws, world, thread, launch) -> int``: readies the random numbers of a thread; its slot of
     the ledger."""
@@ -111,7 +91,6 @@ def make_prepare(spec: TransportSpec, cuda: bool) -> wp.Function:
     return prepare
 
 
-@memoised
 def make_emit(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(world, id) -> spatial_vector``: start position [m], then unit direction."""
     confocal = spec.confocal
@@ -128,7 +107,6 @@ def make_emit(spec: TransportSpec) -> wp.Function:
     return emit
 
 
-@memoised
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
     confocal, has_port, begin_carried = spec.confocal, spec.laser_port is not None, make_rider(spec).begin
@@ -153,7 +131,7 @@ def make_begin(spec: TransportSpec) -> wp.Function:
                 s.x = passage.x
                 s.u = passage.u
                 s.path = passage.path
-            book_weight(s.weight, s.account, sink, LASER_PORT)
+            book_weight(s.weight, s.account, sink, ledger.LASER_PORT)
         s.analog_weight = s.weight.value
         s.collisions = 0
         s.surface_count = 0
@@ -163,7 +141,6 @@ def make_begin(spec: TransportSpec) -> wp.Function:
     return begin
 
 
-@memoised
 def make_finish(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, sink)``: writes the photon's record, and the ledger entry that takes the rest of its
     weight."""
@@ -192,7 +169,6 @@ def make_finish(spec: TransportSpec) -> wp.Function:
     return finish
 
 
-@memoised
 def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     """The Warp function ``(s, sink)``: adds what a thread has summed up to the ledger, and with `adds` to the tally
     what `add_pending` has left."""
@@ -201,17 +177,17 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     def flush(s: wp.ref[PhotonState], sink: wp.ref[Sink]):
         if wp.static(adds):
             atomic_add_int64(sink.tally, int(s.account.pending[0]), s.account.pending[1])
-        book(s.account, sink, ABSORBED_WATER, s.weight.absorbed_water - s.absorbed_surface - s.directed)
-        book(s.account, sink, ABSORBED_SURFACE, s.absorbed_surface)
-        book(s.account, sink, DIRECTED, s.directed)
-        book(s.account, sink, WATER_COLLISIONS, wp.int64(s.water_collisions))
-        book(s.account, sink, SURFACE_EVENTS, wp.int64(s.surface_events))
-        book(s.account, sink, SURFACE_QUERIES, wp.int64(s.surface_queries))
-        book(s.account, sink, SHADOW_QUERIES, wp.int64(s.shadow_queries))
-        book(s.account, sink, CONTRIBUTIONS, wp.int64(s.contributions))
+        book(s.account, sink, ledger.ABSORBED_WATER, s.weight.absorbed_water - s.absorbed_surface - s.directed)
+        book(s.account, sink, ledger.ABSORBED_SURFACE, s.absorbed_surface)
+        book(s.account, sink, ledger.DIRECTED, s.directed)
+        book(s.account, sink, ledger.WATER_COLLISIONS, wp.int64(s.water_collisions))
+        book(s.account, sink, ledger.SURFACE_EVENTS, wp.int64(s.surface_events))
+        book(s.account, sink, ledger.SURFACE_QUERIES, wp.int64(s.surface_queries))
+        book(s.account, sink, ledger.SHADOW_QUERIES, wp.int64(s.shadow_queries))
+        book(s.account, sink, ledger.CONTRIBUTIONS, wp.int64(s.contributions))
         if wp.static(reflecting):
-            book(s.account, sink, REFLECTIONS, wp.int64(s.bounces.total))
-            book(s.account, sink, BEYOND_MAX_REFLECTIONS, wp.int64(s.bounces.dropped))
+            book(s.account, sink, ledger.REFLECTIONS, wp.int64(s.bounces.total))
+            book(s.account, sink, ledger.BEYOND_MAX_REFLECTIONS, wp.int64(s.bounces.dropped))
 
     return flush
 
@@ -219,7 +195,6 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
 # ---- Fly: how far the photon flies before it collides, and whether a surface stands before that.
 
 
-@memoised
 def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: bool, cuda: bool) -> wp.Function:
     """The Warp function ``(s, world, draws, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
     in its way, to RAY.
@@ -278,7 +253,6 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
     return fly
 
 
-@memoised
 def make_trace(has_bvh: bool) -> wp.Function:
     """The Warp function ``(s, world)``: the surface before a photon that waits for a ray, without other threads."""
 
@@ -309,7 +283,6 @@ class Collision:
     mirror: int  # face of the domain that reflects the photon there; else 0
 
 
-@memoised
 def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world)``: takes a photon to the end of its flight, and on to SCATTER or to END.
 
@@ -332,12 +305,12 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
         c.reason = -1
         limit = world.limits.max_path - s.path
         if s.flight.distance > limit:
-            c.reason = MAX_PATH
+            c.reason = ledger.MAX_PATH
             c.distance = limit
         if wp.static(bounded):
             if outside(world.limits, s.x + c.distance * s.u):
                 leaves = exit_of(world.limits, s.x, s.u)
-                c.reason = EXIT + leaves.face
+                c.reason = ledger.EXIT + leaves.face
                 c.distance = wp.min(c.distance, leaves.distance)
         if wp.static(reflecting):
             # By distance: a photon that has been reflected may be outside by a rounding error.
@@ -349,7 +322,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
                 if face_index(world.limits.boundary, face) > 0.0:
                     c.mirror = face
                 else:
-                    c.reason = EXIT + face
+                    c.reason = ledger.EXIT + face
         if wp.static(flies_on):
             if s.collisions > 0 and s.reason >= 0:
                 c.reason = s.reason
@@ -382,7 +355,6 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     return collide
 
 
-@memoised
 def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Function) -> wp.Function:
     """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
     estimator says so, with what rides along."""
@@ -436,7 +408,6 @@ class Outcome:
     reason: int
 
 
-@memoised
 def make_survive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
     has_mesh, specular = spec.mesh, spec.specular
@@ -458,7 +429,6 @@ def make_survive(spec: TransportSpec) -> wp.Function:
     return survive
 
 
-@memoised
 def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
     """The Warp function ``(s, reflected, lobe, world, id) -> Direction``.
 
@@ -492,7 +462,6 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     return sample_direction
 
 
-@memoised
 def make_continues(flies_on: bool) -> wp.Function:
     """The Warp function ``reason -> bool``: whether there is a flight after an event.
 
@@ -501,12 +470,11 @@ def make_continues(flies_on: bool) -> wp.Function:
 
     @wp.func
     def continues(reason: int) -> bool:
-        return reason < 0 or (wp.static(flies_on) and reason != ROULETTE)
+        return reason < 0 or (wp.static(flies_on) and reason != ledger.ROULETTE)
 
     return continues
 
 
-@memoised
 def make_terminate(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(new, s, world, sink, id)``: the end of a history for its analog weight or its events."""
     roulette = spec.roulette
@@ -516,22 +484,21 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
         new: wp.ref[Outcome], s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64
     ):
         if new.analog_weight < world.limits.weight_cutoff:
-            new.reason = WEIGHT_CUTOFF
+            new.reason = ledger.WEIGHT_CUTOFF
             if wp.static(roulette):
                 chance = u01(random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
-                new.reason = ROULETTE
+                new.reason = ledger.ROULETTE
                 if chance < 0.1 and new.analog_weight > 0.0:
                     new.reason = -1
                     reweigh(new.weight, 10.0)
                     new.analog_weight *= 10.0
-                    book_weight(new.weight, s.account, sink, ROULETTE)
+                    book_weight(new.weight, s.account, sink, ledger.ROULETTE)
         if new.reason < 0 and s.collisions >= world.limits.max_collisions:
-            new.reason = MAX_COLLISIONS
+            new.reason = ledger.MAX_COLLISIONS
 
     return terminate
 
 
-@memoised
 def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink, id)`` of a photon that a face of the domain reflects; what is not reflected
     leaves by the face.
@@ -559,7 +526,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
         reweigh(new.weight, part)
         mirror_carried(s.carried, s.u, u, index)
         # The light of an event that was the last is accounted for by what has ended the history.
-        book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, EXIT + face, s.reason))
+        book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.EXIT + face, s.reason))
         if s.reason < 0:
             new.analog_weight = wp.where(wp.static(directed), s.analog_weight * part, new.weight.value)
             terminate(new, s, world, sink, id)
@@ -572,7 +539,6 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     return bounce
 
 
-@memoised
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink, draws)``: takes a photon from its event to FLIGHT, or to END.
 
@@ -605,7 +571,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             reweigh(new.weight, heading.factor)
             s.directed += new.weight.taken
             if new.weight.value <= 0.0:
-                new.reason = DIRECTED
+                new.reason = ledger.DIRECTED
         if wp.static(specular):
             if on_surface:
                 # What one facet takes of another's light stays in the surface.
@@ -617,7 +583,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
                 else:
                     book_weight(new.weight, s.account, sink, new.reason)
                 if new.weight.value <= 0.0 and new.reason < 0:
-                    new.reason = WEIGHT_CUTOFF
+                    new.reason = ledger.WEIGHT_CUTOFF
         s.u = heading.u
 
     @wp.func
