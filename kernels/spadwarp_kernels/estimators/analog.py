@@ -16,7 +16,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
     if spec.port is not None:
         return Estimator(cross=_make_cross_port(spec, spec.port))
     reflecting = spec.reflecting
-    image_of, scatterings = spec.lens.image or spec.lens.project, _make_scatterings(spec.reflecting)
+    image_of, scatterings = spec.image_of, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:
@@ -73,7 +73,7 @@ def _component(s: wp.ref[PhotonState]) -> int:
 def _make_cross_port(spec: TransportSpec, port: PortKind) -> wp.Function:
     """As `cross` of `make_analog`, for a photon that is refracted by a port and must hit the aperture behind it."""
     reflecting = spec.reflecting
-    image_of, leave, scatterings = spec.lens.image or spec.lens.project, port.leave, _make_scatterings(spec.reflecting)
+    image_of, leave, scatterings = spec.image_of, port.leave, _make_scatterings(spec.reflecting)
 
     @wp.func
     def cross_port(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:

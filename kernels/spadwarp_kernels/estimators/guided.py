@@ -104,7 +104,7 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, rides = spec.varies and not spec.random_albedo, make_rider(spec) is not NOTHING
+    local_albedo, rides = spec.local_albedo, make_rider(spec) is not NOTHING
     collides = spec.scores_collisions
     spares = collides and not spec.reflecting  # mirrored, any flight may lead to an image of the lens
 
@@ -248,7 +248,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     water_at, extinction_at, lens_chance = spec.water.at, _make_extinction_at(spec), _make_lens_chance(spec)
     view_of, toward_middle = spec.lens.view, spec.lens.toward_middle
     has_mesh, specular = spec.mesh, spec.specular
-    in_view = spec.lens.shows if spec.port is None else port_view(spec.port).shows
+    in_view = spec.in_view
     toward, toward_centre = make_toward(spec)
 
     @wp.func

@@ -133,7 +133,7 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, world) -> Mirrored`` of an event by way of one of `Boundary.images`."""
     confocal, measured = spec.confocal, spec.mesh or spec.varies
     followed = measured or make_rider(spec) is not NOTHING
-    image_of = spec.lens.image or spec.lens.project
+    image_of = spec.image_of
     scattering_density, follow = make_scattering(spec), _make_follow(spec, brute_force)
     link_to, value_of = make_link(spec)
     turn, turn_back, origin = (_to_domain, _from_domain, _origin) if spec.rotated_domain else (_same, _same, _no_origin)

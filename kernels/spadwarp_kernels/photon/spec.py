@@ -3,10 +3,14 @@
 from collections.abc import Iterable
 from typing import Any, NamedTuple, get_origin
 
+import warp as wp
+
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer
 from spadwarp_kernels.optics.camera import PLAIN, Lens
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
 from spadwarp_kernels.optics.port import PortKind
+from spadwarp_kernels.optics.visibility import port_view
+from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
 from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
 
@@ -101,6 +105,31 @@ class TransportSpec(NamedTuple):
     def varies(self) -> bool:
         """Whether the water differs from place to place."""
         return self.layered or self.grid is not None
+
+    @property
+    def local_albedo(self) -> bool:
+        """Whether the albedo at an event is that of the water there."""
+        return self.varies and not self.random_albedo
+
+    @property
+    def reflectance_at(self) -> wp.Function:
+        """The Warp function ``(surfaces, face, x) -> float``."""
+        return pattern_reflectance if self.pattern else face_reflectance
+
+    @property
+    def tries_faces(self) -> bool:
+        """Whether a GPU tries every face."""
+        return self.brute_force and not self.use_warp_bvh
+
+    @property
+    def image_of(self) -> wp.Function:
+        """The pixel of a point, by the lens's own law or by that of pixels side by side, see `Lens`."""
+        return self.lens.image or self.lens.project
+
+    @property
+    def in_view(self) -> wp.Function:
+        """The Warp function ``(camera, view, x) -> bool``: whether the camera may see a point."""
+        return self.lens.shows if self.port is None else port_view(self.port).shows
 
     @property
     def scores_collisions(self) -> bool:

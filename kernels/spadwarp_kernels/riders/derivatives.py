@@ -11,7 +11,7 @@ from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.photon.derivatives import LogDerivatives
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Carried, Contribution, World
-from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
+from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
 from spadwarp_kernels.surface.triangle import face_in, face_normal
 from spadwarp_kernels.water.medium import boundary_ahead, layer_index
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
@@ -82,7 +82,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         parameters_of(spec, kind) for kind in ("scattering", "anisotropy", "reflectance")
     )
     in_water = by_scattering | by_anisotropy
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+    reflectance_at = spec.reflectance_at
 
     @wp.func
     def in_the_water(d: LogDerivatives, world: wp.ref[World], x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:

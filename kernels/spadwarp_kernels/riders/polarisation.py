@@ -15,7 +15,7 @@ from spadwarp_kernels.optics.laser import beam_frame
 from spadwarp_kernels.optics.port import Port, PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Carried, Contribution, World
-from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
+from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
 from spadwarp_kernels.surface.triangle import face_in, face_normal
 
 from .rider import NOTHING, Rider
@@ -218,7 +218,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
     """Water multiplies by L M L/m11. A Lambertian surface depolarises; a specular lobe has Fresnel's matrix of the
     facet between u and v, over its m11; both in proportion to what they send to v."""
     has_mesh, specular = spec.mesh, spec.specular
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+    reflectance_at = spec.reflectance_at
 
     @wp.func
     def on_a_face(stokes: wp.vec4, world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec4:

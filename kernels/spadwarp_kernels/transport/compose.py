@@ -72,7 +72,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     """
     estimator = make_estimator(spec)
     alone = not cuda or bool(spec.blocks) or (spec.mesh and spec.use_warp_bvh)
-    brute_force = spec.mesh and spec.brute_force and cuda and not spec.use_warp_bvh
+    brute_force = spec.mesh and spec.tries_faces and cuda
     in_tree, flies_on = spec.mesh and not brute_force, estimator.cross is not None
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)

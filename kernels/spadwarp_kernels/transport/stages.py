@@ -45,8 +45,6 @@ from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box, segment_mee
 from spadwarp_kernels.surface.patches import nearest_patch
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, offset_from_surface, patch_hit
 from spadwarp_kernels.surface.reflectance import (
-    face_reflectance,
-    pattern_reflectance,
     sample_cosine_law,
     sample_reflection,
     unshadowed,
@@ -290,7 +288,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     """
     has_mesh, reflecting = spec.mesh, spec.reflecting
     bounded = spec.bounded and not reflecting
-    local_albedo = spec.varies and not spec.random_albedo
+    local_albedo = spec.local_albedo
     water_at, fly_carried = spec.water.at, make_rider(spec).fly
     to_exit, face_of_exit, exit_of, outside = (
         (exit_distance_rotated, exit_face_rotated, first_exit_rotated, is_outside_rotated)
@@ -411,7 +409,7 @@ class Outcome:
 def make_survive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
     has_mesh, specular = spec.mesh, spec.specular
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+    reflectance_at = spec.reflectance_at
 
     @wp.func
     def survive(s: wp.ref[PhotonState], world: wp.ref[World]) -> Survival:
