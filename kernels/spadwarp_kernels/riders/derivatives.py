@@ -6,7 +6,6 @@ the Lambertian reflectance.
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.photon.derivatives import LogDerivatives
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -27,7 +26,6 @@ def parameters_of(spec: TransportSpec, *kinds: str) -> int:
     return sum(1 << p for p, kind in enumerate(spec.derivatives) if kind in kinds)
 
 
-@memoised
 def make_derivatives_rider(spec: TransportSpec) -> Rider:
     """Of the parameters of a spec."""
     return NOTHING._replace(begin=_begin, fly=_make_fly(spec), event=_make_event(spec), deliver=_deliver)

@@ -182,7 +182,6 @@ def make_port_elements(port: PortKind | None) -> wp.Function | None:
 # ---- The light of a photon, from the laser to the receiver.
 
 
-@memoised
 def make_polarisation_rider(spec: TransportSpec) -> Rider:
     """The Stokes vector of a polarised spec."""
     return NOTHING._replace(
