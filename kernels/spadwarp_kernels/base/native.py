@@ -96,20 +96,18 @@ TWO = wp.constant(wp.float64(2.0))
 def expm1(x: wp.float64) -> wp.float64:
     """exp(x) − 1 without cancellation: relative error below 1e-13."""
     if wp.abs(x) > wp.float64(0.01):
-        return wp.exp(x) - wp.float64(1.0)
-    series = wp.float64(1.0) + x * (
-        wp.float64(1.0 / 2.0) + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0)))
-    )
+        return wp.exp(x) - ONE
+    series = ONE + x * (HALF + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0))))
     return x * series
 
 
 @wp.func
 def log1p(x: wp.float64) -> wp.float64:
     """ln(1 + x) without cancellation (Kahan's correction)."""
-    y = wp.float64(1.0) + x
-    if y == wp.float64(1.0):
+    y = ONE + x
+    if y == ONE:
         return x
-    return x * wp.log(y) / (y - wp.float64(1.0))
+    return x * wp.log(y) / (y - ONE)
 
 
 @wp.func
