@@ -194,9 +194,7 @@ _BEAM = ({"spread": "[0, 2]"}, {"tan2": "[0, inf)"}, {"radius": "[0, inf)"})
 def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> None:
     """Everything that the kernel of a spec reads and writes: numbers in range, arrays long enough and on the device."""
     check_spec(spec)
-    if spec.mesh:
-        _check_surfaces(spec, model)
-    for needs in (_water_needs, _light_needs, _limit_needs, _rider_needs):
+    for needs in (_surface_needs, _water_needs, _light_needs, _limit_needs, _rider_needs):
         for path, fields in needs(spec, model):
             check_fields(f"model.{path}", attrgetter(path)(model), fields, model.device)
     _check_data(spec, model, data, photon_count)
@@ -269,10 +267,11 @@ def _limit_needs(spec: TransportSpec, model: Model) -> Needs:
         yield "limits", {"origin": "(-inf, inf)", "rotation": "unit"}
 
 
-def _check_surfaces(spec: TransportSpec, model: Model) -> None:
-    surfaces, device = model.surfaces, model.device
-    needs = {"reflectance": (None,), "nodes": (None,), "near_depth": (None, None)}
-    check_fields("model.surfaces", surfaces, needs, device)
+def _surface_needs(spec: TransportSpec, model: Model) -> Needs:
+    if not spec.mesh:
+        return
+    surfaces = model.surfaces
+    yield "surfaces", {"reflectance": (None,), "nodes": (None,), "near_depth": (None, None)}
     faces = surfaces.reflectance.size
     if faces == 0:
         raise ArgumentError("spec.mesh = True needs surfaces of a mesh, see make_surfaces; model.surfaces has no faces")
@@ -285,22 +284,21 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
             raise ArgumentError(
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
-    check_faces("model.surfaces", surfaces, faces, device)
+    check_faces("model.surfaces", surfaces, faces, model.device)
     if spec.use_warp_bvh and (model.mesh is None or model.mesh.id != surfaces.mesh):
         raise ArgumentError(
             "spec.use_warp_bvh = True reads the mesh that the surfaces were made of, which has to be model.mesh: the "
             "model keeps it"
         )
-    if spec.brute_force and device.is_cuda:
-        check_patches("model.surfaces", surfaces, faces, device)
+    if spec.brute_force and model.device.is_cuda:
+        check_patches("model.surfaces", surfaces, faces, model.device)
     if spec.pattern:
-        check_fields("model.surfaces", surfaces, {"corner_reflectance": (faces,)}, device)
-        check_fields("model.surfaces.textures", surfaces.textures, {"face": (None,)}, device)
+        yield "surfaces", {"corner_reflectance": (faces,)}
+        yield "surfaces.textures", {"face": (None,)}
         if surfaces.textures.face.size:
-            textured = {"face": (faces,), "coordinates": (faces, 3)}
-            check_fields("model.surfaces.textures", surfaces.textures, textured, device)
+            yield "surfaces.textures", {"face": (faces,), "coordinates": (faces, 3)}
     if spec.specular:
-        check_fields("model.surfaces", surfaces, {"specular": (faces,), "roughness": (faces,)}, device)
+        yield "surfaces", {"specular": (faces,), "roughness": (faces,)}
 
 
 def _rider_needs(spec: TransportSpec, model: Model) -> Needs:

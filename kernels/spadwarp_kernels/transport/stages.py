@@ -52,19 +52,7 @@ from spadwarp_kernels.surface.reflectance import (
 from spadwarp_kernels.tally import ledger
 from spadwarp_kernels.tally.ledger import slot_of_core, to_ledger
 from spadwarp_kernels.tally.tally import atomic_add_int64
-from spadwarp_kernels.water.limits import (
-    exit_distance,
-    exit_distance_rotated,
-    exit_face,
-    exit_face_rotated,
-    face_index,
-    first_exit,
-    first_exit_rotated,
-    flipped,
-    fresnel_reflectance,
-    is_outside,
-    is_outside_rotated,
-)
+from spadwarp_kernels.water import limits
 
 # ---- The begin and the end of a history, and the account of a thread.
 
@@ -286,14 +274,13 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
 
     `flies_on`: see `make_continues`.
     """
-    has_mesh, reflecting = spec.mesh, spec.reflecting
+    has_mesh, reflecting, local_albedo = spec.mesh, spec.reflecting, spec.local_albedo
     bounded = spec.bounded and not reflecting
-    local_albedo = spec.local_albedo
     water_at, fly_carried = spec.water.at, make_rider(spec).fly
     to_exit, face_of_exit, exit_of, outside = (
-        (exit_distance_rotated, exit_face_rotated, first_exit_rotated, is_outside_rotated)
+        (limits.exit_distance_rotated, limits.exit_face_rotated, limits.first_exit_rotated, limits.is_outside_rotated)
         if spec.rotated_domain
-        else (exit_distance, exit_face, first_exit, is_outside)
+        else (limits.exit_distance, limits.exit_face, limits.first_exit, limits.is_outside)
     )
 
     @wp.func
@@ -317,7 +304,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
                 c.distance = exit
                 c.reason = -1
                 face = face_of_exit(world.limits, s.x, s.u)
-                if face_index(world.limits.boundary, face) > 0.0:
+                if limits.face_index(world.limits.boundary, face) > 0.0:
                     c.mirror = face
                 else:
                     c.reason = ledger.EXIT + face
@@ -408,8 +395,7 @@ class Outcome:
 
 def make_survive(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
-    has_mesh, specular = spec.mesh, spec.specular
-    reflectance_at = spec.reflectance_at
+    has_mesh, specular, reflectance_at = spec.mesh, spec.specular, spec.reflectance_at
 
     @wp.func
     def survive(s: wp.ref[PhotonState], world: wp.ref[World]) -> Survival:
@@ -434,9 +420,7 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     """
     if direct is not None:
         return direct
-    has_mesh, specular = spec.mesh, spec.specular
-    phase_sample = spec.phase.sample
-    water_at = spec.water.at
+    has_mesh, specular, phase_sample, water_at = spec.mesh, spec.specular, spec.phase.sample, spec.water.at
 
     @wp.func
     def sample_direction(
@@ -498,8 +482,8 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
 
 
 def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, world, sink, id)`` of a photon that a face of the domain reflects; what is not reflected
-    leaves by the face.
+    """The Warp function ``(new, s, world, sink, id)`` of a photon that a face of the domain reflects; what is not
+    reflected leaves by the face.
 
     `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
     """
@@ -507,20 +491,18 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     mirror_carried = make_rider(spec).mirror
 
     @wp.func
-    def bounce(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64):
+    def bounce(new: wp.ref[Outcome], s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64):
         face = s.bounces.face
         axis = (face - 1) // 2
-        index = face_index(world.limits.boundary, face)
+        index = limits.face_index(world.limits.boundary, face)
         u = s.u
         if wp.static(rotated):
             u = world.limits.rotation * u
-        part = fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), index)
-        u = flipped(u, axis)
+        part = limits.fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), index)
+        u = limits.flipped(u, axis)
         if wp.static(rotated):
             u = wp.normalize(wp.transpose(world.limits.rotation) * u)
-        new = Outcome()
         new.reason = s.reason
-        new.weight = s.weight
         reweigh(new.weight, part)
         mirror_carried(s.carried, s.u, u, index)
         # The light of an event that was the last is accounted for by what has ended the history.
@@ -530,9 +512,6 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
             terminate(new, s, world, sink, id)
         if continues(new.reason):
             s.u = u
-        s.weight = new.weight
-        s.analog_weight = new.analog_weight
-        s.reason = new.reason
 
     return bounce
 
@@ -585,10 +564,9 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         s.u = heading.u
 
     @wp.func
-    def collision(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64):
-        new = Outcome()
-        new.reason = -1
-        new.weight = s.weight
+    def collision(
+        new: wp.ref[Outcome], s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64
+    ):
         on_surface = False
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
@@ -602,9 +580,6 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         terminate(new, s, world, sink, id)
         if continues(new.reason):
             turn(new, s, world, sink, id, on_surface, survival.lobe)
-        s.weight = new.weight
-        s.analog_weight = new.analog_weight
-        s.reason = new.reason
         s.surface_count += wp.where(on_surface, 1, 0)
 
     @wp.func
@@ -612,13 +587,19 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         # Here, not in `collide`: there a select takes the place of the branch, and a core waits for the flight.
         s.collisions += 1
         id = draws.base + wp.uint64(s.photon)
+        new = Outcome()
+        new.reason = -1
+        new.weight = s.weight
         bounced = False
         if wp.static(reflecting):
             bounced = s.bounces.face > 0
             if bounced:
-                bounce(s, world, sink, id)
+                bounce(new, s, world, sink, id)
         if not bounced:
-            collision(s, world, sink, id)
+            collision(new, s, world, sink, id)
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.reason = new.reason
         s.stage = wp.where(continues(s.reason), FLIGHT, END)
 
     return scatter
