@@ -7,7 +7,7 @@ from spadwarp_kernels.base.native import bits_of, from_bits
 from spadwarp_kernels.tally.tally import BACKSCATTER
 
 from .spec import TransportSpec
-from .state import Carried, PhotonState, Sink, World
+from .state import Carried, PhotonRef, SinkRef, WorldRef
 
 # Threads of a block of the transport kernel on CUDA.
 BLOCK_SIZE = 128
@@ -354,7 +354,7 @@ def make_queue(
             put(memory, entry, wp.static(carried), request.carried.stokes)  # which cannot be combined with derivatives
 
     @wp.func
-    def push(s: wp.ref[PhotonState], request: Request, world: wp.ref[World], sink: wp.ref[Sink], memory: int):
+    def push(s: PhotonRef, request: Request, world: WorldRef, sink: SinkRef, memory: int):
         if wp.static(used):
             if request.wanted:
                 write(memory, queue_size(memory, ADD_ENTRY, 0), request)

@@ -1,5 +1,7 @@
 """What a launch reads (World) and adds to (Sink), and the state of a photon and of the thread that carries it."""
 
+from typing import TypeAlias
+
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_device, check_integer
@@ -107,9 +109,6 @@ class Draws:
     keys: RoundKeys  # those of the world, held in registers on CUDA
 
 
-# ---- The weight of a photon, and where it goes.
-
-
 @wp.struct
 class Account:
     """What a thread needs to add to a sink."""
@@ -129,31 +128,6 @@ class Weight:
     value: float  # fraction of the photon that is left
     taken: wp.int64  # by which the last change lowered it, in ledger units
     absorbed_water: wp.int64  # sum over the thread's photons, in ledger units
-
-
-@wp.func
-def reweigh(w: wp.ref[Weight], factor: float):
-    """Multiplies the weight by a factor.
-
-    The ledger is written where weight changes hands; water takes what is missing there. What is taken is to be added to
-    one of the thread's sums for the ledger, or to be booked by `book_weight`.
-    """
-    before = to_ledger(w.value)
-    w.value *= factor
-    w.taken = before - to_ledger(w.value)
-
-
-@wp.func
-def book_weight(w: wp.ref[Weight], account: wp.ref[Account], sink: wp.ref[Sink], entry: int):
-    """What the last change has taken goes to an entry of the ledger."""
-    book(account, sink, entry, w.taken)
-    w.absorbed_water -= w.taken
-
-
-@wp.func
-def book(account: wp.ref[Account], sink: wp.ref[Sink], entry: int, value: wp.int64):
-    """Adds to an entry of the ledger."""
-    add_to_ledger(sink.ledger, account.slot, entry, value)
 
 
 # ---- The photon. Its structs are of attributes that are assigned in place: Warp merges a local that is set under a
@@ -198,19 +172,6 @@ class Flight:
     interval: wp.vec2  # the part that an estimator wants to score [m]; empty for none
     lens: wp.vec3  # the point of the lens by which the flight is scored [m]
     lens_weight: float  # its density if it were uniform, over that of the draw
-
-
-@wp.func
-def is_planned(flight: Flight) -> bool:
-    """Whether an estimator wants to score a part of the flight."""
-    return flight.interval[0] < flight.interval[1]
-
-
-@wp.func
-def shorten(flight: wp.ref[Flight], distance: float):
-    """Ends the flight at a surface at a distance [m]."""
-    flight.distance = wp.min(flight.distance, distance)
-    flight.interval = wp.vec2(flight.interval[0], wp.min(flight.interval[1], distance))
 
 
 @wp.struct
@@ -267,8 +228,16 @@ class PhotonState:
     contributions: int
 
 
+# Arguments by reference: they cost nothing, and may be changed in place.
+WorldRef: TypeAlias = wp.ref[World]
+SinkRef: TypeAlias = wp.ref[Sink]
+AccountRef: TypeAlias = wp.ref[Account]
+CarriedRef: TypeAlias = wp.ref[Carried]
+PhotonRef: TypeAlias = wp.ref[PhotonState]
+
+
 @wp.func
-def first_state(world: wp.ref[World], slot: int) -> PhotonState:
+def first_state(world: WorldRef, slot: int) -> PhotonState:
     """A thread before its first photon."""
     s = PhotonState()
     s.stage = START
@@ -280,6 +249,47 @@ def first_state(world: wp.ref[World], slot: int) -> PhotonState:
     s.target = -1
     s.walk.node = NO_NODE
     return s
+
+
+@wp.func
+def is_planned(flight: Flight) -> bool:
+    """Whether an estimator wants to score a part of the flight."""
+    return flight.interval[0] < flight.interval[1]
+
+
+@wp.func
+def shorten(flight: wp.ref[Flight], distance: float):
+    """Ends the flight at a surface at a distance [m]."""
+    flight.distance = wp.min(flight.distance, distance)
+    flight.interval = wp.vec2(flight.interval[0], wp.min(flight.interval[1], distance))
+
+
+# ---- The weight of a photon, and where it goes.
+
+
+@wp.func
+def reweigh(w: wp.ref[Weight], factor: float):
+    """Multiplies the weight by a factor.
+
+    The ledger is written where weight changes hands; water takes what is missing there. What is taken is to be added to
+    one of the thread's sums for the ledger, or to be booked by `book_weight`.
+    """
+    before = to_ledger(w.value)
+    w.value *= factor
+    w.taken = before - to_ledger(w.value)
+
+
+@wp.func
+def book_weight(w: wp.ref[Weight], account: AccountRef, sink: SinkRef, entry: int):
+    """What the last change has taken goes to an entry of the ledger."""
+    book(account, sink, entry, w.taken)
+    w.absorbed_water -= w.taken
+
+
+@wp.func
+def book(account: AccountRef, sink: SinkRef, entry: int, value: wp.int64):
+    """Adds to an entry of the ledger."""
+    add_to_ledger(sink.ledger, account.slot, entry, value)
 
 
 # ---- Contributions to the tally.
@@ -311,7 +321,7 @@ def to_fixed_point(units: float, rounding_sample: float) -> wp.int64:
 
 
 @wp.func
-def _deposit(account: wp.ref[Account], sink: wp.ref[Sink], c: Contribution):
+def _deposit(account: AccountRef, sink: SinkRef, c: Contribution):
     """Adds a contribution to its voxel of the tally; the ledger counts BEFORE and AFTER, and what is below one unit."""
     exact = c.value * sink.scale
     units = to_fixed_point(exact, c.rounding_sample)
@@ -333,7 +343,7 @@ def _deposit(account: wp.ref[Account], sink: wp.ref[Sink], c: Contribution):
 
 
 @wp.func
-def _deposit_signed(account: wp.ref[Account], sink: wp.ref[Sink], index: int, units: float, rounding_sample: float):
+def _deposit_signed(account: AccountRef, sink: SinkRef, index: int, units: float, rounding_sample: float):
     """Adds to a tally that has signs; rounded down after the rounding sample is added, so that the mean is kept."""
     if wp.abs(units) <= DEPOSIT_LIMIT:
         whole = wp.int64(wp.floor(units + rounding_sample))
@@ -350,7 +360,7 @@ def make_deposit(signed: int, kinds: int, split: bool) -> wp.Function:
     tally are apart."""
 
     @wp.func
-    def deposit(account: wp.ref[Account], sink: wp.ref[Sink], world: wp.ref[World], c: Contribution):
+    def deposit(account: AccountRef, sink: SinkRef, world: WorldRef, c: Contribution):
         if wp.static(signed + kinds > 0):
             if c.index >= 0:
                 blocks = world.derivatives.blocks

@@ -15,7 +15,7 @@ import warp as wp
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.photon.derivatives import NOT_MET, Blocks, met_count, met_entry, score_entry
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried, World
+from spadwarp_kernels.photon.state import CarriedRef, WorldRef
 from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
 
 from .rider import Rider
@@ -50,15 +50,13 @@ def make_blocks_rider(spec: TransportSpec, beside: Rider) -> Rider:
     kinds = len(spec.blocks)
 
     @wp.func
-    def begin(
-        c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3
-    ):
+    def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
         beside.begin(c, world, target, emitted, x, u)
         c.half = 0
         _forget(world.derivatives.blocks, 0)
 
     @wp.func
-    def fork(c: wp.ref[Carried], world: wp.ref[World]):
+    def fork(c: CarriedRef, world: WorldRef):
         beside.fork(c, world)
         blocks = world.derivatives.blocks
         _forget(blocks, 1)
@@ -86,7 +84,7 @@ def _make_fly(kinds: int, beside: Rider) -> wp.Function:
             blocks.memory[entry] = blocks.memory[entry] + value
 
     @wp.func
-    def fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
         beside.fly(c, world, x, u, length)
         blocks = world.derivatives.blocks
         line = grid_line(blocks.grid, x, u, length)
@@ -108,7 +106,7 @@ def _make_event(spec: TransportSpec, beside: Rider) -> wp.Function:
     )
 
     @wp.func
-    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
         beside.event(c, world, slot, x, u, v)
         blocks = world.derivatives.blocks
         block = grid_cell(blocks.grid, x)

@@ -9,7 +9,7 @@ import warp as wp
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.photon.derivatives import LogDerivatives
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried, Contribution, World
+from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
 from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
 from spadwarp_kernels.surface.triangle import face_in, face_normal
 from spadwarp_kernels.water.medium import boundary_ahead, layer_index
@@ -32,12 +32,12 @@ def make_derivatives_rider(spec: TransportSpec) -> Rider:
 
 
 @wp.func
-def _begin(c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+def _begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
     c.log_derivatives = LogDerivatives()
 
 
 @wp.func
-def _deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
     k.factors = c.log_derivatives
 
 
@@ -53,7 +53,7 @@ def _make_fly(spec: TransportSpec) -> wp.Function:
         return d
 
     @wp.func
-    def fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
         if wp.static(not layered):
             c.log_derivatives = shorter(c.log_derivatives, wp.static(on_path), length)
         else:
@@ -83,7 +83,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
     reflectance_at = spec.reflectance_at
 
     @wp.func
-    def in_the_water(d: LogDerivatives, world: wp.ref[World], x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
+    def in_the_water(d: LogDerivatives, world: WorldRef, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
         here = int(wp.static(in_water))
         if wp.static(layered):
             here = here & world.derivatives.waters[layer_index(world.layers, wp.dot(world.layers.axis, x))]
@@ -97,9 +97,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         return d
 
     @wp.func
-    def on_a_face(
-        d: LogDerivatives, world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3
-    ) -> LogDerivatives:
+    def on_a_face(d: LogDerivatives, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
         # The Lambertian part of the light that is reflected.
         part = float(1.0)
         face = face_in(world.surfaces.order, slot)
@@ -115,7 +113,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         return d
 
     @wp.func
-    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
         if wp.static(has_mesh):
             if slot >= 0:
                 if wp.static(by_reflectance > 0):

@@ -8,36 +8,36 @@ from typing import NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.photon.state import Carried, Contribution, World
+from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
 
 
 @wp.func
-def _begin(c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+def _begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
     pass
 
 
 @wp.func
-def _fork(c: wp.ref[Carried], world: wp.ref[World]):
+def _fork(c: CarriedRef, world: WorldRef):
     pass
 
 
 @wp.func
-def _fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+def _fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
     pass
 
 
 @wp.func
-def _event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+def _event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
     pass
 
 
 @wp.func
-def _mirror(c: wp.ref[Carried], u: wp.vec3, v: wp.vec3, index: float):
+def _mirror(c: CarriedRef, u: wp.vec3, v: wp.vec3, index: float):
     pass
 
 
 @wp.func
-def _deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
     pass
 
 

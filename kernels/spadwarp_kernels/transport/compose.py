@@ -11,7 +11,7 @@ from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.optics.visibility import may_be_hidden
 from spadwarp_kernels.photon.queue import Request, long_queue_fits, make_queue
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState, Sink, World, is_planned, make_deposit
+from spadwarp_kernels.photon.state import PhotonRef, SinkRef, WorldRef, is_planned, make_deposit
 from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 
@@ -117,7 +117,7 @@ def _make_serve_now(serve: wp.Function) -> wp.Function:
     """What takes the place of `push` without a queue."""
 
     @wp.func
-    def serve_now(s: wp.ref[PhotonState], request: Request, world: wp.ref[World], sink: wp.ref[Sink], memory: int):
+    def serve_now(s: PhotonRef, request: Request, world: WorldRef, sink: SinkRef, memory: int):
         if request.wanted:
             serve(s, request, world, sink)
 
@@ -131,7 +131,7 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
     flights, events, point_of = request_flight is not None, request_event is not None, make_point_of(max(points, 2))
 
     @wp.func
-    def ask_flight(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], memory: int):
+    def ask_flight(s: PhotonRef, world: WorldRef, sink: SinkRef, memory: int):
         if wp.static(flights):
             if is_planned(s.flight):
                 request = request_flight(s)
@@ -141,7 +141,7 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
                 s.flight.interval = wp.vec2(0.0, 0.0)
 
     @wp.func
-    def ask_event(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], memory: int):
+    def ask_event(s: PhotonRef, world: WorldRef, sink: SinkRef, memory: int):
         if wp.static(events):
             take(s, request_event(s, world), world, sink, memory)
 
@@ -161,7 +161,7 @@ def _make_is_seen(spec: TransportSpec, brute_force: bool) -> wp.Function:
     may_hide = may_be_hidden if spec.port is None else _may_hide_behind_port
 
     @wp.func
-    def is_seen(s: wp.ref[PhotonState], found: wp.ref[Scored], world: wp.ref[World]) -> bool:
+    def is_seen(s: PhotonRef, found: wp.ref[Scored], world: WorldRef) -> bool:
         seen = bool(True)
         if wp.static(has_mesh):
             if may_hide(view_of(world.camera, world.camera.view), world.surfaces.near_depth, found.origin):
@@ -187,7 +187,7 @@ def _make_serve(spec: TransportSpec, brute_force: bool, split: bool, deposit: wp
     score_images = make_score_images(spec, brute_force, split)
 
     @wp.func
-    def serve(s: wp.ref[PhotonState], request: Request, world: wp.ref[World], sink: wp.ref[Sink]):
+    def serve(s: PhotonRef, request: Request, world: WorldRef, sink: SinkRef):
         found = score(request, world)
         if request.wanted and not found.contribution.value <= 0.0:  # NaN is counted as such
             s.contributions += 1

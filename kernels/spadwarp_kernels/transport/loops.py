@@ -33,9 +33,11 @@ from spadwarp_kernels.photon.state import (
     SURFACE_RAY,
     Draws,
     Launch,
-    PhotonState,
+    PhotonRef,
     Sink,
+    SinkRef,
     World,
+    WorldRef,
     first_state,
     is_planned,
     shorten,
@@ -117,13 +119,7 @@ def _make_renew(stages: Stages) -> wp.Function:
 
     @wp.func
     def renew(
-        s: wp.ref[PhotonState],
-        world: wp.ref[World],
-        sink: wp.ref[Sink],
-        base: wp.uint64,
-        launch: wp.ref[Launch],
-        memory: int,
-        lane: int,
+        s: PhotonRef, world: WorldRef, sink: SinkRef, base: wp.uint64, launch: wp.ref[Launch], memory: int, lane: int
     ):
         if s.stage == END:
             stages.finish(s, sink)
@@ -231,7 +227,7 @@ class Ray:
 
 
 @wp.func
-def next_ray(s: wp.ref[PhotonState]) -> int:
+def next_ray(s: PhotonRef) -> int:
     """The ray that a thread traces: that which it has begun, that of its photon, or a shadow ray."""
     ray = s.ray
     if ray == NO_RAY:
@@ -243,7 +239,7 @@ def _make_ray_geometry(scores: bool) -> wp.Function:
     """The Warp function ``s -> Ray``: the flight, or the way from the scored point to the lens."""
 
     @wp.func
-    def ray_geometry(s: wp.ref[PhotonState]) -> Ray:
+    def ray_geometry(s: PhotonRef) -> Ray:
         ray = Ray()
         ray.origin = s.x
         ray.direction = s.u
@@ -262,7 +258,7 @@ def _make_end_walk(stages: Stages) -> wp.Function:
     """The Warp function ``(s, world, sink)`` at the end of a ray's walk down the tree."""
 
     @wp.func
-    def end_walk(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink]):
+    def end_walk(s: PhotonRef, world: WorldRef, sink: SinkRef):
         if s.ray == SURFACE_RAY:
             s.surface_queries += 1
             if s.walk.found >= 0:

@@ -29,10 +29,10 @@ from spadwarp_kernels.photon.state import (
     TOO_LONG,
     Draws,
     Launch,
-    PhotonState,
-    Sink,
+    PhotonRef,
+    SinkRef,
     Weight,
-    World,
+    WorldRef,
     book,
     book_weight,
     is_planned,
@@ -63,7 +63,7 @@ def make_prepare(spec: TransportSpec, cuda: bool) -> wp.Function:
     stepped, in_blocks = spec.stepped, bool(spec.blocks)
 
     @wp.func
-    def prepare(draws: wp.ref[Draws], world: wp.ref[World], thread: int, launch: Launch) -> int:
+    def prepare(draws: wp.ref[Draws], world: WorldRef, thread: int, launch: Launch) -> int:
         if wp.static(in_blocks):
             world.derivatives.blocks.thread = thread
         draws.base = launch.first_id
@@ -83,7 +83,7 @@ def make_emit(spec: TransportSpec) -> wp.Function:
     emit_from = emit_measured if spec.measured_beam else emit_along
 
     @wp.func
-    def emit(world: wp.ref[World], id: wp.uint64) -> wp.spatial_vector:
+    def emit(world: WorldRef, id: wp.uint64) -> wp.spatial_vector:
         axis = world.laser.axis
         if wp.static(confocal):
             axis = world.scan.axis[int(id % wp.uint64(world.scan.count))]
@@ -99,9 +99,7 @@ def make_begin(spec: TransportSpec) -> wp.Function:
     enter = spec.laser_port.enter if spec.laser_port is not None else None
 
     @wp.func
-    def begin(
-        s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], emitted: wp.spatial_vector, id: wp.uint64
-    ):
+    def begin(s: PhotonRef, world: WorldRef, sink: SinkRef, emitted: wp.spatial_vector, id: wp.uint64):
         if wp.static(confocal):
             s.target = int(id % wp.uint64(world.scan.count))
             s.view = world.scan.view[s.target]
@@ -133,7 +131,7 @@ def make_finish(spec: TransportSpec) -> wp.Function:
     records, derivatives = spec.records, len(spec.derivatives)
 
     @wp.func
-    def finish(s: wp.ref[PhotonState], sink: wp.ref[Sink]):
+    def finish(s: PhotonRef, sink: SinkRef):
         if wp.static(records):
             sink.records.position[s.photon] = s.x
             sink.records.direction[s.photon] = s.u
@@ -160,7 +158,7 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
     what `add_pending` has left."""
 
     @wp.func
-    def flush(s: wp.ref[PhotonState], sink: wp.ref[Sink]):
+    def flush(s: PhotonRef, sink: SinkRef):
         if wp.static(adds):
             atomic_add_int64(sink.tally, int(s.account.pending[0]), s.account.pending[1])
         book(s.account, sink, ledger.ABSORBED_WATER, s.weight.absorbed_water - s.absorbed_surface - s.directed)
@@ -196,7 +194,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
     meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
 
     @wp.func
-    def fly(s: wp.ref[PhotonState], world: wp.ref[World], draws: wp.ref[Draws], words: wp.array[int]):
+    def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
         id = draws.base + wp.uint64(s.photon)
         event = wp.uint32(s.collisions + 1)
         if wp.static(cuda):
@@ -243,7 +241,7 @@ def make_trace(has_bvh: bool) -> wp.Function:
     """The Warp function ``(s, world)``: the surface before a photon that waits for a ray, without other threads."""
 
     @wp.func
-    def trace(s: wp.ref[PhotonState], world: wp.ref[World]):
+    def trace(s: PhotonRef, world: WorldRef):
         if wp.static(has_bvh):
             if s.stage == RAY:
                 s.surface_queries += 1
@@ -284,7 +282,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     )
 
     @wp.func
-    def end_of_flight(s: wp.ref[PhotonState], world: wp.ref[World]) -> Collision:
+    def end_of_flight(s: PhotonRef, world: WorldRef) -> Collision:
         c = Collision()
         c.distance = s.flight.distance
         c.reason = -1
@@ -317,7 +315,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
         return c
 
     @wp.func
-    def collide(s: wp.ref[PhotonState], world: wp.ref[World]):
+    def collide(s: PhotonRef, world: WorldRef):
         c = end_of_flight(s, world)
         fly_carried(s.carried, world, s.x, s.u, c.distance)
         s.x = s.x + c.distance * s.u
@@ -349,7 +347,7 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
     rides, (_begin, fork, fly, _event, _mirror, deliver) = rider is not NOTHING, rider
 
     @wp.func
-    def cross_aperture(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink]):
+    def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
         if wp.static(crosses):
             c = cross(s, world)
             if wp.static(reflecting):
@@ -398,7 +396,7 @@ def make_survive(spec: TransportSpec) -> wp.Function:
     has_mesh, specular, reflectance_at = spec.mesh, spec.specular, spec.reflectance_at
 
     @wp.func
-    def survive(s: wp.ref[PhotonState], world: wp.ref[World]) -> Survival:
+    def survive(s: PhotonRef, world: WorldRef) -> Survival:
         survival = Survival()
         survival.part = s.albedo
         if wp.static(has_mesh):
@@ -423,9 +421,7 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     has_mesh, specular, phase_sample, water_at = spec.mesh, spec.specular, spec.phase.sample, spec.water.at
 
     @wp.func
-    def sample_direction(
-        s: wp.ref[PhotonState], reflected: wp.vec3, lobe: float, world: wp.ref[World], id: wp.uint64
-    ) -> Direction:
+    def sample_direction(s: PhotonRef, reflected: wp.vec3, lobe: float, world: WorldRef, id: wp.uint64) -> Direction:
         new = Direction()
         on_surface = False
         if wp.static(has_mesh):
@@ -462,9 +458,7 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
     roulette = spec.roulette
 
     @wp.func
-    def terminate(
-        new: wp.ref[Outcome], s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64
-    ):
+    def terminate(new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         if new.analog_weight < world.limits.weight_cutoff:
             new.reason = ledger.WEIGHT_CUTOFF
             if wp.static(roulette):
@@ -491,7 +485,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     mirror_carried = make_rider(spec).mirror
 
     @wp.func
-    def bounce(new: wp.ref[Outcome], s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64):
+    def bounce(new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         face = s.bounces.face
         axis = (face - 1) // 2
         index = limits.face_index(world.limits.boundary, face)
@@ -528,13 +522,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
 
     @wp.func
     def turn(
-        new: wp.ref[Outcome],
-        s: wp.ref[PhotonState],
-        world: wp.ref[World],
-        sink: wp.ref[Sink],
-        id: wp.uint64,
-        on_surface: bool,
-        lobe: float,
+        new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64, on_surface: bool, lobe: float
     ):
         reflected = s.u
         if wp.static(specular):
@@ -564,9 +552,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         s.u = heading.u
 
     @wp.func
-    def collision(
-        new: wp.ref[Outcome], s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], id: wp.uint64
-    ):
+    def collision(new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         on_surface = False
         if wp.static(has_mesh):
             on_surface = s.hit.face >= 0
@@ -583,7 +569,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         s.surface_count += wp.where(on_surface, 1, 0)
 
     @wp.func
-    def scatter(s: wp.ref[PhotonState], world: wp.ref[World], sink: wp.ref[Sink], draws: wp.ref[Draws]):
+    def scatter(s: PhotonRef, world: WorldRef, sink: SinkRef, draws: wp.ref[Draws]):
         # Here, not in `collide`: there a select takes the place of the branch, and a core waits for the flight.
         s.collisions += 1
         id = draws.base + wp.uint64(s.photon)
