@@ -53,11 +53,11 @@ def memoised(make: Callable[P, R]) -> Callable[P, R]:
 # ---- Kernels with one thread a pixel: launches over any number of them, on every core of a CPU.
 
 
-def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any) -> None:
+def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any, threads: int = 0) -> None:
     """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow.
 
-    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads; but not
-    while a graph is captured, which records the launches of one thread.
+    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads (0: one for
+    each core); but not while a graph is captured, which records the launches of one thread.
     """
     device = wp.get_device(device)
     if count == 0:
@@ -66,7 +66,7 @@ def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, devic
         wp.launch(kernel, count, [0, *inputs], device=device)
         return
     wp.load_module(kernel.module, device=device)  # compiled once, before the threads
-    workers = os.cpu_count() or 1
+    workers = threads or os.cpu_count() or 1
     edges = np.unique(np.linspace(0, count, 8 * workers + 1).astype(int)) if workers > 1 else np.array([0, count])
 
     def part(index: int) -> None:

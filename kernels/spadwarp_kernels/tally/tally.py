@@ -1,6 +1,5 @@
 """Tallies in 64-bit fixed point, whose sums do not depend on the order of their terms, and the batches of a run."""
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -187,10 +186,9 @@ def _add_wide(low: wp.array[wp.uint64], high: wp.array[wp.uint64], i: int, more_
 
 @wp.kernel
 def close_batch_kernel(
+    first: int,
     component_count: int,
     least: wp.int64,
-    first: int,
-    stop: int,
     run: int,
     batch: wp.array[wp.int64],
     # Out:
@@ -205,11 +203,11 @@ def close_batch_kernel(
     `sums` takes its components, over voxels; `overflow` is set where a total leaves [least, 2^62).
 
     Integers, so that the sums depend neither on the order of the batches nor on how they were merged.
-    Launch: runs of `run` voxels from `first` to `stop`.
+    Launch: runs of `run` voxels from the `first` on.
     """
-    begin = first + wp.tid() * run
-    end = wp.min(begin + run, stop)
     voxels = squares_low.shape[0]
+    begin = (first + wp.tid()) * run
+    end = wp.min(begin + run, voxels)
     lit = bool(False)
     for component in range(component_count):
         lit = lit or _has_light(batch, component * voxels + begin, end - begin)
@@ -234,11 +232,8 @@ def close_batch_kernel(
             low = wp.uint64(t) & _LOW32
             high = wp.uint64(t) >> wp.uint64(32)
             middle = wp.uint64(2) * low * high
-            square_low = low * low + (middle << wp.uint64(32))
-            square_high = high * high + (middle >> wp.uint64(32))
-            if square_low < low * low:
-                square_high += wp.uint64(1)
-            _add_wide(squares_low, squares_high, voxel, square_low, square_high)
+            _add_wide(squares_low, squares_high, voxel, low * low, high * high)
+            _add_wide(squares_low, squares_high, voxel, middle << wp.uint64(32), middle >> wp.uint64(32))
 
 
 @wp.kernel
@@ -289,21 +284,11 @@ class Batches:
         """Takes the tally over as one batch and sets it to zero; on a CPU with so many threads."""
         check_array("tally", tally, wp.int64, tuple(self.total.shape), self.total.device, contiguous=True)
         threads = 1 if tally.device.is_cuda else check_integer("threads", threads, 1, 4096)
-        voxels = self.second_moment[0].size
-        edges = [voxels * i // threads for i in range(threads + 1)]
         run = 1 if tally.device.is_cuda else _RUN
-        outputs = [self.total, *self.second_moment, self._sums, self._overflow]
-
-        def part(first: int, stop: int) -> None:
-            inputs = [self._component_count, self._least, first, stop, run, tally]
-            runs = -(-(stop - first) // run)
-            wp.launch(close_batch_kernel, dim=runs, inputs=inputs, outputs=outputs, device=tally.device)
-
-        if threads == 1 or self.count == 0:  # the first loads the kernel
-            part(0, voxels)
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(part, edges[:-1], edges[1:]))
+        inputs = [self._component_count, self._least, run, tally, self.total, *self.second_moment]
+        inputs += [self._sums, self._overflow]
+        runs = -(-self.second_moment[0].size // run)
+        launch_pixels(close_batch_kernel, runs, inputs, device=tally.device, threads=threads)
         self.count += 1
 
     def add(self, other: "Batches") -> None:
