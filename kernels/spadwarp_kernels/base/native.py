@@ -4,24 +4,16 @@ import numpy as np
 import warp as wp
 
 
-@wp.func_native("""
-    union { float number; int bits; } both;
-    both.number = number;
-    return both.bits;
-""")
+@wp.func
 def bits_of(number: float) -> int:
     """The int32 with the bits of a float32."""
-    ...
+    return wp.cast(number, int)
 
 
-@wp.func_native("""
-    union { float number; int bits; } both;
-    both.bits = bits;
-    return both.number;
-""")
+@wp.func
 def from_bits(bits: int) -> float:
     """The float32 with the bits of an int32; to be moved and not to be computed with."""
-    ...
+    return wp.cast(bits, float)
 
 
 # ---- Memory that is read and written all over.

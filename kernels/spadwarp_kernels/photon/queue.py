@@ -46,31 +46,6 @@ class Request:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return __popc(__ballot_sync(0xffffffffu, condition));
-#else
-    return condition ? 32 : 0;
-#endif
-""")
-def count_lanes(condition: bool) -> int:
-    """Number of lanes, out of 32, in which the condition holds; every lane of the warp must take part, and all meet
-    here."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __popc(__ballot_sync(0xffffffffu, condition) & ((1u << (threadIdx.x & 31u)) - 1u));
-#else
-    return 0;
-#endif
-""")
-def count_lanes_before(condition: bool) -> int:
-    """Number of lanes of the warp before this one in which the condition holds; every lane must take part."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
     const unsigned int lanes = __ballot_sync(0xffffffffu, condition);
     return wp::vec2i(__popc(lanes & ((1u << (threadIdx.x & 31u)) - 1u)), __popc(lanes));
 #else
@@ -78,8 +53,15 @@ def count_lanes_before(condition: bool) -> int:
 #endif
 """)
 def vote(condition: bool) -> wp.vec2i:
-    """`count_lanes_before` and `count_lanes` of one vote."""
+    """Number of lanes of the warp before this one, and of all 32, in which the condition holds; every lane must take
+    part, and all meet here."""
     ...
+
+
+@wp.func
+def count_lanes(condition: bool) -> int:
+    """Number of lanes, out of 32, in which the condition holds, by a `vote`."""
+    return vote(condition)[1]
 
 
 # ---- A warp's shared memory, in units of 16 bytes: 32 vectors of six numbers, the size of its queue, and that.
@@ -228,7 +210,7 @@ def _lane(lane: int, takes: bool) -> int:
 
 @wp.func
 def _among_takers(lane: int, takes: bool) -> int:
-    return count_lanes_before(takes)
+    return vote(takes)[0]
 
 
 def _has_more(spec: TransportSpec, flights: bool) -> bool:
