@@ -1,5 +1,6 @@
 """Tallies in 64-bit fixed point, whose sums do not depend on the order of their terms, and the batches of a run."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -326,22 +327,19 @@ class Batches:
 @wp.kernel
 def _rates_kernel(
     first_pixel: int,
-    tally: wp.array[wp.int64],
+    tally: wp.array4d[wp.int64],
     scale: wp.array[wp.float64],
     component: int,
     stop_component: int,
-    parameters: int,
     parameter: int,
     # Out:
     rates: wp.array2d[float],
 ):
     pixel = first_pixel + wp.tid()
-    bins = rates.shape[1]
-    for k in range(bins):
+    for k in range(rates.shape[1]):
         total = wp.int64(0)
         for c in range(component, stop_component):
-            voxel = (wp.int64(c) * wp.int64(rates.shape[0]) + wp.int64(pixel)) * wp.int64(bins) + wp.int64(k)
-            total += tally[int(voxel) * parameters + parameter]
+            total += tally[c, pixel, k, parameter]
         rates[pixel, k] = float(wp.float64(total) * scale[pixel])
 
 
@@ -367,19 +365,16 @@ def tally_rates(
     Raises:
         ArgumentError: Arrays or numbers that do not fit each other.
     """
-    check_array("tally", tally, wp.int64, (None,))
-    check_array("scale", scale, wp.float64, (None,), tally.device)
+    check_array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
     bins, parameters = check_integer("bins", bins, 1), check_integer("parameters", parameters, 1)
     if not (isinstance(components, tuple | list) and len(components) == 2):
         raise ArgumentError("components is not a pair such as (0, 3)")
-    first, stop = (check_integer("components", one, 0) for one in components)
-    parameter = check_integer("parameter", parameter, 0)
-    pixels = scale.shape[0]
-    if tally.size != 3 * pixels * bins * parameters:
-        raise ArgumentError(f"tally has {tally.size} values; {3 * pixels * bins * parameters} are needed")
-    if not (first < stop <= 3) or parameter >= parameters or tally.size >= 2**31:
-        raise ArgumentError(f"components {first} to {stop} or parameter {parameter} is outside the tally")
-    rates: Any = wp.empty((pixels, bins), dtype=float, device=tally.device)
-    inputs = [tally, scale, first, stop, parameters, parameter, rates]
-    launch_pixels(_rates_kernel, pixels, inputs, device=tally.device)
+    stop = check_integer("components[1]", components[1], 1, len(COMPONENTS))
+    first = check_integer("components[0]", components[0], 0, stop - 1)
+    parameter = check_integer("parameter", parameter, 0, parameters - 1)
+    shape = (len(COMPONENTS), scale.shape[0], bins, parameters)
+    check_array("tally", tally, wp.int64, (check_integer("values of tally", math.prod(shape), 0),), contiguous=True)
+    rates: Any = wp.empty(shape[1:3], dtype=float, device=tally.device)
+    inputs = [tally.reshape(shape), scale, first, stop, parameter, rates]
+    launch_pixels(_rates_kernel, shape[1], inputs, device=tally.device)
     return rates
