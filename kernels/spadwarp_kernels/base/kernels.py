@@ -105,9 +105,7 @@ def unpack_kernels() -> int:
         return 0
     wp.init()
     with contextlib.suppress(*_UNUSABLE), zipfile.ZipFile(ARCHIVE) as archive:
-        if this_system() == json.loads(archive.read(MANIFEST)) and set(FEATURES) <= set(
-            Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
-        ):
+        if this_system() == json.loads(archive.read(MANIFEST)) and set(FEATURES) <= _processor_features():
             # The end of this key is what Warp adds to the names of objects for the processor at hand.
             ending = "cpu" + wp.get_cpu_kernel_cache_key().rpartition("-")[2]
             return sum(_unpack(archive, name, ending) for name in archive.namelist() if name.endswith(".o"))
