@@ -174,7 +174,7 @@ def test_parts_of_a_model_name_what_is_wrong(make, arguments, text):
         (sk.TransportSpec("next_event", lens=sk.CALIBRATED), r"model.camera.focal = 0.0 is outside \(0, inf\)"),
         (
             sk.TransportSpec("next_event", rotated_domain=True),
-            "model.limits.rotation, a row .* a unit vector is needed",
+            "model.limits.rotation = .* a unit vector is needed",
         ),
         (sk.TransportSpec("next_event", phase="henyey_greenstein"), "spec.phase = 'henyey_greenstein' is not a"),
         (sk.TransportSpec("next_event", bounded="yes"), "spec.bounded = 'yes' is not True or False"),

@@ -5,9 +5,8 @@ import warp as wp
 from spadwarp_kernels.base.philox import u01
 from spadwarp_kernels.optics.port import FLAT_PORT, PortRay
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, TOO_LONG, Contribution, tally_index
+from spadwarp_kernels.photon.state import TOO_LONG, Contribution, PhotonState, World, tally_index
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
 
 from .estimator import Estimator
 
@@ -15,7 +14,7 @@ from .estimator import Estimator
 def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
     reflecting, has_port = spec.reflecting, spec.port is not None
-    image_of, leave = spec.lens.project, (spec.port or FLAT_PORT).leave
+    image_of, leave = spec.image_of, (spec.port or FLAT_PORT).leave
 
     @wp.func
     def cross(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:

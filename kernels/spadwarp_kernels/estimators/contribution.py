@@ -10,16 +10,14 @@ from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u0
 from spadwarp_kernels.base.rotations import cos_sin_turn, cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import Camera, lens_point
 from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
-from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import Contribution, PhotonState, World, tally_index
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.ray_cast import patch_face, tree_face
-from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
+from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
 from spadwarp_kernels.water.medium import Layers, Medium, Profile
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
 
@@ -328,8 +326,7 @@ class ScoredPoint:
 @memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
-    view_of = spec.lens.view
-    shows = spec.lens.shows if spec.port is None else port_view(spec.port).shows
+    view_of, shows = spec.lens.view, spec.in_view
     reflecting, tracks, has_mesh = spec.reflecting, spec.grid is not None, spec.mesh
     rides = make_rider(spec) is not NOTHING
 
@@ -381,7 +378,7 @@ def scores_collision(word: wp.uint32) -> bool:
 @memoised
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, world) -> ScoredPoint`` that draws the point of a flight to be scored."""
-    local_albedo = spec.varies and not spec.random_albedo
+    local_albedo = spec.local_albedo
     water, profile = spec.water, spec.water.profile
     water_extinction, water_at = water.extinction, water.at
     sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
@@ -469,8 +466,8 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     has_mesh, specular = spec.mesh, spec.specular
     water_at = spec.water.at
     phase_pdf = spec.phase.pdf
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
-    face_at = patch_face if spec.brute_force and not spec.use_warp_bvh else tree_face
+    reflectance_at = spec.reflectance_at
+    face_at = patch_face if spec.tries_faces else tree_face
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
@@ -501,7 +498,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """
     confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
-    image_of = spec.lens.project
+    image_of = spec.image_of
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     link_to, value_of, *_ = make_lens_way(spec.port)
     rider = make_rider(spec)

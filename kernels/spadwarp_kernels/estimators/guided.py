@@ -14,8 +14,7 @@ from spadwarp_kernels.optics.camera import clip_to_gate, lens_point
 from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import PhotonState, World
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import reflection_pdf, sample_cosine_law
@@ -105,7 +104,7 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, rides = spec.varies and not spec.random_albedo, make_rider(spec) is not NOTHING
+    local_albedo, rides = spec.local_albedo, make_rider(spec) is not NOTHING
     collides = spec.scores_collisions
     spares = collides and not spec.reflecting  # mirrored, any flight may lead to an image of the lens
 
@@ -210,7 +209,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     water_at, tracks, collides = spec.water.at, spec.grid is not None, spec.scores_collisions
     view_of, toward_middle = spec.lens.view, spec.lens.toward_middle
     has_mesh, specular = spec.mesh, spec.specular
-    in_view = spec.lens.shows if spec.port is None else port_view(spec.port).shows
+    in_view = spec.in_view
     *_, toward, toward_centre = make_lens_way(spec.port)
 
     @wp.func

@@ -6,15 +6,13 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import join_words, u01, u01_high, u01_low
 from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.photon.queue import Request
-from spadwarp_kernels.photon.sink import Sink, make_deposit
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import Contribution, PhotonState, Sink, World, make_deposit, tally_index
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
-from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
+from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED
 from spadwarp_kernels.water.limits import (
     face_index,
     flipped,
@@ -111,7 +109,7 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, world) -> Mirrored`` of an event by way of one of `Boundary.images`."""
     confocal, measured = spec.confocal, spec.mesh or spec.varies
     followed = measured or make_rider(spec) is not NOTHING
-    image_of = spec.lens.project
+    image_of = spec.image_of
     scattering_density, follow = make_scattering(spec), _make_follow(spec, brute_force)
     link_to, value_of, *_ = make_lens_way(spec.port)
     domain = make_domain(spec.rotated_domain)

@@ -165,10 +165,6 @@ def make_boundary(
 # ---- The box and the limits.
 
 
-# Where a history may leave, by the number of the face in `Exit`.
-EXIT_FACES = ("lateral_limit", "exit_x_low", "exit_x_high", "exit_y_low", "exit_y_high", "exit_z_low", "exit_z_high")
-
-
 @wp.struct
 class Limits:
     """Limits of a history; 1e30 stands for none.
