@@ -20,7 +20,7 @@ from spadwarp_kernels.base.arguments import (
     check_numbers,
     check_struct,
 )
-from spadwarp_kernels.water.grid import Grid
+from spadwarp_kernels.water.medium import Grid
 
 __all__ = [
     "BLOCK_DERIVATIVES",

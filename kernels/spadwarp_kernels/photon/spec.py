@@ -123,8 +123,8 @@ class TransportSpec(NamedTuple):
 
     @property
     def image_of(self) -> wp.Function:
-        """The pixel of a point, by the lens's own law or by that of pixels side by side, see `Lens`."""
-        return self.lens.image or self.lens.project
+        """The pixel of a point, see `Lens.project`."""
+        return self.lens.project
 
     @property
     def in_view(self) -> wp.Function:

@@ -275,11 +275,8 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     has_mesh, reflecting, local_albedo = spec.mesh, spec.reflecting, spec.local_albedo
     bounded = spec.bounded and not reflecting
     water_at, fly_carried = spec.water.at, make_rider(spec).fly
-    to_exit, face_of_exit, exit_of, outside = (
-        (limits.exit_distance_rotated, limits.exit_face_rotated, limits.first_exit_rotated, limits.is_outside_rotated)
-        if spec.rotated_domain
-        else (limits.exit_distance, limits.exit_face, limits.first_exit, limits.is_outside)
-    )
+    domain = limits.make_domain(spec.rotated_domain)
+    outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
 
     @wp.func
     def end_of_flight(s: PhotonRef, world: WorldRef) -> Collision:
@@ -301,7 +298,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
             if exit < c.distance:
                 c.distance = exit
                 c.reason = -1
-                face = face_of_exit(world.limits, s.x, s.u)
+                face = exit_of(world.limits, s.x, s.u).face
                 if limits.face_index(world.limits.boundary, face) > 0.0:
                     c.mirror = face
                 else:
@@ -482,6 +479,7 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
     """
     rotated, terminate, continues = spec.rotated_domain, make_terminate(spec), make_continues(flies_on)
+    turn, turn_back = limits.make_domain(rotated).turn, limits.make_domain(rotated).turn_back
     mirror_carried = make_rider(spec).mirror
 
     @wp.func
@@ -489,13 +487,11 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
         face = s.bounces.face
         axis = (face - 1) // 2
         index = limits.face_index(world.limits.boundary, face)
-        u = s.u
-        if wp.static(rotated):
-            u = world.limits.rotation * u
+        u = turn(world.limits, s.u)
         part = limits.fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), index)
-        u = limits.flipped(u, axis)
+        u = turn_back(world.limits, limits.flipped(u, axis))
         if wp.static(rotated):
-            u = wp.normalize(wp.transpose(world.limits.rotation) * u)
+            u = wp.normalize(u)
         new = Outcome()
         new.reason = s.reason
         new.weight = s.weight

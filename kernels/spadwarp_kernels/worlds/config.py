@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.analytic.backscatter import Scattering, make_scattering, single_scatter_rate
-from spadwarp_kernels.analytic.lidar import BACKSCATTER_SOURCES, Lidar
-from spadwarp_kernels.analytic.optics import IN_WATER
+from spadwarp_kernels.analytic.optics import BACKSCATTER_SOURCES, IN_WATER, Lidar
+from spadwarp_kernels.analytic.rates import Scattering, make_scattering, single_scatter_rate
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_choice,

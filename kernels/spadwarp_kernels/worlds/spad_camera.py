@@ -8,9 +8,8 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.analytic.depth_frames import depth_of_path
-from spadwarp_kernels.analytic.lidar import Lidar, beam_path
-from spadwarp_kernels.analytic.optics import IN_WATER
-from spadwarp_kernels.analytic.signal import radiometric_signal
+from spadwarp_kernels.analytic.optics import IN_WATER, Lidar, beam_path
+from spadwarp_kernels.analytic.rates import radiometric_signal
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
