@@ -19,7 +19,7 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.visibility import near_depth_map, update_near_depth
 
-from .bvh import empty_bvh, node_depths, pack_bvh, refit_bvh
+from .bvh import empty_bvh, pack_bvh, refit_bvh
 from .patches import BRUTE_FORCE_FACES, PATCH_ROWS, empty_patches, pack_patches, set_patches
 from .triangle import LANES, face_vectors, pack_faces, set_faces
 from .wide import empty_wide, pack_wide, refit_wide
@@ -175,10 +175,9 @@ def make_surfaces(
         surfaces.order = wp.array(numbers, dtype=int, device=device)  # each face in the slot of its own number
         surfaces.faces = pack_faces(mesh, surfaces.extent, surfaces.order)
     elif device.is_cuda:
-        surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, surfaces.extent, join=extent is None)
+        surfaces.nodes, surfaces.faces, surfaces.order, depth = pack_bvh(mesh, surfaces.extent, join=extent is None)
         if extent is not None:
-            surfaces.depth = node_depths(surfaces.nodes)
-            surfaces.levels = int(surfaces.depth.numpy().max()) + 1
+            surfaces.depth, surfaces.levels = depth, int(depth.numpy().max()) + 1
     else:
         surfaces.nodes, surfaces.faces, surfaces.order = pack_wide(mesh, surfaces.extent)
         surfaces.levels = 0 if extent is None else 1

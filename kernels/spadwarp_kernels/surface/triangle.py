@@ -123,10 +123,16 @@ def middle_planes(p: wp.vec3, e1: wp.vec3, e2: wp.vec3, triangle: float):
     )
 
 
-@wp.func
-def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int, faces: wp.array[wp.vec4]):
-    """Writes a face, or the parallelogram that it is a half of: then `triangle` is 0, and the corner is the one that is
-    not on the diagonal."""
+@wp.kernel(enable_backward=False)
+def _rows_kernel(mesh: wp.uint64, order: wp.array[int], corners: wp.array[int], faces: wp.array[wp.vec4]):
+    """Faces as CUDA takes them, or the parallelograms that they are halves of. Launch: slots."""
+    slot = wp.tid()
+    face = face_in(order, slot)
+    corner = int(-1)
+    if corners.shape[0] > 0:
+        corner = corners[slot]
+    triangle = wp.where(corner < 0, 1.0, 0.0)
+    corner = wp.max(corner, 0)
     m = wp.mesh_get(mesh)
     p = m.points[m.indices[3 * face + corner]]
     q = m.points[m.indices[3 * face + (corner + 1) % 3]]
@@ -141,16 +147,11 @@ def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int,
     faces[3 * slot + 2] = wp.vec4(turned[0], turned[1], turned[2], _times_sign(offset, triangle - 0.5))
 
 
-@wp.kernel(enable_backward=False)
-def _rows_kernel(mesh: wp.uint64, order: wp.array[int], faces: wp.array[wp.vec4]):
-    """Launch: slots."""
-    slot = wp.tid()
-    set_row(mesh, face_in(order, slot), 0, 1.0, slot, faces)
-
-
-def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array) -> None:
-    """Writes the faces in their slots as CUDA takes them, each by itself."""
-    wp.launch(_rows_kernel, order.size, [mesh.id, order], [faces], device=mesh.device)
+def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array, corners: wp.array | None = None) -> None:
+    """Writes the faces in their slots as CUDA takes them; `corners` is that of `join_faces`, None for triangles."""
+    if corners is None:
+        corners = wp.empty(0, dtype=int, device=mesh.device)
+    wp.launch(_rows_kernel, order.size, [mesh.id, order, corners], [faces], device=mesh.device)
 
 
 @wp.func_native("return reinterpret_cast<const float*>(rows.data)[index];")
@@ -268,14 +269,6 @@ def meet_face(faces: wp.array[wp.vec4], slot: int, x: wp.vec3, u: wp.vec3):
     met = meet_planes(a, b, n, x, u)
     last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
     return met[0], wp.where(met[1] > 0.0, last, slot), last
-
-
-@wp.func
-def face_distance(faces: wp.array[wp.vec4], slot: int, x: wp.vec3, u: wp.vec3) -> float:
-    """Distance from x along the unit vector u at which the ray meets the face in a slot, >= 0, or -1 for a miss; on
-    CUDA, in the first of two slots whose faces are kept as a parallelogram, that."""
-    distance, _, _ = meet_face(faces, slot, x, u)
-    return distance
 
 
 @wp.func

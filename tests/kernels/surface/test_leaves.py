@@ -11,8 +11,8 @@ from helpers.launch import Vectors, launched, on_device
 from helpers.meshes import mesh_and_surfaces
 from spadwarp_kernels import intersect_mesh, intersect_surfaces
 from spadwarp_kernels.base.native import bits_of
-from spadwarp_kernels.surface.bvh import LARGEST_LEAF, join_leaves, open_pairs, read_tree
-from spadwarp_kernels.surface.triangle import meet_planes, set_rows
+from spadwarp_kernels.surface.bvh import LARGEST_LEAF, pack_bvh
+from spadwarp_kernels.surface.triangle import meet_planes
 
 Rows = wp.array(dtype=wp.vec4)
 
@@ -54,12 +54,8 @@ def packed(shape, leaf_size, device="cpu"):
         bvh_constructor="cubql",
         bvh_leaf_size=leaf_size,
     )
-    extent = float(np.abs(shape.vertices).max())
-    pairs, order = read_tree(mesh, extent)
-    rows = wp.zeros(3 * order.size, dtype=wp.vec4, device=device)
-    set_rows(mesh, order, rows)
-    join_leaves(mesh, extent, pairs, order, rows)
-    return mesh, open_pairs(pairs, order).numpy(), rows, order.numpy()
+    nodes, rows, order, _ = pack_bvh(mesh, float(np.abs(shape.vertices).max()))
+    return mesh, nodes.numpy(), rows, order.numpy()
 
 
 def leaves(nodes):

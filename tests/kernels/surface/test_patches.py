@@ -12,7 +12,6 @@ from spadwarp_kernels.surface.patches import (
     nearest_patch,
     normal_and_face,
     pack_patches,
-    pair_faces,
     patch_faces,
     patch_normal,
     set_patches,
@@ -50,7 +49,10 @@ def mesh_of(points, faces, device="cpu"):
 
 
 def pairs_of(points, faces):
-    return pair_faces(mesh_of(np.asarray(points, float), faces))
+    """(face, second face, corner) of the patches; a triangle is its own second face."""
+    patches, _ = pack_patches(mesh_of(np.asarray(points, float), faces), np.arange(len(faces)))
+    rows = patches.numpy().reshape(-1, 5, 4).view(np.int32)
+    return [(int(row[4, 1]), int(row[4, 3]), int(row[3, 3])) for row in rows]
 
 
 def packed(shape, pairs=True, device="cpu"):

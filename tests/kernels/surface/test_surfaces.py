@@ -70,33 +70,23 @@ def test_the_tree_is_read_as_warp_writes_it(device):
         mesh, points = ball(device)
         mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor, bvh_leaf_size=1)
         try:
-            nodes, order = (one.numpy() for one in read_tree(mesh, 1.2))
+            tree = read_tree(mesh, 1.2)
         except Exception as error:
             pytest.fail(f"{PRIVATE_LAYOUT} ({error})")
-        faces = np.where(order < 0, ~order, order)
-        corners = points[mesh.indices.numpy().reshape(-1, 3)]
-        pairs, seen, stack = nodes.reshape(-1, 2, 2, 4), [], [(0, np.full(3, -np.inf), np.full(3, np.inf))]
-        while stack and len(seen) <= len(faces):
-            pair, low, high = stack.pop()
-            for child in range(2):
-                lower, upper = pairs[pair, child, 0, :3], pairs[pair, child, 1, :3]
-                entry = int(pairs[pair, child, 0, 3].view(np.int32))
-                if entry == -1:
-                    continue
-                inside = (lower >= low - 1e-5).all() and (upper <= high + 1e-5).all()
-                assert inside, f"{PRIVATE_LAYOUT} (a child leaves its parent's box, {constructor})"
-                if entry >= 0:
-                    stack.append((entry, lower, upper))
-                    continue
-                slot = -2 - entry
-                while True:
-                    held = (corners[faces[slot]] >= lower).all() and (corners[faces[slot]] <= upper).all()
-                    assert held, f"{PRIVATE_LAYOUT} (a face leaves its box, {constructor})"
-                    seen.append(faces[slot])
-                    if order[slot] >= 0:
-                        break
-                    slot += 1
-        assert sorted(seen) == list(range(len(faces))), f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
+        assert sorted(tree.faces) == list(range(len(tree.faces))), (
+            f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
+        )
+        corners, stack, seen = points[mesh.indices.numpy().reshape(-1, 3)[tree.faces]], [tree.root], 0
+        while stack:
+            node = stack.pop()
+            held = corners[tree.start[node] : tree.stop[node]]
+            inside = (held >= tree.lower[node]).all() and (held <= tree.upper[node]).all()
+            assert inside, f"{PRIVATE_LAYOUT} (a face leaves a box, {constructor})"
+            if tree.children[node, 0] >= 0:
+                stack += tree.children[node].tolist()
+            else:
+                seen += len(held)
+        assert seen == len(tree.faces), f"{PRIVATE_LAYOUT} (faces are in no leaf, {constructor})"
 
 
 @pytest.mark.parametrize("use_warp_bvh", [False, True])
