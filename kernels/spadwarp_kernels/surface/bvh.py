@@ -29,6 +29,7 @@ from .triangle import box_padding, face_in, meet_face, number_in, set_rows
 
 
 @wp.func_native("""
+#if defined(__CUDA_ARCH__)
     float in[3], out[3];
     for (int i = 0; i < 3; ++i) {
         // Infinite for a segment parallel to these two sides: in and out are then infinite as well, and their signs
@@ -37,28 +38,16 @@ from .triangle import box_padding, face_in, meet_face, number_in, set_rows
         in[i] = wp::min(a, b);
         out[i] = wp::max(a, b);
     }
-#if defined(__CUDA_ARCH__)
     // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
     // negative counts only as that.
     const auto bits = [](float number) { return __float_as_int(number); };
     const int enters = __vimax3_s32_relu(bits(in[0]), bits(in[1]), bits(in[2]));
     return enters <= min(__vimin3_s32(bits(out[0]), bits(out[1]), bits(out[2])), bits(length));
 #else
-    const float enters = wp::max(wp::max(in[0], in[1]), wp::max(in[2], 0.0f));
-    return enters <= wp::min(wp::min(out[0], out[1]), wp::min(out[2], length));
-#endif
-""")
-def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
-    """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
-    ...
-
-
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
+    // The three axes in one vector register; the fourth lane is the segment itself, from 0 to its length.
     typedef float row __attribute__((vector_size(16)));
     const auto least = [](row p, row q) { return p < q ? p : q; };
     const auto most = [](row p, row q) { return p > q ? p : q; };
-    // The fourth lane is the segment itself, from 0 to its length.
     const row start = {x[0], x[1], x[2], 0.0f}, low = {lower[0], lower[1], lower[2], 0.0f};
     const row high = {upper[0], upper[1], upper[2], length}, heading = {u[0], u[1], u[2], 1.0f};
     const row tiny = row{} + 1.0e-12f;
@@ -70,12 +59,10 @@ def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upp
     near = most(near, __builtin_shufflevector(near, near, 1, 0, 3, 2));
     far = least(far, __builtin_shufflevector(far, far, 1, 0, 3, 2));
     return near[0] <= far[0];
-#else
-    return true;
 #endif
 """)
-def segment_meets_box_on_cpu(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
-    """`segment_meets_box`, its three axes in one vector register; CPU alone."""
+def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
+    """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
     ...
 
 
@@ -203,17 +190,11 @@ def read_tree(mesh: wp.Mesh, extent: float) -> Tree:
 
 
 def open_tree(tree: Tree, closed: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes of more children, level by level: of each child that is not closed the one with the largest surface is
-    opened until there are so many.
-
-    Args:
-        tree: From `read_tree`.
-        closed: Which of its nodes become leaves.
-        width: Children of a node.
+    """Nodes of `width` children, level by level: the child with the largest surface is opened until there are so many,
+    but none that is closed, a leaf.
 
     Returns:
-        The tree's node that each stands for, the nodes that are its children, [nodes, width], -1 for none, and its
-        level.
+        The tree's node that each stands for; its children among those, [nodes, width], -1 for none; its level.
     """
     size = tree.upper - tree.lower
     area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
@@ -358,8 +339,7 @@ def box_of(nodes: wp.array[wp.vec4], node: int):
 #endif
 """)
 def box_entries(nodes: wp.array[wp.vec4], node: int, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4ui:
-    """Bits of the distances at which a ray enters the boxes of four children; 2^31 more for those that it misses. CUDA
-    alone."""
+    """Bits of the distances at which a ray enters four children; 2^31 more for those that it misses. CUDA alone."""
     ...
 
 
@@ -379,7 +359,7 @@ def children_of(nodes: wp.array[wp.vec4], node: int) -> wp.vec4ui:
 # ---- The tree.
 
 
-# Nodes that a walk will return to: three a level, and NO_NODE.
+# Where a walk will return to: three a level, and NO_NODE.
 Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
 
 # Leaves of more faces are left as they are: all pairs of a leaf's faces are compared.
@@ -534,14 +514,8 @@ class NodeStep:
 
 @wp.func
 def step_node(nodes: wp.array[wp.vec4], walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> NodeStep:
-    """The children of a node that a ray meets.
-
-    Args:
-        nodes: From `pack_bvh`.
-        walk: Its node is >= 0; a walk begins with node 0. Below `NO_NODE` are leaves, see `leaf_at`.
-        inverse: `inverse_direction` of the ray.
-        shift: The ray's origin times `inverse`, by components.
-    """
+    """The children of the walk's node, >= 0, that a ray meets; `inverse_direction` of the ray and its origin times that
+    by components. A walk begins with node 0."""
     entry = box_entries(nodes, walk.node, inverse, shift)
     child = children_of(nodes, walk.node)
     a, b = _first(wp.vec2ui(entry[0], child[0]), wp.vec2ui(entry[1], child[1]))
@@ -566,13 +540,7 @@ class LeafStep:
 
 @wp.func
 def step_leaf(faces: wp.array[wp.vec4], order: wp.array[int], walk: TreeWalk, x: wp.vec3, u: wp.vec3) -> LeafStep:
-    """Tries the face that a walk has come to.
-
-    Args:
-        faces, order: From `pack_bvh`.
-        walk: Its node is below NO_NODE, see `step_node`.
-        x, u: Origin and unit direction of the ray.
-    """
+    """Tries the face that a walk has come to: its node is below NO_NODE; origin and unit direction of the ray."""
     step = LeafStep()
     slot = slot_of(walk.node)
     distance, met, last = meet_face(faces, slot, x, u)

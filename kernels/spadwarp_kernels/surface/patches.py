@@ -31,15 +31,9 @@ LEAST_HEIGHT = 100.0
 
 
 def shared_corner(first: np.ndarray, second: np.ndarray, same: float) -> np.ndarray:
-    """The corner (0 to 2) of each face that is not on the diagonal of the parallelogram that another one completes.
-
-    Args:
-        first, second: Corners of the faces, float32 [faces, 3, 3].
-        same: Points so far from each other [m] are taken for one.
-
-    Returns:
-        int [faces]; -1 for faces that make no parallelogram, or are less high than LEAST_HEIGHT.
-    """
+    """The corner (0 to 2) of each face that is not on the diagonal of the parallelogram that another one completes; -1
+    for none, and for faces less high than LEAST_HEIGHT. Corners are float32 [faces, 3, 3]; points so far from each
+    other [m] are taken for one."""
     found = np.full(len(first), -1)
     edges = np.roll(first, -1, axis=1) - first
     height = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -56,18 +50,8 @@ def shared_corner(first: np.ndarray, second: np.ndarray, same: float) -> np.ndar
 def join_faces(
     points: np.ndarray, faces: np.ndarray, start: np.ndarray, stop: np.ndarray, same: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Faces of each leaf in another order: behind a face the one with which it makes a parallelogram.
-
-    Args:
-        points: Corners of the mesh's faces, float32 [faces, 3, 3].
-        faces: The face in each slot.
-        start, stop: Slots of the leaves.
-        same: See `shared_corner`.
-
-    Returns:
-        The face in each slot, and its `shared_corner` with the next one; -1 for a triangle and for a second face.
-        Faces that turn opposite ways are not joined.
-    """
+    """The faces in the slots of each leaf anew: behind a face the one with which it makes a parallelogram, where they
+    turn the same way. Also the `shared_corner` of each with the next one; -1 for a triangle and for a second face."""
     order, corners = faces.copy(), np.full(len(faces), -1)
     free, place = np.ones(len(faces), bool), start.copy()
     most = int((stop - start).max(initial=0))
@@ -124,13 +108,8 @@ def set_patches(mesh: wp.Mesh, patches: wp.array, normals: wp.array) -> None:
 
 
 def pack_patches(mesh: wp.Mesh, order: np.ndarray, pairs: bool = True) -> tuple[wp.array, wp.array]:
-    """The patches of a mesh, vec4 [5 * patches]; vec4 [slots]: normals, see `normal_and_face`.
-
-    Args:
-        mesh: Of a few faces: each is compared with all others.
-        order: The face in each slot, or its complement, see `pack_bvh`.
-        pairs: Whether to look for parallelograms: not where the points will move.
-    """
+    """The patches of a mesh of a few faces, vec4 [5 * patches], and vec4 [slots] for `normal_and_face`; `order` is that
+    of `pack_bvh`, `pairs` false where the points will move."""
     faces = np.arange(len(order))
     corners = np.full(len(order), -1)
     if pairs:
@@ -148,11 +127,6 @@ def pack_patches(mesh: wp.Mesh, order: np.ndarray, pairs: bool = True) -> tuple[
     normals = wp.zeros(len(order), dtype=wp.vec4, device=mesh.device)
     set_patches(mesh, patches, normals)
     return patches, normals
-
-
-def empty_patches(device: wp.DeviceLike) -> tuple[wp.array, wp.array]:
-    """What `pack_patches` returns, for no faces at all."""
-    return wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=wp.vec4, device=device)
 
 
 @wp.func_native("""
@@ -192,12 +166,8 @@ def empty_patches(device: wp.DeviceLike) -> tuple[wp.array, wp.array]:
     return wp::vec4(nearest, rate_there, side, both.number);
 """)
 def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: float) -> wp.vec4:
-    """The nearest patch along a ray from x in the unit direction u.
-
-    Returns:
-        Its distance [m], below `reach`, or that; the rate at which the ray gains height over it along its normal; the
-        sum of its coordinates there; bits of its first row, -1 for none.
-    """
+    """The nearest patch along a ray from x in the unit direction u: its distance [m], below `reach`, or that; the rate
+    at which the ray gains height over it; the sum of its coordinates there; bits of its first row, -1 for none."""
     ...
 
 

@@ -157,11 +157,8 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
 
 @wp.func
 def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3:
-    """x moved off the surface along the normal by a bound of its float32 error, so that a new ray does not hit the
-    same face.
-
-    The error of x + s u grows with the coordinates and with s: a few units in the last place of either.
-    """
+    """x moved off the surface along the normal by a bound of its float32 error, a few units in the last place of its
+    coordinates and of the distance, so that a new ray does not hit the same face."""
     magnitude = wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
     return x + (5.0e-7 * (magnitude + distance)) * normal
 
@@ -184,9 +181,8 @@ def truth_kernel(
     """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
     width).
 
-    Rays go from `origins` [m], from which the range counts, such as those behind a port; where there are none, from the
-    lens. They go along `directions` (unit vectors through the pixel centres); where there are none, the camera has
-    square pixels about its axis.
+    Rays go from `origins` [m], from which the range counts, such as those behind a port, else from the lens; along
+    `directions`, unit vectors through the pixel centres, else through square pixels about the camera's axis.
     """
     row, column = wp.tid()
     x = wp.vec3(0.0)

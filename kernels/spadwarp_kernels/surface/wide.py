@@ -59,17 +59,8 @@ def _boxes_kernel(faces: wp.array[wp.vec4], nodes: wp.array[wp.vec4]):
 
 
 def pack_wide(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of a mesh's tree, for `walk_wide`; see `refit_wide` for moved points.
-
-    Args:
-        mesh: Any `wp.Mesh` on the CPU.
-        extent: Its largest coordinate [m], for the padding of the boxes.
-
-    Returns:
-        nodes: vec4 [14 * nodes], see above; boxes are padded against rounding.
-        faces: vec4 [36 * leaves], see `triangle`.
-        order: int32 [8 * leaves]: the face in each slot, -1 for none.
-    """
+    """A mesh's tree for `walk_wide`, for coordinates up to the extent [m]: nodes, vec4 [14 * nodes], see above; faces,
+    vec4 [36 * leaves], see `triangle`; and the face in each slot, int32 [8 * leaves], -1 for none."""
     tree = _split_leaves(read_tree(mesh, extent))
     leaf = tree.stop - tree.start <= LANES
     nodes, held, _ = open_tree(tree, leaf, LANES)
@@ -194,13 +185,7 @@ def walk_wide(
     reach: float,
     any_hit: bool,
 ) -> wp.vec2:
-    """Distance of the nearest face along a ray and the bits of its slot; CPU alone.
-
-    Args:
-        nodes, faces, order: From `pack_wide`.
-        x, u: Origin and unit direction.
-        inverse, shift: `inverse_direction` of the ray, and its origin times that, by components.
-        reach: Length of the ray [m], which is returned with slot -1 where it meets no face.
-        any_hit: Whether the first leaf with a face that it meets is enough.
-    """
+    """Distance of the nearest face along a ray of length `reach`, or that, and the bits of its slot, -1 for none; CPU
+    alone. `inverse` is `inverse_direction`, `shift` the origin times that, by components; with `any_hit` the first leaf
+    with a face that it meets is enough."""
     ...

@@ -21,7 +21,7 @@ from spadwarp_kernels.base.arguments import (
     check_number,
 )
 from spadwarp_kernels.detection.arrival_time import ArrivalEstimator
-from spadwarp_kernels.detection.counts import first_photon_step
+from spadwarp_kernels.detection.counts import first_photon_counts
 
 from .config import SpadConfig, backscatter_rates, check_config, optical_to
 from .shapes import Shapes, ShapeTable, check_poses, intersect_shapes, move_shapes
@@ -177,7 +177,7 @@ class WorldCameras:
         """Counts and depth of all cameras from their rates, and the next step; nothing is allocated or read."""
         config = self.config
         rates, counts = self.rates.reshape(self._rows), self.histogram.reshape(self._rows)
-        first_photon_step(rates, pulses=config.pulses, frame=self.step, seed=config.seed, counts=counts)
+        first_photon_counts(rates, pulses=config.pulses, first_frame=self.step, seed=config.seed, counts=counts)
         self._estimate(counts, self._arrival)
         inputs = [self._arrival, self._view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
         outputs = [self.depth.flatten(), self.counts.flatten(), self.step]
