@@ -11,8 +11,7 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
 
-from .closed_forms import SHAPE_KINDS
-from .shapes import Shapes, make_shapes
+from .shapes import SHAPE_KINDS, Shapes, make_shapes
 
 __all__ = ["mujoco_shapes", "newton_shapes", "write_poses"]
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from spadwarp_kernels.worlds import SHAPE_KINDS
-from spadwarp_kernels.worlds.closed_forms import intersect_shape
+from spadwarp_kernels.worlds.shapes import intersect_shape
 
 SIZE = (0.4, 0.7, 0.3)
 
