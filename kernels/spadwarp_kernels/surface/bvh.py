@@ -492,7 +492,7 @@ class TreeWalk:
 
 @wp.func_native("__builtin_assume(depth >= 0); return depth;")
 def place(depth: int) -> int:
-    """Index into a `Stack`: the compiler knows then that it does not count from the end."""
+    """An index of which the compiler then knows that it does not count from the end of an array."""
     ...
 
 

@@ -108,8 +108,8 @@ def set_patches(mesh: wp.Mesh, patches: wp.array, normals: wp.array) -> None:
 
 
 def pack_patches(mesh: wp.Mesh, order: np.ndarray, pairs: bool = True) -> tuple[wp.array, wp.array]:
-    """The patches of a mesh of a few faces, vec4 [5 * patches], and vec4 [slots] for `normal_and_face`; `order` is that
-    of `pack_bvh`, `pairs` false where the points will move."""
+    """The patches of a mesh of a few faces, vec4 [5 * patches], and the unit normal of the face in each slot with the
+    bits of its index, vec4 [slots]; `order` is that of `pack_bvh`, `pairs` false where the points will move."""
     faces = np.arange(len(order))
     corners = np.full(len(order), -1)
     if pairs:
@@ -173,6 +173,19 @@ def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: flo
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(rows.data) + static_cast<int64_t>(row));
+    return wp::vec4(v.x, v.y, v.z, v.w);
+#else
+    return rows.data[row];
+#endif
+""")
+def load_row(rows: wp.array[wp.vec4], row: int) -> wp.vec4:
+    """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
     const int4 v = __ldg(reinterpret_cast<const int4*>(patches.data + static_cast<int64_t>(row)) + 4);
     return second ? wp::vec2i(v.z, v.w) : wp::vec2i(v.x, v.y);
 #else
@@ -182,37 +195,4 @@ def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: flo
 """)
 def patch_faces(patches: wp.array[wp.vec4], row: int, second: bool) -> wp.vec2i:
     """Slot and index of the first or the second face of the patch that begins at a row."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const float4 v = __ldg(reinterpret_cast<const float4*>(patches.data + static_cast<int64_t>(row)));
-    const float against = -copysignf(1.0f, rate);
-    return wp::vec3(against * v.x, against * v.y, against * v.z);
-#else
-    const wp::vec4& v = patches.data[row];
-    const float against = rate > 0.0f ? -1.0f : 1.0f;
-    return wp::vec3(against * v[0], against * v[1], against * v[2]);
-#endif
-""")
-def patch_normal(patches: wp.array[wp.vec4], row: int, rate: float) -> wp.vec3:
-    """The unit normal of the patch that begins at a row, against a ray with that rate, see `nearest_patch`."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const float4 v = __ldg(reinterpret_cast<const float4*>(normals.data) + slot);
-    const int face = __float_as_int(v.w);
-    __builtin_assume(face >= 0);
-    union { int bits; float number; } both;
-    both.bits = face;
-    return wp::vec4(v.x, v.y, v.z, both.number);
-#else
-    return normals.data[slot];
-#endif
-""")
-def normal_and_face(normals: wp.array[wp.vec4], slot: int) -> wp.vec4:
-    """The unit normal of the face in a slot, and bits of its index."""
     ...

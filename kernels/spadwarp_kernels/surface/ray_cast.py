@@ -7,9 +7,9 @@ from spadwarp_kernels.optics.camera import Camera, pixel_direction
 
 from .bvh import NO_NODE, Stack, TreeWalk, inverse_direction, place, step_leaf, step_node
 from .mesh import Surfaces
-from .patches import nearest_patch, normal_and_face, patch_faces, patch_normal
+from .patches import load_row, nearest_patch, patch_faces
 from .reflectance import reflectance_at
-from .triangle import face_in, face_normal
+from .triangle import face_in, face_normal, times_sign
 from .wide import walk_wide
 
 __all__ = ["SurfaceHit", "intersect_mesh", "intersect_surfaces", "offset_from_surface", "truth_kernel"]
@@ -64,12 +64,13 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
 def patch_hit(surfaces: Surfaces, met: wp.vec4) -> SurfaceHit:
     """The hit on the patch that `nearest_patch` has found."""
     row = bits_of(met[3])
-    named = patch_faces(surfaces.patches, row, met[2] > 0.0)
+    faces = patch_faces(surfaces.patches, row, met[2] > 0.0)
+    normal = load_row(surfaces.patches, row)
     hit = SurfaceHit()
     hit.distance = met[0]
-    hit.normal = patch_normal(surfaces.patches, row, met[1])
-    hit.slot = named[0]
-    hit.face = named[1]
+    hit.normal = times_sign(-1.0, met[1]) * wp.vec3(normal[0], normal[1], normal[2])
+    hit.slot = faces[0]
+    hit.face = faces[1]
     return hit
 
 
@@ -102,9 +103,9 @@ def patch_face(surfaces: Surfaces, slot: int, u: wp.vec3):
     """`tree_face` for surfaces with patches."""
     if _on_cpu():
         return face_in(surfaces.order, slot), face_normal(surfaces.faces, slot, u)
-    row = normal_and_face(surfaces.normals, slot)
+    row = load_row(surfaces.normals, slot)
     normal = wp.vec3(row[0], row[1], row[2])
-    return bits_of(row[3]), wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
+    return place(bits_of(row[3])), wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
 
 
 @wp.func

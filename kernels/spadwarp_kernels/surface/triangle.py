@@ -42,7 +42,7 @@ def load_plane(faces: wp.array[wp.vec4], slot: int, plane: int) -> wp.vec4:
     return __builtin_signbit(sign) ? -x : x;
 #endif
 """)
-def _times_sign(x: float, sign: float) -> float:
+def times_sign(x: float, sign: float) -> float:
     """x, negated where the sign bit is set, also of a zero."""
     ...
 
@@ -123,11 +123,11 @@ def _rows_kernel(mesh: wp.uint64, order: wp.array[int], corners: wp.array[int], 
     a, b, n, height = middle_planes(p, q - p, r - p, triangle)
     faces[3 * slot] = a
     faces[3 * slot + 1] = b
-    turned = _times_sign(height, n[3]) * wp.vec3(n[0], n[1], n[2])
+    turned = times_sign(height, n[3]) * wp.vec3(n[0], n[1], n[2])
     if triangle == 0.0:
         turned = -1.0 * turned
     offset = height * wp.abs(n[3])
-    faces[3 * slot + 2] = _plane(turned, _times_sign(offset, triangle - 0.5))
+    faces[3 * slot + 2] = _plane(turned, times_sign(offset, triangle - 0.5))
 
 
 def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array, corners: wp.array | None = None) -> None:
@@ -225,7 +225,7 @@ def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> w
     second = b[0] * y[0] + b[1] * y[1] + b[2] * y[2] + b[3]
     both = first + second
     # Of a parallelogram the last does not count: negated it is the largest only beyond a corner.
-    most = wp.max(wp.max(wp.abs(first), wp.abs(second)), _times_sign(both + 1.0, n[3]))
+    most = wp.max(wp.max(wp.abs(first), wp.abs(second)), times_sign(both + 1.0, n[3]))
     hair = WIDENING * (wp.abs(y[0]) + wp.abs(y[1]) + wp.abs(y[2]) + distance)
     if not ((1.0 - most) * wp.abs(rate) >= -hair and distance >= 0.0):
         distance = -1.0

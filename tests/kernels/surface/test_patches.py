@@ -8,14 +8,9 @@ import warp as wp
 from helpers.brute_force import brute_force
 from helpers.launch import Vectors, launched, on_device
 from spadwarp_kernels.base.native import bits_of
-from spadwarp_kernels.surface.patches import (
-    nearest_patch,
-    normal_and_face,
-    pack_patches,
-    patch_faces,
-    patch_normal,
-    set_patches,
-)
+from spadwarp_kernels.surface.mesh import Surfaces
+from spadwarp_kernels.surface.patches import load_row, nearest_patch, pack_patches, set_patches
+from spadwarp_kernels.surface.ray_cast import patch_hit
 
 OUT = (float, wp.vec3, wp.vec3i)
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
@@ -35,13 +30,14 @@ def _cast(
     """Distance, normal against the ray, and (slot, face, face in that slot)."""
     i = wp.tid()
     met = nearest_patch(patches, x[i], u[i], reach)
-    row = bits_of(met[3])
     distance[i] = met[0]
     faces[i] = wp.vec3i(-1)
-    if row >= 0:
-        named = patch_faces(patches, row, met[2] > 0.0)
-        normal[i] = patch_normal(patches, row, met[1])
-        faces[i] = wp.vec3i(named[0], named[1], bits_of(normal_and_face(normals, named[0])[3]))
+    if bits_of(met[3]) >= 0:
+        surfaces = Surfaces()
+        surfaces.patches = patches
+        hit = patch_hit(surfaces, met)
+        normal[i] = hit.normal
+        faces[i] = wp.vec3i(hit.slot, hit.face, bits_of(load_row(normals, hit.slot)[3]))
 
 
 def mesh_of(points, faces, device="cpu"):
