@@ -209,7 +209,6 @@ class ArrivalEstimator:
     def __init__(
         self,
         bins: int,
-        *,
         device: wp.DeviceLike,
         method: str = "centroid",
         background: wp.array | None = None,
@@ -246,7 +245,7 @@ class ArrivalEstimator:
         search.response = wp.array(taps.astype(np.float32), device=self.device)
 
     def __call__(self, histogram: wp.array, arrival: wp.array) -> None:
-        """Writes the arrival times of a histogram `[pixel, bin]` into `arrival`, float32 `[pixel]`."""
+        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`."""
         check_array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
         check_array("arrival", arrival, wp.float32, (pixels,), self.device)
@@ -302,17 +301,8 @@ def arrival_bins(
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
     check_array("histogram", histogram, RATES, (None, None))
-    estimator = ArrivalEstimator(
-        histogram.shape[1],
-        device=histogram.device,
-        method=method,
-        background=background,
-        response=response,
-        lowest_tap=lowest_tap,
-        first=first,
-        stop=stop,
-        half_width=half_width,
-    )
-    arrival = wp.empty(histogram.shape[0], dtype=float, device=histogram.device)
-    estimator(histogram, arrival)
+    bins, device = histogram.shape[1], histogram.device
+    search = (method, background, response, lowest_tap, first, stop, half_width)
+    arrival = wp.empty(histogram.shape[0], dtype=float, device=device)
+    ArrivalEstimator(bins, device, *search)(histogram, arrival)
     return arrival

@@ -6,6 +6,7 @@ event by event, with dead time and afterpulses. Every draw is keyed by (seed, fr
 not depend on how a launch is cut up.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,12 @@ EVENT_LIMIT = 2**27
 
 RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
 """What rows of counts, tallies or rates may be."""
+
+
+def _by_row(kernel: wp.Kernel, inputs: Sequence[Any], out: wp.array) -> wp.array:
+    """What a kernel writes of each of the rows of its last argument."""
+    launch_pixels(kernel, out.shape[0], [*inputs, out], device=out.device)
+    return out
 
 
 @memoised
@@ -134,9 +141,7 @@ def expected_detections(
     hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
     kinds = ((row_start, int), (source_bin, int), (weight, float), (width, float))
     matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
-    inputs = [source, *matrix, noise_rate, hazard]
-    launch_pixels(_response_kernel(source.dtype), source.shape[0], inputs, device=device)
-    return hazard
+    return _by_row(_response_kernel(source.dtype), [source, *matrix, noise_rate], hazard)
 
 
 def _check_matrix(columns: int, row_start: Any, source_bin: Any, weight: Any, width: Any) -> None:
@@ -199,11 +204,8 @@ def dark_count_rates(
     pixels, seed = check_integer("pixels", pixels, 0), check_seed(seed)
     check_range("[0, inf)", median=median, spread=spread, hot_rate=hot_rate, offset=offset)
     check_number("hot_fraction", hot_fraction, "[0, 1]")
-    device = check_device("device", device)
-    rate = wp.empty(pixels, dtype=float, device=device)
-    inputs = [seed, median, spread, hot_fraction, hot_rate, offset, rate]
-    launch_pixels(_dark_count_kernel, pixels, inputs, device=rate.device)
-    return rate
+    rate = wp.empty(pixels, dtype=float, device=check_device("device", device))
+    return _by_row(_dark_count_kernel, [seed, median, spread, hot_fraction, hot_rate, offset], rate)
 
 
 @wp.kernel(enable_backward=False)
@@ -241,8 +243,7 @@ def add_crosstalk(hazard: wp.array, detections: wp.array, *, image_width: int, p
     check_number("probability", probability, "[0, 1]")
     if hazard.shape[0] % image_width:
         raise ArgumentError(f"image_width = {image_width} does not divide hazard's {hazard.shape[0]} pixels")
-    inputs = [image_width, probability, detections, hazard]
-    launch_pixels(_crosstalk_kernel, hazard.shape[0], inputs, device=hazard.device)
+    _by_row(_crosstalk_kernel, [image_width, probability, detections], hazard)
 
 
 # ---- What a detector makes of them on average.
@@ -266,8 +267,7 @@ def first_photon_probabilities(hazard: wp.array) -> wp.array:
     """P(first photon in bin k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)), of λ's shape `[pixel, bin]` and float type."""
     check_array("hazard", hazard, (wp.float32, wp.float64), (None, None))
     law = wp.empty(hazard.shape, dtype=hazard.dtype, device=hazard.device)
-    launch_pixels(_first_photon_law_kernel(hazard.dtype), hazard.shape[0], [hazard, law], device=hazard.device)
-    return law
+    return _by_row(_first_photon_law_kernel(hazard.dtype), [hazard], law)
 
 
 @wp.kernel(enable_backward=False)
@@ -292,9 +292,7 @@ def free_running_probabilities(hazard: wp.array, *, dead_time: float, period: fl
     check_number("dead_time", dead_time, "[0, inf)")
     check_number("period", period, "(0, inf)")
     seen = wp.empty(hazard.shape, dtype=float, device=hazard.device)
-    inputs = [hazard, dead_time, period, seen]
-    launch_pixels(_free_running_kernel, hazard.shape[0], inputs, device=hazard.device)
-    return seen
+    return _by_row(_free_running_kernel, [hazard, dead_time, period], seen)
 
 
 @wp.kernel(enable_backward=False)
@@ -320,8 +318,7 @@ def coates(counts: wp.array, *, pulses: float) -> wp.array:
     check_array("counts", counts, wp.int32, (None, None))
     check_number("pulses", pulses, "(0, inf)")
     hazard = wp.empty(counts.shape, dtype=wp.float64, device=counts.device)
-    launch_pixels(_coates_kernel, counts.shape[0], [counts, pulses, hazard], device=counts.device)
-    return hazard
+    return _by_row(_coates_kernel, [counts, pulses], hazard)
 
 
 # ---- Counts.
@@ -471,9 +468,7 @@ def first_photon_counts(
     counts = _zeroed_counts(counts, (rows, bins), hazard.device)
     if not isinstance(first_frame, wp.array):
         first_frame = wp.array([first_frame], dtype=wp.int64, device=hazard.device)
-    inputs = [hazard, pulses, first_frame, frames if summed else 1, depth, seed, counts]
-    launch_pixels(_first_photon_kernel, rows, inputs, device=hazard.device)
-    return counts
+    return _by_row(_first_photon_kernel, [hazard, pulses, first_frame, frames if summed else 1, depth, seed], counts)
 
 
 # ---- Event by event.
@@ -728,7 +723,7 @@ def event_counts(
         for offset in range(0, pixels, chunk):
             size = min(chunk, pixels - offset)
             cumulative = wp.empty((size, bins + 1), dtype=wp.float64, device=device)
-            launch_pixels(_cumulative_kernel, size, [offset, hazard, cumulative], device=device)
+            _by_row(_cumulative_kernel, [offset, hazard], cumulative)
             inputs = [detector, cumulative, offset, pixels, first_frame, depth, seed, start, counts, number, pulse, bin]
             launch_pixels(_event_kernel, frames * size, inputs, device=device)
 

@@ -467,9 +467,9 @@ def _camera_worlds(world: wp.array | Sequence[int] | None, cameras: int, device:
 @wp.kernel(enable_backward=False)
 def _images_kernel(
     view: wp.array[wp.vec3],
-    # In, [cameras, height, width]; those without an entry are left out:
+    # In, [cameras, height, width]; those that are None have no entries:
     depth_in: wp.array3d[float],
-    along_ray: int,
+    along_ray: bool,
     normal_in: wp.array3d[wp.vec3],
     camera_q: wp.array[wp.transform],
     optical: wp.transform,
@@ -485,7 +485,7 @@ def _images_kernel(
     width = depth.shape[2]
     u = view[i * width + j]
     z = depth_in[v, i, j]
-    if along_ray == 1:
+    if along_ray:
         z = z * u[2]
     depth[v, i, j] = wp.where(wp.isfinite(z) and z > 0.0, z, wp.NAN)
     value = one_reflectance
@@ -505,14 +505,14 @@ def _images_kernel(
 
 
 @wp.func
-def _point(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int):
+def _point(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v: int, i: int, j: int):
     u = view[i * depth.shape[2] + j]
-    return wp.where(along_ray == 1, depth[v, i, j], depth[v, i, j] / u[2]) * u
+    return wp.where(along_ray, depth[v, i, j], depth[v, i, j] / u[2]) * u
 
 
 @wp.func
 def _neighbour_step(
-    view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int, di: int, dj: int
+    view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v: int, i: int, j: int, di: int, dj: int
 ) -> wp.vec3:
     """From a pixel to the nearer in depth of its two neighbours along one axis: not across an edge of a thing."""
     here = _point(view, depth, along_ray, v, i, j)
@@ -532,7 +532,7 @@ def _neighbour_step(
 
 
 @wp.func
-def _slope(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: int, v: int, i: int, j: int) -> wp.vec3:
+def _slope(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v: int, i: int, j: int) -> wp.vec3:
     """Normal of the surface through a pixel and its neighbours; towards the camera where it has none."""
     across = _neighbour_step(view, depth, along_ray, v, i, j, 0, 1)
     down = _neighbour_step(view, depth, along_ray, v, i, j, 1, 0)
@@ -637,9 +637,6 @@ class SpadCamera(WorldCameras):
         super().__init__(config, cameras, world=world, frame=frame, device=device)
         self._lidar = self.config.lidar()
         self._signal, self._path = (wp.zeros(self._rows[0], dtype=float, device=self.device) for _ in range(2))
-        self._none = wp.empty((0, 0, 0), dtype=float, device=self.device)
-        self._no_normal = wp.empty((0, 0, 0), dtype=wp.vec3, device=self.device)
-        self._no_pose = wp.empty(0, dtype=wp.transform, device=self.device)
 
     def update(self, shapes: Shapes, camera_q: wp.array, body_q: wp.array | None = None) -> None:
         """A step: moves the shapes, casts a ray a pixel, and draws a frame.
@@ -677,13 +674,12 @@ class SpadCamera(WorldCameras):
         if isinstance(reflectance, wp.array):
             check_array("reflectance", reflectance, wp.float32, shape, self.device)
         else:
-            number, reflectance = check_number("reflectance", reflectance, "[0, 1]"), self._none
+            number, reflectance = check_number("reflectance", reflectance, "[0, 1]"), None
         if normal is not None:
             check_array("normal", normal, wp.vec3, shape, self.device)
         if camera_q is not None:
             check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
-        inputs = [self._view, depth, int(bool(along_ray)), self._no_normal if normal is None else normal]
-        inputs += [self._no_pose if camera_q is None else camera_q, self._optical, reflectance, number]
+        inputs = [self._view, depth, bool(along_ray), normal, camera_q, self._optical, reflectance, number]
         outputs = [self.true_depth, self.normal, self.reflectance]
         wp.launch(_images_kernel, shape, inputs, outputs, device=self.device)
         self._draw()
