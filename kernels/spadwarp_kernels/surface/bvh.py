@@ -92,55 +92,43 @@ DEEPEST = 32
 
 @wp.func_native("""
     const wp::Mesh m = wp::mesh_get(mesh);
-    const wp::BVHPackedNodeHalf half = upper ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
-    union { float number; int bits; } both;
-    both.bits = static_cast<int32_t>(half.i);
-    return wp::vec4(half.x, half.y, half.z, both.number);
-""")
-def _tree_node(mesh: wp.uint64, node: int, upper: bool) -> wp.vec4:
-    """A corner of a node's box and the bits of its child, or of the first and last face of a leaf."""
-    ...
-
-
-@wp.func_native("""
-    const wp::Mesh m = wp::mesh_get(mesh);
     // The linear builder fills all nodes that there are room for, the others count theirs.
     const bool linear = m.bvh.constructor_type == BVH_CONSTRUCTOR_LBVH;
-    if (node >= (linear ? m.bvh.max_nodes : m.bvh.num_nodes)) return -1;
-    return m.bvh.node_lowers[node].b ? 1 : 0;
+    const bool there = node < (linear ? m.bvh.max_nodes : m.bvh.num_nodes);
+    leaf.data[node] = there ? static_cast<int>(m.bvh.node_lowers[node].b) : -1;
+    for (int k = 0; there && k < 2; ++k) {
+        const wp::BVHPackedNodeHalf half = k ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
+        boxes.data[2 * node + k] = wp::vec3(half.x, half.y, half.z);
+        children.data[2 * node + k] = static_cast<int32_t>(half.i);
+    }
+    if (node < faces.shape[0]) faces.data[node] = m.bvh.primitive_indices[node];
+    if (node == 0) root.data[0] = *m.bvh.root;
 """)
-def _tree_kind(mesh: wp.uint64, node: int) -> int:
-    """0 for a node with children, 1 for a leaf, -1 beyond the tree."""
+def _read_node(
+    mesh: wp.uint64,
+    node: int,
+    leaf: wp.array[int],
+    boxes: wp.array2d[wp.vec3],
+    children: wp.array2d[int],
+    faces: wp.array[int],
+    root: wp.array[int],
+):
+    """Whether a node is a leaf, -1 beyond the tree; the corners of its box; its children, or of a leaf the first face
+    and the one after the last."""
     ...
-
-
-@wp.func_native("return *wp::mesh_get(mesh).bvh.root;")
-def _tree_root(mesh: wp.uint64) -> int: ...
-
-
-@wp.func_native("return wp::mesh_get(mesh).bvh.primitive_indices[slot];")
-def _tree_face(mesh: wp.uint64, slot: int) -> int: ...
 
 
 @wp.kernel(enable_backward=False)
 def _read_kernel(
     mesh: wp.uint64,
-    # Out:
-    kind: wp.array[int],
-    lower: wp.array[wp.vec4],
-    upper: wp.array[wp.vec4],
-    root: wp.array[int],
+    leaf: wp.array[int],
+    boxes: wp.array2d[wp.vec3],
+    children: wp.array2d[int],
     faces: wp.array[int],
+    root: wp.array[int],
 ):
     """Launch: nodes that the tree may have."""
-    node = wp.tid()
-    kind[node] = _tree_kind(mesh, node)
-    if kind[node] >= 0:
-        lower[node] = _tree_node(mesh, node, False)
-        upper[node] = _tree_node(mesh, node, True)
-    if node < faces.shape[0]:
-        faces[node] = _tree_face(mesh, node)
-        root[0] = _tree_root(mesh)
+    _read_node(mesh, wp.tid(), leaf, boxes, children, faces, root)
 
 
 class Tree(NamedTuple):
@@ -159,21 +147,17 @@ def read_tree(mesh: wp.Mesh, extent: float) -> Tree:
     """The tree of any `wp.Mesh` with coordinates up to the extent [m]."""
     count, device = mesh.indices.size // 3, mesh.device
     most = 2 * count + 1
-    arrays = [wp.zeros(size, dtype=int, device=device) for size in (most, 1, count)]
-    boxes = [wp.zeros(most, dtype=wp.vec4, device=device) for _ in range(2)]
-    outputs = [arrays[0], *boxes, *arrays[1:]]
-    wp.launch(_read_kernel, most, [mesh.id], outputs, device=device)
-    kind, (lower, upper) = arrays[0].numpy(), (box.numpy() for box in boxes)
-    # Of a leaf: its first face, and the one after its last.
-    children = np.stack([lower[:, 3].view(np.int32), upper[:, 3].view(np.int32)], axis=1).astype(np.int64)
-    root, slots = (array.numpy() for array in arrays[1:])
-    levels, leaves, here = [], [], root.astype(np.int64)
+    shapes = ((most, int), ((most, 2), wp.vec3), ((most, 2), int), (count, int), (1, int))
+    arrays = [wp.zeros(shape, dtype=kind, device=device) for shape, kind in shapes]
+    wp.launch(_read_kernel, most, [mesh.id], arrays, device=device)
+    kind, boxes, children, slots, root = (array.numpy() for array in arrays)
+    levels, leaves, here = [], [], root
     while here.size:
         leaves.append(here[kind[here] == 1])
         levels.append(here[kind[here] == 0])
         here = children[levels[-1]].ravel()
     leaf = np.concatenate(leaves)
-    size, start = np.zeros(most, np.int64), np.zeros(most, np.int64)
+    size, start = (np.zeros(most, np.int64) for _ in range(2))
     size[leaf] = children[leaf, 1] - children[leaf, 0]
     for nodes in reversed(levels):
         size[nodes] = size[children[nodes]].sum(axis=1)
@@ -183,10 +167,10 @@ def read_tree(mesh: wp.Mesh, extent: float) -> Tree:
     leaf = leaf[np.argsort(start[leaf], kind="stable")]
     faces = slots[np.repeat(children[leaf, 0] - start[leaf], size[leaf]) + np.arange(count)]
     inner = np.concatenate(levels)
-    below = np.full_like(children, -1)
+    below = np.full((most, 2), -1)
     below[inner] = children[inner]
     pad = np.float32(box_padding(extent))
-    return Tree(int(root[0]), below, lower[:, :3] - pad, upper[:, :3] + pad, start, start + size, faces)
+    return Tree(int(root[0]), below, boxes[:, 0] - pad, boxes[:, 1] + pad, start, start + size, faces)
 
 
 def open_tree(tree: Tree, closed: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ from spadwarp_kernels.surface.bvh import read_tree
 PRIVATE_LAYOUT = (
     f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/surface/bvh.py reads "
     "(members of wp::Mesh::bvh: node_lowers, node_uppers, root, primitive_indices, num_nodes, max_nodes). Mend "
-    "`_tree_node`, `_tree_kind`, `_tree_root` and `_tree_face` there; until then make_surfaces(..., use_warp_bvh=True) "
+    "`_read_node` there; until then make_surfaces(..., use_warp_bvh=True) "
     "takes wp.mesh_query_ray."
 )
 
