@@ -9,6 +9,7 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
+from helpers.launch import Floats, Integers, Vectors, launched, on_device
 from helpers.meshes import mesh_and_surfaces
 from spadwarp_kernels.optics.visibility import near_depth_map
 from spadwarp_kernels.surface.bvh import read_tree
@@ -29,25 +30,19 @@ def ball(device, count=24):
     first = (np.arange(2 * count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     faces = np.stack([first, first + count, first + 1, first + 1, first + count, first + count + 1], axis=1)
     points = points.reshape(-1, 3).astype(np.float32)
-    mesh = wp.Mesh(wp.array(points, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=int, device=device))
+    mesh = wp.Mesh(on_device(points, device), on_device(faces.ravel(), device, int))
     return mesh, points
 
 
 @wp.kernel(enable_backward=False)
-def cast(
-    surfaces: sk.Surfaces,
-    x: wp.array(dtype=wp.vec3),
-    u: wp.array(dtype=wp.vec3),
-    mine: wp.array(dtype=float),
-    hers: wp.array(dtype=float),
-):
+def cast(surfaces: sk.Surfaces, x: Vectors, u: Vectors, mine: Floats, hers: Floats):
     i = wp.tid()
     mine[i] = sk.intersect_surfaces(surfaces, x[i], u[i], 100.0, False).distance
     hers[i] = sk.intersect_mesh(surfaces.mesh, x[i], u[i], 100.0).distance
 
 
 @wp.kernel(enable_backward=False)
-def meets(surfaces: sk.Surfaces, x: wp.array(dtype=wp.vec3), way: wp.array(dtype=wp.vec3), met: wp.array(dtype=int)):
+def meets(surfaces: sk.Surfaces, x: Vectors, way: Vectors, met: Integers):
     i = wp.tid()
     hit = sk.intersect_surfaces(surfaces, x[i], wp.normalize(way[i]), wp.length(way[i]), True)
     met[i] = wp.where(hit.slot >= 0, 1, 0)
@@ -58,10 +53,7 @@ def distances(surfaces, device, count=20_000):
     u = rng.normal(size=(count, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     x = rng.uniform(-2, 2, (count, 3)) - 5.0 * u
-    mine, hers = (wp.empty(count, dtype=float, device=device) for _ in range(2))
-    rays = [wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (x, u)]
-    wp.launch(cast, count, [surfaces, *rays], [mine, hers], device=device)
-    return mine.numpy(), hers.numpy()
+    return launched(cast, [surfaces, x, u], (float, float), device, count)
 
 
 def test_the_tree_is_read_as_warp_writes_it(device):
@@ -100,7 +92,7 @@ def test_surfaces_follow_moving_points(use_warp_bvh, device):
     sk.update_surfaces(surfaces, mesh)
     mesh.refit()
     mine, hers = distances(surfaces, device)
-    new = wp.Mesh(wp.array(moved.astype(np.float32), dtype=wp.vec3, device=device), mesh.indices)
+    new = wp.Mesh(on_device(moved.astype(np.float32), device), mesh.indices)
     fresh = distances(sk.make_surfaces(new), device)[0]
     assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
     assert (np.abs(mine - before) > 1e-3).mean() > 0.1
@@ -165,8 +157,7 @@ def test_nothing_hides_what_lies_before_the_map(device):
     ]
     corners = np.concatenate(parts).astype(np.float32)
     faces = (np.array([0, 1, 2, 0, 2, 3]) + 4 * np.arange(4)[:, None]).ravel()
-    points = wp.array(corners, dtype=wp.vec3, device=device)
-    mesh = wp.Mesh(points, wp.array(faces, dtype=int, device=device))
+    mesh = wp.Mesh(on_device(corners, device), on_device(faces, device, int))
     camera = wide_camera()
     near = near_depth_map(mesh, camera).numpy().astype(float)
     assert near[100, 64] == pytest.approx(0.4 / (0.8 * 73.0 / 128), rel=0.05)  # of the floor, less the lens's radius
@@ -179,10 +170,8 @@ def test_nothing_hides_what_lies_before_the_map(device):
     start = np.concatenate([tangent, np.ones((count, 1))], axis=1) * depth[:, None]
     turn = rng.uniform(0, 2 * np.pi, count)
     lens = camera.aperture_radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
-    x, way = (wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (start, lens - start))
-    met = wp.zeros(count, dtype=int, device=device)
-    wp.launch(meets, count, [sk.make_surfaces(mesh), x, way], [met], device=device)
-    assert not met.numpy().any()
+    (met,) = launched(meets, [sk.make_surfaces(mesh), start, lens - start], [int], device, count)
+    assert not met.any()
 
 
 def small_model(mesh, surfaces):
