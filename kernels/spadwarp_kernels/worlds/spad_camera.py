@@ -511,31 +511,29 @@ def _point(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v
 
 
 @wp.func
-def _neighbour_step(
-    view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v: int, i: int, j: int, di: int, dj: int
-) -> wp.vec3:
-    """From a pixel to the nearer in depth of its two neighbours along one axis: not across an edge of a thing."""
-    here = _point(view, depth, along_ray, v, i, j)
-    best = wp.vec3(0.0)
-    least = float(1.0e30)
-    for side in range(2):
-        sign = 2 * side - 1
-        ii = i + sign * di
-        jj = j + sign * dj
-        if ii >= 0 and jj >= 0 and ii < depth.shape[1] and jj < depth.shape[2]:
-            there = _point(view, depth, along_ray, v, ii, jj)
-            gap = wp.abs(there[2] - here[2])
-            if wp.isfinite(gap) and gap < least:
-                least = gap
-                best = float(sign) * (there - here)
-    return best
-
-
-@wp.func
 def _slope(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v: int, i: int, j: int) -> wp.vec3:
-    """Normal of the surface through a pixel and its neighbours; towards the camera where it has none."""
-    across = _neighbour_step(view, depth, along_ray, v, i, j, 0, 1)
-    down = _neighbour_step(view, depth, along_ray, v, i, j, 1, 0)
+    """Normal of the surface through a pixel and of its two neighbours along each axis that which is nearer in depth,
+    not across an edge of a thing; towards the camera where it has none."""
+    here = _point(view, depth, along_ray, v, i, j)
+    across = wp.vec3(0.0)
+    down = wp.vec3(0.0)
+    for axis in range(2):
+        best = wp.vec3(0.0)
+        least = float(1.0e30)
+        for side in range(2):
+            sign = 2 * side - 1
+            ii = i + sign * axis
+            jj = j + sign * (1 - axis)
+            if ii >= 0 and jj >= 0 and ii < depth.shape[1] and jj < depth.shape[2]:
+                there = _point(view, depth, along_ray, v, ii, jj)
+                gap = wp.abs(there[2] - here[2])
+                if wp.isfinite(gap) and gap < least:
+                    least = gap
+                    best = float(sign) * (there - here)
+        if axis == 0:
+            across = best
+        else:
+            down = best
     n = wp.cross(across, down)
     return wp.where(wp.length_sq(n) > 0.0, n, view[i * depth.shape[2] + j])
 

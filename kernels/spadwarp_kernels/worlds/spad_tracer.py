@@ -363,14 +363,9 @@ class SpadTracer(WorldCameras):
         wp.launch(_reflectance_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
         update_surfaces(surfaces, model.mesh, model.camera)
         lane.data.tally.zero_()
+        threads = CUDA_THREADS // len(self._lanes)
         launch_transport(
-            self._spec,
-            model,
-            lane.data,
-            seed=config.seed,
-            first_id=v * photons,
-            photon_count=photons,
-            threads=CUDA_THREADS // len(self._lanes),
+            self._spec, model, lane.data, seed=config.seed, first_id=v * photons, photon_count=photons, threads=threads
         )
         pixels = config.height * config.width
         factor = config.photons * config.pde / (model.scale * photons)
@@ -408,21 +403,14 @@ class SpadTracer(WorldCameras):
         # 2^62 units hold the thousandth part of all photons in one bin; 2^58 units are the largest contribution.
         scale = min(2.0**72 / self.photons, 2.0**58)
         extent = gate.stop + math.hypot(*config.laser_position)  # no photon that counts comes further
+        moving: dict[str, Any] = {"camera": camera, "extent": extent, "use_warp_bvh": self._use_warp_bvh}
         self._face_shape, models = [], []
         for mesh, owner in zip(self._meshes.build(), self._meshes.face_shape, strict=True):
             self._face_shape.append(wp.array(owner, dtype=int, device=self.device))
             reflectance = wp.zeros(len(owner), dtype=float, device=self.device)
             textures = self._textures(owner)
             corners = None if textures is None else wp.zeros(len(owner), dtype=wp.vec3, device=self.device)
-            surfaces = make_surfaces(
-                mesh,
-                reflectance,
-                corner_reflectance=corners,
-                textures=textures,
-                camera=camera,
-                extent=extent,
-                use_warp_bvh=self._use_warp_bvh,
-            )
+            surfaces = make_surfaces(mesh, reflectance, corner_reflectance=corners, textures=textures, **moving)
             models.append(Model(self.device, medium, laser, camera, gate, limits, guiding, mesh, surfaces, scale))
         self._models = models
         choices = surface_choices(models[0].surfaces)
