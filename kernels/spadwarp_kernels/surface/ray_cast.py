@@ -34,7 +34,7 @@ class SurfaceHit:
 
 @wp.func
 def surface_hit(surfaces: Surfaces, walk: TreeWalk, u: wp.vec3) -> SurfaceHit:
-    """What a ray along u has found on its way down the tree."""
+    """The hit of a ray along u that has come down the tree."""
     hit = SurfaceHit()
     hit.distance = walk.nearest
     hit.slot = walk.found

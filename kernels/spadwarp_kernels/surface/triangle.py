@@ -137,16 +137,9 @@ def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array, corners: wp.array 
     wp.launch(_rows_kernel, order.size, [mesh.id, order, corners], [faces], device=mesh.device)
 
 
-@wp.func_native("return reinterpret_cast<const float*>(rows.data)[index];")
-def number_at(rows: wp.array[wp.vec4], index: int) -> float:
-    """A number of contiguous rows."""
-    ...
-
-
-@wp.func_native("reinterpret_cast<float*>(rows.data)[index] = value;")
-def set_number(rows: wp.array[wp.vec4], index: int, value: float):
-    """Writes a number of contiguous rows."""
-    ...
+def numbers_of(rows: wp.array) -> wp.array:
+    """The same memory as float32."""
+    return wp.array(ptr=rows.ptr, dtype=float, shape=4 * rows.size, device=rows.device)
 
 
 @wp.func
@@ -156,7 +149,7 @@ def face_number(slot: int, row: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces: wp.array[wp.vec4]):
+def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces: wp.array[float]):
     """Launch: slots; CPU. A slot without a face keeps planes of zeros and a box that no ray meets."""
     slot = wp.tid()
     face = order[slot]
@@ -165,17 +158,17 @@ def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces:
     if face >= 0:
         a, b, n = _planes(mesh, face)
         for i in range(4):
-            set_number(faces, face_number(slot, i), a[i])
-            set_number(faces, face_number(slot, 4 + i), b[i])
-            set_number(faces, face_number(slot, 8 + i), n[i])
+            faces[face_number(slot, i)] = a[i]
+            faces[face_number(slot, 4 + i)] = b[i]
+            faces[face_number(slot, 8 + i)] = n[i]
         m = wp.mesh_get(mesh)
         for corner in range(3):
             p = m.points[m.indices[3 * face + corner]]
             low = wp.min(low, p - wp.vec3(padding))
             high = wp.max(high, p + wp.vec3(padding))
     for axis in range(3):
-        set_number(faces, face_number(slot, 12 + axis), low[axis])
-        set_number(faces, face_number(slot, 15 + axis), high[axis])
+        faces[face_number(slot, 12 + axis)] = low[axis]
+        faces[face_number(slot, 15 + axis)] = high[axis]
 
 
 def box_padding(extent: float) -> float:
@@ -184,7 +177,7 @@ def box_padding(extent: float) -> float:
 
 
 def face_vectors(slots: int, device: wp.Device) -> int:
-    """How many vec4 the faces in so many slots take."""
+    """Number of vec4 of the faces in so many slots."""
     return 3 * slots if device.is_cuda else 36 * (slots // 8)
 
 
@@ -193,7 +186,8 @@ def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) ->
     if mesh.device.is_cuda:
         set_rows(mesh, order, faces)
     else:
-        wp.launch(_blocks_kernel, order.size, [mesh.id, box_padding(extent), order], [faces], device=mesh.device)
+        inputs = [mesh.id, box_padding(extent), order]
+        wp.launch(_blocks_kernel, order.size, inputs, [numbers_of(faces)], device=mesh.device)
 
 
 def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:

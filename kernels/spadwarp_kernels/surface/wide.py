@@ -17,7 +17,7 @@ import warp as wp
 from spadwarp_kernels.base.native import bits_of
 
 from .bvh import NO_NODE, Tree, open_tree, read_tree
-from .triangle import LANES, face_number, number_at, pack_faces, set_faces, set_number
+from .triangle import LANES, face_number, numbers_of, pack_faces, set_faces
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -35,27 +35,27 @@ def _split_leaves(tree: Tree) -> Tree:
 
 
 @wp.kernel(enable_backward=False)
-def _boxes_kernel(faces: wp.array[wp.vec4], nodes: wp.array[wp.vec4]):
+def _boxes_kernel(faces: wp.array[float], nodes: wp.array[float]):
     """Boxes of all children, from the last node to the first, which stand after their parents. Launch: 1."""
-    count = nodes.shape[0] / 14
+    count = nodes.shape[0] / 56
     for i in range(count):
         node = count - 1 - i
         for k in range(LANES):
-            child = bits_of(number_at(nodes, 56 * node + 48 + k))
+            child = bits_of(nodes[56 * node + 48 + k])
             for axis in range(3):
                 low = float(1.0e30)
                 high = float(-1.0e30)
                 if child != NO_NODE:
                     for lane in range(LANES):
                         if child >= 0:
-                            low = wp.min(low, number_at(nodes, 56 * child + 8 * axis + lane))
-                            high = wp.max(high, number_at(nodes, 56 * child + 24 + 8 * axis + lane))
+                            low = wp.min(low, nodes[56 * child + 8 * axis + lane])
+                            high = wp.max(high, nodes[56 * child + 24 + 8 * axis + lane])
                         else:
                             slot = -2 - child + lane
-                            low = wp.min(low, number_at(faces, face_number(slot, 12 + axis)))
-                            high = wp.max(high, number_at(faces, face_number(slot, 15 + axis)))
-                set_number(nodes, 56 * node + 8 * axis + k, low)
-                set_number(nodes, 56 * node + 24 + 8 * axis + k, high)
+                            low = wp.min(low, faces[face_number(slot, 12 + axis)])
+                            high = wp.max(high, faces[face_number(slot, 15 + axis)])
+                nodes[56 * node + 8 * axis + k] = low
+                nodes[56 * node + 24 + 8 * axis + k] = high
 
 
 def pack_wide(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
@@ -75,18 +75,18 @@ def pack_wide(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.arra
     boxes = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu", copy=False)  # in large pages, see `zeros`
     order = wp.array(slots.ravel(), dtype=int, device="cpu")
     faces = pack_faces(mesh, extent, order)
-    wp.launch(_boxes_kernel, 1, [faces], [boxes], device="cpu")
+    wp.launch(_boxes_kernel, 1, [numbers_of(faces)], [numbers_of(boxes)], device="cpu")
     return boxes, faces, order
 
 
 def refit_wide(mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array) -> None:
     """Boxes and faces of a packed tree for points that have moved."""
     set_faces(mesh, extent, order, faces)
-    wp.launch(_boxes_kernel, 1, [faces], [nodes], device="cpu")
+    wp.launch(_boxes_kernel, 1, [numbers_of(faces)], [numbers_of(nodes)], device="cpu")
 
 
 def empty_wide() -> tuple[wp.array, wp.array, wp.array]:
-    """What `pack_wide` returns, for no faces at all."""
+    """The tree of no faces at all, see `pack_wide`."""
     rows = np.zeros((7, LANES), np.float32)
     rows[:3], rows[3:6], rows[6] = 1.0e30, -1.0e30, np.array(-1, np.int32).view(np.float32)
     nodes = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu")

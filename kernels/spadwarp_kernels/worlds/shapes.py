@@ -1,4 +1,4 @@
-"""What stands in the worlds: shapes on bodies, as the arrays that a simulator has on the device, and rays against them.
+"""Shapes on bodies in many worlds, as the arrays that a simulator has on the device, and rays against them.
 
 Shapes other than meshes are met in closed form, in their own frame: centred at the origin, along z, as in Newton and
 MuJoCo. Surfaces have two sides.

@@ -261,7 +261,7 @@ def _advance_kernel(offset: wp.array[wp.uint64], count: wp.uint64):
 
 @dataclasses.dataclass(frozen=True)
 class _Lane:
-    """What cameras that are traced one after the other share; lanes run side by side on a GPU."""
+    """Memory that cameras share which are traced one after the other; lanes run side by side on a GPU."""
 
     stream: wp.Stream | None  # none for the device's current one
     data: Data  # its tally and cursor; the ledger and the offset are those of all lanes
