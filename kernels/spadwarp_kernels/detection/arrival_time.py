@@ -49,7 +49,7 @@ def _parabola_vertex(left: float, centre: float, right: float) -> float:
 
 @wp.struct
 class _Search:
-    """What is looked for in a histogram, see `arrival_bins`."""
+    """The search in a histogram, see `arrival_bins`."""
 
     background: wp.array2d[float]
     first: int

@@ -49,11 +49,11 @@ EVENT_LIMIT = 2**27
 """Most detections of a pixel in one frame of the event-driven detector: random blocks are numbered in 28 bits."""
 
 RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
-"""What rows of counts, tallies or rates may be."""
+"""Types of rows of counts, tallies or rates."""
 
 
 def _by_row(kernel: wp.Kernel, inputs: Sequence[Any], out: wp.array) -> wp.array:
-    """What a kernel writes of each of the rows of its last argument."""
+    """Launches a kernel over the rows of its last argument, and returns that."""
     launch_pixels(kernel, out.shape[0], [*inputs, out], device=out.device)
     return out
 
@@ -246,7 +246,7 @@ def add_crosstalk(hazard: wp.array, detections: wp.array, *, image_width: int, p
     _by_row(_crosstalk_kernel, [image_width, probability, detections], hazard)
 
 
-# ---- What a detector makes of them on average.
+# ---- The mean of what a detector makes of them.
 
 
 @memoised
