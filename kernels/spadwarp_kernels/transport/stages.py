@@ -41,7 +41,7 @@ from spadwarp_kernels.photon.state import (
 )
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
-from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box, segment_meets_box_on_cpu
+from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box
 from spadwarp_kernels.surface.patches import nearest_patch
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, offset_from_surface, patch_hit
 from spadwarp_kernels.surface.reflectance import (
@@ -191,7 +191,6 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
     events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
     has_bvh = spec.mesh and not brute_force
-    meets_box = segment_meets_box if cuda else segment_meets_box_on_cpu
 
     @wp.func
     def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
@@ -224,7 +223,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
         if wp.static(random_albedo):
             s.albedo = world.medium.albedo * u01(random_block_keyed(draws.keys, id, event, STREAM_ROULETTE)[1])
         if wp.static(has_bvh):
-            if meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
+            if segment_meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
                 s.stage = RAY
         if wp.static(brute_force):
             # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
