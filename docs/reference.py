@@ -26,7 +26,7 @@ from pydantic_core import PydanticUndefined
 import spadwarp
 from spadwarp.cli import app
 from spadwarp.dataset import Distribution, Recipe
-from spadwarp.limits import Interval
+from spadwarp.values import Interval
 from spadwarp.scene import Scene
 from spadwarp.scene.grid import COEFFICIENTS
 from spadwarp.scene.sections import interval_of, parts_of

@@ -39,39 +39,10 @@ _HOMES = {name: package for package, names in _PACKAGES.items() for name in name
 
 # Type checkers take "as" for public, and without `__getattr__` they find misspelled names.
 if TYPE_CHECKING:
-    from spadwarp import (
-        analytic as analytic,
-        benchmark as benchmark,
-        checks as checks,
-        dataset as dataset,
-        denoise as denoise,
-        device as device,
-        doctor as doctor,
-        errors as errors,
-        files as files,
-        frames as frames,
-        interop as interop,
-        inverse as inverse,
-        io as io,
-        mesh as mesh,
-        parallel as parallel,
-        result as result,
-        scene as scene,
-        transport as transport,
-        validate as validate,
-        viz as viz,
-        water as water,
-    )
+    from spadwarp import values as errors
     from spadwarp.analytic import budget as budget, plan as plan, simulate_analytic as simulate_analytic, sweep as sweep
     from spadwarp.checks import check as check
-    from spadwarp.errors import (
-        ArgumentError as ArgumentError,
-        ConfigError as ConfigError,
-        DeviceError as DeviceError,
-        FileError as FileError,
-        MeshError as MeshError,
-        SpadwarpError as SpadwarpError,
-    )
+    from spadwarp.values import ArgumentError as ArgumentError, ConfigError as ConfigError, DeviceError as DeviceError, FileError as FileError, MeshError as MeshError, SpadwarpError as SpadwarpError
     from spadwarp.files import export as export, load as load
     from spadwarp.frames import Frames as Frames, arrival_time as arrival_time, crlb as crlb, detect as detect
     from spadwarp.interop import to_pandas as to_pandas

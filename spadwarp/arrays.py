@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import shown
+from spadwarp.values import ArgumentError
+from spadwarp.values import shown
 
 if TYPE_CHECKING:
     import torch

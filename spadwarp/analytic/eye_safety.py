@@ -21,8 +21,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_real
+from spadwarp.values import ArgumentError
+from spadwarp.values import check_real
 from spadwarp.scene import Laser, Scene
 from spadwarp.scene.laser import load_profile
 from spadwarp.scene.scene import laser_port

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import daylight_rate, phase_function, water_lines
 from spadwarp.scene.camera import to_world

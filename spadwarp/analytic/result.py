@@ -19,10 +19,10 @@ from spadwarp.analytic.model import (
     warn_of_model,
 )
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
+from spadwarp.values import ArgumentError, ConfigError, kernel_errors
 from spadwarp.interop import labelled
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
-from spadwarp.limits import SEED, check_integer
+from spadwarp.values import SEED, check_integer
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene

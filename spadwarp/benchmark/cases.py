@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from spadwarp.units import path_from_time, time_from_path
+from spadwarp.values import path_from_time, time_from_path
 
 __all__ = ["CASES", "GROUPS", "Case"]
 

@@ -17,7 +17,7 @@ from spadwarp.scene.laser import profile_extent
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
-from spadwarp.units import range_from_time, time_from_path
+from spadwarp.values import range_from_time, time_from_path
 
 __all__ = ["CheckMessage"]
 

@@ -14,7 +14,7 @@ from spadwarp.cli.app import complain, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, write_json
 from spadwarp.cli.text import count, progress, readable, show_table
-from spadwarp.limits import environment_integer
+from spadwarp.values import environment_integer
 
 if TYPE_CHECKING:
     from spadwarp.denoise import Evaluation

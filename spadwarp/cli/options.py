@@ -17,8 +17,8 @@ import typer
 
 import spadwarp
 from spadwarp.cli.app import Command, app, running
-from spadwarp.limits import parse_number, shown, suggestion
-from spadwarp.units import quantity
+from spadwarp.values import parse_number, shown, suggestion
+from spadwarp.values import quantity
 
 if TYPE_CHECKING:
     from spadwarp import Ray, Result, Scene

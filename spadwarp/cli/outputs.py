@@ -19,7 +19,7 @@ import typer
 import spadwarp
 from spadwarp.cli.app import running, say, until_the_end
 from spadwarp.cli.text import in_bytes, readable, written
-from spadwarp.errors import FileError
+from spadwarp.values import FileError
 
 __all__ = ["answer", "check_outputs", "write_json"]
 

@@ -15,7 +15,7 @@ from spadwarp.cli.app import complain, fail, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import check_outputs, write_json
 from spadwarp.cli.text import count, rows
-from spadwarp.limits import suggestion
+from spadwarp.values import suggestion
 
 
 def _model(kind: str) -> Any:

@@ -21,9 +21,9 @@ from spadwarp.dataset.card import card, croissant
 from spadwarp.dataset.read import FrameReader
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shards import FIELDS, FRAME_COLUMNS, HISTOGRAM_FIELDS, Column, checksum, scene_columns
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.values import ArgumentError, FileError
 from spadwarp.io.text import write_json, write_text
-from spadwarp.limits import check_choice, check_integer
+from spadwarp.values import check_choice, check_integer
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from spadwarp.dataset.make import read_manifest
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shards import FIELDS, HistogramFile, ShardFile, frame_count
-from spadwarp.errors import ArgumentError, FileError
-from spadwarp.limits import SEED, check_choice, check_integer
+from spadwarp.values import ArgumentError, FileError
+from spadwarp.values import SEED, check_choice, check_integer
 from spadwarp.scene import Scene
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]

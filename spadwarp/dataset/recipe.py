@@ -20,10 +20,10 @@ from pydantic import (
     model_validator,
 )
 
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.limits import check_real, shown
+from spadwarp.values import check_real, shown
 from spadwarp.scene import Scene
 from spadwarp.scene.document import Document
 from spadwarp.scene.sections import FilePath, Section, Whole, listed

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.values import ArgumentError, FileError
 from spadwarp.frames import Reduction, detector_response
 from spadwarp.io.arrays import point_cloud, write_array, write_exr, write_ply
 from spadwarp.io.paths import file_within, remove_temporaries
 from spadwarp.io.text import write_text
-from spadwarp.limits import check_choice
+from spadwarp.values import check_choice
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
 from spadwarp.result.file import read_head

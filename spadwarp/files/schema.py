@@ -14,7 +14,7 @@ from spadwarp.scene import Laser, Medium, Scene, presets
 
 __all__ = ["json_schema"]
 
-# A number with a unit, as in `spadwarp.units.quantity`; which unit goes with which field is not in the schema.
+# A number with a unit, as in `spadwarp.values.quantity`; which unit goes with which field is not in the schema.
 _QUANTITY = {
     "description": 'a number with a unit, such as "150 nJ"',
     "type": "string",

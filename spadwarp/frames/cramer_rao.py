@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, kernel_errors
+from spadwarp.values import ArgumentError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
-from spadwarp.limits import BIN_WIDTH, check_choice, check_real
+from spadwarp.values import BIN_WIDTH, check_choice, check_real
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.result import Result
 from spadwarp.scene import noise_rate
-from spadwarp.units import percent
+from spadwarp.values import percent
 
 __all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
-from spadwarp.errors import ArgumentError, kernel_errors
-from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
+from spadwarp.values import ArgumentError, kernel_errors
+from spadwarp.values import BIN_WIDTH, TIME, check_choice, check_real, shown
 from spadwarp.scene import Camera, Medium, Scene
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
-from spadwarp.units import path_from_time
+from spadwarp.values import path_from_time
 
 if TYPE_CHECKING:
     from spadwarp.frames.response import InstrumentResponse

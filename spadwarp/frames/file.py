@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError, FileError, SpadwarpWarning
+from spadwarp.values import ArgumentError, ConfigError, FileError, SpadwarpWarning
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.response import InstrumentResponse, detector_response
@@ -26,7 +26,7 @@ from spadwarp.io.hdf5 import (
     read_hdf5,
     write_hdf5,
 )
-from spadwarp.limits import SEED, check_integer
+from spadwarp.values import SEED, check_integer
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, Trajectory, as_scene, load_trajectory
 from spadwarp.scene.camera import camera_attributes

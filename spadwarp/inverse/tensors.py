@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.values import ArgumentError, FileError
 from spadwarp.inverse.unknowns import read_unknowns, with_values
-from spadwarp.limits import SEED, check_integer
+from spadwarp.values import SEED, check_integer
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.grid import Grid
 from spadwarp.scene.medium import grid_cells

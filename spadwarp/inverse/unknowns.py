@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.limits import shown, suggestion
+from spadwarp.values import ArgumentError, ConfigError
+from spadwarp.values import shown, suggestion
 from spadwarp.scene.camera import to_world
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.values import ArgumentError, FileError
 from spadwarp.io.paths import atomic_path, existing_file
 
 __all__ = ["point_cloud", "read_exr", "read_npy", "read_npz", "write_array", "write_exr", "write_ply"]

@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError, SpadwarpError
+from spadwarp.values import FileError, SpadwarpError
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5
 
 __all__ = ["SparseMatrix", "Variable", "open_mat"]

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.values import ConfigError, FileError
 from spadwarp.io.paths import atomic_path, similar, used
-from spadwarp.limits import Interval, parse_number, shown
-from spadwarp.units import UNITS
+from spadwarp.values import Interval, parse_number, shown
+from spadwarp.values import UNITS
 
 __all__ = ["json_text", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml", "write_csv", "write_json"]
 __all__ += ["write_text"]

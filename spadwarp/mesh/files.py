@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import MeshError
+from spadwarp.values import MeshError
 
 if TYPE_CHECKING:
     import trimesh

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError, MeshError
+from spadwarp.values import ArgumentError, ConfigError, MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
-from spadwarp.limits import suggestion
+from spadwarp.values import suggestion
 from spadwarp.mesh.files import USD_ENDINGS, Images, Pattern, check_sizes, check_triangles, read_coloured_mesh, read_usd
 from spadwarp.scene import Scene, Target
 from spadwarp.scene.camera import to_camera

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from spadwarp.device import core_count, physical_memory, pick_device, processor_name
-from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.values import ConfigError, DeviceError
 from spadwarp.parallel.worker import Event, Ray, Worker
 
 __all__ = ["RayWorkers"]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 import numpy as np
 
 from spadwarp.arrays import is_torch
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 from spadwarp.interop import Variable, labelled
-from spadwarp.limits import check_choice
+from spadwarp.values import check_choice
 from spadwarp.result.result import ARRAYS, COMPONENTS, Component, Result, coordinates_of
 
 if TYPE_CHECKING:

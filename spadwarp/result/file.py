@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spadwarp.errors import ArgumentError, ConfigError, FileError
+from spadwarp.values import ArgumentError, ConfigError, FileError
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
-from spadwarp.limits import check_integer, shown
+from spadwarp.values import check_integer, shown
 from spadwarp.result.result import (
     ARRAYS,
     COMPONENTS,

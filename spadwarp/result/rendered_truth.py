@@ -9,9 +9,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.values import ArgumentError, FileError
 from spadwarp.io.arrays import read_exr
-from spadwarp.limits import check_choice, check_real
+from spadwarp.values import check_choice, check_real
 from spadwarp.result.result import Truth
 from spadwarp.scene.sight import pixel_directions
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.values import ConfigError, SpadwarpError
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

@@ -12,9 +12,9 @@ from typing import Any, ClassVar, Self
 from pydantic import BaseModel, PrivateAttr, ValidationError
 from pydantic.fields import FieldInfo
 
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 from spadwarp.io.text import parse_toml
-from spadwarp.limits import parse_number, shown, suggestion
+from spadwarp.values import parse_number, shown, suggestion
 from spadwarp.scene.sections import (
     PRESETS,
     Section,
@@ -26,7 +26,7 @@ from spadwarp.scene.sections import (
     takes_any_table,
     with_paths,
 )
-from spadwarp.units import quantity
+from spadwarp.values import quantity
 
 __all__ = ["parse_override"]
 

@@ -32,10 +32,10 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.values import ConfigError, FileError
 from spadwarp.io.text import read_columns
-from spadwarp.limits import Interval, bounds, shown
-from spadwarp.units import UNITS, quantity
+from spadwarp.values import Interval, bounds, shown
+from spadwarp.values import UNITS, quantity
 
 __all__ = ["Preset", "presets"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from spadwarp.limits import SEED, bounds
+from spadwarp.values import SEED, bounds
 from spadwarp.scene.sections import (
     AnyFile,
     Corner,

@@ -18,7 +18,7 @@ from spadwarp.scene.camera import Camera, image_tangents
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.scene import Scene, camera_port, laser_port
-from spadwarp.units import path_from_time
+from spadwarp.values import path_from_time
 
 __all__: list[str] = []
 

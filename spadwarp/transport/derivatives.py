@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 import spadwarp_kernels as sk
-from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.limits import shown, suggestion
+from spadwarp.values import ArgumentError, ConfigError
+from spadwarp.values import shown, suggestion
 from spadwarp.scene import Scene
 from spadwarp.scene.medium import grid_cells
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
-from spadwarp.errors import ConfigError, DeviceError
+from spadwarp.values import ConfigError, DeviceError
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Truth
 from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix

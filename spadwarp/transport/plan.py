@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
-from spadwarp.errors import ConfigError
-from spadwarp.limits import SEED, check_integer, check_part, check_real
+from spadwarp.values import ConfigError
+from spadwarp.values import SEED, check_integer, check_part, check_real
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Result, ResultLike
 from spadwarp.result.result import ResultHead, difference

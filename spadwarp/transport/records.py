@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 from spadwarp.io.hdf5 import Coordinate, name_dimensions, read_hdf5, write_hdf5
-from spadwarp.limits import SEED, check_integer
+from spadwarp.values import SEED, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import to_world

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, pick_device, pick_devices, processor_name
-from spadwarp.errors import ConfigError, DeviceError, SpadwarpError, address_space, kernel_errors
-from spadwarp.limits import check_integer
+from spadwarp.values import ConfigError, DeviceError, SpadwarpError, address_space, kernel_errors
+from spadwarp.values import check_integer
 from spadwarp.parallel import Ray, Worker
 from spadwarp.parallel.ray import RayWorkers
 from spadwarp.parallel.worker import Event

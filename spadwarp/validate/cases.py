@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.limits import check_choice, check_integer
+from spadwarp.values import check_choice, check_integer
 from spadwarp.mesh import load_target
 from spadwarp.scene import Target
 from spadwarp.scene.pose import rotation_angles
-from spadwarp.units import path_from_time
+from spadwarp.values import path_from_time
 from spadwarp.validate import references
 from spadwarp.validate.measure import (
     PENCIL,

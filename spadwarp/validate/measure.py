@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.scene import Scene, phase_function
 from spadwarp.transport import simulate, trace
-from spadwarp.units import time_from_path
+from spadwarp.values import time_from_path
 
 __all__ = ["PENCIL", "Estimate", "Quantity", "Run", "batch_means", "block_means", "holm", "point_source"]
 __all__ += ["quantities", "scene", "slab_domain", "two_sided_p"]

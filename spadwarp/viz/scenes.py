@@ -14,8 +14,8 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameReader
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_integer
+from spadwarp.values import ArgumentError
+from spadwarp.values import check_integer
 from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, TriangleMesh, build_mesh, builtin_names, make_builtin
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_camera, to_world

@@ -23,9 +23,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError
+from spadwarp.values import FileError
 from spadwarp.io.paths import atomic_path
-from spadwarp.limits import check_real
+from spadwarp.values import check_real
 from spadwarp.result import Channel
 
 STYLE = "spadwarp.viz.paper"

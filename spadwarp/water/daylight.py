@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.limits import check_real
+from spadwarp.values import check_real
 from spadwarp.water.seawater import RANGES, check_ranges, table_columns
 
 __all__ = ["Skylight", "clear_sky_irradiance", "daylight_attenuation", "surface_reflectance"]

@@ -16,7 +16,7 @@ from spadwarp.analytic import (
     simulate_analytic,
     sweep,
 )
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
 
 SCENE = scene(
     medium={"extinction": 0.3, "albedo": 0.7},

@@ -11,7 +11,7 @@ import spadwarp
 from helpers.scenes import scene
 from reference import crlb
 from spadwarp.analytic import simulate_analytic
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.result.result import Truth
 from spadwarp.scene.sight import pixel_directions
 

@@ -10,7 +10,7 @@ import spadwarp
 from spadwarp.analytic import eye_limit, pixel_maps
 from spadwarp.analytic.eye_safety import as_if_bare
 from spadwarp.checks import summary
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.files.loader import gate_of, stored_depth
 from spadwarp.scene import Scene, daylight_rate
 from spadwarp.scene.scene import camera_port

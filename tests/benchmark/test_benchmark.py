@@ -15,7 +15,7 @@ import spadwarp
 from helpers.cli import DEVICE, run
 from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, newest_report, report
 from spadwarp.benchmark.runs import measure
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.values import ArgumentError, FileError
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
 

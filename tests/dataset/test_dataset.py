@@ -32,7 +32,7 @@ from spadwarp.dataset import (
 from spadwarp.dataset.shards import HISTOGRAM_FIELDS
 from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
-from spadwarp.units import SPEED_OF_LIGHT
+from spadwarp.values import SPEED_OF_LIGHT
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from helpers.datasets import make, recipe
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file
 from spadwarp.denoise.reading import read_depth
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 from spadwarp.frames import instrument_response
 
 BIN = 80e-12

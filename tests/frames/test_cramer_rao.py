@@ -154,7 +154,7 @@ def test_a_bound_that_is_noise_is_refused_with_the_photons_that_it_needs():
         for photons in (2_000, 10_000, 50_000):
             try:
                 given.append(np.nanmedian(spadwarp.crlb(run(photons, seed), device="cpu")) / truth)
-            except spadwarp.errors.ArgumentError as error:
+            except spadwarp.values.ArgumentError as error:
                 found = re.search(
                     r"result: \d+ % of the information .* about (\S+) photons instead of (\S+) would", str(error)
                 )

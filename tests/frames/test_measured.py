@@ -11,7 +11,7 @@ import pytest
 
 import spadwarp
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.errors import ArgumentError, FileError, SpadwarpWarning
+from spadwarp.values import ArgumentError, FileError, SpadwarpWarning
 from spadwarp.frames import read_histograms, read_response
 
 scipy_io = pytest.importorskip("scipy.io")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 from spadwarp.frames.response import (
     FWHM_PER_SIGMA,
     InstrumentResponse,

@@ -10,7 +10,7 @@ from PIL import Image
 import spadwarp
 from helpers.cli import run
 from helpers.synthetic_result import make_scene
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.frames import simulate_sequence
 from spadwarp.scene import Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_matrix

@@ -12,7 +12,7 @@ import spadwarp
 from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp import ArgumentError
-from spadwarp.errors import SpadwarpWarning
+from spadwarp.values import SpadwarpWarning
 from spadwarp.frames import InstrumentResponse, coates, detect, first_photon_probabilities, monte_carlo_noise
 from spadwarp.scene import Detector, Laser
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 from spadwarp.scene import Scene
 
 CAMERA = {"width": 8, "height": 6, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.01}

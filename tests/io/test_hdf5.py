@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from spadwarp.errors import FileError
+from spadwarp.values import FileError
 from spadwarp.io import hdf5
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from spadwarp.errors import MeshError
+from spadwarp.values import MeshError
 from spadwarp.mesh import load_target
 from spadwarp.scene import Target
 

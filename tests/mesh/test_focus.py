@@ -9,7 +9,7 @@ import pytest
 import spadwarp
 from helpers.minimal_scene import problems
 from helpers.scenes import scene
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 from spadwarp.mesh import build_mesh, focus_distance
 
 SQUARE = {"builtin": "plane", "size": [0.2, 0.2]}

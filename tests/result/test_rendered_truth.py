@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
-from spadwarp.errors import FileError
+from spadwarp.values import FileError
 from spadwarp.io.arrays import write_exr
 from spadwarp.result.rendered_truth import load_truth_exr
 from spadwarp.scene.sight import pixel_directions

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import spadwarp
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 from spadwarp.scene import daylight_radiance, daylight_rate, downwelling_irradiance, noise_rate, phase_function
-from spadwarp.units import PLANCK, SPEED_OF_LIGHT
+from spadwarp.values import PLANCK, SPEED_OF_LIGHT
 
 pytestmark = pytest.mark.physics
 
@@ -202,7 +202,7 @@ def test_ambient_of_the_caller():
         laser=spadwarp.scene.Laser(), detector=spadwarp.scene.Detector(dark_count_rate=0.0),
     )  # fmt: skip
     assert frames.expected.mean(axis=-1) == pytest.approx(light * 1e-10)
-    with pytest.raises(spadwarp.errors.ArgumentError, match=r"ambient has shape \(2,\)"):
+    with pytest.raises(spadwarp.values.ArgumentError, match=r"ambient has shape \(2,\)"):
         spadwarp.detect(
             cube, pulses=1, seed=0, gate_start=0.0, bin_width=1e-10, ambient=[1.0, 2.0], laser=spadwarp.scene.Laser()
         )

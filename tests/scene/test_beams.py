@@ -10,7 +10,7 @@ from scipy import stats
 import spadwarp
 import spadwarp.checks.checks
 from helpers.scenes import scene
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.values import ConfigError, FileError
 from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import laser as beam_profile

@@ -9,7 +9,7 @@ import spadwarp
 from helpers.scenes import scene
 from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.values import ConfigError, FileError
 from spadwarp.scene import Medium
 from spadwarp.scene.medium import PHASE_TABLES
 

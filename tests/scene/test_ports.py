@@ -8,7 +8,7 @@ import pytest
 import spadwarp
 from helpers.scenes import WATER, scene
 from reference import refraction
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.scene import Scene
 from spadwarp.scene.port import air_indices, window_indices

@@ -9,7 +9,7 @@ import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.scene import Camera, Gate, Laser, Medium, Scene
 from spadwarp.scene.sections import field_unit, models_of
-from spadwarp.units import percent, quantity, with_prefix
+from spadwarp.values import percent, quantity, with_prefix
 
 
 @pytest.mark.parametrize(

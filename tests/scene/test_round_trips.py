@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.minimal_scene import CAMERA, MINIMAL, scene
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 from spadwarp.scene import Scene, load_scene, presets
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 import spadwarp
-from spadwarp.errors import ConfigError, FileError
+from spadwarp.values import ConfigError, FileError
 from spadwarp.scene import detection_efficiency, filter_transmission, spectral_lines, water_lines
 
 pytestmark = pytest.mark.fast

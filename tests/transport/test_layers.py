@@ -13,7 +13,7 @@ from reference.single_scatter import Lidar, single_scatter_total
 from spadwarp import simulate
 from spadwarp.checks import summary
 from spadwarp.scene import Scene
-from spadwarp.units import SPEED_OF_LIGHT
+from spadwarp.values import SPEED_OF_LIGHT
 from spadwarp.water import water_optics
 
 pytestmark = pytest.mark.physics

@@ -6,7 +6,7 @@ import pytest
 from helpers.estimators import agreeing_cells, clear_at_the_lens, means
 from helpers.scenes import scene
 from spadwarp import simulate
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 from spadwarp.transport import trace
 
 WATER = 1.34

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.image import imread
 
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.errors import FileError
+from spadwarp.values import FileError
 from spadwarp.result.result import Result
 from spadwarp.viz import draw_result
 
