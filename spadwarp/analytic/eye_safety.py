@@ -21,11 +21,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from spadwarp.values import ArgumentError
-from spadwarp.values import check_real
 from spadwarp.scene import Laser, Scene
 from spadwarp.scene.laser import load_profile
 from spadwarp.scene.scene import laser_port
+from spadwarp.values import ArgumentError, check_real
 
 __all__ = ["EyeLimit", "axis_fluence", "eye_limit", "permissible_exposure"]
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
 from spadwarp.analytic.model import false_peaks
 from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
-from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.frames import (
     METHODS,
     Method,
@@ -32,14 +31,26 @@ from spadwarp.frames import (
 )
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.values import SEED, check_choice, check_integer, check_real, shown
 from spadwarp.result import CHANNELS, Channel, analyser_channel, merge
 from spadwarp.scene import SceneLike, Transport, as_scene, noise_rate
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight, port_advance
 from spadwarp.transport import RunOptions, simulate, truth_maps
-from spadwarp.values import quantity, range_from_time, time_from_path, time_from_range, with_prefix
+from spadwarp.values import (
+    SEED,
+    ArgumentError,
+    ConfigError,
+    check_choice,
+    check_integer,
+    check_real,
+    quantity,
+    range_from_time,
+    shown,
+    time_from_path,
+    time_from_range,
+    with_prefix,
+)
 
 if TYPE_CHECKING:
     from spadwarp.frames import Frames

@@ -18,16 +18,15 @@ from spadwarp.analytic.model import (
     scene_optics,
     warn_of_model,
 )
+from spadwarp.arrays import labelled
 from spadwarp.device import pick_device
-from spadwarp.values import ArgumentError, ConfigError, kernel_errors
-from spadwarp.interop import labelled
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
-from spadwarp.values import SEED, check_integer
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
+from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, kernel_errors
 
 if TYPE_CHECKING:
     import xarray

@@ -17,16 +17,24 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, warn_of_model
 from spadwarp.analytic.result import simulate_analytic
-from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
 from spadwarp.io.text import parse_toml
-from spadwarp.values import check_choice, check_integer, check_real, parse_number, shown
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
 from spadwarp.scene.document import locate, parse_key
 from spadwarp.scene.sections import field_unit, takes_integers
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
-from spadwarp.values import quantity
+from spadwarp.values import (
+    ArgumentError,
+    ConfigError,
+    SpadwarpWarning,
+    check_choice,
+    check_integer,
+    check_real,
+    parse_number,
+    quantity,
+    shown,
+)
 
 __all__ = [
     "OUTLIERS",

@@ -21,13 +21,12 @@ import numpy as np
 from spadwarp.analytic import simulate_analytic
 from spadwarp.benchmark.cases import CASES, GROUPS, Case
 from spadwarp.device import core_count, nvidia_driver, pick_device, processor_name
-from spadwarp.values import FileError
 from spadwarp.frames import detect
-from spadwarp.values import check_choice, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import provenance, simulate, trace, truth_maps
 from spadwarp.transport.model import build_model, transport_spec
+from spadwarp.values import FileError, check_choice, check_integer
 
 if TYPE_CHECKING:
     import warp as wp

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic import PILE_UP
 from spadwarp.checks.survey import CheckMessage, OnAxis, Survey
-from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, guess_unit
 from spadwarp.scene import (
@@ -35,7 +34,7 @@ from spadwarp.scene.port import Port
 from spadwarp.scene.sections import field_unit
 from spadwarp.scene.sight import beam_planes, points_inside, view_planes
 from spadwarp.transport import points_per_flight
-from spadwarp.values import path_from_time, quantity, with_prefix
+from spadwarp.values import ArgumentError, ConfigError, path_from_time, quantity, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
 __all__ = ["check", "summary"]

@@ -16,9 +16,7 @@ from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, write_json
 from spadwarp.cli.text import count, progress, rows, show_table
 from spadwarp.cli.text import written as names_of
-from spadwarp.values import ArgumentError, ConfigError, FileError
-from spadwarp.values import parse_number
-from spadwarp.values import percent, range_from_time, rounded
+from spadwarp.values import ArgumentError, ConfigError, FileError, parse_number, percent, range_from_time, rounded
 
 if TYPE_CHECKING:
     import numpy as np

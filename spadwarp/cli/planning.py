@@ -27,9 +27,7 @@ from spadwarp.cli.text import (
     show_table,
 )
 from spadwarp.cli.text import written as names_of
-from spadwarp.values import ArgumentError
-from spadwarp.values import shown
-from spadwarp.values import with_prefix
+from spadwarp.values import ArgumentError, shown, with_prefix
 
 if TYPE_CHECKING:
     from spadwarp import Scene

@@ -18,8 +18,7 @@ from spadwarp.cli.app import INTERRUPTED, complain, fail, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, write_json
 from spadwarp.cli.text import count, progress, readable, rows, written
-from spadwarp.values import ArgumentError, ConfigError, address_space
-from spadwarp.values import parse_number
+from spadwarp.values import ArgumentError, ConfigError, address_space, parse_number
 
 if TYPE_CHECKING:
     from types import ModuleType

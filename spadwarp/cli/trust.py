@@ -14,8 +14,7 @@ from spadwarp.cli.app import complain, fail, running, say
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import check_outputs, write_json
 from spadwarp.cli.text import in_bytes, show_table
-from spadwarp.values import FileError
-from spadwarp.values import percent
+from spadwarp.values import FileError, percent
 
 if TYPE_CHECKING:
     from spadwarp.benchmark import BenchResult, Comparison

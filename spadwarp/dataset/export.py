@@ -21,11 +21,10 @@ from spadwarp.dataset.card import card, croissant
 from spadwarp.dataset.read import FrameReader
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shards import FIELDS, FRAME_COLUMNS, HISTOGRAM_FIELDS, Column, checksum, scene_columns
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.io.text import write_json, write_text
-from spadwarp.values import check_choice, check_integer
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["EXPORT_FIELDS", "EXPORT_FORMATS", "export_dataset"]
 

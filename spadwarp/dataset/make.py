@@ -25,11 +25,10 @@ from spadwarp.dataset.plan import Plan, Shard
 from spadwarp.dataset.recipe import SPLITS, Recipe, load_recipe
 from spadwarp.dataset.shards import FORMAT_VERSION, checksum, write_scene_index, write_shard
 from spadwarp.device import core_count, pick_devices
-from spadwarp.values import ConfigError, FileError
 from spadwarp.io.paths import file_problem, lock, remove_temporaries
 from spadwarp.io.text import parse_json, parse_toml, read_text, read_toml, write_json, write_text
-from spadwarp.values import check_integer, check_part, shown
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
+from spadwarp.values import ConfigError, FileError, check_integer, check_part, shown
 
 __all__ = ["DatasetReport", "make_dataset", "read_manifest", "verify_dataset"]
 

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset.recipe import SPLITS, UNIFORM, Distribution, Plume, Recipe, Targets
-from spadwarp.values import ConfigError, FileError, MeshError
 from spadwarp.mesh import BUILTINS, builtin_names, load_target
 from spadwarp.mesh.files import USD_ENDINGS
 from spadwarp.mesh.targets import placement
@@ -27,7 +26,7 @@ from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Scene, Target, Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_angles
 from spadwarp.scene.sight import port_advance
-from spadwarp.values import time_from_range
+from spadwarp.values import ConfigError, FileError, MeshError, time_from_range
 
 __all__ = ["Plan"]
 

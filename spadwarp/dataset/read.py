@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from spadwarp.dataset.make import read_manifest
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shards import FIELDS, HistogramFile, ShardFile, frame_count
-from spadwarp.values import ArgumentError, FileError
-from spadwarp.values import SEED, check_choice, check_integer
 from spadwarp.scene import Scene
+from spadwarp.values import SEED, ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
 

@@ -20,13 +20,12 @@ from pydantic import (
     model_validator,
 )
 
-from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.values import check_real, shown
 from spadwarp.scene import Scene
 from spadwarp.scene.document import Document
 from spadwarp.scene.sections import FilePath, Section, Whole, listed
+from spadwarp.values import ArgumentError, ConfigError, check_real, shown
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 

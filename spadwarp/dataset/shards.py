@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from spadwarp.dataset.plan import Plan, Shard
 from spadwarp.dataset.render import PROFILE_BINS, RenderedScene, render_analytic, render_transport
 from spadwarp.device import core_count, pick_device
-from spadwarp.values import DeviceError, FileError, SpadwarpError
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5, write_hdf5
 from spadwarp.io.paths import remove_temporaries
 from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.sight import port_advance
-from spadwarp.values import range_from_time
+from spadwarp.values import DeviceError, FileError, SpadwarpError, range_from_time
 
 FORMAT_VERSION = 1
 

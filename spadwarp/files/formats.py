@@ -15,20 +15,18 @@ from spadwarp.analytic import AnalyticFile
 from spadwarp.arrays import on_host
 from spadwarp.dataset import FrameReader
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.files.loader import load, locate
 from spadwarp.frames import Frames, FramesFile, SequenceFile
 from spadwarp.io.arrays import write_array, write_exr
 from spadwarp.io.paths import atomic_path
 from spadwarp.io.text import write_text
-from spadwarp.values import check_choice, check_integer
 from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.result import COMPONENTS, Result
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.camera import CALIBRATION_ENDINGS, save_calibration
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import time_from_path
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, time_from_path
 
 __all__ = ["FORMATS", "export", "export_sensor_fusion", "open_source", "sequence"]
 

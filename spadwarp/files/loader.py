@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic import AnalyticFile
 from spadwarp.dataset import FrameReader
-from spadwarp.values import FileError
 from spadwarp.frames import FramesFile, Reduction, SequenceFile
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import file_within
 from spadwarp.result import Result, load_result
 from spadwarp.scene.sight import lines_of_sight, port_advance
 from spadwarp.transport import PhotonRecords, load_records
-from spadwarp.values import range_from_time
+from spadwarp.values import FileError, range_from_time
 
 __all__ = ["Held", "gate_of", "holds_own_file", "is_own_file", "load", "locate", "stored_depth", "summary"]
 

@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.frames import Reduction, detector_response
 from spadwarp.io.arrays import point_cloud, write_array, write_exr, write_ply
 from spadwarp.io.paths import file_within, remove_temporaries
 from spadwarp.io.text import write_text
-from spadwarp.values import check_choice
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
 from spadwarp.result.file import read_head
@@ -28,6 +26,7 @@ from spadwarp.result.result import difference
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.values import ArgumentError, FileError, check_choice
 
 if TYPE_CHECKING:
     from spadwarp.inverse import Fit, Unknown

@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.values import ArgumentError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
-from spadwarp.values import BIN_WIDTH, check_choice, check_real
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.result import Result
 from spadwarp.scene import noise_rate
-from spadwarp.values import percent
+from spadwarp.values import BIN_WIDTH, ArgumentError, check_choice, check_real, kernel_errors, percent
 
 __all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
 

@@ -10,12 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
-from spadwarp.values import ArgumentError, kernel_errors
-from spadwarp.values import BIN_WIDTH, TIME, check_choice, check_real, shown
 from spadwarp.scene import Camera, Medium, Scene
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
-from spadwarp.values import path_from_time
+from spadwarp.values import (
+    BIN_WIDTH,
+    TIME,
+    ArgumentError,
+    check_choice,
+    check_real,
+    kernel_errors,
+    path_from_time,
+    shown,
+)
 
 if TYPE_CHECKING:
     from spadwarp.frames.response import InstrumentResponse

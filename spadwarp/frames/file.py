@@ -11,12 +11,11 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, ConfigError, FileError, SpadwarpWarning
+from spadwarp.arrays import Variable
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.frames.spad import Frames, MonteCarloNoise, detect, monte_carlo_noise
-from spadwarp.interop import Variable
 from spadwarp.io.hdf5 import (
     PIXELS,
     Hdf5File,
@@ -26,11 +25,11 @@ from spadwarp.io.hdf5 import (
     read_hdf5,
     write_hdf5,
 )
-from spadwarp.values import SEED, check_integer
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, Trajectory, as_scene, load_trajectory
 from spadwarp.scene.camera import camera_attributes
 from spadwarp.scene.sight import depth_from_time, depth_per_time
+from spadwarp.values import SEED, ArgumentError, ConfigError, FileError, SpadwarpWarning, check_integer
 
 __all__ = ["FrameErrors", "FramesFile", "Recording", "SequenceFile", "is_frames_file", "record_frames"]
 __all__ += ["simulate_sequence"]

@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, FileError, SpadwarpError, SpadwarpWarning
 from spadwarp.frames.depth import Histograms
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.response import InstrumentResponse, detector_response
@@ -26,9 +25,9 @@ from spadwarp.io.arrays import read_npy
 from spadwarp.io.hdf5 import hdf5_format, open_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file
-from spadwarp.values import check_real, shown
 from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.file import load_result
+from spadwarp.values import ArgumentError, FileError, SpadwarpError, SpadwarpWarning, check_real, shown
 
 __all__ = ["read_histograms"]
 

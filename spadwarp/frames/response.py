@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import real_array
-from spadwarp.values import ArgumentError, ConfigError, FileError
 from spadwarp.io.arrays import read_npy
 from spadwarp.io.paths import file_problem
 from spadwarp.io.text import read_columns, read_text
-from spadwarp.values import BIN_WIDTH, TIME, check_integer, check_real, shown
+from spadwarp.values import BIN_WIDTH, TIME, ArgumentError, ConfigError, FileError, check_integer, check_real, shown
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser

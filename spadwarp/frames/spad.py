@@ -16,16 +16,33 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, output_tensor, tensor_of
-from spadwarp.values import ArgumentError, SpadwarpWarning, kernel_errors
+from spadwarp.arrays import (
+    Variable,
+    histogram_rows,
+    in_torch_order,
+    is_torch,
+    labelled,
+    on_host,
+    output_tensor,
+    tensor_of,
+)
 from spadwarp.frames.depth import Method, arrival_time
 from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
-from spadwarp.interop import Variable, labelled
 from spadwarp.io.hdf5 import PIXELS, image_coordinates
-from spadwarp.values import BIN_WIDTH, SEED, TIME, check_integer, check_real, shown
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
+from spadwarp.values import (
+    BIN_WIDTH,
+    SEED,
+    TIME,
+    ArgumentError,
+    SpadwarpWarning,
+    check_integer,
+    check_real,
+    kernel_errors,
+    shown,
+)
 
 if TYPE_CHECKING:
     import xarray

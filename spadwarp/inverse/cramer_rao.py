@@ -14,9 +14,8 @@ from spadwarp.inverse.equations import pseudo_inverse
 from spadwarp.inverse.exposure import Exposure
 from spadwarp.inverse.fitting import BATCHES, SIMULATION, Fitter, Joint, Prior, State
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, scene_value
-from spadwarp.values import check_integer
 from spadwarp.scene import SceneLike, as_scene
-from spadwarp.values import percent
+from spadwarp.values import check_integer, percent
 
 __all__ = ["Bound", "Bounds", "bounds"]
 

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError
 from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
 from spadwarp.frames.spad import LIMIT
-from spadwarp.values import check_integer
 from spadwarp.scene import phase_function
 from spadwarp.transport import truth_maps
+from spadwarp.values import ArgumentError, check_integer
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

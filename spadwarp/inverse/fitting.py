@@ -24,16 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.frames.spad import DRAWN_EFFECTS
 from spadwarp.inverse.equations import Equations, Law, Moments, Solution, solve, solve_pooled
 from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposure
 from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
-from spadwarp.values import SEED, check_integer, check_real
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport import truth_maps
-from spadwarp.values import percent
+from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, check_real, percent
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Scene

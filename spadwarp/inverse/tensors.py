@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.inverse.unknowns import read_unknowns, with_values
-from spadwarp.values import SEED, check_integer
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.grid import Grid
 from spadwarp.scene.medium import grid_cells
 from spadwarp.transport import RunOptions, resolve_derivatives, simulate
 from spadwarp.transport.derivatives import is_block_name
+from spadwarp.values import SEED, ArgumentError, FileError, check_integer
 
 if TYPE_CHECKING:
     import torch

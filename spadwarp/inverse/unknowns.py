@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, ConfigError
-from spadwarp.values import shown, suggestion
 from spadwarp.scene.camera import to_world
+from spadwarp.values import ArgumentError, ConfigError, shown, suggestion
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

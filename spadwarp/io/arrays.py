@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.io.paths import atomic_path, existing_file
+from spadwarp.values import ArgumentError, FileError
 
 __all__ = ["point_cloud", "read_exr", "read_npy", "read_npz", "write_array", "write_exr", "write_ply"]
 

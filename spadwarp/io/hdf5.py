@@ -24,10 +24,9 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import FileError
 from spadwarp.io.paths import atomic_path, existing_file, used
 from spadwarp.io.text import parse_json
-from spadwarp.values import check_integer, check_real
+from spadwarp.values import FileError, check_integer, check_real
 
 if TYPE_CHECKING:
     import h5py

@@ -20,8 +20,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import FileError, SpadwarpError
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5
+from spadwarp.values import FileError, SpadwarpError
 
 __all__ = ["SparseMatrix", "Variable", "open_mat"]
 

@@ -15,8 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from spadwarp.values import FileError, SpadwarpError
-from spadwarp.values import suggestion
+from spadwarp.values import FileError, SpadwarpError, suggestion
 
 __all__ = ["MESH_ENDINGS", "atomic_path", "check_apart", "example_or_path", "examples", "existing_file", "file_problem"]
 __all__ += ["file_within", "is_stream", "lock", "remove_temporaries", "similar", "used"]

@@ -18,10 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ConfigError, FileError
 from spadwarp.io.paths import atomic_path, similar, used
-from spadwarp.values import Interval, parse_number, shown
-from spadwarp.values import UNITS
+from spadwarp.values import UNITS, ConfigError, FileError, Interval, parse_number, shown
 
 __all__ = ["json_text", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml", "write_csv", "write_json"]
 __all__ += ["write_text"]

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, ConfigError, MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
-from spadwarp.values import suggestion
 from spadwarp.mesh.files import USD_ENDINGS, Images, Pattern, check_sizes, check_triangles, read_coloured_mesh, read_usd
 from spadwarp.scene import Scene, Target
 from spadwarp.scene.camera import to_camera
@@ -24,6 +22,7 @@ from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sight import points_inside, view_planes
+from spadwarp.values import ArgumentError, ConfigError, MeshError, suggestion
 
 __all__ = ["BUILTINS", "SIZED_BUILTINS", "MeshSummary", "TriangleMesh", "build_mesh", "builtin_names", "describe_mesh"]
 __all__ += ["focus_distance", "guess_unit", "load_target", "make_builtin"]

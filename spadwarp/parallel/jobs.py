@@ -26,9 +26,9 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from spadwarp.device import core_count, pick_devices
-from spadwarp.values import DeviceError, address_space
 from spadwarp.parallel.ray import RETRIES, RayWorkers
 from spadwarp.parallel.worker import Ray, Worker
+from spadwarp.values import DeviceError, address_space
 
 __all__ = ["Forked", "run_jobs"]
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from spadwarp.device import core_count, physical_memory, pick_device, processor_name
-from spadwarp.values import ConfigError, DeviceError
 from spadwarp.parallel.worker import Event, Ray, Worker
+from spadwarp.values import ConfigError, DeviceError
 
 __all__ = ["RayWorkers"]
 

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from spadwarp.values import ArgumentError
-from spadwarp.values import check_integer, shown
+from spadwarp.values import ArgumentError, check_integer, shown
 
 __all__ = ["Ray", "Worker", "interruptible"]
 

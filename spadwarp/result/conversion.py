@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 
-from spadwarp.arrays import is_torch
-from spadwarp.values import ArgumentError
-from spadwarp.interop import Variable, labelled
-from spadwarp.values import check_choice
+from spadwarp.arrays import Variable, is_torch, labelled
 from spadwarp.result.result import ARRAYS, COMPONENTS, Component, Result, coordinates_of
+from spadwarp.values import ArgumentError, check_choice
 
 if TYPE_CHECKING:
     import torch

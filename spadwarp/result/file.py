@@ -12,11 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spadwarp.values import ArgumentError, ConfigError, FileError
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
-from spadwarp.values import check_integer, shown
 from spadwarp.result.result import (
     ARRAYS,
     COMPONENTS,
@@ -33,6 +31,7 @@ from spadwarp.result.result import (
 from spadwarp.result.tallies import Range, SignedTallies, added, joined, moments_of, total_of
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes
+from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, shown
 
 __all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps", "merge"]
 __all__ += ["save_depth_exr", "save_result", "save_truth_maps"]

@@ -9,11 +9,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.io.arrays import read_exr
-from spadwarp.values import check_choice, check_real
 from spadwarp.result.result import Truth
 from spadwarp.scene.sight import pixel_directions
+from spadwarp.values import ArgumentError, FileError, check_choice, check_real
 
 __all__ = ["EXR_PRESETS", "ExrPreset", "load_truth_exr"]
 

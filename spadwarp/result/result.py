@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
-from spadwarp.values import check_choice
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.values import percent
+from spadwarp.values import ArgumentError, ConfigError, check_choice, percent
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

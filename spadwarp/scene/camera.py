@@ -19,12 +19,11 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from spadwarp.values import ArgumentError, ConfigError, FileError
 from spadwarp.io.text import parse_json, read_text, write_text
-from spadwarp.values import check_integer, read_real, shown
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field, field_range, listed
+from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, read_real, shown
 
 __all__ = ["Camera", "load_calibration", "save_calibration"]
 

@@ -12,9 +12,7 @@ from typing import Any, ClassVar, Self
 from pydantic import BaseModel, PrivateAttr, ValidationError
 from pydantic.fields import FieldInfo
 
-from spadwarp.values import ConfigError
 from spadwarp.io.text import parse_toml
-from spadwarp.values import parse_number, shown, suggestion
 from spadwarp.scene.sections import (
     PRESETS,
     Section,
@@ -26,7 +24,7 @@ from spadwarp.scene.sections import (
     takes_any_table,
     with_paths,
 )
-from spadwarp.values import quantity
+from spadwarp.values import ConfigError, parse_number, quantity, shown, suggestion
 
 __all__ = ["parse_override"]
 

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from spadwarp.values import ConfigError, FileError, SpadwarpError
 from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
-from spadwarp.values import Interval
 from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range
+from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 
 __all__: list[str] = []
 

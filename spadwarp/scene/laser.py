@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from spadwarp.values import ConfigError, FileError, SpadwarpError
 from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file
-from spadwarp.values import Interval
 from spadwarp.scene.port import Port
 from spadwarp.scene.sections import (
     AnyFile,
@@ -33,7 +31,7 @@ from spadwarp.scene.sections import (
     unit_vector,
 )
 from spadwarp.scene.settings import Detector
-from spadwarp.values import PLANCK, SPEED_OF_LIGHT
+from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval, SpadwarpError
 from spadwarp.water.seawater import RANGES
 
 __all__ = ["Laser", "SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]

@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
-from spadwarp.values import ConfigError
-from spadwarp.values import bounds
 from spadwarp.scene.grid import COEFFICIENTS, Grid, GridCells, cells_of
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.sections import (
@@ -32,7 +30,7 @@ from spadwarp.scene.sections import (
     listed,
     read_table,
 )
-from spadwarp.values import pulse_speed
+from spadwarp.values import ConfigError, bounds, pulse_speed
 from spadwarp.water import (
     molecular_density,
     rayleigh_matrix,

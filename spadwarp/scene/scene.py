@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
-from spadwarp.values import ArgumentError, ConfigError, FileError
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import read_text, read_toml
-from spadwarp.values import check_integer, check_real, read_real, shown
 from spadwarp.scene.camera import Camera, to_camera, to_world
 from spadwarp.scene.document import Document, Overrides
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
@@ -28,7 +26,16 @@ from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, vector_of
 from spadwarp.scene.sections import listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
-from spadwarp.values import path_from_time
+from spadwarp.values import (
+    ArgumentError,
+    ConfigError,
+    FileError,
+    check_integer,
+    check_real,
+    path_from_time,
+    read_real,
+    shown,
+)
 
 __all__ = ["Scene", "SceneLike", "Trajectory", "WaterLine", "as_scene", "load_scene", "load_trajectory", "template"]
 __all__ += ["water_lines"]

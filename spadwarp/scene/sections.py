@@ -32,10 +32,8 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
-from spadwarp.values import ConfigError, FileError
 from spadwarp.io.text import read_columns
-from spadwarp.values import Interval, bounds, shown
-from spadwarp.values import UNITS, quantity
+from spadwarp.values import UNITS, ConfigError, FileError, Interval, bounds, quantity, shown
 
 __all__ = ["Preset", "presets"]
 

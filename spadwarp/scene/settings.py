@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from spadwarp.values import SEED, bounds
 from spadwarp.scene.sections import (
     AnyFile,
     Corner,
@@ -25,6 +24,7 @@ from spadwarp.scene.sections import (
     field,
     unit_vector,
 )
+from spadwarp.values import SEED, bounds
 from spadwarp.water.daylight import refracted_cosine
 from spadwarp.water.seawater import RANGES
 

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 import spadwarp_kernels as sk
-from spadwarp.values import ArgumentError, ConfigError
-from spadwarp.values import shown, suggestion
 from spadwarp.scene import Scene
 from spadwarp.scene.medium import grid_cells
+from spadwarp.values import ArgumentError, ConfigError, shown, suggestion
 
 if TYPE_CHECKING:
     import warp as wp

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
-from spadwarp.values import ConfigError, DeviceError
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Truth
 from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix
@@ -26,6 +25,7 @@ from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_scale
+from spadwarp.values import ConfigError, DeviceError
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh

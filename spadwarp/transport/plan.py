@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
-from spadwarp.values import ConfigError
-from spadwarp.values import SEED, check_integer, check_part, check_real
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Result, ResultLike
 from spadwarp.result.result import ResultHead, difference
@@ -24,6 +22,7 @@ from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import view_planes
 from spadwarp.transport.derivatives import resolve_derivatives
+from spadwarp.values import SEED, ConfigError, check_integer, check_part, check_real
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh

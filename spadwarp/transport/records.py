@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
-from spadwarp.values import ArgumentError
 from spadwarp.io.hdf5 import Coordinate, name_dimensions, read_hdf5, write_hdf5
-from spadwarp.values import SEED, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import to_world
@@ -26,6 +24,7 @@ from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.transport.plan import LAUNCH_SIZE
 from spadwarp.transport.simulation import Progress
 from spadwarp.transport.workers import DeviceWorker
+from spadwarp.values import SEED, ArgumentError, check_integer
 
 __all__ = ["PhotonRecords", "load_records", "save_records", "trace"]
 

@@ -19,8 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_devices, processor_name
-from spadwarp.values import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning
-from spadwarp.values import shown
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.parallel.worker import Event
 from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
@@ -29,7 +27,7 @@ from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, coun
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
 from spadwarp.transport.workers import ClusterWorkers, LocalWorkers, trace_block
-from spadwarp.values import percent
+from spadwarp.values import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning, percent, shown
 
 __all__ = ["Progress", "provenance", "simulate"]
 

@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import check_choice, check_integer
 from spadwarp.mesh import load_target
 from spadwarp.scene import Target
 from spadwarp.scene.pose import rotation_angles
-from spadwarp.values import path_from_time
 from spadwarp.validate import references
 from spadwarp.validate.measure import (
     PENCIL,
@@ -32,6 +30,7 @@ from spadwarp.validate.measure import (
     slab_domain,
     two_sided_p,
 )
+from spadwarp.values import check_choice, check_integer, path_from_time
 from spadwarp.viz import draw_validation
 
 __all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run", "vessel_reading"]

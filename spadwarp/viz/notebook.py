@@ -15,12 +15,11 @@ import numpy as np
 
 from spadwarp.analytic import AnalyticResult, Proposal
 from spadwarp.checks import summary
-from spadwarp.values import SpadwarpError
 from spadwarp.frames import Frames
 from spadwarp.mesh import build_mesh
 from spadwarp.result import Result
 from spadwarp.scene import Scene
-from spadwarp.values import with_prefix
+from spadwarp.values import SpadwarpError, with_prefix
 from spadwarp.viz.result import plot
 from spadwarp.viz.style import spaced
 

@@ -14,7 +14,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.analytic import AnalyticResult
-from spadwarp.values import ArgumentError
 from spadwarp.frames import Frames, FramesFile, Method, first_photon_probabilities
 from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
@@ -23,7 +22,7 @@ from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import rounded
+from spadwarp.values import ArgumentError, rounded
 from spadwarp.viz import style
 from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits, spaced
 

@@ -14,14 +14,13 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameReader
-from spadwarp.values import ArgumentError
-from spadwarp.values import check_integer
 from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, TriangleMesh, build_mesh, builtin_names, make_builtin
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_camera, to_world
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import truth_maps
+from spadwarp.values import ArgumentError, check_integer
 from spadwarp.viz import style
 from spadwarp.viz.style import BOUND_MAP, DEPTH_MAP, INTENSITY_MAP, PAGE, PaperFigure, coloured_depth, paper, save
 

@@ -23,10 +23,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from spadwarp.values import FileError
 from spadwarp.io.paths import atomic_path
-from spadwarp.values import check_real
 from spadwarp.result import Channel
+from spadwarp.values import FileError, check_real
 
 STYLE = "spadwarp.viz.paper"
 """Name of the style file for `matplotlib.style.use`."""

@@ -17,17 +17,16 @@ from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
 from spadwarp.files.formats import FrameSequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.spad import noise_caption
 from spadwarp.io.paths import atomic_path, check_apart
-from spadwarp.values import check_choice, check_integer, check_real
 from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real
 from spadwarp.viz import style
 from spadwarp.viz.result import channel_text
 from spadwarp.viz.style import PaperFigure, colour_map, median_pixel, paper

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.io import write_text
-from spadwarp.values import check_integer, check_real
+from spadwarp.values import ArgumentError, FileError, check_integer, check_real
 from spadwarp.water.scattering_matrix import MATRIX_COLUMNS, rayleigh_matrix
 from spadwarp.water.seawater import (
     Coefficients,

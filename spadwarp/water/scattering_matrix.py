@@ -16,9 +16,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ConfigError
 from spadwarp.io.text import read_columns
-from spadwarp.values import check_real
+from spadwarp.values import ConfigError, check_real
 from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION
 
 __all__ = ["MATRIX_COLUMNS", "rayleigh_matrix", "read_matrix_table", "scaled_rayleigh_matrix", "voss_fry_matrix"]

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.values import ArgumentError
-from spadwarp.values import Interval, shown
+from spadwarp.values import ArgumentError, Interval, shown
 
 __all__ = ["WATER_DEPOLARISATION", "WaterOptics", "group_index", "molecular_density", "pure_water_absorption"]
 __all__ += ["pure_water_scattering", "refractive_index", "water_optics"]

@@ -11,9 +11,9 @@ import spadwarp
 from helpers.scenes import scene
 from reference import crlb
 from spadwarp.analytic import simulate_analytic
-from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.result.result import Truth
 from spadwarp.scene.sight import pixel_directions
+from spadwarp.values import ArgumentError, ConfigError
 
 MAPS = (
     *("signal", "arrival", "backscatter", "alpha", "fisher", "sigma_time", "sigma_depth"),

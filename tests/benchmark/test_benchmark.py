@@ -15,9 +15,9 @@ import spadwarp
 from helpers.cli import DEVICE, run
 from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, newest_report, report
 from spadwarp.benchmark.runs import measure
-from spadwarp.values import ArgumentError, FileError
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
+from spadwarp.values import ArgumentError, FileError
 
 PEERS = Path(__file__).parents[2] / "bench" / "peers"
 

@@ -8,10 +8,9 @@ from scipy import io, sparse
 import spadwarp
 from helpers.cli import run
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.values import FileError, SpadwarpWarning
 from spadwarp.frames import record_frames
 from spadwarp.frames.measured import read_histograms
-from spadwarp.values import SPEED_OF_LIGHT
+from spadwarp.values import SPEED_OF_LIGHT, FileError, SpadwarpWarning
 
 WIDTH, HEIGHT, BINS, PULSES, FRAMES = 8, 5, 48, 20_000, 2
 LASER = {"position": [0.1, 0.0, 0.0], "pulse_energy": 1e-7, "repetition_rate": 4e6}  # a period of 34.6 m of path

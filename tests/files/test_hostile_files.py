@@ -12,10 +12,10 @@ from helpers import hostile
 from helpers.datasets import make, recipe
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.dataset import FIELDS, FrameReader
-from spadwarp.values import FileError
 from spadwarp.files import open_source
 from spadwarp.frames import FramesFile, record_frames
 from spadwarp.transport import load_records, save_records, trace
+from spadwarp.values import FileError
 
 SMALL = {
     "targets.builtin": ["staircase"],

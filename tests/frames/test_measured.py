@@ -11,8 +11,8 @@ import pytest
 
 import spadwarp
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.values import ArgumentError, FileError, SpadwarpWarning
 from spadwarp.frames import read_histograms, read_response
+from spadwarp.values import ArgumentError, FileError, SpadwarpWarning
 
 scipy_io = pytest.importorskip("scipy.io")
 

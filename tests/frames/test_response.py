@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from spadwarp.values import ArgumentError
 from spadwarp.frames.response import (
     FWHM_PER_SIGMA,
     InstrumentResponse,
@@ -14,6 +13,7 @@ from spadwarp.frames.response import (
     read_response,
     response_matrix,
 )
+from spadwarp.values import ArgumentError
 
 PS = 1e-12
 

@@ -10,10 +10,10 @@ from PIL import Image
 import spadwarp
 from helpers.cli import run
 from helpers.synthetic_result import make_scene
-from spadwarp.values import ArgumentError, ConfigError
 from spadwarp.frames import simulate_sequence
 from spadwarp.scene import Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.values import ArgumentError, ConfigError
 
 WIDTH, HEIGHT, BINS = 8, 6, 32
 TABLE = """# a camera that comes nearer, a target that moves to the side

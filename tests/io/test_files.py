@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from helpers.cli import ENVIRONMENT
-from spadwarp.values import FileError
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import write_hdf5
 from spadwarp.io.paths import atomic_path, lock, remove_temporaries
+from spadwarp.values import FileError
 
 
 def test_a_write_that_fails_midway_says_where_and_cleans_up(tmp_path):

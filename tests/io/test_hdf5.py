@@ -6,9 +6,9 @@ import h5py
 import numpy as np
 import pytest
 
-from spadwarp.values import FileError
 from spadwarp.io import hdf5
 from spadwarp.io.hdf5 import hdf5_format, read_hdf5, write_hdf5
+from spadwarp.values import FileError
 
 
 @pytest.fixture

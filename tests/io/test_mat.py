@@ -5,8 +5,8 @@ import pytest
 from scipy import sparse
 from scipy.io import savemat
 
-from spadwarp.values import FileError
 from spadwarp.io.mat import open_mat
+from spadwarp.values import FileError
 
 KINDS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
 

@@ -24,10 +24,9 @@ LEVELS = (
     ("mesh", "result"),
     ("scene",),
     ("water",),
-    ("parallel", "interop", "arrays"),
+    ("parallel", "arrays"),
     ("io", "device"),
-    ("limits",),
-    ("units", "errors"),
+    ("values",),
 )
 LEVEL = {package: level for level, packages in enumerate(LEVELS) for package in packages}
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import spadwarp
-from spadwarp.values import ConfigError
 from spadwarp.scene import daylight_radiance, daylight_rate, downwelling_irradiance, noise_rate, phase_function
-from spadwarp.values import PLANCK, SPEED_OF_LIGHT
+from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError
 
 pytestmark = pytest.mark.physics
 

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from helpers.minimal_scene import CAMERA, MINIMAL, problems, scene
 from spadwarp.dataset.recipe import Recipe
 from spadwarp.denoise.recipe import TrainingRecipe
-from spadwarp.values import ConfigError, FileError, SpadwarpError
 from spadwarp.scene import Camera, Domain, Medium, Scene, load_scene, parse_override, presets
 from spadwarp.scene.sections import interval_of, models_of, parts_of
-from spadwarp.values import SPEED_OF_LIGHT
+from spadwarp.values import SPEED_OF_LIGHT, ConfigError, FileError, SpadwarpError
 
 coefficients = st.floats(1e-6, 1e3)
 

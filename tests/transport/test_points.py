@@ -9,8 +9,8 @@ from helpers.estimators import cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp import simulate
-from spadwarp.values import ConfigError
 from spadwarp.transport import trace
+from spadwarp.values import ConfigError
 from spadwarp_kernels.transport.launch import check_spec
 
 BARS = [

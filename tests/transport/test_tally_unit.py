@@ -15,11 +15,10 @@ from helpers.launch import Floats, launched
 from helpers.scenes import scene
 from spadwarp import RunOptions, simulate
 from spadwarp.device import pick_device
-from spadwarp.values import ConfigError, SpadwarpError
 from spadwarp.mesh import build_mesh
 from spadwarp.transport import PHOTON_CAPACITY, photon_capacity, tally_scale
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.values import path_from_time
+from spadwarp.values import ConfigError, SpadwarpError, path_from_time
 from spadwarp_kernels.photon.state import to_fixed_point
 
 

@@ -12,10 +12,10 @@ from reference.adding_doubling import cumulative_reflectance, exit_cosine_fracti
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
 from reference.slab_derivatives import slab_derivatives
-from spadwarp.values import ArgumentError
 from spadwarp.io import json_text
 from spadwarp.validate import CASES, draw_results, references, report, run
 from spadwarp.validate.measure import Estimate, Quantity, batch_means, block_means, holm, two_sided_p
+from spadwarp.values import ArgumentError
 
 # The statistics
 

@@ -11,8 +11,8 @@ import pytest
 from matplotlib.image import imread
 
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.values import FileError
 from spadwarp.result.result import Result
+from spadwarp.values import FileError
 from spadwarp.viz import draw_result
 
 NAMES = ["depth.png", "intensity.png", "histogram.png", "truth.png"]
