@@ -180,8 +180,9 @@ def open_tree(tree: Tree, closed: np.ndarray, width: int) -> tuple[np.ndarray, n
     Returns:
         The tree's node that each stands for; its children among those, [nodes, width], -1 for none; its level.
     """
-    size = tree.upper - tree.lower
-    area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
+    with np.errstate(over="ignore", invalid="ignore"):  # places that the tree does not use hold anything
+        size = tree.upper - tree.lower
+        area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
     area = np.append(np.where(closed, -1.0, area), -1.0)  # the last is that of the child -1
     nodes, children, here = [], [], np.array([tree.root])
     while here.size:
