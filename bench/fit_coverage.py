@@ -93,7 +93,7 @@ def light_of(scene, path, photons, device):
 
 
 def main(asked):
-    warnings.simplefilter("ignore", spadwarp.errors.SpadwarpWarning)
+    warnings.simplefilter("ignore", spadwarp.SpadwarpWarning)
     began, name, device, scene = time.perf_counter(), asked.scene, asked.device, load(asked.scene)
     calibrated = name == "harbour_5m"
     reflectance = scene.targets[0].reflectance

@@ -26,10 +26,10 @@ from pydantic_core import PydanticUndefined
 import spadwarp
 from spadwarp.cli import app
 from spadwarp.dataset import Distribution, Recipe
-from spadwarp.limits import Interval
 from spadwarp.scene import Scene
+from spadwarp.scene.grid import COEFFICIENTS
 from spadwarp.scene.sections import interval_of, parts_of
-from spadwarp.scene.tables import COEFFICIENTS
+from spadwarp.values import Interval
 
 FOLDER = Path(__file__).parent / "reference"
 MADE = "<!-- Made by docs/reference.py from the code. -->\n\n"
@@ -288,7 +288,8 @@ def python() -> str:
         homes.setdefault(home, []).append(name)
     for package in sorted(spadwarp._PACKAGES):
         module = import_module(f"spadwarp.{package}")
-        names = [name for name in getattr(module, "__all__", ()) if name not in spadwarp._HOMES]
+        inner = package in ("arrays", "values")  # of which users need what `spadwarp` itself names
+        names = [name for name in ([] if inner else getattr(module, "__all__", ())) if name not in spadwarp._HOMES]
         homes.setdefault(package, []).extend(name for name in names if callable(getattr(module, name)))
     homes = {home: names for home, names in homes.items() if names}
     parts = [

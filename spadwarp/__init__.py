@@ -31,9 +31,17 @@ _PACKAGES = {
     "benchmark": (),
     "doctor": (),
     "device": (),
-    "interop": ("to_pandas",),
+    "arrays": ("to_pandas",),
     "io": (),
-    "errors": ("ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"),
+    "values": (
+        "ArgumentError",
+        "ConfigError",
+        "DeviceError",
+        "FileError",
+        "MeshError",
+        "SpadwarpError",
+        "SpadwarpWarning",
+    ),
 }
 _HOMES = {name: package for package, names in _PACKAGES.items() for name in names}
 
@@ -41,16 +49,15 @@ _HOMES = {name: package for package, names in _PACKAGES.items() for name in name
 if TYPE_CHECKING:
     from spadwarp import (
         analytic as analytic,
+        arrays as arrays,
         benchmark as benchmark,
         checks as checks,
         dataset as dataset,
         denoise as denoise,
         device as device,
         doctor as doctor,
-        errors as errors,
         files as files,
         frames as frames,
-        interop as interop,
         inverse as inverse,
         io as io,
         mesh as mesh,
@@ -59,22 +66,24 @@ if TYPE_CHECKING:
         scene as scene,
         transport as transport,
         validate as validate,
+        values as values,
         viz as viz,
         water as water,
     )
     from spadwarp.analytic import budget as budget, plan as plan, simulate_analytic as simulate_analytic, sweep as sweep
     from spadwarp.checks import check as check
-    from spadwarp.errors import (
+    from spadwarp.values import (
         ArgumentError as ArgumentError,
         ConfigError as ConfigError,
         DeviceError as DeviceError,
         FileError as FileError,
         MeshError as MeshError,
         SpadwarpError as SpadwarpError,
+        SpadwarpWarning as SpadwarpWarning,
     )
     from spadwarp.files import export as export, load as load
     from spadwarp.frames import Frames as Frames, arrival_time as arrival_time, crlb as crlb, detect as detect
-    from spadwarp.interop import to_pandas as to_pandas
+    from spadwarp.arrays import to_pandas as to_pandas
     from spadwarp.inverse import fit as fit
     from spadwarp.parallel import Ray as Ray
     from spadwarp.result import Result as Result, load_result as load_result, merge as merge

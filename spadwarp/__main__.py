@@ -4,7 +4,7 @@ import gc
 import os
 import sys
 
-from spadwarp.errors import address_space, in_words, need_memory
+from spadwarp.values import address_space, in_words, need_memory
 
 
 def main() -> None:

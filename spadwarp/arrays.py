@@ -1,26 +1,26 @@
-"""Arrays of any kind: NumPy's, Warp's and torch's, which share memory where they can.
+"""Arrays of any kind: NumPy's, Warp's and torch's, which share memory where they can; labelled arrays and data frames.
 
 Who hands in torch tensors is given torch tensors, on their device, in the order of the torch stream that is current.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import shown
+from spadwarp.values import ArgumentError, FileError, shown
+
+__all__ = ["Variable", "as_warp", "caller_tallies", "histogram_rows", "in_torch_order", "is_torch", "labelled"]
+__all__ += ["on_host", "output_tensor", "real_array", "tensor_of", "to_pandas"]
 
 if TYPE_CHECKING:
     import torch
     import warp as wp
-
-__all__ = ["as_warp", "caller_tallies", "histogram_rows", "in_torch_order", "is_torch", "on_host", "output_tensor"]
-__all__ += ["real_array", "tensor_of"]
 
 
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
@@ -184,3 +184,59 @@ def caller_tallies(tallies: Any, *, shape: Sequence[int], device: wp.Device) -> 
     with in_torch_order(tallies):
         array.zero_()
     return array.reshape((size,))
+
+
+# ---- Labelled arrays (xarray) and data frames (pandas); both are optional.
+
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+
+Variable = tuple[tuple[str, ...], Any, str, str]
+"""Dimensions, values, unit ("1" for a plain number) and meaning of an array."""
+
+
+def labelled(
+    variables: Mapping[str, Variable], coordinates: Mapping[str, Variable], attributes: Mapping[str, Any]
+) -> xarray.Dataset:
+    """An xarray data set whose arrays have `units` and `long_name`. Raises `FileError` without xarray."""
+    try:
+        import xarray
+    except ModuleNotFoundError as error:
+        raise FileError("labelled arrays need xarray: pip install 'spadwarp[xarray]'") from error
+
+    def array(variable: Variable) -> tuple[tuple[str, ...], Any, dict[str, str]]:
+        dimensions, values, unit, meaning = variable
+        return dimensions, values, {"units": unit, "long_name": meaning}
+
+    return xarray.Dataset(
+        {name: array(variable) for name, variable in variables.items()},
+        coords={name: array(variable) for name, variable in coordinates.items()},
+        attrs=dict(attributes),
+    )
+
+
+def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
+    """Rows as a pandas DataFrame: a list of data classes or dicts, or a `Sweep`, whose values are the index.
+
+    For what `spadwarp.budget`, `sweep`, `check`, `scene.presets` and `analytic.plan` give: `to_pandas(budget(scene))`.
+
+    Raises:
+        FileError: pandas is not installed.
+        ArgumentError: Rows that are neither data classes nor dicts.
+    """
+    try:
+        import pandas
+    except ModuleNotFoundError as error:
+        raise FileError("data frames need pandas: pip install 'spadwarp[xarray]'") from error
+    index = None
+    if hasattr(rows, "rows") and hasattr(rows, "values") and hasattr(rows, "field"):
+        rows, index = rows.rows, pandas.Index(rows.values, name=rows.field)
+    elif isinstance(rows, Mapping):
+        rows = rows.values()
+    table: list[Any] = [dataclasses.asdict(row) if dataclasses.is_dataclass(row) else row for row in rows]  # type: ignore[arg-type]
+    if not all(isinstance(row, Mapping) for row in table):
+        raise ArgumentError(f"rows hold a {type(table[0]).__name__}; data classes or dicts are needed")
+    return pandas.DataFrame(table, index=index)

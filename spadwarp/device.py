@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spadwarp.errors import DeviceError, need_memory
-from spadwarp.limits import shown
+from spadwarp.values import DeviceError, need_memory, shown
 
 if TYPE_CHECKING:
     import warp as wp

@@ -72,24 +72,11 @@ def diagnose(
     """
     chosen = pick_device(device)
     problems: list[str] = []
-    packages = _packages(problems)
-    cache = _cache(problems)
-    tests: list[SelfTest] = []
-    seconds: dict[str, float] = {}
-    if self_test:
-        tests, seconds = _run_self_test(chosen.alias, progress or (lambda _: None))
-    return Diagnosis(
-        facts={
-            "System": _system(),
-            "Packages": packages,
-            "Devices": {entry["name"]: _device_text(entry) for entry in devices()},
-            "Kernel cache": cache,
-        },
-        gpu=_gpu_reasons(),
-        problems=problems,
-        tests=tests,
-        seconds=seconds,
-    )
+    packages, cache = _packages(problems), _cache(problems)
+    tests, seconds = _run_self_test(chosen.alias, progress or (lambda _: None)) if self_test else ([], {})
+    found = {entry["name"]: _device_text(entry) for entry in devices()}
+    facts = {"System": _system(), "Packages": packages, "Devices": found, "Kernel cache": cache}
+    return Diagnosis(facts=facts, gpu=_gpu_reasons(), problems=problems, tests=tests, seconds=seconds)
 
 
 # Facts
@@ -111,50 +98,40 @@ def _system() -> dict[str, str]:
 
 
 def _packages(problems: list[str]) -> dict[str, str]:
-    needed = {name: _version(name) or "MISSING" for name in NEEDED}
-    problems += [f"{name} is not installed: pip install spadwarp" for name in NEEDED if needed[name] == "MISSING"]
-    optional = {
-        name: _version(name) or f"not installed (optional: pip install 'spadwarp[{extra}]')"
-        for name, extra in OPTIONAL.items()
-    }
-    return needed | optional
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+    found = {}
+    for name in (*NEEDED, *OPTIONAL):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            if name in OPTIONAL:
+                found[name] = f"not installed (optional: pip install 'spadwarp[{OPTIONAL[name]}]')"
+            else:
+                found[name] = "MISSING"
+                problems.append(f"{name} is not installed: pip install spadwarp")
+    return found
 
 
 def _device_text(device: dict[str, Any]) -> str:
-    parts = [device["description"]]
-    if device["memory"]:
-        parts.append(f"{device['memory'] / 2**30:.1f} GiB")
-    if device["compute_capability"]:
-        parts.append(f"compute capability {device['compute_capability']}")
-    return ", ".join(parts) + (" (default)" if device["default"] else "")
+    memory, capability = device["memory"], device["compute_capability"]
+    size = f", {memory / 2**30:.1f} GiB" if memory else ""
+    newest = f", compute capability {capability}" if capability else ""
+    return f"{device['description']}{size}{newest}{' (default)' if device['default'] else ''}"
 
 
 def _cache(problems: list[str]) -> dict[str, str]:
     import warp as wp
 
-    folder = Path(str(wp.config.kernel_cache_dir))
+    folder, writable = Path(str(wp.config.kernel_cache_dir)), "yes"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        writable = "yes"
     except OSError as error:
         writable = "NO"
         problems.append(f"the kernel cache {folder} cannot be written ({error.strerror}): set WARP_CACHE_PATH")
-    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     modules = sum(path.is_dir() for path in folder.glob("*"))
-    return {
-        "folder": str(folder),
-        "holds": f"{modules} kernel modules, {sum(sizes) / 2**20:.1f} MiB",
-        "writable": writable,
-    }
+    return {"folder": str(folder), "holds": f"{modules} kernel modules, {size / 2**20:.1f} MiB", "writable": writable}
 
 
 def _dotted(version: int) -> str:
@@ -174,26 +151,28 @@ def _driver_cuda() -> int | None:
 
 
 def _gpu_reasons() -> list[str]:
+    """Why no GPU is used and what to do about it: the first thing that is missing."""
     import warp as wp
 
     if wp.is_cuda_available():
         return []
+    version, hidden = _driver_cuda(), os.environ.get("CUDA_VISIBLE_DEVICES")
     if not wp.get_cuda_toolkit_version():
-        return ["this build of Warp has no CUDA; the wheels for Linux and Windows on x86-64 and Linux on ARM have it"]
-    version = _driver_cuda()
-    hidden = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if version is None:
-        if Path("/proc/driver/nvidia").exists() or Path("/dev/nvidiactl").exists():
-            return [
-                "the system has an NVIDIA driver, but its library libcuda is not found: start a container with "
-                "--gpus all (NVIDIA Container Toolkit)"
-            ]
-        return ["no NVIDIA driver: an NVIDIA GPU needs driver R580 or newer; without one everything runs on the CPU"]
-    if version < _OLDEST_CUDA:
-        return [f"the driver runs CUDA {_dotted(version)}; Warp needs 13.0: driver R580 or newer"]
-    if hidden is not None and not hidden.strip("-1 "):
-        return [f"CUDA_VISIBLE_DEVICES = {hidden!r} hides the GPUs"]
-    return ["the driver finds no GPU: see the output of `nvidia-smi`"]
+        reason = "this build of Warp has no CUDA; the wheels for Linux and Windows on x86-64 and Linux on ARM have it"
+    elif version is None and (Path("/proc/driver/nvidia").exists() or Path("/dev/nvidiactl").exists()):
+        reason = (
+            "the system has an NVIDIA driver, but its library libcuda is not found: start a container with --gpus all "
+            "(NVIDIA Container Toolkit)"
+        )
+    elif version is None:
+        reason = "no NVIDIA driver: an NVIDIA GPU needs driver R580 or newer; without one everything runs on the CPU"
+    elif version < _OLDEST_CUDA:
+        reason = f"the driver runs CUDA {_dotted(version)}; Warp needs 13.0: driver R580 or newer"
+    elif hidden is not None and not hidden.strip("-1 "):
+        reason = f"CUDA_VISIBLE_DEVICES = {hidden!r} hides the GPUs"
+    else:
+        reason = "the driver finds no GPU: see the output of `nvidia-smi`"
+    return [reason]
 
 
 # Self-test: two small scenes whose answer is known
@@ -203,10 +182,11 @@ _PHOTONS = 400_000
 
 # A pencil beam at normal incidence on a plate in turbid water, seen by one pixel.
 _PENCIL = {"profile": "collimated", "beam_radius": 0.0, "position": [0.0, 0.0, 0.0]}
+_CAMERA = {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01}
 _PLATE = {
     "medium": {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.924},
     "laser": _PENCIL,
-    "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01},
+    "camera": _CAMERA,
     "gate": {"start_ns": 17.0, "bin_width_ps": 500.0, "bins": 8},
     "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}],
     "transport": {"axis_threshold": 1.0},
@@ -216,8 +196,8 @@ _PLATE = {
 _SLAB = {
     "medium": {"extinction": 1.0, "albedo": 0.9, "anisotropy": 0.75},
     "laser": _PENCIL,
+    "camera": _CAMERA,
     "domain": {"shape": "slab", "lower": [0.0, 0.0, 0.0], "upper": [0.0, 0.0, 2.0]},
-    "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01},
     "gate": {"start_ns": 0.0, "bin_width_ps": 1e6, "bins": 1},
     "transport": {"axis_threshold": 1.0, "termination": "roulette", "weight_cutoff": 0.05},
 }
@@ -267,20 +247,12 @@ def _run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[S
     arrive = math.exp(-plate.medium.extinction * 2.0)
     returned = 0.5 / math.pi * plate.camera.aperture_area / 2.0**2 * arrive
     ballistic = float(result.component("ballistic").sum()) / returned
-    tests = [
-        _compared("ballistic light from the plate", ballistic, arrive, math.sqrt(arrive * (1 - arrive) / _PHOTONS))
-    ]
-    for name, face, reference in (
-        ("reflected by the slab", "exit_z_low", _REFLECTED),
-        ("transmitted by the slab", "exit_z_high", _TRANSMITTED),
-    ):
-        weight = records.weight * records.ended(face)
-        error = float(weight.std()) / math.sqrt(_PHOTONS)
-        tests.append(_compared(name, float(weight.mean(dtype=float)), reference, math.hypot(error, _ROUNDING)))
+    error = math.sqrt(arrive * (1 - arrive) / _PHOTONS)
+    measured = [("ballistic light from the plate", ballistic, arrive, error)]
+    for part, face, reference in (("reflected", "low", _REFLECTED), ("transmitted", "high", _TRANSMITTED)):
+        weight = records.weight * records.ended(f"exit_z_{face}")
+        error = math.hypot(float(weight.std()) / math.sqrt(_PHOTONS), _ROUNDING)
+        measured.append((f"{part} by the slab", float(weight.mean(dtype=float)), reference, error))
+    tests = [SelfTest(*row, abs(row[1] - row[2]) < _LARGEST_Z * row[3]) for row in measured]
     difference = float(result.energy_report()["difference"])
-    tests.append(SelfTest("energy that is not accounted for", difference, 0.0, 0.0, difference == 0))
-    return tests, seconds
-
-
-def _compared(name: str, value: float, reference: float, standard_error: float) -> SelfTest:
-    return SelfTest(name, value, reference, standard_error, abs(value - reference) < _LARGEST_Z * standard_error)
+    return [*tests, SelfTest("energy that is not accounted for", difference, 0.0, 0.0, difference == 0)], seconds

@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 import spadwarp
 from spadwarp.frames import InstrumentResponse, read_histograms
 from spadwarp.scene import Detector
-from spadwarp.units import SPEED_OF_LIGHT
+from spadwarp.values import SPEED_OF_LIGHT
 from spadwarp.viz import style as viz
 
 Floats = NDArray[np.float64]

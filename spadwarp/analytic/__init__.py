@@ -3,12 +3,11 @@
 from typing import TYPE_CHECKING
 
 from spadwarp.analytic.eye_safety import *
-from spadwarp.analytic.file import *
 from spadwarp.analytic.model import *
 from spadwarp.analytic.planning import *
 from spadwarp.analytic.result import *
 from spadwarp.analytic.sweeps import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _modules = (eye_safety, file, model, planning, result, sweeps)
+    _modules = (eye_safety, model, planning, result, sweeps)
     __all__ = sorted(name for module in _modules for name in module.__all__)

@@ -17,21 +17,16 @@ Exposures are means over a 7 mm aperture in the middle of the beam, in clear wat
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_real
+from spadwarp.scene import Laser, Scene
 from spadwarp.scene.laser import load_profile
 from spadwarp.scene.scene import laser_port
+from spadwarp.values import ArgumentError, check_real
 
-if TYPE_CHECKING:
-    from spadwarp.scene import Laser, Scene
-
-__all__ = ["EyeLimit", "axis_fluence", "beam_axis_fluence", "eye_limit", "permissible_exposure", "scene_eye_limit"]
+__all__ = ["EyeLimit", "axis_fluence", "eye_limit", "permissible_exposure"]
 
 STANDARD = "IEC 60825-1:2014, Table A.1 and A.3, small source, 7 mm aperture; a guide, not a classification"
 
@@ -84,11 +79,12 @@ def permissible_exposure(duration: float, wavelength_nm: float) -> float:
     return min(thermal, c3 * max(100.0, duration))
 
 
-def eye_limit(laser: Laser, *, distance: float = 0.1, exposure: float = 100.0) -> EyeLimit:
+def eye_limit(of: Laser | Scene, *, distance: float = 0.1, exposure: float = 100.0) -> EyeLimit:
     """The largest pulse energy and average power of a laser within the MPE, and its hazard distance.
 
     Args:
-        laser: Its profile, divergence, wavelength, repetition rate and pulse duration; its energy for the distance.
+        of: A laser: its profile, divergence, wavelength, repetition rate and pulse duration; its energy for the
+            distance. Of a scene, whose laser may be behind a port: then for an eye in the water.
         distance: Of the eye from where the beam begins [m], ≥ 0; 0.1 m is that of the standard's third condition.
         exposure: [s], in [1e-6, 3e4]; 100 s is the standard's time base where nobody means to look into the beam,
             0.25 s the time within which one turns away from visible light.
@@ -97,17 +93,24 @@ def eye_limit(laser: Laser, *, distance: float = 0.1, exposure: float = 100.0) -
         ArgumentError: A value out of its range, or a wavelength outside 400 to 1050 nm.
         FileError: The image of a measured beam.
     """
-    distance = check_real("distance", distance, "[0, 1e9] m")
+    laser = of if isinstance(of, Laser) else of.laser
     exposure = check_real("exposure", exposure, "[1e-6, 3e4] s")
+    distance = check_real("distance", distance, "[0, 1e9] m")
     limit, criterion = _pulse_limit(laser, exposure)
     densest = _densest(laser)
-    energy = limit * _AREA / _share(laser, distance, densest)
     allowed = limit * _AREA / laser.pulse_energy  # share through the aperture
+
+    def is_within(bare: float) -> bool:
+        return _share(laser, bare, densest) <= allowed
+
     hazard = math.inf
-    if _share(laser, 0.0, densest) <= allowed:
+    if is_within(0.0):
         hazard = 0.0
-    elif _share(laser, _FARTHEST, densest) <= allowed:
-        hazard = _first(lambda other: _share(laser, other, densest) <= allowed, _FARTHEST)
+    elif is_within(_FARTHEST):
+        hazard = bare = _first(is_within, _FARTHEST)
+        if isinstance(of, Scene) and laser_port(of) is not None and of.beam.profile != "collimated":
+            hazard = _first(lambda other: as_if_bare(of, other) >= bare, 1e9)
+    energy = limit * _AREA / _share(laser, _bare(of, distance), densest)
     return EyeLimit(
         distance=distance,
         exposure=exposure,
@@ -118,11 +121,13 @@ def eye_limit(laser: Laser, *, distance: float = 0.1, exposure: float = 100.0) -
     )
 
 
-def axis_fluence(laser: Laser, distance: float) -> float:
+def axis_fluence(of: Laser | Scene, distance: float) -> float:
     """Energy of a pulse through a unit of area in the middle of the beam, over the pulse's energy [1/m²].
 
-    In clear water, at a distance [m] from where the beam begins; infinite for a pencil beam.
+    In clear water, at a distance [m] from where the beam begins; infinite for a pencil beam. Of a scene's laser behind
+    its port, if it has one.
     """
+    laser, distance = of if isinstance(of, Laser) else of.laser, _bare(of, distance)
     if laser.profile == "collimated":
         return 1.0 / (math.pi * laser.beam_radius**2) if laser.beam_radius > 0.0 else math.inf
     if laser.profile == "gaussian":
@@ -130,6 +135,10 @@ def axis_fluence(laser: Laser, distance: float) -> float:
     if laser.profile == "measured":
         return _densest(laser) / distance**2
     return 1.0 / (4.0 * math.pi * (math.sin(0.5 * laser.half_angle) * distance) ** 2)
+
+
+def _bare(of: Laser | Scene, distance: float) -> float:
+    return distance if isinstance(of, Laser) else as_if_bare(of, distance)
 
 
 def _pulse_limit(laser: Laser, exposure: float) -> tuple[float, str]:
@@ -188,19 +197,3 @@ def as_if_bare(scene: Scene, distance: float) -> float:
         return distance
     lead = float(port.enter(beam.position, beam.axis)[2])
     return 1.0 / math.sqrt(port.spread(beam.position, beam.axis, max(distance, lead + 1e-6)))
-
-
-def beam_axis_fluence(scene: Scene, distance: float) -> float:
-    """`axis_fluence` of a scene's laser, behind its port if it has one [1/m²]."""
-    return axis_fluence(scene.laser, as_if_bare(scene, distance))
-
-
-def scene_eye_limit(scene: Scene, *, distance: float, exposure: float) -> EyeLimit:
-    """`eye_limit` of a scene's laser, for an eye in the water if the laser is behind a port."""
-    limit = eye_limit(scene.laser, distance=as_if_bare(scene, distance), exposure=exposure)
-    if laser_port(scene) is None:
-        return limit
-    hazard = limit.hazard_distance
-    if 0.0 < hazard < math.inf and scene.beam.profile != "collimated":
-        hazard = _first(lambda other: as_if_bare(scene, other) >= limit.hazard_distance, 1e9)
-    return dataclasses.replace(limit, distance=distance, hazard_distance=hazard)

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import daylight_rate, phase_function, water_lines
 from spadwarp.scene.camera import to_world
@@ -27,6 +26,7 @@ from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import LinesOfSight, depth_per_time, lines_of_sight
 from spadwarp.transport.model import port_kind, port_parameters
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -131,7 +131,7 @@ def pixel_maps(
         raise ConfigError(
             f"analytic.count_law = 'per_frame_lu2024' needs alpha < 1; it reaches {largest:.4g} detections per pulse "
             "here, use 'per_frame'",
-            source=source_name(scene),
+            source=scene.source,
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = maps["signal"] / maps["backscatter"]
@@ -144,20 +144,15 @@ def response_sigma(scene: Scene) -> float:
     """Standard deviation of the Gaussian response, pulse ⊗ jitter [s]; raises `ConfigError` for other responses."""
     if scene.detector.irf != "gaussian":
         raise ConfigError(
-            f"detector.irf = {scene.detector.irf!r}: the analytic model needs 'gaussian'", source=source_name(scene)
+            f"detector.irf = {scene.detector.irf!r}: the analytic model needs 'gaussian'", source=scene.source
         )
     fwhm = math.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps) * 1e-12
     if not fwhm > 0:
         raise ConfigError(
             "laser.pulse_fwhm_ps and detector.jitter_fwhm_ps are both 0: the analytic model needs some width",
-            source=source_name(scene),
+            source=scene.source,
         )
     return fwhm / FWHM_PER_SIGMA
-
-
-def source_name(scene: Scene) -> str | None:
-    """The file of a scene, for an error."""
-    return str(scene.source) if scene.source else None
 
 
 def scene_optics(scene: Scene) -> tuple[Any, Any]:
@@ -178,14 +173,8 @@ def scene_optics(scene: Scene) -> tuple[Any, Any]:
 
 
 def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Map:
-    """Probability that a maximum-likelihood fit takes background for the return.
-
-    Args:
-        signal: Recorded photons of the return.
-        level: Of background per standard deviation of the response.
-        lengths: Of the gate in standard deviations.
-        device: Warp device.
-    """
+    """Probability that a maximum-likelihood fit takes background for the return: from recorded photons of the return,
+    and of background per standard deviation of the response, and the gate's length in these."""
     import warp as wp
 
     from spadwarp_kernels.analytic import outlier_probabilities
@@ -200,7 +189,7 @@ class _Model:
 
     def __init__(self, scene: Scene, views: Map, distances: Map, device: Any, start: float, stop: float) -> None:
         if problems := [text for text, is_met in _not_covered(scene).items() if is_met]:
-            raise ConfigError(problems, source=source_name(scene))
+            raise ConfigError(problems, source=scene.source)
         self.scene, self.device, self.lines = scene, device, water_lines(scene)
         self.lidar, self.optics = _lidar(scene, start, stop)
         # At 0, where the density may be infinite, that of 2e-5 rad.
@@ -340,13 +329,7 @@ _PIECES, _LINES = 400, 256
 
 def passed_by_grid(scene: Scene, views: Map, distances: Map) -> Map:
     """Part of the light that passes the cells on its way from the laser to points and on to the lens, over what passes
-    the medium without cells; exact for the cells.
-
-    Args:
-        scene: The scene.
-        views: Unit vectors `[P, 3]` in which the lens sees the points.
-        distances: From the lens along the line of sight, which a port bends, `[P]` [m].
-    """
+    the medium without cells; exact for the cells. Views `[P, 3]` and distances `[P]` [m] as in `pixel_maps`."""
     cells, c = grid_cells(scene.medium), scene.medium.extinction
     sights = lines_of_sight(scene, views)
     points = sights.points(distances)
@@ -386,14 +369,9 @@ def grid_backscatter(
 ) -> NDArray[np.float32]:
     """Detections per pulse and bin of light scattered once, `[P, T]`.
 
-    The beam's way to a point is taken to lose what the line of sight to it loses, by their lengths in the water, as it
-    does for a laser beside the camera.
-
-    Args:
-        scene: The scene.
-        views: Unit vectors in which the lens sees the pixels `[P, 3]`.
-        paths, cumulative, total: Table of `single_scatter_table` with a scattering coefficient of 1 / m everywhere.
-        gate: (start, stop) [s].
+    From the table of `single_scatter_table` with a scattering coefficient of 1 / m everywhere. The beam's way to a
+    point is taken to lose what the line of sight to it loses, by their lengths in the water, as it does for a laser
+    beside the camera.
     """
     bins = max(1, round((gate[1] - gate[0]) / scene.gate.bin_width))
     edges = np.linspace(*gate, bins + 1) * scene.medium.pulse_speed

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.eye_safety import EyeLimit, beam_axis_fluence, scene_eye_limit
-from spadwarp.analytic.model import false_peaks, source_name
+from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
+from spadwarp.analytic.model import false_peaks
 from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
-from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import (
     METHODS,
     Method,
@@ -31,14 +31,26 @@ from spadwarp.frames import (
 )
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.limits import SEED, check_choice, check_integer, check_real, shown
 from spadwarp.result import CHANNELS, Channel, analyser_channel, merge
 from spadwarp.scene import SceneLike, Transport, as_scene, noise_rate
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight, port_advance
 from spadwarp.transport import RunOptions, simulate, truth_maps
-from spadwarp.units import quantity, range_from_time, time_from_path, time_from_range, with_prefix
+from spadwarp.values import (
+    SEED,
+    ArgumentError,
+    ConfigError,
+    check_choice,
+    check_integer,
+    check_real,
+    quantity,
+    range_from_time,
+    shown,
+    time_from_path,
+    time_from_range,
+    with_prefix,
+)
 
 if TYPE_CHECKING:
     from spadwarp.frames import Frames
@@ -54,6 +66,14 @@ PILE_UP = 0.05
 """Detections per pulse of the brightest pixels up to which pile-up is small: the usual rule of 1 to 5 % (O'Connor &
 Phillips, Time-correlated single photon counting, 1984)."""
 
+_PROPOSED = (
+    "gate.start_ns",
+    "gate.bin_width_ps",
+    "gate.bins",
+    "laser.repetition_rate",
+    "laser.pulse_energy",
+    "detector.pulses_per_frame",
+)
 _SIDE = 16  # largest width and height of the window [pixels]
 _MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
 _MANY_PHOTONS = 100.0  # of the return, from which on the width of the response is the cheaper thing to improve
@@ -176,24 +196,19 @@ class Proposal:
     @property
     def values(self) -> dict[str, float | int]:
         """The proposed values by the names of the scene's fields."""
-        proposed = {
-            "gate": ("start_ns", "bin_width_ps", "bins"),
-            "laser": ("repetition_rate", "pulse_energy"),
-            "detector": ("pulses_per_frame",),
-        }
-        return {
-            f"{section}.{name}": getattr(getattr(self.scene, section), name)
-            for section, names in proposed.items()
-            for name in names
-        }
+        return {name: operator.attrgetter(name)(self.scene) for name in _PROPOSED}
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, in numbers and text that JSON can hold."""
-        fields = {name: value for name, value in vars(self).items() if name != "scene"}
-        for name in ("eye", "pilot"):
-            fields[name] = dataclasses.asdict(fields[name])
-        channels = {name: dataclasses.asdict(pilot) for name, pilot in self.channels.items()}
-        return {"values": self.values, **fields, "channels": channels}
+        fields = {one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name != "scene"}
+        return {"values": self.values, **_plain(fields)}
+
+
+def _plain(value: Any) -> Any:
+    """Dicts of dicts and data classes as dicts."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return dataclasses.asdict(value) if isinstance(value, EyeLimit | Pilot) else value
 
 
 def plan(
@@ -261,18 +276,15 @@ def plan(
         channel=channel,
         progress=progress,
     )
+    problem = ""
     if channel != "I" and not scene.camera.channels:
-        raise ConfigError(
-            f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'", source=source_name(scene)
-        )
-    if ranges is None:
+        problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'"
+    elif ranges is None:
         distance = truth_maps(scene, device=device).range
         if np.isnan(distance).all():
-            raise ConfigError(
-                "no target is in view: give one in [[targets]], or the ranges where it may be",
-                source=source_name(scene),
-            )
-        span = float(np.nanmin(distance)), float(np.nanmax(distance))
+            problem = "no target is in view: give one in [[targets]], or the ranges where it may be"
+        else:
+            span = float(np.nanmin(distance)), float(np.nanmax(distance))
     else:
         if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
             raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
@@ -280,7 +292,9 @@ def plan(
         if not 0 < span[0] <= span[1] < math.inf:
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
         scene = with_plane(scene, span[1])
-    proposal = planner.propose(scene, span, propose_gate(scene, span, planner.margin), photons)
+    if problem:
+        raise ConfigError(problem, source=scene.source)
+    proposal = planner.propose(with_gate(scene, span, planner.margin), span, photons)
     if not largest_range:
         return proposal
     largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
@@ -312,19 +326,16 @@ class _Planner:
     channel: Channel
     progress: Progress | None
 
-    def propose(
-        self, scene: Scene, span: tuple[float, float], gate: Gate, photons: int, *, even: bool = False
-    ) -> Proposal:
+    def propose(self, scene: Scene, span: tuple[float, float], photons: int, *, even: bool = False) -> Proposal:
         """The experiment with a target at these ranges: light, pulse energy, pulses, error; `even` as in `measure`."""
-        rate, target = scene.laser.repetition_rate, scene
-        if scene.detector.wrap and rate > gate.largest_rate:
-            rate = _rounded_down(gate.largest_rate)
-        fields = {"start_ns": gate.start_ns, "bins": gate.bins}
-        scene = scene.with_overrides(gate=fields, laser={"repetition_rate": rate}, transport={"max_path": None})
+        rate, largest_rate = scene.laser.repetition_rate, 1.0 / scene.gate.stop
+        if scene.detector.wrap and rate > largest_rate:
+            rate = _rounded_down(largest_rate)
+            scene = scene.with_overrides(laser={"repetition_rate": rate})
         small = window(scene, self.device)
         runs = trace(small, photons, self.seed, self.device, None if even else self.progress)
         pilot = measure(runs, scene, self.device, even=even, channel=self.channel)
-        eye = scene_eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
+        eye = eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
         piled = scene.laser.pulse_energy * max(PILE_UP - pilot.noise, 0.0) / pilot.brightest
         allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": eye.pulse_energy})
         energy_limit = min(allowed, key=allowed.__getitem__)
@@ -344,10 +355,10 @@ class _Planner:
             detector={"pulses_per_frame": pulses}, analytic={"pulses_per_depth_frame": depth_pulses}
         )
         compared = CHANNELS if small.camera.channels and not even else ()
-        line = axis_line(target)
-        optical_depth = target.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
-        fluence = beam_axis_fluence(scene, span[0]) * math.exp(-optical_depth)
-        index, advance = scene.medium.group_index, port_advance(target)
+        line = axis_line(scene)
+        optical_depth = scene.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
+        fluence = axis_fluence(scene, span[0]) * math.exp(-optical_depth)
+        index, advance = scene.medium.group_index, port_advance(scene)
         return Proposal(
             scene=scene,
             depth_error=self.depth_error,
@@ -357,7 +368,7 @@ class _Planner:
             optical_depth=optical_depth,
             gate_range=tuple(range_from_time(end, index) + advance for end in (scene.gate.start, scene.gate.stop)),
             unambiguous_range=range_from_time(1.0 / rate, index) + advance,
-            largest_rate=gate.largest_rate,
+            largest_rate=largest_rate,
             pile_up_energy=piled,
             eye=eye,
             energy_limit=energy_limit,
@@ -368,7 +379,7 @@ class _Planner:
             reached=purpose in ("depth error", "false peaks") and frame_time <= self.time,
             terms=terms,
             limit=limit,
-            advice=self._advice(limit, purpose, frame_time, rate, gate.largest_rate),
+            advice=self._advice(limit, purpose, frame_time, rate, largest_rate),
             pilot=pilot,
             channels={name: measure(runs, scene, self.device, channel=name) for name in compared},
         )
@@ -382,10 +393,8 @@ class _Planner:
         fixed = math.hypot(pilot.floor[self.method], pilot.pile_up[self.method])
         left = math.sqrt(max(self.depth_error**2 - fixed**2, 0.0))
         purpose = "depth error" if left > 0 else "floor"
-        wanted, peaks = (
-            (pilot.bound / (left or fixed / 3.0)) ** 2,
-            _pulses_without_false_peaks(scene, pilot, self.device),
-        )
+        wanted = (pilot.bound / (left or fixed / 3.0)) ** 2
+        peaks = _pulses_without_false_peaks(scene, pilot, self.device)
         if peaks > wanted:
             wanted, purpose = peaks, "false peaks" if left > 0 else "floor"
         if not wanted <= _MOST_PULSES:
@@ -425,13 +434,13 @@ class _Planner:
                 return False
             if self.progress is not None:
                 self.progress(f"a plane at {distance:.3g} m", 0, 0)
-            target, span = with_plane(scene, distance), (distance, distance)
-            gate = propose_gate(target, span, self.margin)
-            if scene.detector.wrap and gate.largest_rate < scene.laser.repetition_rate:
+            span = (distance, distance)
+            gated = with_gate(with_plane(scene, distance), span, self.margin)
+            if scene.detector.wrap and 1.0 / gated.gate.stop < scene.laser.repetition_rate:
                 reason = "repetition rate"
                 return False
             try:
-                proposal = self.propose(target, span, gate, photons, even=True)
+                proposal = self.propose(gated, span, photons, even=True)
             except ConfigError:
                 reason = "no light of the target"
                 return False
@@ -456,16 +465,9 @@ class _Planner:
 # Targets and gates
 
 
-class Gate(NamedTuple):
-    """Start [ns], as a file holds it, bins, and the rate up to which a pulse's gate ends before the next pulse [Hz]."""
-
-    start_ns: float
-    bins: int
-    largest_rate: float
-
-
-def propose_gate(scene: Scene, span: tuple[float, float], margin: float) -> Gate:
-    """A gate for returns from a span of ranges [m], with `margin` [m] and the instrument response on both sides.
+def with_gate(scene: Scene, span: tuple[float, float], margin: float) -> Scene:
+    """The scene with a gate for returns from a span of ranges [m], with `margin` [m] and the instrument response on
+    both sides. Its end is the least time between pulses.
 
     The bins keep their width. Raises `ConfigError` for a gate of more than a million bins.
     """
@@ -481,9 +483,9 @@ def propose_gate(scene: Scene, span: tuple[float, float], margin: float) -> Gate
         raise ConfigError(
             f"gate.bin_width_ps = {scene.gate.bin_width_ps:g}: a gate for {span[0]:.4g} to {span[1]:.4g} m takes "
             f"{bins} bins, more than {_MOST_BINS}",
-            source=source_name(scene),
+            source=scene.source,
         )
-    return Gate(start_ns, bins, 1.0 / (start_ns * 1e-9 + bins * width))
+    return scene.with_overrides(gate={"start_ns": start_ns, "bins": bins}, transport={"max_path": None})
 
 
 def with_plane(scene: Scene, distance: float) -> Scene:
@@ -541,18 +543,15 @@ def trace(
     """Two runs of half the photons each."""
     half = max(1, photons // 2)
 
-    def report(stage: str, done: int, total: int) -> None:
-        if progress is not None and total:
-            progress(stage, traced + done, 2 * half)
-        elif progress is not None and not traced:
-            progress(stage, done, total)
+    def half_run(first: int) -> Result:
+        def report(stage: str, done: int, total: int) -> None:
+            if progress is not None and (total or not first):
+                progress(stage, first + done if total else done, 2 * half if total else total)
 
-    runs = []
-    for traced in (0, half):
-        run = RunOptions(first_photon=traced)
-        options: dict[str, Any] = {"run": run, "seed": seed, "device": device, "progress": report}
-        runs.append(simulate(scene, photons=half, **options))
-    return runs[0], runs[1]
+        options: dict[str, Any] = {"seed": seed, "device": device, "progress": report}
+        return simulate(scene, photons=half, run=RunOptions(first_photon=first), **options)
+
+    return half_run(0), half_run(half)
 
 
 def measure(
@@ -569,9 +568,11 @@ def measure(
     `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
     its modulus.
     """
-    first, second = (
-        analyser_channel(dataclasses.replace(run, scene=_as_traced(run.scene, scene)), channel) for run in runs
-    )
+    # The traced scene with what a detector sees of the wanted one.
+    names = ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")
+    laser = runs[0].scene.laser.model_copy(update={name: getattr(scene.laser, name) for name in names})
+    seen_by = runs[0].scene.model_copy(update={"laser": laser, "detector": scene.detector})
+    first, second = (analyser_channel(dataclasses.replace(run, scene=seen_by), channel) for run in runs)
     both = merge([first, second])
     clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
     frames, clear_frames, *half_frames = (
@@ -584,7 +585,7 @@ def measure(
     if not seen.any():
         raise ConfigError(
             "no light of the target reaches the pixels near the axis: `spadwarp check` says why",
-            source=source_name(scene),
+            source=scene.source,
         )
 
     def median(values: Any) -> float:
@@ -627,14 +628,6 @@ def measure(
         level=median(level),
         photons=both.photons,
     )
-
-
-def _as_traced(traced: Scene, wanted: Scene) -> Scene:
-    """The traced scene with what a detector sees of the wanted one."""
-    laser = traced.laser.model_copy(
-        update={name: getattr(wanted.laser, name) for name in ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")}
-    )
-    return traced.model_copy(update={"laser": laser, "detector": wanted.detector})
 
 
 def _depth_error(result: Result, frames: Frames, histogram: Any, method: Any, device: str | None) -> Floats:

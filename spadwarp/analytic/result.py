@@ -1,28 +1,83 @@
-"""The analytic simulator: maps of a scene by the model, and depth frames drawn from them, without tracing photons."""
+"""The analytic simulator: maps of a scene by the model, depth frames drawn from them, and their file."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, scene_optics, source_name, warn_of_model
+from spadwarp.analytic.model import (
+    BackscatterTable,
+    Map,
+    pixel_maps,
+    response_sigma,
+    scene_optics,
+    warn_of_model,
+)
+from spadwarp.arrays import labelled
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, ConfigError, kernel_errors
-from spadwarp.limits import SEED, check_integer
+from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
+from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, kernel_errors
 
-__all__ = ["AnalyticResult", "background_photons", "simulate_analytic"]
+if TYPE_CHECKING:
+    import xarray
 
+__all__ = ["AnalyticFile", "AnalyticResult", "simulate_analytic"]
+
+_FORMAT, _FORMAT_VERSION = "spadwarp analytic", 1
 _PART_PIXELS = 1 << 28  # of frames that a GPU holds at a time: 1.3 GB
+_PART_BYTES = 1 << 28  # of frames that are held at a time while a file is written
+_PACKED = {"compression": "gzip", "shuffle": True, "compression_opts": 1}
+_READ_ME = (
+    "Depth frames [frame, height, width] in metres along z, NaN for no estimate; labels: the pixel reports background "
+    "light. maps/: signal, backscatter and alpha are expected detections per pulse within the gate, arrival and "
+    "sigma_time are seconds, sigma_depth metres, fisher 1/s^2 per detected photon. "
+    "Camera frame: +x right, +y down, +z forward."
+)
+_MAPS = {
+    "signal": "1",
+    "arrival": "s",
+    "backscatter": "1",
+    "alpha": "1",
+    "fisher": "s^-2",
+    "sigma_time": "s",
+    "sigma_depth": "m",
+    "signal_to_backscatter": "1",
+    "background_level": "1",
+    "outlier_probability": "1",
+    "background_probability": "1",
+}
+# Dimensions, unit and meaning of the arrays of a file, by name.
+_ARRAYS = {
+    **{f"maps/{name}": (PIXELS, unit, name.replace("_", " ")) for name, unit in _MAPS.items()},
+    "truth/depth": (PIXELS, "m", "true depth"),
+    "truth/range": (PIXELS, "m", "true range"),
+    "truth/normal": ((*PIXELS, "axis"), "1", "true normal"),
+    "truth/reflectance": (PIXELS, "1", "true reflectance"),
+    "depth": (("frame", *PIXELS), "m", "planar depth of the frame"),
+    "labels": (("frame", *PIXELS), "1", "whether the pixel reports background"),
+}
+# Names of the labelled arrays, and in the file.
+_LABELLED = {name: f"maps/{name}" for name in _MAPS} | {
+    "true_depth": "truth/depth",
+    "true_range": "truth/range",
+    "reflectance": "truth/reflectance",
+    "depth": "depth",
+    "label": "labels",
+}
+
+
+def _coordinates(frames: int, shape: tuple[int, ...]) -> dict[str, Coordinate]:
+    return {"frame": (np.arange(frames), "1", "number of the frame"), **image_coordinates(*shape)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -90,12 +145,6 @@ class AnalyticResult:
 
         return spadwarp.viz.html(self)
 
-    def to_xarray(self) -> Any:
-        """Maps, truth and frames with coordinates and units: see `spadwarp.analytic.to_xarray`."""
-        import spadwarp
-
-        return spadwarp.analytic.to_xarray(self)
-
     @kernel_errors()
     def sample(
         self, frames: int, *, first: int = 0, seed: int | None = None, device: Any = None
@@ -110,17 +159,25 @@ class AnalyticResult:
 
         device = pick_device(device)
         shape, pixels = self.truth.depth.shape, self.truth.depth.size
-        inputs, (optics, ports) = self._inputs(device), scene_optics(self.scene)
+        optics, ports = scene_optics(self.scene)
         speed, gate = self.scene.medium.pulse_speed, self.scene.gate
-        depth = np.empty((frames, *shape), np.float32)
-        labels = np.empty((frames, *shape), np.bool_)
+        depth, labels = np.empty((frames, *shape), np.float32), np.empty((frames, *shape), np.bool_)
+        view, in_water = pixel_directions(self.scene.camera), lines_of_sight(self.scene).direction
+        # No bound is worse than a guess anywhere in the gate.
+        sigma = np.minimum(self.sigma_depth, gate_deviation(self.scene, in_water))
+        values = (np.where(np.isnan(self.sigma_depth), np.nan, self.truth.depth), sigma, self.background_probability)
+        rows = (*(one.reshape(-1) for one in values), self._flat_share, *self._table)
+        inputs: list[Any] = [
+            wp.array(np.ascontiguousarray(one, np.float32), dtype=kind, device=device)
+            for one, kind in ((view.reshape(-1, 3), wp.vec3), *((row, wp.float32) for row in rows))
+        ]
         # On the CPU kernels write into the result itself; a GPU works in parts.
         part = max(frames, 1) if device.is_cpu else max(_PART_PIXELS // pixels, 2)
         for start in range(0, frames, part):
             stop = min(start + part, frames)
-            rows: list[Any] = [
-                wp.array(values[start:stop].reshape(stop - start, pixels), dtype=kind, device="cpu", copy=False)
-                for values, kind in ((depth, wp.float32), (labels, wp.bool))
+            out: list[Any] = [
+                wp.array(whole[start:stop].reshape(stop - start, pixels), dtype=kind, device="cpu", copy=False)
+                for whole, kind in ((depth, wp.float32), (labels, wp.bool))
             ]
             drawn = kernels.sample_frames(
                 *inputs,
@@ -131,45 +188,80 @@ class AnalyticResult:
                 first_frame=first + start,
                 frames=stop - start,
                 seed=self.seed if seed is None else seed,
-                out=(rows[0], rows[1]) if device.is_cpu else None,
+                out=(out[0], out[1]) if device.is_cpu else None,
             )
             if not device.is_cpu:
-                for row, array in zip(rows, drawn, strict=True):
+                for row, array in zip(out, drawn, strict=True):
                     wp.copy(row, array)
                 wp.synchronize_device(device)
         return depth, labels
 
-    def _inputs(self, device: Any) -> list[Any]:
-        """Arrays of the sampler on the device: a value a pixel, and the table of backscatter."""
-        import warp as wp
+    def _array(self, stored: str) -> NDArray[Any]:
+        """An array of the file by its name."""
+        section, _, name = stored.rpartition("/")
+        values: NDArray[Any] = getattr(self.truth if section == "truth" else self, name)
+        return values
 
-        def put(values: NDArray[Any], kind: Any = wp.float32) -> Any:
-            return wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=device)
+    def to_xarray(self) -> xarray.Dataset:
+        """Maps and truth (y, x) and depth frames (frame, y, x) with coordinates and units.
 
-        view, in_water = pixel_directions(self.scene.camera), lines_of_sight(self.scene).direction
-        return [
-            put(view.reshape(-1, 3), wp.vec3),
-            put(np.where(np.isnan(self.sigma_depth), np.nan, self.truth.depth).reshape(-1)),
-            # No bound is worse than a guess anywhere in the gate.
-            put(np.minimum(self.sigma_depth, gate_deviation(self.scene, in_water)).reshape(-1)),
-            put(self.background_probability.reshape(-1)),
-            put(self._flat_share),
-            put(self._table.paths),
-            put(self._table.cumulative),
-        ]
+        Raises:
+            FileError: xarray is not installed.
+        """
+        variables = {name: (_ARRAYS[at][0], self._array(at), *_ARRAYS[at][1:]) for name, at in _LABELLED.items()}
+        axes = _coordinates(len(self.depth), self.truth.depth.shape)
+        coordinates = {name: ((name,), *axes[name]) for name in ("frame", *PIXELS)}
+        return labelled(variables, coordinates, {"seed": str(self.seed), "scene": self.scene.to_toml()})
 
     def save(self, path: str | Path, *, frames: int | None = None, device: Any = None) -> Path:
-        """Writes everything to one HDF5 file, whole or not at all: see `spadwarp.analytic.save_analytic`."""
-        import spadwarp
+        """Writes maps, truth, frames and scene to one HDF5 file, whole or not at all; returns its path.
 
-        return spadwarp.analytic.save_analytic(self, path, frames=frames, device=device)
+        Args:
+            path: The file.
+            frames: Number of frames to draw and write in parts, however many; default: those that the result holds.
+            device: Warp device that draws them.
 
+        Raises:
+            FileError: The file cannot be written.
+        """
+        from spadwarp import __version__
 
-def background_photons(scene: Scene, maps: dict[str, Map]) -> tuple[Map, Map]:
-    """Expected background photons per pulse within the gate, and the part of them that is flat over the gate, `[P]`."""
-    dark = (scene.detector.noise_rate + maps["daylight"]) * (scene.gate.stop - scene.gate.start)
-    noise = maps["backscatter"] + dark
-    return noise, np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
+        if frames is not None:
+            frames = check_integer("frames", frames, "[0, 2147483647]")
+        count, shape, scene = len(self.depth) if frames is None else frames, self.truth.depth.shape, self.scene
+        attributes = {
+            "format": _FORMAT,
+            "format_version": _FORMAT_VERSION,
+            "read_me": _READ_ME,
+            "version": __version__,
+            "source": str(scene.source or ""),
+            "seed": str(self.seed),
+            "form": scene.analytic.form,
+            "backscatter": scene.analytic.backscatter,
+            "count_law": scene.analytic.count_law,
+            "response_sigma": response_sigma(scene),
+            "gate_start": scene.gate.start,
+            "bin_width": scene.gate.bin_width,
+            "bins": scene.gate.bins,
+            "group_index": scene.medium.group_index,
+        }
+        with write_hdf5(path) as file:
+            file.attrs.update(attributes)
+            file.create_dataset("config", data=scene.to_toml())
+            for name, (dimensions, _, _) in _ARRAYS.items():
+                if frames is None or "frame" not in dimensions:
+                    values = self._array(name)
+                    file.create_dataset(name, data=values, **(_PACKED if values.size else {}))
+            if frames is not None:
+                packed = {"chunks": (1, *shape), **_PACKED} if frames else {}
+                depth = file.create_dataset("depth", (frames, *shape), np.float32, **packed)
+                labels = file.create_dataset("labels", (frames, *shape), np.bool_, **packed)
+                part = max(1, _PART_BYTES // (5 * self.truth.depth.size))
+                for first in range(0, frames, part):
+                    stop = min(first + part, frames)
+                    depth[first:stop], labels[first:stop] = self.sample(stop - first, first=first, device=device)
+            name_dimensions(file, _coordinates(count, shape), _ARRAYS)
+        return Path(path)
 
 
 def simulate_analytic(
@@ -223,14 +315,13 @@ def simulate_analytic(
         raise ConfigError(
             f"gate [{scene.gate.start * 1e9:.4g}, {scene.gate.stop * 1e9:.4g}) ns holds no return; "
             f"the target's arrive from {times.min():.4g} to {times.max():.4g} ns",
-            source=source_name(scene),
+            source=scene.source,
         )
-    probability, flat = _background(scene, maps)
+    maps["background_probability"], flat = _background(scene, maps)
     result = AnalyticResult(
         scene=scene,
         truth=truth,
         **{name: values.reshape(shape) for name, values in maps.items()},
-        background_probability=probability.reshape(shape),
         depth=np.empty((0, *shape), np.float32),
         labels=np.empty((0, *shape), np.bool_),
         seed=seed,
@@ -245,7 +336,10 @@ def _background(scene: Scene, maps: dict[str, Map]) -> tuple[Map, Map]:
     """Probability that a pixel reports a background photon, and the part of these that is flat over the gate."""
     fraction, estimated = scene.analytic.backscatter_fraction, maps["fisher"] > 0
     if fraction is None:
-        return np.where(estimated, maps["outlier_probability"], 0.0), background_photons(scene, maps)[1]
+        dark = (scene.detector.noise_rate + maps["daylight"]) * (scene.gate.stop - scene.gate.start)
+        noise = maps["backscatter"] + dark
+        flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
+        return np.where(estimated, maps["outlier_probability"], 0.0), flat
     if scene.analytic.backscatter == "constant":  # the fraction alone matters, the rate may be 0
         return np.where(estimated, fraction, 0.0), np.ones(estimated.shape)
     return np.where(estimated & (maps["backscatter"] > 0), fraction, 0.0), np.zeros(estimated.shape)
@@ -285,3 +379,68 @@ def _check_truth(truth: Truth, scene: Scene) -> None:
             raise ArgumentError(f"truth.{name} = {values[wrong]} at pixel ({row}, {column}) is outside {interval}")
     if not np.isfinite(truth.normal[hit]).all():
         raise ArgumentError("truth.normal is not finite where truth.depth is")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class AnalyticFile:
+    """A file of the analytic simulator; depth frames are read when they are asked for, the rest is in memory.
+
+    Attributes:
+        path: The file.
+        frames: Their number.
+        seed: Of the frames.
+        scene: The scene.
+        truth: Depth, range, normal and reflectance.
+        maps: Name → float64 `[H, W]`, as the attributes of `AnalyticResult`.
+    """
+
+    path: Path
+    frames: int
+    seed: int
+    scene: Scene
+    truth: Truth
+    maps: dict[str, NDArray[np.float64]]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Opens a file that `AnalyticResult.save` wrote. Raises `FileError`."""
+        with read_hdf5(path, _FORMAT, version=_FORMAT_VERSION) as file:
+            scene = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
+            shape = scene.camera.height, scene.camera.width
+            sides = dict(zip((*PIXELS, "axis"), (*shape, 3), strict=True))
+            arrays: dict[str, dict[str, Any]] = {"maps": {}, "truth": {}}
+            for stored, (dimensions, _, _) in _ARRAYS.items():
+                section, _, name = stored.rpartition("/")
+                if section:
+                    kind = np.float64 if section == "maps" else np.float32
+                    arrays[section][name] = file.array(stored, kind, tuple(sides[side] for side in dimensions))
+            count = len(file.stored("depth", np.float32, (None, *shape)))
+            file.stored("labels", np.bool_, (count, *shape))
+            return cls(
+                path=Path(path),
+                frames=count,
+                seed=file.integer("seed"),
+                scene=scene,
+                truth=Truth(**arrays["truth"]),
+                maps=arrays["maps"],
+            )
+
+    def __repr__(self) -> str:
+        height, width = self.truth.depth.shape
+        return f"AnalyticFile({self.path}: {self.frames} depth frames, {width} x {height} pixels)"
+
+    def depth(self, frame: int | None = None) -> NDArray[np.float32]:
+        """Depth of one frame `[H, W]`, or of all `[frames, H, W]` [m]; NaN for no estimate."""
+        return self._read("depth", np.float32, frame)
+
+    def labels(self, frame: int | None = None) -> NDArray[np.bool_]:
+        """Whether pixels report a background photon, `[H, W]` or `[frames, H, W]`."""
+        return self._read("labels", np.bool_, frame)
+
+    def _read(self, name: str, kind: Any, frame: int | None) -> NDArray[Any]:
+        if frame is not None and not 0 <= frame < self.frames:
+            raise ArgumentError(f"frame = {frame} is outside [0, {self.frames}), the frames of {self.path}")
+        with read_hdf5(self.path, _FORMAT) as file:
+            return np.asarray(
+                file.stored(name, kind, (self.frames, *self.truth.depth.shape))[... if frame is None else frame]
+            )

@@ -15,19 +15,26 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, source_name, warn_of_model
+from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, warn_of_model
 from spadwarp.analytic.result import simulate_analytic
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
 from spadwarp.io.text import parse_toml
-from spadwarp.limits import check_choice, check_integer, check_real, parse_number, shown
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
-from spadwarp.scene.messages import locate
+from spadwarp.scene.document import locate, parse_key
 from spadwarp.scene.sections import field_unit, takes_integers
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight, pixel_directions
-from spadwarp.scene.tables import parse_key
 from spadwarp.transport import truth_maps
-from spadwarp.units import quantity
+from spadwarp.values import (
+    ArgumentError,
+    ConfigError,
+    SpadwarpWarning,
+    check_choice,
+    check_integer,
+    check_real,
+    parse_number,
+    quantity,
+    shown,
+)
 
 __all__ = [
     "OUTLIERS",
@@ -237,7 +244,7 @@ def central_pixel(scene: Scene, truth: Truth) -> tuple[Any, ...]:
     """Row and column of the target pixel nearest to the optical axis. Raises `ConfigError` without any."""
     hit = ~np.isnan(truth.depth)
     if not hit.any():
-        raise ConfigError("no target is in view", source=source_name(scene))
+        raise ConfigError("no target is in view", source=scene.source)
     off_axis = np.where(hit, -pixel_directions(scene.camera)[..., 2], np.inf)
     return np.unravel_index(np.argmin(off_axis), off_axis.shape)
 
@@ -296,8 +303,7 @@ def _central_row(scene: Scene, device: str | None) -> BudgetRow:
     warn_of_model(scene, stacklevel=4)
     truth = truth_maps(scene)
     pixel = central_pixel(scene, truth)
-    distance = np.array([float(truth.range[pixel])])
-    return axis_rows(scene, None, distance, float(truth.reflectance[pixel]), device)[0]
+    return axis_rows(scene, None, np.array([float(truth.range[pixel])]), float(truth.reflectance[pixel]), device)[0]
 
 
 def _depth_error(scene: Scene, device: str | None) -> DepthErrorRow:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from spadwarp.units import path_from_time, time_from_path
+from spadwarp.values import path_from_time, time_from_path
 
 __all__ = ["CASES", "GROUPS", "Case"]
 
@@ -98,17 +98,8 @@ def _plane() -> dict[str, Any]:
 
 def _spheres() -> list[dict[str, Any]]:
     """Four by three spheres of 81 920 faces each."""
-    return [
-        {
-            "builtin": "sphere",
-            "size": 0.75,
-            "subdivisions": 3,
-            "translation": [0.9 * (i - 1.5), 0.9 * (j - 1.0), 5.0],
-            "reflectance": 0.5,
-        }
-        for j in range(3)
-        for i in range(4)
-    ]
+    sphere = {"builtin": "sphere", "size": 0.75, "subdivisions": 3, "reflectance": 0.5}
+    return [{**sphere, "translation": [0.9 * (i - 1.5), 0.9 * (j - 1.0), 5.0]} for j in range(3) for i in range(4)]
 
 
 def _cube60() -> dict[str, Any]:
@@ -160,27 +151,19 @@ CASES: dict[str, Case] = {
 
 def _scaling(cuda: bool) -> list[Case]:
     """How cost and memory grow with photons, faces and bins; to larger sizes on a GPU than on a CPU."""
-    base = _at_5m(_staircase())
     box = {"builtin": "box", "size": [3.0, 3.0, 0.5], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
     images = [(32, 32, 256), (64, 64, 1024), (128, 128, 1024), (256, 192, 1024), (256, 192, 4096)]
-    cases = [
-        *(
-            Case(f"photons_1e{power}", f"staircase_5m, 1e{power} photons", scene=base, photons=10**power)
-            for power in range(5, 11 if cuda else 8)
-        ),
-        *(
-            Case(f"faces_{12 * 4**n}", f"a box of {12 * 4**n} faces", scene=_at_5m([{**box, "subdivisions": n}]))
-            for n in (0, 2, 4, 6, 8)
-        ),
-        *(
-            Case(
-                f"bins_{width}x{height}x{bins}",
-                f"staircase_5m into {width} x {height} x {bins} bins",
-                scene=_at_5m(_staircase(), width=width, height=height, bins=bins),
-            )
-            for width, height, bins in (images if cuda else images[:3])
-        ),
-    ]
+    cases = []
+    for power in range(5, 11 if cuda else 8):
+        text = f"staircase_5m, 1e{power} photons"
+        cases.append(Case(f"photons_1e{power}", text, scene=_at_5m(_staircase()), photons=10**power))
+    for n in (0, 2, 4, 6, 8):
+        faces = 12 * 4**n
+        cases.append(Case(f"faces_{faces}", f"a box of {faces} faces", scene=_at_5m([{**box, "subdivisions": n}])))
+    for width, height, bins in images if cuda else images[:3]:
+        scene = _at_5m(_staircase(), width=width, height=height, bins=bins)
+        text = f"staircase_5m into {width} x {height} x {bins} bins"
+        cases.append(Case(f"bins_{width}x{height}x{bins}", text, scene=scene))
     return [replace(case, error=False, time_limit=2.0) for case in cases]
 
 

@@ -17,18 +17,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spadwarp.analytic import simulate_analytic
 from spadwarp.benchmark.cases import CASES, GROUPS, Case
 from spadwarp.device import core_count, nvidia_driver, pick_device, processor_name
-from spadwarp.errors import FileError
 from spadwarp.frames import detect
-from spadwarp.limits import check_choice, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import provenance, simulate, trace, truth_maps
 from spadwarp.transport.model import build_model, transport_spec
+from spadwarp.values import FileError, check_choice, check_integer
 
 if TYPE_CHECKING:
     import warp as wp
@@ -102,8 +100,8 @@ def load_report(path: str | Path) -> dict[str, Any]:
         raise FileError(f"{path}: not JSON: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT or not isinstance(stored.get("results"), list):
         raise FileError(f"{path}: not a file that `spadwarp bench --json` wrote")
-    if stored.get("format_version") != FORMAT_VERSION:
-        raise FileError(f"{path}: format_version = {stored.get('format_version')} is not {FORMAT_VERSION}")
+    if (version := stored.get("format_version")) != FORMAT_VERSION:
+        raise FileError(f"{path}: format_version = {version} is not {FORMAT_VERSION}")
     needed = {field.name for field in fields(BenchResult)}
     if any(not isinstance(row, dict) or not needed <= row.keys() for row in stored["results"]):
         raise FileError(f"{path}: a result lacks one of {', '.join(sorted(needed))}")
@@ -127,10 +125,7 @@ def _commit() -> str | None:
 
 # Runs
 
-# Photons of one timed run.
-CUDA_PHOTONS = 1 << 26
-CPU_PHOTONS_PER_CORE = 1 << 18
-
+CUDA_PHOTONS, CPU_PHOTONS_PER_CORE = 1 << 26, 1 << 18  # of one timed run
 _LAUNCH = 1 << 26  # the most photons of one launch
 _CHECK_PHOTONS = 1 << 20  # whose terminal states are kept for the check of a mean
 _SIGMAS = 4.0  # beyond which a check fails: one correct run in 16 000
@@ -167,15 +162,99 @@ def run(
     photons = None if photons is None else check_integer("photons", photons, "[1, 1000000000000]")
     repeats = check_integer("repeats", repeats, "[1, 1000]")
     wp_device = pick_device(device)
-    chosen = [case for name in names for case in (GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]])]
     results = []
-    for case in chosen:
+    for case in (
+        case for name in names for case in (GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]])
+    ):
         if progress is not None:
             progress(case)
-        results.append(_KINDS[case.kind](case, wp_device, photons, repeats))
+        results.append(measure(case, wp_device, photons, repeats))
         if found is not None:
             found(results[-1])
     return results
+
+
+def measure(case: Case, device: wp.Device, photons: int | None, repeats: int) -> BenchResult:
+    """One case; see `run`."""
+    before = _memory(device)
+    facts, run_number = _STAGES[case.kind](case, device, photons)
+    runs: list[tuple[dict[str, int], float]] = []
+    while len(runs) < repeats and sum(seconds for _, seconds in runs) < case.time_limit:
+        runs.append(run_number(len(runs)))
+    work, fastest = min(runs, key=lambda timed: timed[1])
+    rates, memory = {unit: number / fastest for unit, number in work.items()}, None
+    if before is not None and (after := _memory(device)) is not None:
+        # Warp cannot reset its maximum: where an earlier case reached it, the memory that is used now.
+        memory = (after[1] if after[1] > before[1] else after[0]) - before[0]
+    size, tally_bytes = facts["size"], facts.get("tally_bytes")
+    del run_number  # and its histograms, before the next run makes its own
+    error = check = None
+    if case.error and tally_bytes is not None:
+        error = _error(case, device, min(size["photons"], _usual_photons(device)), rates["photons"])
+    if case.absorbed is not None:
+        check = _absorbed(case, device, size["photons"], *case.absorbed)
+    return BenchResult(
+        case=case.name,
+        device=device.alias,
+        threads=None if device.is_cuda else facts.pop("threads", core_count()),
+        seconds=tuple(seconds for _, seconds in runs),
+        rates=rates,
+        memory=memory,
+        error_per_root_second=error,
+        check=check,
+        **facts,
+    )
+
+
+def _usual_photons(device: wp.Device) -> int:
+    return CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count()
+
+
+def _memory(device: wp.Device) -> tuple[int, int] | None:
+    """Memory of a GPU that is used, and the most that was [bytes]; None where Warp does not count it."""
+    import warp as wp
+
+    if not (device.is_cuda and device.is_mempool_supported):
+        return None
+    return wp.get_mempool_used_mem_current(device), wp.get_mempool_used_mem_high(device)
+
+
+def _timed(device: wp.Device, work: Callable[[], Any]) -> tuple[Any, float]:
+    """What some work returns, and the seconds until the device has finished it."""
+    import warp as wp
+
+    wp.synchronize_device(device)
+    began = time.perf_counter()
+    result = work()
+    wp.synchronize_device(device)
+    return result, time.perf_counter() - began
+
+
+def _error(case: Case, device: wp.Device, photons: int, photons_per_second: float) -> float:
+    """Relative error after one second at that rate; from a separate run, since batches take time."""
+    scene = Scene.from_dict(case.scene)
+    result = simulate(scene, photons=max(photons, 2 * scene.scan_positions), device=device.alias, uncertainty=True)
+    return result.relative_error * math.sqrt(result.photons / photons_per_second)
+
+
+def _absorbed(case: Case, device: wp.Device, photons: int, reference: float, rounding: float) -> dict[str, Any]:
+    scene = Scene.from_dict(case.scene)
+    weights = trace(scene, photons=max(2, min(photons, _CHECK_PHOTONS)), device=device.alias).weight
+    lost = 1.0 - weights.astype(np.float64)
+    value, error = float(lost.mean()), float(lost.std(ddof=1) / math.sqrt(lost.size))
+    return {
+        "name": "absorbed fraction",
+        "value": value,
+        "standard_error": error,
+        "reference": reference,
+        "passed": abs(value - reference) <= rounding + _SIGMAS * error,
+    }
+
+
+# Stages: each is set up and compiled; returns what `BenchResult` has of that, and a function that does the timed run of
+# a number and returns its work by unit, and seconds.
+
+_Stage = tuple[dict[str, Any], Callable[[int], tuple[dict[str, int], float]]]
 
 
 class TransportRun:
@@ -189,6 +268,8 @@ class TransportRun:
     """
 
     def __init__(self, case: Case, device: wp.Device) -> None:
+        import warp as wp
+
         import spadwarp_kernels as sk
 
         scene = Scene.from_dict(case.scene)
@@ -198,7 +279,7 @@ class TransportRun:
         self.scores: bool = sk.ESTIMATORS[self._spec.estimator](self._spec).scores
         self._model: Model = build_model(scene, device, mesh, camera=self.scores)
         self._data: Data = sk.make_data(self._model)
-        _wait(device)
+        wp.synchronize_device(device)
         ready = time.perf_counter()
         sk.load_transport_kernel(self._spec, device, model=self._model)
         self.setup, self.compile = ready - began, time.perf_counter() - ready
@@ -210,191 +291,84 @@ class TransportRun:
         seconds until the device had finished."""
         import spadwarp_kernels as sk
 
+        device = self._model.device
+        workers = 1 if device.is_cuda else min(core_count(), photons)
+        edges = [first + photons * i // workers for i in range(workers + 1)]
+
         def launch(start: int, stop: int) -> None:
             for at in range(start, stop, _LAUNCH):
                 sk.launch_transport(
                     self._spec, self._model, self._data, seed=0, first_id=at, photon_count=min(_LAUNCH, stop - at)
                 )
 
-        device = self._model.device
-        workers = 1 if device.is_cuda else min(core_count(), photons)
-        edges = [first + photons * i // workers for i in range(workers + 1)]
-        self._data.ledger.zero_()
-        _wait(device)
-        began = time.perf_counter()
-        if workers == 1:
-            launch(first, first + photons)
-        else:
+        def launch_all() -> None:
+            if workers == 1:
+                return launch(first, first + photons)
             with ThreadPoolExecutor(workers) as pool:
                 list(pool.map(launch, edges[:-1], edges[1:]))
-        _wait(device)
-        seconds = time.perf_counter() - began
+
+        self._data.ledger.zero_()
+        _, seconds = _timed(device, launch_all)
         return (*sk.read_ledger(self._data), seconds)
 
 
-def measure_transport(case: Case, device: wp.Device, photons: int | None, repeats: int) -> BenchResult:
-    usual = CUDA_PHOTONS if device.is_cuda else CPU_PHOTONS_PER_CORE * core_count()
-    photons = case.photons or photons or usual
-    memory = _Memory(device)
+def _transport(case: Case, device: wp.Device, photons: int | None) -> _Stage:
+    photons = case.photons or photons or _usual_photons(device)
     traced = TransportRun(case, device)
     traced.run(min(photons, _LAUNCH if device.is_cuda else 1 << 20))  # a GPU's kernel may depend on the number
-    seconds: list[float] = []
-    counts: list[dict[str, int]] = []
-    while len(seconds) < repeats and sum(seconds) < case.time_limit:
-        _, counters, took = traced.run(photons, first=len(seconds) * photons)
-        seconds.append(took)
-        counts.append(counters)
-    fastest = min(range(len(seconds)), key=seconds.__getitem__)
-    counted = counts[fastest]
-    work = {
-        "photons": photons,
-        "collisions": counted["water_collisions"] + counted["surface_events"],
-        "queries": counted["surface_queries"] + counted["shadow_queries"],
-    }
-    rates = {unit: number / seconds[fastest] for unit, number in work.items()}
-    used = memory.peak()
-    setup, compiled, faces, tally_bytes = traced.setup, traced.compile, traced.faces, traced.tally_bytes
-    error = case.error and traced.scores
-    del traced  # and its histograms, before the next run makes its own
-    scene = Scene.from_dict(case.scene)
-    return BenchResult(
-        case=case.name,
-        device=device.alias,
-        threads=None if device.is_cuda else core_count(),
-        faces=faces,
-        size={"photons": photons},
-        setup=setup,
-        compile=compiled,
-        seconds=tuple(seconds),
-        rates=rates,
-        memory=used,
-        tally_bytes=tally_bytes,
-        error_per_root_second=_error(scene, device, min(photons, usual), rates["photons"]) if error else None,
-        check=None if case.absorbed is None else _absorbed(scene, device, photons, *case.absorbed),
-    )
+
+    def timed_run(number: int) -> tuple[dict[str, int], float]:
+        _, counted, seconds = traced.run(photons, first=number * photons)
+        work = {
+            "photons": photons,
+            "collisions": counted["water_collisions"] + counted["surface_events"],
+            "queries": counted["surface_queries"] + counted["shadow_queries"],
+        }
+        return work, seconds
+
+    facts = {name: getattr(traced, name) for name in ("setup", "compile", "faces", "tally_bytes")}
+    return {**facts, "size": {"photons": photons}}, timed_run
 
 
-def _wait(device: wp.Device) -> None:
-    import warp as wp
-
-    wp.synchronize_device(device)
-
-
-def _error(scene: Scene, device: wp.Device, photons: int, photons_per_second: float) -> float:
-    """Relative error after one second at that rate; from a separate run, since batches take time."""
-    result = simulate(scene, photons=max(photons, 2 * scene.scan_positions), device=device.alias, uncertainty=True)
-    return result.relative_error * math.sqrt(result.photons / photons_per_second)
+def _alone(device: wp.Device, setup: float, work: Callable[[int], Any], rates: dict[str, int], **size: int) -> _Stage:
+    """A stage on one thread, whose run of any number does the work of `rates`."""
+    _, compiled = _timed(device, lambda: work(0))
+    facts = {"setup": setup, "compile": compiled, "size": {**rates, **size}, "threads": 1}
+    return facts, lambda number: (rates, _timed(device, lambda: work(number + 1))[1])
 
 
-def _absorbed(scene: Scene, device: wp.Device, photons: int, reference: float, rounding: float) -> dict[str, Any]:
-    weights = trace(scene, photons=max(2, min(photons, _CHECK_PHOTONS)), device=device.alias).weight
-    lost = 1.0 - weights.astype(np.float64)
-    value, error = float(lost.mean()), float(lost.std(ddof=1) / math.sqrt(lost.size))
-    return {
-        "name": "absorbed fraction",
-        "value": value,
-        "standard_error": error,
-        "reference": reference,
-        "passed": abs(value - reference) <= rounding + _SIGMAS * error,
-    }
+def _analytic(case: Case, device: wp.Device, _: int | None) -> _Stage:
+    scene, frames = Scene.from_dict(case.scene), 512 if device.is_cuda else 32
+    truth, setup = _timed(device, lambda: truth_maps(scene, device=device.alias))
+
+    def work(number: int) -> None:
+        simulate_analytic(scene, truth=truth, frames=frames if number else 1, seed=number, device=device.alias)
+
+    return _alone(device, setup, work, {"frames": frames})
 
 
-class _Memory:
-    """Memory that a case uses on a GPU, above what was used before it."""
-
-    def __init__(self, device: wp.Device) -> None:
-        self._device = device if device.is_cuda and device.is_mempool_supported else None
-        self._before, self._high = self._read()
-
-    def _read(self) -> tuple[int, int]:
-        import warp as wp
-
-        if self._device is None:
-            return 0, 0
-        return wp.get_mempool_used_mem_current(self._device), wp.get_mempool_used_mem_high(self._device)
-
-    def peak(self) -> int | None:
-        """[bytes]. Warp cannot reset its maximum: where an earlier case reached it, the memory that is used now."""
-        now, high = self._read()
-        if self._device is None:
-            return None
-        return (high if high > self._high else now) - self._before
-
-
-def _analytic(case: Case, device: wp.Device, _: int | None, repeats: int) -> BenchResult:
-    frames = 512 if device.is_cuda else 32
-    scene, memory, clock = Scene.from_dict(case.scene), _Memory(device), _Clock(device)
-    truth = truth_maps(scene, device=device.alias)
-    clock.lap()
-
-    def simulate_frames(count: int, seed: int) -> None:
-        simulate_analytic(scene, truth=truth, frames=count, seed=seed, device=device.alias)
-
-    simulate_frames(1, 0)
-    clock.lap()
-    for seed in range(repeats):
-        simulate_frames(frames, seed)
-        clock.lap()
-    return _stage(case, clock, memory, rates={"frames": frames})
-
-
-def _detect(case: Case, device: wp.Device, _: int | None, repeats: int) -> BenchResult:
+def _detect(case: Case, device: wp.Device, _: int | None) -> _Stage:
     import warp as wp
 
     # A flat background, and a return whose time and strength vary over the image.
+    began, pulses = time.perf_counter(), 1_000_000
     height, width, bins = (192, 256, 1024) if device.is_cuda else (24, 32, 1024)
-    pulses, memory, clock = 1_000_000, _Memory(device), _Clock(device)
     row, column, k = np.ogrid[:height, :width, :bins]
     centre = 300.0 + 400.0 * row / height
     light = 1e-5 + 0.01 * (1 + column) / width * np.exp(-0.5 * ((k - centre) / 2.0) ** 2)
     source: Any = wp.array(light.astype(np.float32), dtype=wp.float32, device=device)
-    detector, laser = Detector(wrap=False), Laser()
-    clock.lap()
-    for seed in range(repeats + 1):
-        detect(
-            source,
-            seed=seed,
-            pulses=pulses,
-            detector=detector,
-            laser=laser,
-            gate_start=0.0,
-            bin_width=100e-12,
-            device=device,
-        )
-        clock.lap()
-    return _stage(case, clock, memory, rates={"bins": height * width * bins, "frames": 1}, pulses=pulses)
+    options: dict[str, Any] = {"detector": Detector(wrap=False), "laser": Laser(), "gate_start": 0.0}
+    options |= {"bin_width": 100e-12, "pulses": pulses, "device": device}
+    wp.synchronize_device(device)
+
+    def work(number: int) -> None:
+        detect(source, seed=number, **options)
+
+    rates = {"bins": height * width * bins, "frames": 1}
+    return _alone(device, time.perf_counter() - began, work, rates, pulses=pulses)
 
 
-class _Clock:
-    """Seconds between laps, each of which waits for the device."""
-
-    def __init__(self, device: wp.Device) -> None:
-        self.device, self.seconds, self._last = device, list[float](), time.perf_counter()
-
-    def lap(self) -> None:
-        _wait(self.device)
-        now = time.perf_counter()
-        self.seconds.append(now - self._last)
-        self._last = now
-
-
-def _stage(case: Case, clock: _Clock, memory: _Memory, *, rates: Mapping[str, int], **size: int) -> BenchResult:
-    """The result of laps for setup, compilation and each timed run, which does the work of `rates`."""
-    setup, compiled, *seconds = clock.seconds
-    return BenchResult(
-        case=case.name,
-        device=clock.device.alias,
-        threads=None if clock.device.is_cuda else 1,
-        size={**rates, **size},
-        setup=setup,
-        compile=compiled,
-        seconds=tuple(seconds),
-        rates={unit: number / min(seconds) for unit, number in rates.items()},
-        memory=memory.peak(),
-    )
-
-
-_KINDS = {"transport": measure_transport, "analytic": _analytic, "detect": _detect}
+_STAGES = {"transport": _transport, "analytic": _analytic, "detect": _detect}
 
 
 # Comparison
@@ -447,52 +421,36 @@ def compare(now: Mapping[str, Any], before: Mapping[str, Any]) -> list[Compariso
 
 
 def _compared(now: Mapping[str, Any], before: Mapping[str, Any]) -> Comparison:
+    from scipy.special import stdtrit
+
     unit = next(iter(now["rates"]))
-    new, old = _log_rates(now, unit), _log_rates(before, unit)
-    interval = _interval(new, old)
+    new, old = sides = [np.log(row["size"][unit] / np.asarray(row["seconds"], np.float64)) for row in (now, before)]
+    difference, interval = float(new.mean() - old.mean()), None
+    verdict: Literal["faster", "slower", "same", "unclear"] = "unclear"
+    if min(new.size, old.size) > 1:
+        # Degrees of freedom by Welch and Satterthwaite.
+        parts = [max(float(side.var(ddof=1)), _TIMER**2) / side.size for side in sides]
+        freedom = sum(parts) ** 2 / sum(part**2 / (side.size - 1) for part, side in zip(parts, sides, strict=True))
+        half = float(stdtrit(freedom, 0.5 + 0.5 * _CONFIDENCE)) * math.sqrt(sum(parts))
+        low, high = interval = math.exp(difference - half), math.exp(difference + half)
+        if low > 1.0 + MARGIN:
+            verdict = "faster"
+        elif high < 1.0 / (1.0 + MARGIN):
+            verdict = "slower"
+        elif max(high, 1.0 / low) <= 1.0 + _RESOLUTION:
+            verdict = "same"
+    spread_now, spread_before = (float(side.std(ddof=1)) if side.size > 1 else None for side in sides)
     return Comparison(
         case=now["case"],
         unit=unit,
         before=math.exp(old.mean()),
         now=math.exp(new.mean()),
-        spread_before=_spread(old),
-        spread_now=_spread(new),
-        ratio=math.exp(new.mean() - old.mean()),
+        spread_before=spread_before,
+        spread_now=spread_now,
+        ratio=math.exp(difference),
         interval=interval,
-        verdict=_verdict(interval),
+        verdict=verdict,
     )
-
-
-def _verdict(interval: tuple[float, float] | None) -> Literal["faster", "slower", "same", "unclear"]:
-    if interval is None:
-        return "unclear"
-    low, high = interval
-    if low > 1.0 + MARGIN:
-        return "faster"
-    if high < 1.0 / (1.0 + MARGIN):
-        return "slower"
-    return "same" if max(high, 1.0 / low) <= 1.0 + _RESOLUTION else "unclear"
-
-
-def _log_rates(row: Mapping[str, Any], unit: str) -> NDArray[np.float64]:
-    return np.asarray(np.log(row["size"][unit] / np.asarray(row["seconds"], dtype=np.float64)))
-
-
-def _spread(log_rates: NDArray[np.float64]) -> float | None:
-    return float(log_rates.std(ddof=1)) if log_rates.size > 1 else None
-
-
-def _interval(new: NDArray[np.float64], old: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Of the ratio, from logarithms of rates; degrees of freedom by Welch and Satterthwaite."""
-    from scipy.special import stdtrit
-
-    if min(new.size, old.size) < 2:
-        return None
-    parts = [max(float(side.var(ddof=1)), _TIMER**2) / side.size for side in (new, old)]
-    freedom = sum(parts) ** 2 / (parts[0] ** 2 / (new.size - 1) + parts[1] ** 2 / (old.size - 1))
-    half = float(stdtrit(freedom, 0.5 + 0.5 * _CONFIDENCE)) * math.sqrt(sum(parts))
-    difference = float(new.mean() - old.mean())
-    return math.exp(difference - half), math.exp(difference + half)
 
 
 def history(directory: str | Path) -> list[tuple[Path, dict[str, Any]]]:

@@ -6,24 +6,40 @@ import dataclasses
 import math
 from typing import Any
 
-from spadwarp.analytic.model import source_name
-from spadwarp.checks.geometry import check_focus, check_ports, check_scan, check_targets
-from spadwarp.checks.light import check_daylight, check_polarisation, check_spectrum, check_statistics, check_timing
-from spadwarp.checks.plausible import check_plausible
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.analytic import PILE_UP
 from spadwarp.checks.survey import CheckMessage, OnAxis, Survey
-from spadwarp.checks.water import check_grid, check_medium, grid_summary
-from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import detector_response
-from spadwarp.mesh import TriangleMesh
-from spadwarp.scene import SceneLike, as_scene
+from spadwarp.mesh import TriangleMesh, guess_unit
+from spadwarp.scene import (
+    Laser,
+    Layer,
+    Medium,
+    Scene,
+    SceneLike,
+    as_scene,
+    daylight_rate,
+    downwelling_irradiance,
+    phase_function,
+    scattering_matrix,
+    spectral_lines,
+    water_lines,
+)
+from spadwarp.scene.camera import image_points, to_camera, to_world
+from spadwarp.scene.laser import profile_extent
+from spadwarp.scene.medium import WATER_INDICES, grid_cells
+from spadwarp.scene.port import Port
+from spadwarp.scene.sections import field_unit
+from spadwarp.scene.sight import beam_planes, points_inside, view_planes
 from spadwarp.transport import points_per_flight
+from spadwarp.values import ArgumentError, ConfigError, path_from_time, quantity, with_prefix
+from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
 __all__ = ["check", "summary"]
 
-_CHECKS = (
-    *(check_plausible, check_targets, check_focus, check_ports, check_scan, check_timing, check_spectrum),
-    *(check_daylight, check_medium, check_grid, check_polarisation, check_statistics),
-)
+Points = NDArray[np.float64]
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
@@ -38,7 +54,7 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     try:  # read here, since only depth and counts need it: at the end of a run it would be too late
         detector_response(survey.scene.detector, survey.scene.laser)
     except ArgumentError as error:
-        raise ConfigError(f"detector.irf: {error}", source=source_name(survey.scene)) from None
+        raise ConfigError(f"detector.irf: {error}", source=survey.scene.source) from None
     for find in _CHECKS:
         find(survey)
     return sorted(survey.messages, key=lambda message: message.level != "warning")
@@ -60,17 +76,17 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     scene = as_scene(scene)
     survey = Survey(scene, mesh)
     camera, gate, laser, medium = scene.camera, scene.gate, scene.laser, scene.medium
-
-    def water(part: Any) -> dict[str, float]:
-        return {"attenuation_length": part.attenuation_length, "albedo": part.scattering / part.extinction}
-
     axis = dict.fromkeys(field.name for field in dataclasses.fields(OnAxis))
     axis |= {} if survey.on_axis is None else vars(survey.on_axis)
     del axis["distance"]
+    waters = [
+        {"attenuation_length": water.attenuation_length, "albedo": water.scattering / water.extinction}
+        for water in medium.waters
+    ]
     return {
-        **water(medium),
-        "layers": [{"start": layer.start, **water(layer)} for layer in medium.layers],
-        "grid": grid_summary(scene),
+        **waters[0],
+        "layers": [{"start": layer.start, **water} for layer, water in zip(medium.layers, waters[1:], strict=True)],
+        "grid": _grid_summary(scene),
         "target_range": survey.target_range,
         "target_arrival_ns": survey.target_arrival_ns,
         **axis,
@@ -90,3 +106,622 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "pde": scene.detections_per_photon,
         "histogram_bytes": survey.histogram_bytes,
     }
+
+
+# Values that are valid but far from what a SPAD camera, its laser, water and targets have: mostly a wrong unit
+
+# Field → lowest and highest plausible value in the field's own unit, and units that people take it for. 0 is always
+# allowed: it leaves something out. Lasers from picosecond diodes to Q-switched ones of 1 kHz, cameras from endoscopes
+# to telescopes, water from pure to milk; ports with a window, that of a calm surface may be far.
+_PLAUSIBLE: dict[str, tuple[float, float, tuple[str, ...]]] = {
+    "laser.pulse_energy": (1e-14, 0.1, ("nJ", "µJ")),
+    "laser.repetition_rate": (1e3, 1e10, ("kHz", "MHz")),
+    "laser.pulse_fwhm_ps": (1.0, 1e5, ("s", "ns")),
+    "laser.wavelength_nm": (200.0, 2000.0, ("m", "µm")),
+    "laser.linewidth_nm": (1e-7, 300.0, ("m", "µm")),
+    "laser.half_angle_deg": (1e-3, 180.0, ()),
+    "laser.beam_radius": (1e-5, 2.0, ("mm",)),
+    "camera.focal_length": (1e-4, 5.0, ("mm",)),
+    "camera.pixel_pitch_um": (0.5, 2000.0, ("m", "mm")),
+    "camera.aperture_diameter": (1e-5, 5.0, ("mm",)),
+    "camera.f_number": (0.3, 200.0, ()),
+    "detector.jitter_fwhm_ps": (0.5, 1e5, ("s", "ns")),
+    "detector.irf_tail_ps": (0.1, 1e6, ("s", "ns")),
+    "detector.dark_count_rate": (1e-4, 1e9, ()),
+    "detector.filter_centre_nm": (200.0, 2000.0, ("m", "µm")),
+    "detector.filter_fwhm_nm": (0.01, 500.0, ("m", "µm")),
+    "detector.dead_time_ns": (0.1, 1e6, ("s", "µs")),
+    "detector.afterpulsing_time_constant_ns": (0.1, 1e6, ("s", "µs")),
+    "gate.start_ns": (1e-3, 1e5, ("s", "µs", "ps")),
+    "gate.bin_width_ps": (0.1, 1e5, ("s", "ns", "fs")),
+    "medium.absorption": (1e-6, 1e3, ()),
+    "medium.scattering": (1e-6, 1e4, ()),
+    "medium.extinction": (1e-5, 1e4, ()),
+    "port.distance": (1e-4, 2.0, ("mm",)),
+    "port.radius": (1e-3, 2.0, ("mm",)),
+    "port.thickness": (1e-4, 0.5, ("mm",)),
+}
+_MOST_POWER = 100.0  # [W]
+_FARTHEST = 1000.0  # [m] of a laser, a camera or a target
+_MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
+
+
+def _check_plausible(survey: Survey) -> None:
+    """Values of the scene outside what is plausible, with the unit that was probably meant."""
+    scene, laser = survey.scene, survey.scene.laser
+    ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
+    ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
+    for field, plausible in _PLAUSIBLE.items():
+        section, _, name = field.partition(".")
+        for place, model in (ports if section == "port" else {section: getattr(scene, section)}).items():
+            _check_value(survey, f"{place}.{name}", model, plausible)
+    if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
+        energy, rate = with_prefix(laser.pulse_energy, "J"), with_prefix(laser.repetition_rate, "Hz")
+        text = f"{energy} at {rate} are {with_prefix(laser.average_power, 'W')} on average"
+        survey.warn("laser.pulse_energy", text, average_power=laser.average_power)
+    places = {"laser.position": laser.position, "camera.position": scene.camera.position}
+    places |= {f"targets[{i}].translation": target.translation for i, target in enumerate(scene.targets)}
+    for name, point in places.items():
+        if (farthest := max(map(abs, point))) > _FARTHEST:
+            text = f"{list(point)} m is {farthest:.4g} m away; in mm it would be {[1e-3 * x for x in point]} m"
+            survey.warn(name, text, farthest=farthest)
+    for index, (target, triangles) in enumerate(zip(scene.targets, survey.targets, strict=True)):
+        if target.mesh is not None and len(triangles):
+            _check_mesh(survey, f"targets[{index}].scale", target.scale, np.ptp(triangles.reshape(-1, 3), axis=0))
+
+
+def _check_value(survey: Survey, field: str, model: Any, plausible: tuple[float, float, tuple[str, ...]]) -> None:
+    (low, high, units), name = plausible, field.rpartition(".")[2]
+    value = getattr(model, name)
+    if not isinstance(value, float) or value == 0.0 or low <= value <= high:
+        return
+    unit_of_field = field_unit(type(model).model_fields[name]) or "1"
+    unit = "" if unit_of_field == "1" else f" {unit_of_field}"
+    text = f"{value:g}{unit} is not plausible ({low:g} to {high:g}{unit} is)"
+    meant = {other: quantity(f"{value!r} {other}", unit_of_field) for other in units}
+    meant = {other: number for other, number in meant.items() if low <= number <= high}
+    if meant:
+        words = [f'"{value:g} {other}" ({number:g}{unit})' for other, number in meant.items()]
+        text += f"; did you mean {' or '.join(words)}?"
+    survey.warn(field, text, value=value, **{f"in_{other}": number for other, number in meant.items()})
+
+
+def _check_mesh(survey: Survey, field: str, scales: tuple[float, ...], extent: Points) -> None:
+    """The size of a target from a file, whose unit most formats do not state."""
+    if _MESH_SIDES[0] <= (longest := float(extent.max())) <= _MESH_SIDES[1]:
+        return
+    text = f"the mesh is {' x '.join(f'{side:.4g}' for side in extent)} m"
+    if (guess := guess_unit(longest)) is not None and guess[0] != "m":
+        scale = [guess[1] * factor for factor in scales]
+        shown = f"{scale[0]:g}" if len(set(scale)) == 1 else f"{[float(f'{factor:g}') for factor in scale]}"
+        smaller = " x ".join(f"{side * guess[1]:.4g}" for side in extent)
+        text += f"; if its unit is {guess[0]}, scale = {shown} makes it {smaller} m"
+    survey.warn(field, text, longest=longest)
+
+
+# Where things are: targets in the view, the beam, the gate and the water; focus, ports and the confocal scan
+
+_AROUND = 2.0  # [ns] of a gate before and after a target
+
+
+def _check_targets(survey: Survey) -> None:
+    """The targets, and where camera and laser stand."""
+    scene = survey.scene
+    if not scene.targets:
+        survey.note("targets", "the scene has none: only the water scatters light back")
+    for index, triangles in enumerate(survey.targets):
+        if len(triangles):
+            _check_target(survey, f"targets[{index}]", triangles)
+    for index, target in enumerate(scene.targets):
+        if target.specular > 0.0:
+            text = (
+                f"specular = {target.specular:g} acts in `simulate` alone: the analytic simulator, budgets and the "
+                "signal named here take the target as Lambertian"
+            )
+            survey.note(f"targets[{index}].specular", text, specular=target.specular)
+    (low, high), laser = scene.domain.bounds, to_world(scene.camera, scene.beam.position)
+    for name, point in (("the lens", scene.camera.position), ("the laser", laser)):
+        if any(not (a <= x <= b) for a, x, b in zip(low, point, high, strict=True)):
+            text = f"{name} at {_vector(point)} m is outside the water, {_vector(low)} to {_vector(high)} m"
+            survey.warn("domain", text)
+
+
+def _vector(values: Any) -> str:
+    """`(0, 1, 2.5)`"""
+    return "(" + ", ".join(f"{value:.4g}" for value in np.asarray(values)) + ")"
+
+
+def _check_target(survey: Survey, name: str, triangles: Points) -> None:
+    """One target; where light cannot come back from it, the first reason alone."""
+    scene, laser, in_view = survey.scene, survey.scene.beam, points_inside(triangles, survey.view)
+    illuminated = survey.illuminated_part(triangles) if len(in_view) else in_view
+    if _is_dark(survey, name, triangles, in_view, illuminated):
+        return
+    if laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0:
+        widest = math.degrees(float(_angles(in_view, laser).max()))
+        if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
+            text = (
+                f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
+                f"{_beam_text(scene.laser)}"
+            )
+            survey.note("laser.half_angle_deg", text, widest_angle_deg=widest)
+    _check_gate(survey, name, survey.paths(illuminated))
+    side = float(np.abs(illuminated[:, :2]).max())
+    if side > scene.transport.lateral_limit:
+        text = f"lateral_limit = {scene.transport.lateral_limit:.4g} m cuts {name}, which is seen out to {side:.4g} m"
+        survey.warn("transport.lateral_limit", text, side=side)
+    corners, bounds = to_world(scene.camera, triangles.reshape(-1, 3)), scene.domain.bounds
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    if (low < bounds[0]).any() or (high > bounds[1]).any():
+        text = (
+            f"spans {_vector(low)} to {_vector(high)} m in the world; the water reaches from {_vector(bounds[0])} to "
+            f"{_vector(bounds[1])} m: nothing outside is hit"
+        )
+        survey.warn(name, text)
+    extent = np.ptp(image_points(scene.camera, in_view[:, :2] / in_view[:, 2:]), axis=0)
+    if extent.max() < 1.0:
+        text = (
+            f"smaller than a pixel, {extent[0]:.2g} x {extent[1]:.2g} of one: the truth maps may miss it, and what is "
+            "beside it shares its pixel"
+        )
+        survey.warn(name, text, columns=float(extent[0]), rows=float(extent[1]))
+
+
+def _is_dark(survey: Survey, name: str, triangles: Points, in_view: Points, illuminated: Points) -> bool:
+    """Whether no light comes back from a target; says why."""
+    scene, corners = survey.scene, triangles.reshape(-1, 3)
+    ends = zip("xyz", corners.min(0), corners.max(0), strict=True)
+    where = f"spans {', '.join(f'{axis} {low:.4g} to {high:.4g}' for axis, low, high in ends)} m"
+    where += " in the camera frame" if scene.camera.is_posed else ""
+    depth = float(triangles[..., 2].max())
+    if not len(in_view) and depth <= 0:
+        survey.warn(name, f"behind the camera: {where}", depth=depth)
+    elif not len(in_view):
+        left, top, right, bottom = (depth * tangent for tangent in scene.camera.view_box)
+        wide, tall = max(-left, right), max(-top, bottom)
+        text = f"outside the view: {where}, the view at its far end is |x| < {wide:.3g}, |y| < {tall:.3g} m"
+        survey.warn(name, text, half_width=wide, half_height=tall, depth=depth)
+    elif (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
+        survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
+    elif not len(illuminated):
+        angles = np.degrees(_angles(in_view, scene.beam))
+        text = (
+            f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
+            f"off the axis, {_beam_text(scene.laser)}"
+        )
+        survey.warn(name, text, nearest_angle_deg=float(angles.min()))
+    else:
+        return False
+    return True
+
+
+def _check_gate(survey: Survey, name: str, paths: Points) -> None:
+    scene, nearest, farthest = survey.scene, float(paths.min()), float(paths.max())
+    first, last = survey.arrival_ns(nearest), survey.arrival_ns(farthest)
+    start, stop, limit = scene.gate.start * 1e9, scene.gate.stop * 1e9, scene.path_limit
+    if first < start or last > stop or first >= stop:
+        partly = "" if first >= stop or last < start else "partly "
+        begin = max(0.0, math.floor(first - _AROUND))
+        bins = math.ceil(1e3 * (last + _AROUND - begin) / scene.gate.bin_width_ps)
+        advice = f"start_ns = {begin:g} and bins = {bins} hold it, and `spadwarp plan` proposes a gate"
+        text = (
+            f"{partly}outside the gate: its light comes back from {first:.5g} to {last:.5g} ns, the gate is open from "
+            f"{start:.5g} to {stop:.5g} ns; {advice if bins <= 1_000_000 else '`spadwarp plan` proposes one'}"
+        )
+        survey.warn(name, text, first_ns=first, last_ns=last, start_ns=start, stop_ns=stop)
+    if farthest > limit < path_from_time(scene.gate.stop, scene.medium.group_index):
+        text = f"max_path = {limit:.4g} m ends photons before they return from {name}, up to {farthest:.4g} m"
+        survey.warn("transport.max_path", text, max_path=limit, path=farthest)
+
+
+def _angles(points: Points, laser: Laser) -> Points:
+    """Angles [rad] of the points against the beam's axis, seen from the laser."""
+    away, axis = points - np.array(laser.position), np.array(laser.axis)
+    along = away @ axis
+    return np.arctan2(np.linalg.norm(away - along[:, None] * axis, axis=1), along)
+
+
+def _beam_text(laser: Laser) -> str:
+    if laser.profile == "collimated":
+        return f"the beam is parallel with a radius of {laser.beam_radius:.3g} m"
+    if laser.profile == "measured":
+        wide, tall = (math.degrees(math.atan(tangent)) for tangent in profile_extent(laser))
+        return f"the beam's image spans ±{wide:.3g}° and ±{tall:.3g}°"
+    return f"the beam's half angle is {laser.half_angle_deg:.3g}°"
+
+
+def _check_focus(survey: Survey) -> None:
+    """How far the lens is out of focus on what it sees."""
+    camera, focus, port = survey.scene.camera, survey.focus_distance, survey.camera_port
+    if focus is None or survey.target_range is None or survey.on_axis is None:
+        return
+
+    def blur(distance: float) -> float:
+        """Of a point at a range on the axis [pixels]."""
+        apparent = distance
+        if port is not None:
+            start, axis, lead, _ = port.enter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+            apparent = port.apparent_distance(start + (distance - float(lead)) * axis)
+        return 2.0 * camera.aperture_radius * abs(1.0 / apparent - 1.0 / focus) / camera.pixel_tangent
+
+    worst = max(survey.target_range, key=blur)
+    if (pixels := blur(worst)) > 1.0:
+        text = (
+            f"a point at {worst:.4g} m is blurred over {pixels:.3g} pixels by a lens focused at "
+            f"{focus:.4g} m; truth maps and the analytic simulator are sharp"
+        )
+        survey.note("camera.focus_distance", text, distance=worst, pixels=pixels)
+
+
+def _check_ports(survey: Survey) -> None:
+    """The view through a port, and whether a surface is where the water ends."""
+    scene, port = survey.scene, survey.camera_port
+    if port is not None:
+        left, top, right, bottom = scene.camera.view_box
+        edges = np.array([[left, 0.0, 1.0], [right, 0.0, 1.0], [0.0, top, 1.0], [0.0, bottom, 1.0]])
+        _, water, _, _ = port.enter((0.0, 0.0, 0.0), edges / np.linalg.norm(edges, axis=1, keepdims=True))
+        angles = np.degrees(np.arctan2(water[[0, 1, 2, 3], [0, 0, 1, 1]], water[:, 2]))
+        wide, tall = float(angles[1] - angles[0]), float(angles[3] - angles[2])
+        if not math.isfinite(wide + tall):
+            survey.warn("camera.port", "some of the view does not get through the port: it shows nothing there")
+        else:
+            text = f"through it the camera sees {wide:.3g} x {tall:.3g}° of the water; intrinsics are those in air"
+            survey.note("camera.port", text, wide_deg=wide, tall_deg=tall)
+    low, high = np.array(scene.domain.bounds)
+    for name, surface, place in (
+        ("camera", scene.camera.port, np.array(scene.camera.position)),
+        ("laser", scene.laser.port, to_world(scene.camera, scene.beam.position)),
+    ):
+        is_surface = isinstance(surface, Port) and surface.shape == "flat" and surface.thickness == 0.0
+        if is_surface and (low <= place).all() and (place <= high).all():
+            text = "without a window it is a calm surface, but no face of the domain ends the water there: domain"
+            survey.warn(f"{name}.port", text)
+
+
+def _check_scan(survey: Survey) -> None:
+    """Whether the beam of a confocal scan is where its pixel looks, and what of the detector is then one pixel's."""
+    scene, laser, axis = survey.scene, survey.scene.beam, survey.on_axis
+    if scene.scan_positions == 1:
+        return
+    if scene.laser.direction != Laser().direction:
+        survey.note("laser.direction", f"direction = {list(scene.laser.direction)} is not used: a scan aims the laser")
+    snapped = math.degrees(math.acos(scene.transport.axis_threshold))
+    pixel_deg = math.degrees(math.atan(scene.camera.pixel_tangent))
+    if snapped > pixel_deg:
+        text = (
+            f"axis_threshold = {scene.transport.axis_threshold:g} scatters light within {snapped:.3g}° of the optical "
+            f"axis as if it went along it, and a pixel sees {pixel_deg:.3g}°: 1 is exact"
+        )
+        survey.warn("transport.axis_threshold", text, degrees=snapped, pixel_deg=pixel_deg)
+    for name in ("crosstalk_probability", "dark_count_spread", "hot_pixel_fraction"):
+        if value := getattr(scene.detector, name):
+            text = f"{name} = {value:g} is drawn between positions of the scan, where one pixel looks at all of them"
+            survey.note(f"detector.{name}", text, **{name: value})
+    if axis is None:
+        return
+    aside = math.hypot(*laser.position[:2]) * abs(1.0 - axis.distance / scene.scan.distance)
+    spot = laser.beam_radius if laser.profile == "collimated" else math.tan(min(laser.half_angle, 1.5)) * axis.distance
+    pixel = scene.camera.pixel_tangent * axis.distance
+    if aside > spot + pixel:
+        text = (
+            f"at {axis.distance:.4g} m the beam is {aside:.3g} m beside what its pixel sees ({pixel:.3g} m wide, the "
+            f"spot's radius is {spot:.3g} m): scan.distance makes them cross"
+        )
+        survey.warn("scan.distance", text, aside=aside, spot=spot, pixel=pixel)
+
+
+# The light: time of flight, spectrum, daylight, polarisation, and whether enough photons come back
+
+_FRESH, _SEA = WATER_INDICES["fresh"][1], WATER_INDICES["seawater"][1]
+_MEMORY_LIMIT = 2 * 2**30  # [bytes] of one set of tallies, from which on it is mentioned
+
+
+def _check_timing(survey: Survey) -> None:
+    """Range aliasing, the length of the gate, the width of its bins, and the group index."""
+    laser, gate, wraps = survey.scene.laser, survey.scene.gate, survey.scene.detector.wrap
+    unambiguous, period = survey.range_of(1.0 / laser.repetition_rate), 1e9 / laser.repetition_rate
+    if survey.target_arrival_ns is not None and (last := survey.target_arrival_ns[1]) > period:
+        text = (
+            f"the target returns after up to {last:.5g} ns, later than the next pulse ({period:.5g} ns): the "
+            f"unambiguous range is {unambiguous:.4g} m, "
+            f"{'time wraps' if wraps else 'ignored, since detector.wrap is false'}"
+        )
+        report = survey.warn if wraps else survey.note
+        report("laser.repetition_rate", text, unambiguous_range=unambiguous, last_ns=last, period_ns=period)
+    if (length := (gate.stop - gate.start) * 1e9) > period * (1 + 1e-9):
+        text = f"the gate of {length:.5g} ns is longer than the pulse period, {period:.5g} ns: time wraps within it"
+        survey.note("gate.bins", text, gate_ns=length, period_ns=period)
+    if gate.bin_width_ps > survey.irf_fwhm_ps:
+        text = (
+            f"bin_width_ps = {gate.bin_width_ps:.4g} is coarser than the instrument response, "
+            f"{survey.irf_fwhm_ps:.4g} ps: depth is resolved to {survey.bin_range:.3g} m"
+        )
+        survey.note("gate.bin_width_ps", text, irf_fwhm_ps=survey.irf_fwhm_ps)
+    medium, index = survey.scene.medium, survey.scene.medium.group_index
+    distance = survey.target_range[0] if survey.target_range else survey.range_of(gate.stop)
+    if index in (_FRESH, _SEA) and abs(laser.wavelength_nm - 532.0) > 10.0 and laser.is_visible:
+        true = group_index(laser.wavelength_nm, salinity=35.0 * (index == _SEA))
+        error = distance * (true / index - 1.0)
+        text = (
+            f"{index} is for 532 nm; at the laser's {laser.wavelength_nm:g} nm it is {true:.4f}: {error:.3f} m at "
+            f"{distance:.3g} m; medium.temperature takes it from the laser"
+        )
+        survey.warn("medium.group_index", text, group_index=true, error=error)
+    elif "group_index" not in medium.model_fields_set and not medium.follows_wavelength:
+        survey.note("medium.group_index", f"not given: {index}, seawater at 532 nm, is used for the time of flight")
+    elif 1.32 < index < 1.35:
+        error = distance * (_SEA / index - 1.0)
+        text = (
+            f"{index} is a phase index; light pulses travel with the group index, {_SEA} in seawater and {_FRESH} in "
+            f"fresh water at 532 nm: {error:.2f} m at {distance:.3g} m in seawater"
+        )
+        survey.warn("medium.group_index", text, error=error, distance=distance)
+
+
+def _check_spectrum(survey: Survey) -> None:
+    """The part that the filter passes; what the Monte Carlo run, which traces one wavelength, leaves out."""
+    scene, laser, detector = survey.scene, survey.scene.laser, survey.scene.detector
+    lines = spectral_lines(laser, detector)
+    passed = math.fsum(line.share for line in lines)
+    if detector.has_filter and passed < 0.2:
+        field = "filter_fwhm_nm" if detector.filter_table is None else "filter_table"
+        text = f"the filter passes {100.0 * passed:.3g} % of the laser's light, which is at {laser.wavelength_nm:g} nm"
+        survey.warn(f"detector.{field}", text, passed=passed)
+    if len(lines) == 1 or survey.on_axis is None or passed == 0.0:
+        return
+    field = "laser.linewidth_nm" if laser.spectrum is None else "laser.spectrum"
+    try:
+        waters, path = water_lines(scene), 2.0 * survey.on_axis.distance
+    except ConfigError as error:
+        survey.note(field, f"the analytic simulator refuses it: {error.problems[0].removeprefix('laser: ')}")
+        return
+    if len(waters) == 1:
+        return
+    weights = [line.share * math.exp(-(line.extinction - scene.medium.extinction) * path) for line in waters]
+    total = math.fsum(weights)
+    if abs((ratio := total / passed) - 1.0) > 0.01:
+        text = (
+            f"over the spectrum the water leaves {ratio:.3g} times the target's unscattered light that it leaves at "
+            f"{laser.wavelength_nm:g} nm, which is the wavelength that simulate traces; the analytic simulator takes "
+            "the whole spectrum"
+        )
+        survey.note(field, text, ratio=ratio)
+    mean = math.fsum(weight / line.speed for weight, line in zip(weights, waters, strict=True)) / total
+    variance = math.fsum(w * (1.0 / line.speed - mean) ** 2 for w, line in zip(weights, waters, strict=True)) / total
+    spread_ps = 2.0 * math.sqrt(2.0 * math.log(2.0)) * math.sqrt(variance) * path * 1e12
+    if spread_ps > 0.3 * survey.irf_fwhm_ps:
+        text = (
+            f"dispersion spreads the target's light over {spread_ps:.3g} ps, and the response has "
+            f"{survey.irf_fwhm_ps:.3g} ps: set pulse_fwhm_ps to both, the spread is left out"
+        )
+        survey.note(field, text, spread_ps=spread_ps)
+
+
+def _check_daylight(survey: Survey) -> None:
+    """How much daylight a pixel that looks into open water along the optical axis detects, and what leaves it out."""
+    scene, report = survey.scene, survey.note
+    if scene.daylight is None:
+        return
+    rate = float(daylight_rate(scene, view=np.array([[0.0, 0.0, 1.0]]))[0])
+    per_pulse = rate * min(scene.gate.stop - scene.gate.start, 1.0 / scene.laser.repetition_rate)
+    text = f"a pixel on the optical axis detects {rate:.3g} photons of daylight per second in open water"
+    if scene.laser.is_visible:
+        irradiance = downwelling_irradiance(scene, scene.laser.wavelength_nm)
+        text += f"; the irradiance from above is {irradiance:.3g} W/m²/nm at {scene.laser.wavelength_nm:g} nm"
+    if per_pulse > PILE_UP:
+        text += f"; that is {per_pulse:.2g} a pulse, and more than {PILE_UP:g} distort the histogram (pile-up)"
+        text += "" if scene.detector.has_filter else ": there is no filter (detector.filter_fwhm_nm)"
+        report = survey.warn
+    report("daylight", text, rate=rate, per_pulse=per_pulse)
+    if scene.medium.phase_index < 1.3:
+        text = f"phase_index = {scene.medium.phase_index:g} is not water's: light from above is not refracted to it"
+        survey.note("medium.phase_index", text, phase_index=scene.medium.phase_index)
+
+
+def _check_polarisation(survey: Survey) -> None:
+    """Polarised light that no channel records, and fields without their choice; reads the matrix's table."""
+    scene, medium, laser = survey.scene, survey.scene.medium, survey.scene.laser
+    scattering_matrix(medium)
+    measured, cameras = scene.camera.polarisation != "none", "polarisation = 'analyser' or 'stokes'"
+    if scene.polarised and not measured:
+        text = "light is polarised, but the result will have no channels: 'analyser' or 'stokes' records them"
+        survey.note("camera.polarisation", text)
+    if measured and laser.polarisation == "none":
+        survey.note("laser.polarisation", "the camera measures polarisation, but the laser's light is not polarised")
+    rayleigh = "rayleigh" in (medium.scattering_matrix, medium.phase_function)
+    scaled = medium.scattering_matrix == "scaled_rayleigh"
+    for section, field, used, needed in (
+        ("laser", "polarisation_angle_deg", laser.polarisation == "linear", "polarisation = 'linear'"),
+        ("medium", "depolarisation_ratio", rayleigh, "scattering_matrix or phase_function = 'rayleigh'"),
+        ("medium", "largest_polarisation", scaled, "scattering_matrix = 'scaled_rayleigh'"),
+        ("camera", "analyser_angle_deg", measured, cameras),
+        ("camera", "analyser_extinction_ratio", measured, cameras),
+    ):
+        model = getattr(scene, section)
+        value = getattr(model, field)
+        if not used and value != type(model).model_fields[field].default:
+            survey.note(f"{section}.{field}", f"{field} = {value:g} is not used: it goes with {section}.{needed}")
+
+
+def _check_statistics(survey: Survey) -> None:
+    """The size of the tallies, the expected signal, and the photons that a pixel gets."""
+    scene, size, axis = survey.scene, survey.histogram_bytes, survey.on_axis
+    if size > _MEMORY_LIMIT:
+        text = f"the tallies take {size / 2**30:.3g} GiB, and a run on the CPU needs twice that"
+        survey.warn("gate.bins", text, bytes=size)
+    if axis is None:
+        return
+    signal, samples, traced = axis.signal_per_pulse, axis.samples_per_pixel, scene.transport.photons
+    text = (
+        f"optical depth to the nearest illuminated point {axis.optical_depth:.3g} one way ({axis.distance:.4g} m); "
+        f"a pixel on the beam's axis detects {signal:.3g} unscattered photons a pulse"
+    )
+    survey.note("medium.extinction", text, optical_depth=axis.optical_depth, signal_per_pulse=signal)
+    if signal > 0.05:
+        text = f"{signal:.3g} target detections per pulse and pixel: first-photon counting piles up"
+        survey.note("laser.pulse_energy", text, signal_per_pulse=signal)
+    if scene.transport.estimator == "analog":
+        emitted = scene.laser.photons_per_pulse * scene.detections_per_photon or math.inf
+        photons = signal * traced / scene.scan_positions / emitted
+        if photons < 10.0:
+            text = f"analog: only about {photons:.2g} of {traced:.3g} photons reach a pixel unscattered"
+            survey.warn("transport.estimator", text, photons_per_pixel=photons)
+    elif samples < 10.0:
+        text = f"only about {samples:.2g} of {traced:.3g} photons reach what a pixel sees unscattered"
+        survey.warn("transport.photons", text, samples_per_pixel=samples)
+
+
+# The water: its coefficients, phase function and cells, and what ends a photon's history in it
+
+
+def _check_medium(survey: Survey) -> None:
+    """The medium and its layers."""
+    medium, laser = survey.scene.medium, survey.scene.laser
+    pure = pure_water_absorption(laser.wavelength_nm) if laser.is_visible else 0.0
+    waters: dict[str, Medium | Layer] = {"medium": medium}
+    waters |= {f"medium.layers[{i}]": layer for i, layer in enumerate(medium.layers)}
+    for name, water in waters.items():
+        if water.absorption < 0.95 * pure:
+            text = f"absorption = {water.absorption:.3g} 1/m is below pure water's {pure:.3g} 1/m"
+            survey.note(f"{name}.absorption", text, absorption=water.absorption, pure_water=pure)
+    for name, water in waters.items():
+        if water.preset is None or abs(laser.wavelength_nm - 532.0) <= 10.0:
+            continue
+        text = f"the coefficients of {water.preset} are for about 532 nm, the laser has {laser.wavelength_nm:g} nm"
+        values = {"wavelength_nm": laser.wavelength_nm}
+        if laser.is_visible:
+            green = pure_water_absorption(532.0)
+            values |= {"pure_water": pure, "pure_water_532": green}
+            text += f", where pure water absorbs {pure:.3g} 1/m and not {green:.3g}"
+        survey.warn(f"{name}.preset", text, **values)
+    for name, water in waters.items():
+        if medium.layers and medium.phase_function == "henyey_greenstein" and water.chlorophyll is not None:
+            _check_molecular_scattering(survey, name, water, water.chlorophyll)
+
+
+def _check_molecular_scattering(survey: Survey, name: str, water: Medium | Layer, chlorophyll: float) -> None:
+    """Water molecules scatter little, but nearly evenly: the phase function of particles misses it straight back."""
+    medium = survey.scene.medium
+    optics = water_optics(survey.scene.laser.wavelength_nm, chlorophyll=chlorophyll, **medium.state)
+    molecules = optics.water_scattering * float(molecular_density(np.array(2.0)))
+    g = medium.anisotropy if water.anisotropy is None else water.anisotropy
+    particles = (optics.scattering - optics.water_scattering) * (1.0 - g) / (4.0 * math.pi * (1.0 + g) ** 2)
+    missing = molecules / (molecules + particles)
+    if missing > 0.1:
+        text = (
+            f"layers have the phase function of particles alone: {100.0 * missing:.2g} % of what would be scattered "
+            "straight back is the water's own and is missing"
+        )
+        survey.note(f"{name}.chlorophyll", text, missing=missing)
+
+
+def _check_phase_table(survey: Survey) -> None:
+    """A forward peak narrower than the near-axis rule; a table that leaves most of the light to its power law."""
+    scene = survey.scene
+    if not scene.medium.has_phase_table:
+        return
+    law, snapped = phase_function(scene.medium), math.acos(scene.transport.axis_threshold)
+    within = law.fraction_below(snapped) if snapped > 0.0 else 0.0
+    if within > 0.1:
+        text = (
+            f"axis_threshold = {scene.transport.axis_threshold:g} takes light within {math.degrees(snapped):.3g}° of "
+            f"the optical axis for axial, and {100.0 * within:.2g} % of the scattered light turns by less than that; "
+            "guided follows the forward peak with axis_threshold = 1 only, else single photons stand out"
+        )
+        survey.warn("transport.axis_threshold", text, within=within)
+    continued = law.fraction_below(law.first_angle) if law.first_angle > 0.0 else 0.0
+    if continued > 0.1:
+        text = (
+            f"begins at {math.degrees(law.first_angle):.3g}°: {100.0 * continued:.2g} % of the scattered light is "
+            "below that, where the law between the first two points is continued"
+        )
+        survey.note("medium.phase_table", text, continued=continued)
+
+
+def _check_collisions(survey: Survey) -> None:
+    """Whether `max_collisions` or `weight_cutoff` ends histories that the longest path would let go on."""
+    scene, transport, beam = survey.scene, survey.scene.transport, survey.scene.beam
+    mean = scene.medium.range.extinction * scene.path_limit  # along the longest path
+    if scene.medium.grid is not None:  # most of which is not in the densest cell
+        far = [p + 0.5 * scene.path_limit * u for p, u in zip(beam.position, beam.axis, strict=True)]
+        mean = 2.0 * scene.optical_depth(beam.position, far)
+    most, cutoff = mean + 3.0 * math.sqrt(mean), _cutoff_collisions(scene)
+    values = {"path_collisions": mean, "cutoff_collisions": cutoff}
+    if transport.max_collisions < min(most, cutoff):
+        text = (
+            f"max_collisions = {transport.max_collisions} ends histories that the longest path would let collide "
+            f"{mean:.3g} times on average, {most:.3g} at most"
+        )
+        survey.warn("transport.max_collisions", text, **values)
+    elif cutoff < min(most, transport.max_collisions):
+        text = (
+            f"weight_cutoff = {transport.weight_cutoff:g} ends histories after about {cutoff:.0f} collisions, before "
+            f"max_collisions = {transport.max_collisions} matters; the longest path allows {mean:.3g} on average "
+            f'(termination = "roulette" is without this bias)'
+        )
+        survey.note("transport.weight_cutoff", text, **values)
+
+
+def _cutoff_collisions(scene: Scene) -> float:
+    """Collisions after which the analog weight is below the cut-off, on average; inf where it never is."""
+    transport = scene.transport
+    if transport.termination != "cutoff" or transport.weight_cutoff == 0.0:
+        return math.inf
+    if scene.medium.albedo == "lu2024":
+        step = math.log(0.97) - 1.0  # the mean of ln ω for ω uniform in (0, 0.97)
+    else:
+        albedo = scene.medium.range.albedo
+        if albedo in (0.0, 1.0):
+            return 1.0 if albedo == 0.0 else math.inf
+        step = math.log(albedo)
+    return max(1.0, math.ceil(math.log(transport.weight_cutoff) / step))
+
+
+def _check_grid(survey: Survey) -> None:
+    """The cells of `medium.grid`: where their box lies, and what light loses in it."""
+    scene, axis = survey.scene, survey.on_axis
+    if scene.medium.grid is None:
+        return
+    cells, view = grid_cells(scene.medium), view_planes(scene.camera)
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    corners = to_camera(scene.camera, (signs * 0.5 * np.array(cells.size)) @ cells.rotation.T + cells.centre)
+    # Whether one plane of the view, and one of the beam, has the whole box behind it.
+    misses = [
+        (((corners @ planes[:, :3].T + planes[:, 3]) < 0.0).all(axis=0).any())
+        for planes in (view, beam_planes(scene.beam) if scene.scan_positions == 1 else view)
+    ]
+    if all(misses):
+        survey.warn("medium.grid", "lies beside the view and the beam: single scattering does not show it")
+    else:
+        begin, end = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * scene.path_limit if axis is None else axis.distance)
+        depth, without = scene.optical_depth(begin, end), scene.medium.extinction * end[2]
+        where = "to the end of the gate" if axis is None else "to the target's range"
+        text = f"optical depth along the axis {where} ({end[2]:.4g} m): {depth:.3g} one way, {without:.3g} without it"
+        survey.note("medium.grid", text, optical_depth=depth, without_grid=without)
+    longest = max(edge / count for edge, count in zip(cells.size, cells.extinction.shape, strict=True))
+    thickest = float(cells.extinction.max()) * longest
+    if thickest > 1.0:
+        text = f"a cell has an optical depth of up to {thickest:.3g} and does not resolve what varies in it; take more"
+        survey.warn("medium.grid.cells", text, cell_optical_depth=thickest)
+
+
+def _grid_summary(scene: Scene) -> dict[str, Any] | None:
+    """Numbers of the cells, see `summary`."""
+    if scene.medium.grid is None:
+        return None
+    cells = grid_cells(scene.medium)
+    reach = float(to_camera(scene.camera, cells.centre)[2]) + math.hypot(*cells.size)
+    return {
+        "cells": list(cells.extinction.shape),
+        "size": list(cells.size),
+        "extinction": [float(cells.extinction.min()), float(cells.extinction.max())],
+        "optical_depth": scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, max(reach, 0.0))),
+        "bytes": cells.extinction.size * (8 if cells.anisotropy is None else 12),
+    }
+
+
+_CHECKS = (
+    *(_check_plausible, _check_targets, _check_focus, _check_ports, _check_scan, _check_timing, _check_spectrum),
+    *(_check_daylight, _check_medium, _check_phase_table, _check_collisions, _check_grid),
+    *(_check_polarisation, _check_statistics),
+)

@@ -22,7 +22,7 @@ import typer
 from typer.core import TyperGroup
 
 import spadwarp
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, in_words
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, in_words
 
 FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 

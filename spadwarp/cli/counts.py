@@ -14,8 +14,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, count, progress, rows, show_table, write_json, written
-from spadwarp.errors import ArgumentError, ConfigError, FileError
-from spadwarp.units import percent, range_from_time, rounded
+from spadwarp.values import ArgumentError, ConfigError, FileError, percent, range_from_time, rounded
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene
@@ -84,9 +83,9 @@ def detect(
         device=device,
         progress=progress("frames"),
     )
-    for text in (*recording.notes, *_bound_noise(recording, result.photons)):
+    for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
-    files = [recording.path, spadwarp.viz.draw_recording(recording, result, out / "frame.png")]
+    files = [recording.file.path, spadwarp.viz.draw_recording(recording.file, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 
@@ -113,38 +112,35 @@ def _with_detector(result: Result, overrides: list[str] | None) -> Result:
 def _recorded(recording: Recording, frames: int) -> dict[str, Any]:
     import numpy as np
 
-    first, bound = recording.first, recording.bound_depth[~np.isnan(recording.bound_depth)]
+    file, noise, bound = recording.file, recording.bound.noise, recording.file.bound_depth()
+    bound = bound[~np.isnan(bound)]
     median = float(np.median(bound)) if bound.size else math.inf
-    drawn = frames * first.counts.shape[1] * first.counts.shape[2]
+    per_pixel = recording.detections / (frames * file.shape[1] * file.shape[2])
     return {
-        "pulses": first.pulses,
+        "pulses": file.pulses,
         "frames": frames,
-        "seed": first.seed,
-        "detections_per_frame_and_pixel": recording.detections / drawn,
-        "detections_per_pulse_and_pixel": recording.detections / (drawn * first.pulses),
+        "seed": file.seed,
+        "detections_per_frame_and_pixel": per_pixel,
+        "detections_per_pulse_and_pixel": per_pixel / file.pulses,
         "bound": {
             "pixels": int(bound.size),
             "median_m": median if math.isfinite(median) else None,
-            "noise_fraction": recording.bound_noise if math.isfinite(recording.bound_noise) else None,
+            "noise_fraction": noise if math.isfinite(noise) else None,
         },
         "depth": {name: dataclasses.asdict(error) for name, error in recording.errors.items()},
         "monte_carlo_noise": None if recording.monte_carlo is None else dataclasses.asdict(recording.monte_carlo),
-        "notes": list(recording.notes),
+        "notes": list(file.notes),
     }
 
 
 def _bound_noise(recording: Recording, photons: int) -> list[str]:
-    """How much of the bound's information was noise, and the photons that would leave a tenth.
-
-    Nothing where there is no bound: too few photons were traced, as a note of the recording says.
-    """
-    refused = not (recording.bound_time == recording.bound_time).any()
-    if not recording.bound_noise > _NOISE or (refused and math.isfinite(recording.bound_noise)):
+    """How much of the bound's information was noise, and the photons that would leave a tenth."""
+    noise = recording.bound.noise
+    if not noise > _NOISE or recording.bound.problem is not None:
         return []
     return [
-        f"{percent(recording.bound_noise)} % of the information in the median pixel was noise of the simulation; the "
-        "Cramér–Rao bound is without it"
-        + (", and only roughly known" if recording.bound_noise > 0.3 else "")
+        f"{percent(noise)} % of the information in the median pixel was noise of the simulation; the Cramér–Rao bound "
+        + ("is without it, and only roughly known" if noise > 0.3 else "is without it")
         + f"; about {recording.bound_photons:.1e} photons instead of {photons:.1e} would make that a tenth"
     ]
 

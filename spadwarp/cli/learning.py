@@ -11,7 +11,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import note, running, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, count, progress, show_table, write_json, written
-from spadwarp.limits import environment_integer
+from spadwarp.values import environment_integer
 
 if TYPE_CHECKING:
     from spadwarp.denoise import Evaluation, HistogramScores, PhotonSweep, SceneScores

@@ -17,8 +17,7 @@ import typer
 
 import spadwarp
 from spadwarp.cli.app import app, running, wrong
-from spadwarp.limits import parse_number, shown, suggestion
-from spadwarp.units import quantity
+from spadwarp.values import parse_number, quantity, shown, suggestion
 
 if TYPE_CHECKING:
     from spadwarp import Ray, Result, Scene

@@ -21,7 +21,7 @@ import typer
 
 import spadwarp
 from spadwarp.cli.app import complain, running, say, until_the_end, wrong
-from spadwarp.errors import FileError
+from spadwarp.values import FileError
 
 __all__ = ["Report", "answer", "check_outputs", "count", "in_bytes", "in_percent", "progress", "readable", "rows"]
 __all__ += ["short", "show_table", "write_json", "written"]

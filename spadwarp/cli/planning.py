@@ -27,9 +27,7 @@ from spadwarp.cli.outputs import (
     write_json,
     written,
 )
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import shown
-from spadwarp.units import with_prefix
+from spadwarp.values import ArgumentError, shown, with_prefix
 
 if TYPE_CHECKING:
     from spadwarp import Scene

@@ -14,7 +14,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import INTERRUPTED, complain, fail, note, running, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, count, progress
-from spadwarp.errors import ArgumentError, ConfigError, address_space
+from spadwarp.values import ArgumentError, ConfigError, address_space
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene

@@ -12,7 +12,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import fail, note, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import check_outputs, count, rows, write_json
-from spadwarp.limits import suggestion
+from spadwarp.values import suggestion
 
 
 @command(without=("json",))

@@ -12,7 +12,7 @@ import spadwarp
 from spadwarp.cli.app import fail, note, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import check_outputs, in_bytes, show_table, write_json
-from spadwarp.units import percent
+from spadwarp.values import percent
 
 if TYPE_CHECKING:
     from spadwarp.benchmark import BenchResult

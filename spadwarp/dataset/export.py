@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import shutil
 import tarfile
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.dataset.card import croissant, export_card
-from spadwarp.dataset.read import FIELDS, FrameReader
+from spadwarp.dataset.card import card, croissant
+from spadwarp.dataset.read import FrameReader
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.dataset.shards import FRAME_COLUMNS, HISTOGRAM_FIELDS, Column, checksum
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.dataset.shards import FIELDS, FRAME_COLUMNS, HISTOGRAM_FIELDS, Column, checksum, scene_columns
 from spadwarp.io.text import write_json, write_text
-from spadwarp.limits import check_choice, check_integer
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["EXPORT_FIELDS", "EXPORT_FORMATS", "export_dataset"]
 
@@ -32,29 +33,26 @@ FEATURE_NAMES = ("peak_depth", "peak_counts", "second_depth", "second_counts", "
 
 EXPORT_FORMATS = ("parquet", "webdataset", "zarr")
 
-EXPORT_FIELDS: dict[str, tuple[str, str]] = {
+_MEANING = f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"
+EXPORT_FIELDS: dict[str, Column] = {
     **FIELDS,
-    "features": ("", f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"),
+    "label": replace(FIELDS["label"], kind=np.uint8),
+    "features": Column(np.float32, "", _MEANING, axis="feature"),
 }
-"""Images of an exported frame: unit and meaning."""
+"""Images of an exported frame."""
 
 _DEFAULT = ("noisy", "clean", "label", "intensity", "bound")
 _OF_HISTOGRAMS = ("features", *HISTOGRAM_FIELDS)
 _ZARR_FRAMES = 16  # of a chunk
+_SCENE_COLUMNS = scene_columns((0, 0))
 _NUMBERS = {
     "sample": FRAME_COLUMNS["sample"],
     "scene": Column(np.int64, "1", "id of the scene"),
-    "backscatter_fraction": Column(
-        np.float32, "1", "requested part of pixels that report backscatter; NaN: the rates decide"
-    ),
-    "attenuation_lengths": FRAME_COLUMNS["attenuation_lengths"],
-    "distance": FRAME_COLUMNS["distance"],
-    "gate_near": Column(np.float32, "m", "range at which the gate opens"),
-    "gate_far": Column(np.float32, "m", "range at which the gate closes"),
-    "pulses": Column(np.float64, "1", "laser pulses of the frame"),
-    "photons": Column(np.float64, "1", "photons traced for the scene; 0: analytic"),
+    **{name: FRAME_COLUMNS[name] for name in ("backscatter_fraction", "attenuation_lengths", "distance")},
+    **{name: replace(_SCENE_COLUMNS[name], kind=np.float32) for name in ("gate_near", "gate_far")},
+    **{name: _SCENE_COLUMNS[name] for name in ("pulses", "photons")},
+    "target": Column(object, "1", "name of the target"),
 }
-
 
 Progress = Callable[[str, int, int], None]
 
@@ -98,25 +96,23 @@ def export_dataset(
     place, out = Path(folder), Path(out)
     if out.exists() and not overwrite and not (out.is_dir() and not any(out.iterdir())):
         raise FileError(f"{out} exists; overwrite replaces it")
-    source = _Source(place, fields)
+    source = _Source(place, fields, progress or (lambda *_: None))
     out.parent.mkdir(parents=True, exist_ok=True)
-    writer = {"parquet": _write_parquet, "webdataset": _write_webdataset, "zarr": _write_zarr}[format]
-    total, done = source.frames, 0
+    write = {"parquet": _write_parquet, "webdataset": _write_webdataset, "zarr": _write_zarr}[format]
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
         made = Path(temporary) / "made"
         made.mkdir()
         try:
-            for _ in writer(source, made, frames_per_file):
-                done += 1
-                if progress is not None:
-                    progress("frames", done, total)
+            write(source, made, frames_per_file)
         except ModuleNotFoundError as error:
             raise FileError(f"{out}: {format} needs {error.name}: pip install 'spadwarp[datasets]'") from error
         except OSError as error:
             raise FileError(f"{out}: cannot be written: {error}") from error
-        files = {path.relative_to(made).as_posix(): checksum(path) for path in _files(made, format)}
+        # Of a Zarr store, which has a file for each chunk, its metadata.
+        found = sorted(path for path in made.rglob("zarr.json" if format == "zarr" else "*") if path.is_file())
+        files = {path.relative_to(made).as_posix(): checksum(path) for path in found}
         write_json(croissant(source.manifest, format, files, source.columns), made / "croissant.json", indent=1)
-        write_text(export_card(source.manifest, format, files, source.columns, source.sizes), made / "README.md")
+        write_text(card(source.manifest, format, files, source.columns), made / "README.md")
         if out.exists():
             shutil.rmtree(out)
         os.replace(made, out)
@@ -126,12 +122,12 @@ def export_dataset(
 class _Source:
     """The frames of a dataset by split, as rows of columns."""
 
-    def __init__(self, folder: Path, fields: Sequence[str] | None) -> None:
+    def __init__(self, folder: Path, fields: Sequence[str] | None, progress: Progress) -> None:
         base = FrameReader(folder, "all", fields=())
         self.folder, self.manifest, self.shape = folder, base.manifest, base.shape
-        self.sizes = {name: self.manifest["splits"][name]["frames"] for name in SPLITS}
-        self.sizes = {name: size for name, size in self.sizes.items() if size}
-        self.frames = sum(self.sizes.values())
+        sizes = {name: self.manifest["splits"][name]["frames"] for name in SPLITS}
+        self.sizes = {name: size for name, size in sizes.items() if size}
+        self._progress, self._done = progress, 0
         self._numbers = {name: base.scene_numbers(name) for name in ("pulses", "photons")}
         bins = base.histogram_bins
         chosen = tuple(fields) if fields else (*_DEFAULT, *(("features",) if bins else ()))
@@ -142,33 +138,26 @@ class _Source:
         if "polarisation" in chosen and "polarisation" not in base.histogram_fields:
             raise ArgumentError(f"fields: 'polarisation': the camera of {folder} does not record it")
         self.fields = tuple(dict.fromkeys(chosen))
-        deep = {"normal": (3,), "features": (len(FEATURE_NAMES),), **dict.fromkeys(HISTOGRAM_FIELDS, (bins,))}
-        self.columns = {
-            name: Column(
-                np.uint8 if name == "label" else np.float32, *EXPORT_FIELDS[name], (*deep.get(name, ()), *base.shape)
-            )
-            for name in self.fields
-        }
-        self.columns |= {**_NUMBERS, "target": Column(object, "1", "name of the target")}
+        deep = {"": (), "axis": (3,), "feature": (len(FEATURE_NAMES),), "bin": (bins,)}
+        images = {name: EXPORT_FIELDS[name] for name in self.fields}
+        self.columns = {name: replace(image, shape=(*deep[image.axis], *base.shape)) for name, image in images.items()}
+        self.columns |= _NUMBERS
 
     def rows(self, split: str) -> Iterator[dict[str, Any]]:
         """The frames of a split, all columns of each."""
-        stored = tuple(name for name in self.fields if name not in _OF_HISTOGRAMS)
-        reader = FrameReader(self.folder, split, fields=stored)
+        reader = FrameReader(self.folder, split, fields=[name for name in self.fields if name not in _OF_HISTOGRAMS])
         cubes = reader.with_fields("counts")
-        for index in range(len(reader)):
-            item = reader[index]
-            row: dict[str, Any] = {name: item[name] if name == "normal" else item[name][0] for name in stored}
-            if "label" in row:
-                row["label"] = row["label"].astype(np.uint8)
-            for name in (name for name in self.fields if name not in stored):
-                row[name] = self._histogram(name, cubes, index, int(item["scene"]))
+        for index, item in enumerate(reader):
             scene = int(item["scene"])
+            row: dict[str, Any] = {name: item[name] if name == "normal" else item[name][0] for name in reader.fields}
+            for name in (name for name in self.fields if name in _OF_HISTOGRAMS):
+                row[name] = self._histogram(name, cubes, index, scene)
             row |= {"gate_near": item["gate"][0], "gate_far": item["gate"][1]}
             row |= {name: values[scene] for name, values in self._numbers.items()}
             row |= {name: item[name] for name in _NUMBERS if name in item}
-            row["target"] = self.manifest["targets"][int(item["target"])]
-            yield row
+            yield row | {"target": self.manifest["targets"][int(item["target"])]}
+            self._done += 1
+            self._progress("frames", self._done, sum(self.sizes.values()))
 
     def _histogram(self, name: str, cubes: FrameReader, index: int, scene: int) -> NDArray[np.float32]:
         if not self._numbers["photons"][scene]:
@@ -177,69 +166,59 @@ class _Source:
             return histogram_features(cubes[index]["counts"], cubes.scene(index))
         return cubes.with_fields(name)[index][name]
 
-
-def _shards(source: _Source, split: str, size: int) -> Iterator[tuple[str, Iterator[dict[str, Any]], int]]:
-    """Name, rows and number of rows of each file of a split."""
-    count = -(-source.sizes[split] // size)
-    rows = source.rows(split)
-    for number in range(count):
-        length = min(size, source.sizes[split] - number * size)
-        yield f"{split}-{number:05}-of-{count:05}", (next(rows) for _ in range(length)), length
+    def files(self, size: int) -> Iterator[tuple[str, int, int, Iterator[dict[str, Any]]]]:
+        """Split, number of the file in it, files of the split, and rows of each file with at most so many."""
+        for split, length in self.sizes.items():
+            rows, count = self.rows(split), -(-length // size)
+            for number in range(count):
+                yield split, number, count, itertools.islice(rows, size)
 
 
-def _write_parquet(source: _Source, out: Path, size: int) -> Iterator[None]:
+def _blocks(rows: Iterator[dict[str, Any]], size: int) -> Iterator[list[dict[str, Any]]]:
+    while block := list(itertools.islice(rows, size)):
+        yield block
+
+
+def _write_parquet(source: _Source, out: Path, size: int) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    def kind_of(column: Column) -> Any:
-        kind = pa.string() if column.is_text else pa.from_numpy_dtype(np.dtype(column.kind))
-        for _ in column.shape:
-            kind = pa.list_(kind)
-        return kind
-
     def array_of(column: Column, values: list[Any]) -> Any:
-        if not column.shape:
-            return pa.array(values, kind_of(column))
-        flat = np.ascontiguousarray(values, column.kind).reshape(-1)
-        array = pa.array(flat)
+        if column.is_text:
+            return pa.array(values, pa.string())
+        array = pa.array(np.array(values, column.kind).reshape(-1))
         for side in reversed(column.shape):
             array = pa.ListArray.from_arrays(pa.array(np.arange(0, len(array) + 1, side, dtype=np.int32)), array)
         return array
 
-    schema = pa.schema([(name, kind_of(column)) for name, column in source.columns.items()])
+    schema = pa.schema([(name, array_of(column, []).type) for name, column in source.columns.items()])
     per_row = sum(int(np.prod(column.shape)) * 4 for column in source.columns.values())
     group = int(np.clip((1 << 26) // max(per_row, 1), 1, 1000))  # rows of 64 MiB
     (out / "data").mkdir()
-    for split in source.sizes:
-        for name, rows, length in _shards(source, split, size):
-            with parquet.ParquetWriter(out / "data" / f"{name}.parquet", schema, compression="zstd") as file:
-                for first in range(0, length, group):
-                    part = []
-                    for row in (next(rows) for _ in range(min(group, length - first))):
-                        part.append(row)
-                        yield
-                    arrays = [array_of(column, [row[name] for row in part]) for name, column in source.columns.items()]
-                    file.write_table(pa.table(arrays, schema=schema))
+    for split, number, count, rows in source.files(size):
+        path = out / "data" / f"{split}-{number:05}-of-{count:05}.parquet"
+        with parquet.ParquetWriter(path, schema, compression="zstd") as file:
+            for block in _blocks(rows, group):
+                arrays = [array_of(column, [row[name] for row in block]) for name, column in source.columns.items()]
+                file.write_table(pa.table(arrays, schema=schema))
 
 
-def _write_webdataset(source: _Source, out: Path, size: int) -> Iterator[None]:
+def _write_webdataset(source: _Source, out: Path, size: int) -> None:
     def add(file: tarfile.TarFile, name: str, content: bytes) -> None:
         entry = tarfile.TarInfo(name)
         entry.size = len(content)
         file.addfile(entry, io.BytesIO(content))
 
-    for split in source.sizes:
-        for number, (_, rows, _) in enumerate(_shards(source, split, size)):
-            with tarfile.open(out / f"{split}-{number:05}.tar", "w") as file:
-                for row in rows:
-                    key = f"{int(row['sample']):09}"
-                    for name in source.fields:
-                        packed = io.BytesIO()
-                        np.save(packed, np.asarray(row[name], source.columns[name].kind))
-                        add(file, f"{key}.{name}.npy", packed.getvalue())
-                    numbers = {name: _plain(row[name]) for name in source.columns if name not in source.fields}
-                    add(file, f"{key}.json", json.dumps(numbers).encode())
-                    yield
+    for split, number, _, rows in source.files(size):
+        with tarfile.open(out / f"{split}-{number:05}.tar", "w") as file:
+            for row in rows:
+                key = f"{int(row['sample']):09}"
+                for name in source.fields:
+                    packed = io.BytesIO()
+                    np.save(packed, np.asarray(row[name], source.columns[name].kind))
+                    add(file, f"{key}.{name}.npy", packed.getvalue())
+                numbers = {name: _plain(row[name]) for name in _NUMBERS}
+                add(file, f"{key}.json", json.dumps(numbers).encode())
 
 
 def _plain(value: Any) -> Any:
@@ -248,44 +227,29 @@ def _plain(value: Any) -> Any:
     return None if isinstance(plain, float) and not np.isfinite(plain) else plain
 
 
-def _write_zarr(source: _Source, out: Path, size: int) -> Iterator[None]:
+def _write_zarr(source: _Source, out: Path, size: int) -> None:
     import zarr
 
     store = zarr.open_group(out / "frames.zarr", mode="w")
     for split, length in source.sizes.items():
-        group = store.create_group(split)
-        arrays = {name: _zarr_array(group, name, column, length) for name, column in source.columns.items()}
+        group: Any = store.create_group(split)
         for name, side in zip(("y", "x"), source.shape, strict=True):
             group.create_array(name, data=np.arange(side), dimension_names=[name])
-        rows = source.rows(split)
-        for first in range(0, length, _ZARR_FRAMES):
-            part = []
-            for row in (next(rows) for _ in range(min(_ZARR_FRAMES, length - first))):
-                part.append(row)
-                yield
+        for name, column in source.columns.items():
+            image = [*([column.axis] if column.axis else []), "y", "x"] if column.shape else []
+            array = group.create_array(
+                name,
+                shape=(length, *column.shape),
+                dtype="string" if column.is_text else column.kind,
+                chunks=(min(_ZARR_FRAMES, length), *column.shape),
+                dimension_names=["frame", *image],
+            )
+            array.attrs.update({"units": column.unit, "long_name": column.meaning})
+        for number, block in enumerate(_blocks(source.rows(split), _ZARR_FRAMES)):
+            first = number * _ZARR_FRAMES
             for name, column in source.columns.items():
                 kind = np.dtypes.StringDType() if column.is_text else column.kind
-                arrays[name][first : first + len(part)] = np.array([row[name] for row in part], dtype=kind)
-
-
-def _zarr_array(group: Any, name: str, column: Column, length: int) -> Any:
-    first = {"normal": "axis", "features": "feature", **dict.fromkeys(HISTOGRAM_FIELDS, "bin")}
-    dimensions = ["frame", *([first[name]] if len(column.shape) == 3 else []), "y", "x"]
-    array = group.create_array(
-        name,
-        shape=(length, *column.shape),
-        dtype="string" if column.is_text else column.kind,
-        chunks=(min(_ZARR_FRAMES, length), *column.shape),
-        dimension_names=dimensions if column.shape else ["frame"],
-    )
-    array.attrs.update({"units": column.unit, "long_name": column.meaning})
-    return array
-
-
-def _files(made: Path, format: str) -> list[Path]:
-    """The files of an export, for checksums; of a Zarr store, which has one for each frame, its metadata."""
-    found = sorted(path for path in made.rglob("*") if path.is_file())
-    return [path for path in found if path.name == "zarr.json"] if format == "zarr" else found
+                group[name][first : first + len(block)] = np.array([row[name] for row in block], dtype=kind)
 
 
 def histogram_features(counts: ArrayLike, scene: Scene) -> NDArray[np.float32]:

@@ -14,21 +14,21 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
 from spadwarp.dataset.card import card, croissant
 from spadwarp.dataset.plan import Plan, Shard
 from spadwarp.dataset.recipe import SPLITS, Recipe, load_recipe
 from spadwarp.dataset.shards import FORMAT_VERSION, checksum, write_scene_index, write_shard
 from spadwarp.device import core_count, pick_devices
-from spadwarp.errors import ConfigError, FileError
-from spadwarp.io.paths import atomic_path, file_problem, lock, remove_temporaries
+from spadwarp.io.paths import file_problem, lock, remove_temporaries
 from spadwarp.io.text import parse_json, parse_toml, read_text, read_toml, write_json, write_text
-from spadwarp.limits import check_integer, check_part, shown
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
+from spadwarp.values import ConfigError, FileError, check_integer, check_part, shown
 
 __all__ = ["DatasetReport", "make_dataset", "read_manifest", "verify_dataset"]
 
@@ -41,32 +41,29 @@ _Count = Annotated[int, Field(ge=0, lt=2**31)]
 _Real = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-
-class _File(_Strict):
+class _File(BaseModel, strict=True):
     bytes: Annotated[int, Field(ge=0)]
     sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 
 
-class _Split(_Strict):
+class _Split(BaseModel, strict=True):
     seed: str
     targets: list[str]
     shards: list[_ShardName]
     frames: _Count
 
 
-class _Splits(_Strict):
+class _Splits(BaseModel, strict=True):
     train: _Split
     validation: _Split
     test: _Split
 
 
-class _Manifest(_Strict):
+class _Manifest(BaseModel, strict=True):
     name: str
+    description: str
+    license: str
     version: str
-    license: str = ""
     seed: str
     frames: _Count
     scenes: _Count
@@ -128,14 +125,14 @@ def verify_dataset(folder: str | os.PathLike[str]) -> list[str]:
         with ThreadPoolExecutor(core_count()) as pool:
             return [text for text in pool.map(lambda name: _compare(place, name, files[name]), files) if text]
     plan = Plan(load_recipe(recipe))
-    states = zip(plan.shards, check_shards(plan, place, plan.shards).values(), strict=True)
+    states = zip(plan.shards, _states(plan, place, plan.shards), strict=True)
     wrong = [f"{shard.frames_file}: missing" if text == "missing" else text for shard, text in states if text]
     return [*wrong, "manifest.json: missing"]
 
 
-def record_path(folder: Path, shard: Shard) -> Path:
+def _record_path(folder: Path, shard: Shard) -> Path:
     """Where the checksums of a shard's files stand."""
-    return folder / "shards" / f"{shard.name}.json"
+    return folder / "shards" / f"{shard.index:05d}.json"
 
 
 def _read_record(path: Path) -> dict[str, Any]:
@@ -149,23 +146,23 @@ def _read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def check_shards(plan: Plan, folder: Path, shards: Sequence[Shard]) -> dict[int, str]:
-    """By the shards' indices "" (whole), "missing", or what is wrong."""
+def _state(plan: Plan, folder: Path, shard: Shard) -> str:
+    """Nothing for a shard that is whole, else "missing" or what is wrong."""
+    path = _record_path(folder, shard)
+    if file_problem(path) == "no such file":
+        return "missing"
+    try:
+        files = _read_record(path)
+    except FileError as error:
+        return str(error)
+    if set(files) != set(plan.files_of(shard)):
+        return f"{path}: not the record of this shard"
+    return next((text for name, file in files.items() if (text := _compare(folder, name, file))), "")
 
-    def state(shard: Shard) -> str:
-        path = record_path(folder, shard)
-        if file_problem(path) == "no such file":
-            return "missing"
-        try:
-            files = _read_record(path)
-        except FileError as error:
-            return str(error)
-        if set(files) != set(plan.files_of(shard)):
-            return f"{path}: not the record of this shard"
-        return next((text for name, file in files.items() if (text := _compare(folder, name, file))), "")
 
+def _states(plan: Plan, folder: Path, shards: Sequence[Shard]) -> list[str]:
     with ThreadPoolExecutor(core_count()) as pool:
-        return dict(zip((shard.index for shard in shards), pool.map(state, shards), strict=True))
+        return list(pool.map(partial(_state, plan, folder), shards))
 
 
 def _compare(folder: Path, name: str, record: dict[str, Any]) -> str:
@@ -181,45 +178,32 @@ def _compare(folder: Path, name: str, record: dict[str, Any]) -> str:
         return f"{name}: cannot be read: {error.strerror}"
 
 
-def finish(plan: Plan, folder: Path) -> tuple[str, ...]:
+def _finish(plan: Plan, folder: Path) -> tuple[str, ...]:
     """Writes the splits, the index of scenes and, once every shard is made, manifest and card.
 
     Returns the shards that are missing.
     """
+    from spadwarp import __version__
+
     files: dict[str, Any] = {}
     missing = []
     for shard in plan.shards:
         try:
-            files |= _read_record(record_path(folder, shard))
+            files |= _read_record(_record_path(folder, shard))
         except FileError:
             missing.append(shard.frames_file)
-    for split in SPLITS:
-        write_text("".join(f"{name}\n" for name in _shards_of(plan, split)), folder / f"{split}.txt")
+    splits = {split: [item for item in plan.shards if item.split == split] for split in SPLITS}
+    for split, shards in splits.items():
+        write_text("".join(f"{item.frames_file}\n" for item in shards), folder / f"{split}.txt")
     write_scene_index(plan, folder)
-    if not missing:
-        files["scenes.h5"] = checksum(folder / "scenes.h5")
-        manifest = _manifest(plan, files)
-        write_text(card(manifest), folder / "README.md")
-        described = {name: record for name, record in files.items() if name.startswith(("frames-", "histograms-"))}
-        write_json(croissant(manifest, "hdf5", described), folder / "croissant.json", indent=1)
-        write_json(manifest, folder / "manifest.json", indent=1)
-    return tuple(missing)
-
-
-def _shards_of(plan: Plan, split: str) -> list[str]:
-    return [shard.frames_file for shard in plan.shards if shard.split == split]
-
-
-def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
-    from spadwarp import __version__
-
-    return {
+    if missing:
+        return tuple(missing)
+    files["scenes.h5"] = checksum(folder / "scenes.h5")
+    manifest = {
         "format": "spadwarp dataset",
         "format_version": FORMAT_VERSION,
         "version": __version__,
-        "name": plan.recipe.name,
-        "description": plan.recipe.description,
-        "license": plan.recipe.license,
+        **{name: getattr(plan.recipe, name) for name in ("name", "description", "license")},
         "seed": str(plan.recipe.seed),
         "frames": plan.sample_count,
         "scenes": plan.scene_count,
@@ -233,13 +217,18 @@ def _manifest(plan: Plan, files: dict[str, Any]) -> dict[str, Any]:
             split: {
                 "seed": str(plan.split_seeds[split]),
                 "targets": [target.name for target in plan.targets if target.split == split],
-                "shards": _shards_of(plan, split),
-                "frames": sum(shard.scenes for shard in plan.shards if shard.split == split) * plan.frames_per_scene,
+                "shards": [item.frames_file for item in shards],
+                "frames": sum(item.scenes for item in shards) * plan.frames_per_scene,
             }
-            for split in SPLITS
+            for split, shards in splits.items()
         },
         "files": dict(sorted(files.items())),
     }
+    write_text(card(manifest, "hdf5", files), folder / "README.md")
+    described = {name: record for name, record in files.items() if name.startswith(("frames-", "histograms-"))}
+    write_json(croissant(manifest, "hdf5", described), folder / "croissant.json", indent=1)
+    write_json(manifest, folder / "manifest.json", indent=1)
+    return ()
 
 
 Progress = Callable[[str, int, int], None]
@@ -299,9 +288,9 @@ def make_dataset(
     processes = check_integer("processes", processes, "[1, 1000]")
     folder = Path(out).absolute()
     _claim(plan, folder)
-    shards = [item for item in plan.shards if item.index % parts == number - 1]
-    state = check_shards(plan, folder, shards)
-    missing = [item for item in shards if state[item.index]]
+    shards = plan.shards[number - 1 :: parts]
+    states = _states(plan, folder, shards)
+    missing = [item for item, text in zip(shards, states, strict=True) if text]
     total = sum(item.scenes for item in missing) * plan.frames_per_scene
     _check_space(plan, folder, total)
     report = progress or (lambda *_: None)
@@ -316,15 +305,15 @@ def make_dataset(
         for _, frames in run_jobs(_make_shard, jobs, note=lambda text: report(text, 0, 0), **options):
             done += frames
             report("frames", done, total)
-    others = finish(plan, folder)
+    others = _finish(plan, folder)
     if done < total:
         raise KeyboardInterrupt
     return DatasetReport(
         folder=Path(out),
         made=tuple(item.frames_file for item in missing),
-        kept=tuple(item.frames_file for item in shards if not state[item.index]),
+        kept=tuple(item.frames_file for item in shards if item not in missing),
         missing=others,
-        broken=tuple(text for text in state.values() if text not in ("", "missing")),
+        broken=tuple(text for text in states if text not in ("", "missing")),
         frames=total,
     )
 
@@ -337,11 +326,11 @@ class _Job(NamedTuple):
 
 def _make_shard(job: _Job, worker: Worker) -> int:
     """Makes a shard and its record, unless another process does; returns its frames."""
-    known = worker.state.get("plan")
-    plan = known if known is not None and known.recipe == job.recipe else Plan(job.recipe)
-    worker.state["plan"] = plan
+    plan = worker.state.get("plan")
+    if plan is None or plan.recipe != job.recipe:
+        plan = worker.state["plan"] = Plan(job.recipe)
     shard = plan.shards[job.shard]
-    record = record_path(job.folder, shard)
+    record = _record_path(job.folder, shard)
     try:
         record.parent.mkdir(exist_ok=True)
     except OSError as error:
@@ -349,7 +338,7 @@ def _make_shard(job: _Job, worker: Worker) -> int:
     with lock(record.with_suffix(".lock"), wait=lambda: not worker.stopped.is_set()) as obtained:
         if not obtained:  # interrupted while another process was making it
             return 0
-        if check_shards(plan, job.folder, [shard])[shard.index]:
+        if _state(plan, job.folder, shard):
             try:
                 record.unlink(missing_ok=True)
             except OSError as error:
@@ -380,8 +369,7 @@ def _claim(plan: Plan, folder: Path) -> None:
                 return
             if any(not path.name.startswith(".") for path in folder.iterdir()):
                 raise FileError(f"{folder}: is not empty and holds no dataset; give another folder")
-            with atomic_path(folder / "recipe.toml") as temporary:
-                temporary.write_text(plan.recipe.to_toml(), encoding="utf-8")
+            write_text(plan.recipe.to_toml(), folder / "recipe.toml")
     except FileExistsError:
         raise FileError(f"{folder}: is a file; a folder is needed") from None
     except OSError as error:

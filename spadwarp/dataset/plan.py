@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.dataset.recipe import SPLITS, UNIFORM, Distribution, Plume, Recipe, Targets
-from spadwarp.errors import ConfigError, FileError, MeshError
 from spadwarp.mesh import BUILTINS, builtin_names, load_target
 from spadwarp.mesh.files import USD_ENDINGS
 from spadwarp.mesh.targets import placement
@@ -27,7 +26,7 @@ from spadwarp.result import Truth, load_truth_exr
 from spadwarp.scene import Camera, Scene, Target, Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_angles
 from spadwarp.scene.sight import port_advance
-from spadwarp.units import time_from_range
+from spadwarp.values import ConfigError, FileError, MeshError, time_from_range
 
 __all__ = ["Plan"]
 
@@ -49,53 +48,77 @@ class TargetSource:
         name: Of the built-in shape, or of the file without its ending.
         split: "train", "validation" or "test".
         mesh, export: The mesh file, or the engine's depth map; neither for a built-in shape.
-        export_preset: Conventions of the program that wrote the depth map.
+        chosen: How the recipe scales and turns mesh files, and which program wrote the depth map.
     """
 
     name: str
     split: str
-    mesh: Path | None = None
-    export: Path | None = None
-    export_preset: Literal["unreal", "blender"] = "unreal"
+    mesh: Path | None
+    export: Path | None
+    chosen: Targets
 
-    def placed(self, pose: dict[str, Any], *, chosen: Targets, fill: float | None, camera: Camera) -> dict[str, Any]:
+    def placed(self, pose: dict[str, Any], *, fill: float | None, camera: Camera) -> dict[str, Any]:
         """The fields of a scene's target, its centre at the pose's translation, scaled as the recipe asks.
 
         Args:
             pose: `translation`, `rotation_deg`, `scale`, `reflectance`.
-            chosen: Size, unit and orientation of mesh files.
             fill: Part of the view that the target fills; replaces `scale`.
             camera: Whose view.
         """
         if self.mesh is None and fill is None:
             return {"builtin": self.name, **pose}
-        scale, (lower, upper) = pose["scale"], _bounds(self)
-        upright = np.eye(3) if self.mesh is None else _UPRIGHT[chosen.orientation]
-        sides = np.abs(upright @ (upper - lower))
+        lower, upper = _bounds(self.name, self.mesh)
+        upright = np.eye(3) if self.mesh is None else _UPRIGHT[self.chosen.orientation]
+        scale = pose["scale"] * self.metres_per_unit
         if fill is not None:
             view = pose["translation"][2] * camera.pixel_tangent * np.array([camera.width, camera.height])
-            scale = fill * float((view / sides[:2]).min())
-        else:
-            scale *= self.metres_per_unit(chosen)
+            scale = fill * float((view / np.abs(upright @ (upper - lower))[:2]).min())
         if self.mesh is None:
             return {"builtin": self.name, **pose, "scale": scale}
         matrix = placement(np.full(3, scale), pose["rotation_deg"], (0.0, 0.0, 0.0))[:3, :3] @ upright
         shift = np.asarray(pose["translation"]) - matrix @ (0.5 * (lower + upper))
         turned = {"scale": scale, "translation": shift.tolist()}
-        if chosen.orientation != "camera":
+        if self.chosen.orientation != "camera":
             turned["rotation_deg"] = list(rotation_angles(matrix / scale))
         return {"mesh": str(self.mesh), **pose, **turned}
 
-    def metres_per_unit(self, chosen: Targets) -> float:
-        """Scale of a mesh file before its pose."""
-        if chosen.mesh_size is None:
-            return chosen.mesh_scale
-        lower, upper = _bounds(self)
-        return chosen.mesh_size / float((upper - lower).max())
+    @property
+    def sides(self) -> NDArray[np.float64]:
+        """Extent in the units of its file, `[3]`."""
+        lower, upper = _bounds(self.name, self.mesh)
+        return upper - lower
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Scale before the pose."""
+        if self.mesh is None:
+            return 1.0
+        size = self.chosen.mesh_size
+        return self.chosen.mesh_scale if size is None else size / float(self.sides.max())
 
     def truth(self, camera: Camera) -> Truth:
         """The truth maps of an `export`, with normals and colours where their files lie beside it."""
-        return _exported(self, camera)
+        assert self.export is not None
+        return _exported(self.export, self.chosen.export_preset, camera)
+
+
+@cache
+def _bounds(name: str, mesh: Path | None) -> NDArray[np.float64]:
+    """Lowest and highest corner, `[2, 3]`."""
+    target = Target(builtin=name) if mesh is None else Target(mesh=str(mesh))
+    return np.asarray(load_target(target).bounds, np.float64)
+
+
+@cache
+def _exported(path: Path, preset: Literal["unreal", "blender"], camera: Camera) -> Truth:
+    normal, albedo = (path.with_name(path.name.replace(_DEPTH_ENDING, end)) for end in (_NORMAL_ENDING, _ALBEDO_ENDING))
+    return load_truth_exr(
+        depth=path,
+        camera=camera,
+        preset=preset,
+        normal=normal if normal.is_file() else None,
+        albedo=albedo if albedo.is_file() else 0.5,
+    )
 
 
 def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
@@ -103,85 +126,54 @@ def find_targets(recipe: Recipe) -> tuple[TargetSource, ...]:
 
     Raises `ConfigError` for names that are unknown or given twice, `MeshError` and `FileError` for missing files.
     """
-    chosen = recipe.targets
-    problems: list[str] = []
-    sources: dict[str, dict[str, Any]] = {name: {} for name in _builtins(recipe, problems)}
-    for name, source in _of_files(recipe):
+    chosen, known, problems = recipe.targets, builtin_names(), []
+    names = [] if chosen.meshes or chosen.exports else [n for n in known if n not in BUILTINS or n == "staircase"]
+    if chosen.builtin != "all":
+        names, listed = list(chosen.builtin), ", ".join(map(repr, known))
+        problems += [f"targets.builtin: {name!r} is not one of {listed}" for name in names if name not in known]
+    sources: dict[str, tuple[Path | None, Path | None]] = dict.fromkeys(names, (None, None))
+    meshes = [(path.stem, (path, None)) for path in _files(chosen.meshes, "", _MESH_ENDINGS, MeshError)]
+    exports = [
+        (path.stem.removesuffix(_DEPTH_ENDING), (None, path))
+        for path in _files(chosen.exports, _DEPTH_ENDING, (".exr",), FileError)
+    ]
+    for name, files in (*meshes, *exports):
         if name in sources:
-            problems.append(f"targets: {next(iter(source.values()))}: there is already a target {name!r}")
-        sources[name] = source
+            problems.append(f"targets: {files[0] or files[1]}: there is already a target {name!r}")
+        sources[name] = files
     splits = dict.fromkeys(sources, "train")
     for split in ("validation", "test"):
         for name in getattr(chosen, split):
-            if splits.get(name) == "train":
-                splits[name] = split
-            elif name in splits:
+            if name not in splits:
+                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets")
+            elif splits[name] != "train":
                 problems.append(f"targets.{split}: {name!r} is already in {splits[name]}")
             else:
-                problems.append(f"targets.{split}: {name!r} is not one of the dataset's targets")
+                splits[name] = split
     if not sources:
         problems.append("targets: none are given")
     if chosen.exports and recipe.monte_carlo.share > 0:
         problems.append("monte_carlo.share: photons need meshes; targets.exports are depth maps")
+    _refuse(problems, recipe.source)
+    return tuple(TargetSource(name, splits[name], *files, chosen) for name, files in sources.items())
+
+
+def _files(
+    places: Sequence[str], ending: str, suffixes: Sequence[str], error: type[MeshError | FileError]
+) -> Iterator[Path]:
+    """The files of these folders whose names end so, and the files that are named themselves."""
+    for path in map(Path, places):
+        files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
+        found = [one for one in files if one == path or (one.stem.endswith(ending) and one.suffix.lower() in suffixes)]
+        if not found:
+            what = "mesh file" if not ending else f"file *{ending}.EXR"
+            raise error(f"targets.{'exports' if ending else 'meshes'}: {path}: no {what} there")
+        yield from found
+
+
+def _refuse(problems: Sequence[str], source: Path | str | None) -> None:
     if problems:
-        raise ConfigError(problems, source=None if recipe.source is None else str(recipe.source))
-    return tuple(TargetSource(name, splits[name], **source) for name, source in sources.items())
-
-
-def _builtins(recipe: Recipe, problems: list[str]) -> list[str]:
-    known, chosen = builtin_names(), recipe.targets
-    if chosen.builtin == "all":
-        objects = [name for name in known if name not in BUILTINS or name == "staircase"]
-        return [] if chosen.meshes or chosen.exports else objects
-    listed = ", ".join(map(repr, known))
-    problems += [f"targets.builtin: {name!r} is not one of {listed}" for name in chosen.builtin if name not in known]
-    return list(chosen.builtin)
-
-
-def _of_files(recipe: Recipe) -> Iterator[tuple[str, dict[str, Any]]]:
-    chosen = recipe.targets
-    for place in chosen.meshes:
-        files = _files(place, lambda path: path.suffix.lower() in _MESH_ENDINGS)
-        if not files:
-            raise MeshError(f"targets.meshes: {place}: no mesh file there")
-        yield from ((path.stem, {"mesh": path}) for path in files)
-    for place in chosen.exports:
-        files = _files(place, lambda path: path.stem.endswith(_DEPTH_ENDING) and path.suffix.lower() == ".exr")
-        if not files:
-            raise FileError(f"targets.exports: {place}: no file *{_DEPTH_ENDING}.EXR there")
-        for path in files:
-            yield path.stem.removesuffix(_DEPTH_ENDING), {"export": path, "export_preset": chosen.export_preset}
-
-
-def _files(place: str, wanted: Callable[[Path], bool]) -> list[Path]:
-    """The wanted files of a folder, or the file itself; empty where there is neither."""
-    path = Path(place)
-    return sorted(filter(wanted, path.iterdir())) if path.is_dir() else [path] if path.is_file() else []
-
-
-@cache
-def _bounds(source: TargetSource) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    mesh = load_target(Target(builtin=source.name) if source.mesh is None else Target(mesh=str(source.mesh)))
-    lower, upper = np.asarray(mesh.bounds, np.float64)
-    return lower, upper
-
-
-@cache
-def _exported(source: TargetSource, camera: Camera) -> Truth:
-    path = source.export
-    assert path is not None
-
-    def beside(ending: str) -> Path | None:
-        neighbour = path.with_name(path.name.replace(_DEPTH_ENDING, ending))
-        return neighbour if neighbour.is_file() else None
-
-    return load_truth_exr(
-        depth=path,
-        camera=camera,
-        preset=source.export_preset,
-        normal=beside(_NORMAL_ENDING),
-        albedo=beside(_ALBEDO_ENDING) or 0.5,
-    )
+        raise ConfigError(list(problems), source=None if source is None else str(source))
 
 
 _SHORTEST_RANGE = 0.05  # [m], the nearest at which a gate opens
@@ -200,21 +192,12 @@ class Shard:
     scenes: int
 
     @property
-    def name(self) -> str:
-        """`00003`"""
-        return f"{self.index:05d}"
-
-    @property
     def frames_file(self) -> str:
-        return f"frames-{self.name}.h5"
+        return f"frames-{self.index:05d}.h5"
 
     @property
     def scenes_file(self) -> str:
-        return f"scenes/scenes-{self.name}.h5"
-
-    @property
-    def histograms_file(self) -> str:
-        return f"histograms-{self.name}.h5"
+        return f"scenes/scenes-{self.index:05d}.h5"
 
     @property
     def indices(self) -> range:
@@ -229,6 +212,7 @@ class SceneDraw:
     Attributes:
         index: Of the scene.
         target: Index into `Plan.targets`.
+        source: That target.
         scene: The scene; where `signal_photons` is given, its number of pulses is not final.
         distance: Of the target's centre [m].
         attenuation_lengths: Extinction times distance.
@@ -236,10 +220,12 @@ class SceneDraw:
         fractions: Backscatter fraction of each frame; NaN where the photon rates decide, as with traced photons.
         photons: Number to trace; None for the analytic model.
         seed: Of photons and camera.
+        split_seed: Of the frames of the analytic model, together with their sample ids.
     """
 
     index: int
     target: int
+    source: TargetSource
     scene: Scene
     distance: float
     attenuation_lengths: float
@@ -247,6 +233,18 @@ class SceneDraw:
     fractions: tuple[float, ...]
     photons: int | None
     seed: int
+    split_seed: int
+
+    @property
+    def samples(self) -> NDArray[np.int64]:
+        """Ids of its frames."""
+        count = len(self.fractions)
+        return np.arange(self.index * count, (self.index + 1) * count)
+
+    @property
+    def frame_seed(self) -> int:
+        """Key of its frames' random numbers."""
+        return self.split_seed if self.photons is None else self.seed
 
 
 class Plan:
@@ -266,30 +264,28 @@ class Plan:
         self._template = recipe.template()
         self._tables = self._template.to_dict()
         self.shape = (self._template.camera.height, self._template.camera.width)
-        self._moves = load_trajectory(recipe.trajectory) if recipe.trajectory else None
-        if self._moves is not None:
-            self._check_moves(self._moves)
+        self._moves = self._trajectory() if recipe.trajectory else None
         self.depth_offset, self.depth_step = self._depth_code()
 
     def check_targets(self) -> None:
         """Raises `ConfigError` that names each mesh file, and its extent, that is too large or too small to be seen
         where the recipe puts it."""
-        recipe, camera = self.recipe, self._template.camera
+        recipe, pixel = self.recipe, self._template.camera.pixel_tangent
         (nearest, farthest), (smallest, largest) = recipe.pose.distance.limits, recipe.pose.size.limits
+        advice = "in another unit? targets.mesh_scale is metres per unit, targets.mesh_size the longest side"
         problems = []
         for target in self.targets if recipe.pose.fill is None else ():
             if target.mesh is None:
                 continue
-            lower, upper = _bounds(target)
-            sides = (upper - lower) * target.metres_per_unit(recipe.targets)
-            extent = f"targets.meshes: {target.mesh}: " + " x ".join(f"{side:.4g}" for side in sides) + " m"
-            advice = "in another unit? targets.mesh_scale is metres per unit, targets.mesh_size the longest side"
+            sides, wrong = target.sides * target.metres_per_unit, ""
             if 0.5 * largest * float(np.linalg.norm(sides)) >= nearest:
-                problems.append(f"{extent}: reaches the camera from pose.distance = {nearest:g} m; {advice}")
-            elif smallest * float(sides.max()) < farthest * camera.pixel_tangent:
-                problems.append(f"{extent}: less than a pixel at pose.distance = {farthest:g} m; {advice}")
-        if problems:
-            raise ConfigError(problems, source=None if recipe.source is None else str(recipe.source))
+                wrong = f"reaches the camera from pose.distance = {nearest:g} m"
+            elif smallest * float(sides.max()) < farthest * pixel:
+                wrong = f"less than a pixel at pose.distance = {farthest:g} m"
+            if wrong:
+                extent = " x ".join(f"{side:.4g}" for side in sides)
+                problems.append(f"targets.meshes: {target.mesh}: {extent} m: {wrong}; {advice}")
+        _refuse(problems, recipe.source)
 
     def split_of(self, scene_index: int) -> str:
         """The split of a scene."""
@@ -309,17 +305,15 @@ class Plan:
         def draw(field: str, distribution: Distribution | None) -> Any:
             return None if distribution is None else distribution.draw(self.generator(split, field, index))
 
-        if source.export is None:
-            distance = float(draw("pose.distance", recipe.pose.distance))
-        else:
-            distance = self._export_distance(source)
+        distance = (
+            self._export_distance(source) if source.export else float(draw("pose.distance", recipe.pose.distance))
+        )
         changes = {name: draw(f"vary.{name}", values) for name, values in recipe.vary.items()}
         scene = Scene.from_dict(self._tables, source=recipe.source).with_overrides(changes)
-        lengths = draw("water.attenuation_lengths", recipe.water.attenuation_lengths)
-        if lengths is None:
-            lengths = scene.medium.extinction * distance
-        else:
+        if (lengths := draw("water.attenuation_lengths", recipe.water.attenuation_lengths)) is not None:
             scene = scene.with_overrides({"medium.extinction": lengths / distance})
+        else:
+            lengths = scene.medium.extinction * distance
         if recipe.plume.probability > 0.0:
             scene = _with_plume(scene, recipe.plume, draw, distance)
         analytic = scene.analytic.to_dict()
@@ -337,6 +331,7 @@ class Plan:
         return SceneDraw(
             index=index,
             target=number,
+            source=source,
             scene=scene,
             distance=distance,
             attenuation_lengths=float(lengths),
@@ -344,20 +339,21 @@ class Plan:
             fractions=tuple(self.fraction(first + k) for k in range(self.frames_per_scene)),
             photons=recipe.monte_carlo.photons if self.is_traced(index) else None,
             seed=int(self.generator(split, "photons", index).integers(2**63)),
+            split_seed=self.split_seeds[split],
         )
 
-    def _check_moves(self, moves: Trajectory) -> None:
-        """Raises `ConfigError` for a trajectory that is too short, or that moves what a recipe draws."""
+    def _trajectory(self) -> Trajectory:
+        """Raises `ConfigError` for one that is too short, or that moves what a recipe draws."""
+        moves = load_trajectory(self.recipe.trajectory)
         own = ("camera.width", "camera.height", "gate.", "analytic.")
-        problems = [
-            f"{name} is not for a trajectory: the recipe draws it" for name in moves.fields if name.startswith(own)
-        ]
+        drawn = [name for name in moves.fields if name.startswith(own)]
+        problems = [f"{name} is not for a trajectory: the recipe draws it" for name in drawn]
         if len(moves) < self.recipe.scenes_per_target:
             problems.append(f"{len(moves)} rows are fewer than scenes_per_target = {self.recipe.scenes_per_target}")
         if any(target.export for target in self.targets):
             problems.append("targets.exports are depth maps, which do not move")
-        if problems:
-            raise ConfigError(problems, source=moves.source)
+        _refuse(problems, moves.source)
+        return moves
 
     def _targets(self, draw: _Draw, source: TargetSource, distance: float, camera: Camera) -> list[dict[str, Any]]:
         """The target and, in part of the scenes, the wall behind it."""
@@ -365,26 +361,24 @@ class Plan:
         placed = {
             "translation": [draw("pose.shift.x", pose.shift), draw("pose.shift.y", pose.shift), distance],
             "rotation_deg": [
-                draw(f"pose.{name}", getattr(pose, name)) for name in ("pitch_deg", "yaw_deg", "roll_deg")
+                draw(f"pose.{name}_deg", getattr(pose, f"{name}_deg")) for name in ("pitch", "yaw", "roll")
             ],
             "reflectance": draw("pose.reflectance", pose.reflectance),
             "scale": draw("pose.size", pose.size),
         }
         fill = draw("pose.fill", pose.fill)
-        targets = [source.placed(placed, chosen=self.recipe.targets, fill=fill, camera=camera)]
+        targets = [source.placed(placed, fill=fill, camera=camera)]
         if draw("backdrop.probability", UNIFORM) < wall.probability:
             behind = distance + draw("backdrop.behind", wall.behind)
             side = 4.0 * behind * camera.pixel_tangent * max(camera.width, camera.height)
-            tilt = [draw("backdrop.tilt.x", wall.tilt_deg), draw("backdrop.tilt.y", wall.tilt_deg), 0.0]
-            targets.append(
-                {
-                    "builtin": "plane",
-                    "size": [side, side],
-                    "rotation_deg": tilt,
-                    "translation": [0.0, 0.0, behind],
-                    "reflectance": draw("backdrop.reflectance", wall.reflectance),
-                }
-            )
+            backdrop = {
+                "builtin": "plane",
+                "size": [side, side],
+                "rotation_deg": [*(draw(f"backdrop.tilt.{axis}", wall.tilt_deg) for axis in "xy"), 0.0],
+                "translation": [0.0, 0.0, behind],
+                "reflectance": draw("backdrop.reflectance", wall.reflectance),
+            }
+            targets.append(backdrop)
         return targets
 
     def _gate(self, draw: _Draw, distance: float, scene: Scene) -> dict[str, Any]:
@@ -400,7 +394,7 @@ class Plan:
     def files_of(self, shard: Shard) -> tuple[str, ...]:
         """Names of a shard's files: frames, scenes, and histograms where photons are traced."""
         traced = self.recipe.monte_carlo.share > 0 and any(map(self.is_traced, shard.indices))
-        return (shard.frames_file, shard.scenes_file, *((shard.histograms_file,) if traced else ()))
+        return (shard.frames_file, shard.scenes_file, *((f"histograms-{shard.index:05d}.h5",) if traced else ()))
 
     def is_traced(self, index: int) -> bool:
         """Whether the photons of a scene are traced."""
@@ -418,11 +412,10 @@ class Plan:
 
     def _shards(self) -> Iterator[Shard]:
         per_target, size = self.recipe.scenes_per_target, self.recipe.scenes_per_shard
-        index = 0
-        for number, target in enumerate(self.targets):
-            for first in range(0, per_target, size):
-                yield Shard(index, number, target.split, number * per_target + first, min(size, per_target - first))
-                index += 1
+        parts = [(number, first) for number in range(len(self.targets)) for first in range(0, per_target, size)]
+        for index, (number, first) in enumerate(parts):
+            scenes, split = min(size, per_target - first), self.targets[number].split
+            yield Shard(index, number, split, number * per_target + first, scenes)
 
     def _export_distance(self, source: TargetSource) -> float:
         return float(np.nanmedian(source.truth(self._template.camera).depth))
@@ -458,8 +451,7 @@ def _with_plume(scene: Scene, plume: Plume, draw: _Draw, distance: float) -> Sce
         "turbulence": min(draw("plume.turbulence", plume.turbulence), 3.0),
         "seed": int(draw("plume.seed", UNIFORM) * 2**53),
         "translation": [
-            draw("plume.shift.x", plume.shift),
-            draw("plume.shift.y", plume.shift),
+            *(draw(f"plume.shift.{axis}", plume.shift) for axis in "xy"),
             draw("plume.place", plume.place) * distance,
         ],
         "extinction": 1.0,

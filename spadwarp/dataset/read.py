@@ -15,31 +15,11 @@ from numpy.typing import NDArray
 
 from spadwarp.dataset.make import read_manifest
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.dataset.shards import HistogramFile, ShardFile, frame_count
-from spadwarp.errors import ArgumentError, FileError
-from spadwarp.limits import SEED, check_choice, check_integer
+from spadwarp.dataset.shards import FIELDS, HistogramFile, ShardFile, frame_count
 from spadwarp.scene import Scene
+from spadwarp.values import SEED, ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
-
-FIELDS: dict[str, tuple[str, str]] = {
-    "noisy": ("m", "depth frame; NaN: no return"),
-    "clean": ("m", "true planar depth; NaN: nothing is hit"),
-    "label": ("1", "1: the pixel reports backscatter or other background, else 0"),
-    "intensity": ("1", "recorded photons"),
-    "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate"),
-    "normal": ("1", "unit normals towards the camera, [3, height, width]"),
-    "reflectance": ("1", "Lambertian reflectance"),
-    "prior": ("1/m", "density with which the water alone reports the depth in noisy; NaN where noisy is"),
-    "counts": ("1", "histogram of the frame, [bin, height, width]; of traced scenes only"),
-    "expected": ("1", "expected histogram before pile-up, [bin, height, width]; of traced scenes only"),
-    "polarisation": (
-        "1",
-        "degree of polarisation of the bins by both channels, without the noise of counts, [bin, height, width]; "
-        "NaN: no light; of traced scenes whose camera records polarisation",
-    ),
-}
-"""Images that an item can hold, float32 `[1, H, W]` where no other shape is given: unit and meaning."""
 
 
 class FrameReader:
@@ -76,7 +56,10 @@ class FrameReader:
         repeats: int = 1,
         seed: int = 0,
     ) -> None:
-        self.path, only = _folder_and_shard(Path(path))
+        self.path, only = Path(path), None
+        if self.path.is_file():  # a shard's
+            only = f"frames-{self.path.name.partition('-')[2]}"
+            self.path = self.path.parent.parent if self.path.parent.name == "scenes" else self.path.parent
         self.manifest = read_manifest(self.path)
         check_choice("split", split, (*SPLITS, "all"))
         if unknown := [name for name in fields if name not in FIELDS]:
@@ -137,12 +120,14 @@ class FrameReader:
         shard, row = self._row(index % self.frame_count)
         window, turns, mirrored = self._changes(index)
         item: dict[str, Any] = {}
-        for name, image in shard.images(row, self.fields, window).items():
-            if turns:
-                image = np.rot90(image, turns, axes=(-2, -1))
+        for name in self.fields:
+            image = np.rot90(shard.image(name, row, window), turns, axes=(-2, -1))
             item[name] = np.ascontiguousarray(image[..., ::-1] if mirrored else image)
-        if "normal" in item:
-            item["normal"] = _rotated(item["normal"], turns, mirrored)
+        if "normal" in item:  # x and y of normals rotate with the image
+            x, y, z = item["normal"]
+            for _ in range(turns):  # np.rot90: what pointed right (+x) points up (−y)
+                x, y = y, -x
+            item["normal"] = np.stack([-x if mirrored else x, y, z])
         return item | shard.numbers(row)
 
     def scene(self, index: int) -> Scene:
@@ -161,21 +146,17 @@ class FrameReader:
     @property
     def histogram_bins(self) -> int:
         """Bins of the histograms of traced scenes; 0 where no scene was traced."""
-        histograms = self._histograms()
-        return 0 if histograms is None else histograms.shape[-1]
+        return 0 if (histograms := self._histograms()) is None else histograms.shape[-1]
 
     @property
     def histogram_fields(self) -> tuple[str, ...]:
         """Those of `FIELDS` that frames of traced scenes have besides; none where no scene was traced."""
-        histograms = self._histograms()
-        return () if histograms is None else histograms.fields
+        return () if (histograms := self._histograms()) is None else histograms.fields
 
     def _histograms(self) -> HistogramFile | None:
         """Of the first shard that has some."""
-        for number, name in enumerate(self.shards):
-            if name.replace("frames-", "histograms-") in self.manifest["files"]:
-                return self._shard(number).histograms
-        return None
+        names = [name.replace("frames-", "histograms-") in self.manifest["files"] for name in self.shards]
+        return self._shard(names.index(True)).histograms if any(names) else None
 
     def _row(self, frame: int) -> tuple[ShardFile, int]:
         """The shard of a frame, and the frame's row in it."""
@@ -273,19 +254,3 @@ def iterate_dataset(
     if shuffle is not None:
         np.random.Generator(np.random.Philox(shuffle)).shuffle(order)
     return (reader[int(index)] for index in order)
-
-
-def _folder_and_shard(path: Path) -> tuple[Path, str | None]:
-    """The dataset's folder, and the frames' file of the shard that a path names."""
-    if not path.is_file():
-        return path, None
-    folder = path.parent.parent if path.parent.name == "scenes" else path.parent
-    return folder, f"frames-{path.name.partition('-')[2]}"
-
-
-def _rotated(normal: NDArray[np.float32], turns: int, mirrored: bool) -> NDArray[np.float32]:
-    """Normals of an image that was rotated: their x and y rotate with it."""
-    x, y, z = normal
-    for _ in range(turns):  # np.rot90: what pointed right (+x) points up (−y)
-        x, y = y, -x
-    return np.ascontiguousarray(np.stack([-x if mirrored else x, y, z]))

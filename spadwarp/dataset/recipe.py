@@ -10,46 +10,30 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
-    PrivateAttr,
-    ValidationError,
     model_validator,
 )
 
-from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.limits import check_real, shown
-from spadwarp.scene import Scene, parse_override
-from spadwarp.scene.messages import describe
-from spadwarp.scene.sections import Whole, listed
-from spadwarp.scene.tables import toml_text
+from spadwarp.scene import Scene
+from spadwarp.scene.document import Document
+from spadwarp.scene.sections import FilePath, Section, Whole, listed
+from spadwarp.values import ArgumentError, ConfigError, check_real, shown
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]
 
 Names = Annotated[tuple[str, ...], BeforeValidator(listed)]
+Paths = Annotated[Names, FilePath()]
 
 
-class Table(BaseModel):
-    """One table of a recipe: frozen, strict about types, unknown keys refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Fields as TOML has them, without those that are None: `Recipe.from_dict` makes an equal recipe of them."""
-        return {name: plain(value) for name, value in self if value is not None}
-
-
-class Distribution(Table):
+class Distribution(Section):
     """One of `choices`, equally likely, or uniform between `low` and `high`."""
 
     choices: Annotated[tuple[Any, ...], BeforeValidator(listed)] = ()
@@ -71,6 +55,11 @@ class Distribution(Table):
         if not all(map(_is_finite, self.choices)):
             raise ValueError(f"holds {shown(self.choices)}, not all of which are finite")
         return self
+
+    @classmethod
+    def merged(cls, base: Mapping[str, Any], layer: Mapping[str, Any], *, at: str = "") -> dict[str, Any]:
+        """A distribution replaces an earlier one as a whole."""
+        return dict(layer)
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -139,21 +128,12 @@ def constant(value: float) -> Distribution:
     return Distribution(choices=(value,))
 
 
-def plain(value: Any) -> Any:
-    """A table, or what is in one, as TOML has it."""
-    if isinstance(value, Table):
-        return value.to_dict()
-    if isinstance(value, dict):
-        return {name: plain(item) for name, item in value.items()}
-    return list(value) if isinstance(value, tuple) else value
-
-
 Shape = Literal["cloud", "plume", "sediment"]
 
 UNIFORM = Distribution(low=0.0, high=1.0)
 
 
-class Plume(Table):
+class Plume(Section):
     """Suspended matter between camera and target in part of the scenes."""
 
     probability: float = Field(0.0, ge=0, le=1, description="part of the scenes that have one")
@@ -161,15 +141,11 @@ class Plume(Table):
         ("cloud", "plume", "sediment"), description="shapes of medium.grid, equally likely"
     )
     optical_depth: Positive = Field(constant(1.0), description="that it adds on the optical axis, one way")
-    place: Share = Field(
-        Distribution(low=0.3, high=0.8), description="of its middle, as part of the distance of the target's centre"
-    )
+    place: Share = Field(Distribution(low=0.3, high=0.8), description="of its middle, as part of the target's distance")
     shift: Real = Field(constant(0.0), description="sideways, drawn for x and for y [m]")
     size: Positive = Field(constant(1.0), description="edge of its box [m]")
     albedo: Share = Field(constant(0.8), description="single-scattering albedo of its matter")
-    turbulence: NotNegative = Field(
-        constant(0.5), description="standard deviation of the logarithm of its density, up to 3"
-    )
+    turbulence: NotNegative = Field(constant(0.5), description="deviation of the logarithm of its density, up to 3")
     cells: Whole = Field(32, ge=1, le=256, description="cells along the edges of its box")
 
 
@@ -178,18 +154,15 @@ _MOST_TRIED = 1000  # values of a field that varies
 SPLITS = ("train", "validation", "test")
 
 
-class Targets(Table):
+class Targets(Section):
     """The targets, and which of them are for validation and test; all others are for training."""
 
     builtin: Names | Literal["all"] = Field(
         "all", description='names from `spadwarp list targets`; "all" objects, or none if meshes or exports are given'
     )
-    meshes: Names = Field((), description="mesh files, or folders of them, relative to the recipe")
+    meshes: Paths = Field((), description="mesh files, or folders of them, relative to the recipe")
     mesh_size: float | None = Field(
-        None,
-        ge=1e-6,
-        le=1e6,
-        description="longest side that meshes are scaled to [m]; if not given they stay as they are",
+        None, ge=1e-6, le=1e6, description="longest side that meshes are scaled to [m]; else they stay as they are"
     )
     mesh_scale: float = Field(1.0, ge=1e-9, le=1e9, description="metres per unit of the mesh files; 0.001 for mm")
     orientation: Literal["camera", "y_up", "z_up"] = Field(
@@ -197,13 +170,13 @@ class Targets(Table):
         description='axes of the mesh files: "camera" (+x right, +y down, +z away), "y_up" (glTF, +z to the viewer) '
         'or "z_up" (CAD, ROS; -y to the viewer)',
     )
-    exports: Names = Field((), description="*_RGBD.EXR of a game engine, or folders of them, rendered with the camera")
+    exports: Paths = Field((), description="*_RGBD.EXR of a game engine, or folders of them, rendered with the camera")
     export_preset: Literal["unreal", "blender"] = Field("unreal", description="program that wrote the exports")
     validation: Names = Field((), description="targets of the validation split")
     test: Names = Field((), description="targets of the test split")
 
 
-class Pose(Table):
+class Pose(Section):
     """Position, rotation, size and reflectance of a target."""
 
     distance: Positive = Field(constant(15.0), description="of the target's centre, along the optical axis [m]")
@@ -216,7 +189,7 @@ class Pose(Table):
     reflectance: Share = Field(constant(0.5), description="Lambertian reflectance of the target")
 
 
-class Backdrop(Table):
+class Backdrop(Section):
     """A wall behind the target."""
 
     probability: float = Field(0.0, ge=0, le=1, description="part of the scenes that have one")
@@ -225,13 +198,13 @@ class Backdrop(Table):
     reflectance: Share = Field(constant(0.3), description="Lambertian reflectance of the wall")
 
 
-class Water(Table):
+class Water(Section):
     """Turbidity of the water; other values are those of the scene."""
 
     attenuation_lengths: Positive | None = Field(None, description="extinction times distance, one way")
 
 
-class Window(Table):
+class Window(Section):
     """The gate, as ranges."""
 
     before: Positive = Field(constant(1.5), description="from where it opens to the target's centre [m]")
@@ -239,13 +212,11 @@ class Window(Table):
     bins: Whole = Field(1024, ge=1, le=1_000_000, description="time bins in it")
 
 
-class Exposure(Table):
+class Exposure(Section):
     """Exposure of a frame: its pulses, or the photons that the median pixel records from the target."""
 
     signal_photons: Positive | None = Field(None, description="recorded from the target by the median pixel of it")
-    pulses_per_depth_frame: PulseCount | None = Field(
-        None, description="pulses of a frame; the scene's if neither is given"
-    )
+    pulses_per_depth_frame: PulseCount | None = Field(None, description="of a frame; the scene's if neither is given")
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -254,18 +225,17 @@ class Exposure(Table):
         return self
 
 
-class Frames(Table):
+class Frames(Section):
     """The depth frames of a scene."""
 
     per_scene: Whole = Field(20, ge=1, le=1_000_000, description="frames of each scene")
     backscatter_fraction: Literal["rates"] | Share = Field(
-        constant(0.183),
-        description='part of the pixels that report backscatter; "rates": the photon rates decide',
+        constant(0.183), description='part of the pixels that report backscatter; "rates": the photon rates decide'
     )
     compression: Literal["none", "gzip"] = Field("none", description='of the frames; "none" reads fastest')
 
 
-class MonteCarlo(Table):
+class MonteCarlo(Section):
     """Scenes that are traced photon by photon; their depth frames come from the counts of the camera."""
 
     share: float = Field(0.0, ge=0, le=1, description="part of the scenes that are traced; the others are analytic")
@@ -289,14 +259,12 @@ class MonteCarlo(Table):
         return self
 
 
-class Recipe(Table):
+class Recipe(Document):
     """Everything a dataset depends on, checked and frozen."""
 
     name: str = Field(..., min_length=1, description="what the dataset is called")
     description: str = Field("", description="one or two sentences for its card")
-    license: str = Field(
-        "", max_length=200, description='licence of the dataset, an SPDX identifier such as "CC-BY-4.0"; for its card'
-    )
+    license: str = Field("", max_length=200, description='SPDX identifier, such as "CC-BY-4.0", for its card')
     seed: Whole = Field(0, ge=0, le=2**64 - 1, description="key of every draw; one seed gives the same dataset")
     scenes_per_target: Whole = Field(50, ge=1, le=1_000_000, description="scenes, each with its own pose and water")
     scenes_per_shard: Whole = Field(25, ge=1, le=1_000_000, description="scenes in one file, all of one target")
@@ -312,12 +280,12 @@ class Recipe(Table):
     vary: dict[str, Annotated[Distribution, BeforeValidator(distribution)]] = Field(
         default_factory=dict, description='further fields of the scene: "laser.preset" = ["lu2024", ...]'
     )
-    trajectory: str = Field(
+    trajectory: Annotated[str, FilePath()] = Field(
         "",
         description="table of fields of the scene by time (CSV), relative to the recipe: scene n of a target has row n",
     )
     scene: dict[str, Any] = Field(..., description="the scene without targets and gate, as in a scene file")
-    _source: Path | None = PrivateAttr(None)
+    overrides_beside_file: ClassVar[bool] = True
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -341,31 +309,25 @@ class Recipe(Table):
                 raise ValueError(f"vary.{field} cannot vary")
         return self
 
-    @property
-    def source(self) -> Path | None:
-        """The file that the recipe came from."""
-        return self._source
-
     @classmethod
-    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Recipe:
-        """A recipe from tables as TOML gives them; relative paths in them start at `source`'s folder.
+    def merged(cls, base: Mapping[str, Any], layer: Mapping[str, Any], *, at: str = "") -> dict[str, Any]:
+        """As of sections; the scene is merged as a scene."""
+        merged = super().merged(base, layer, at=at)
+        for name, model in (("scene", Scene), ("vary", Section)):
+            old, new = base.get(name), layer.get(name)
+            if isinstance(old, Mapping) and isinstance(new, Mapping):
+                merged[name] = model.merged(old, new, at=name)
+        return merged
 
-        Raises `ConfigError` with a line for each problem.
-        """
-        name = None if source is None else str(source)
-        try:
-            recipe = cls.model_validate(_with_paths(tables, source))
-        except ValidationError as error:
-            raise ConfigError(describe(error, cls, {}), source=name) from None
-        recipe._source = None if source is None else Path(source)
+    def _check(self) -> None:
+        """Tries the scene, and what can be drawn for its fields."""
         part = "scene"
         try:
-            template = recipe.template()
+            template = self.template()
             part = "vary"
-            recipe._check_vary(template)
+            self._check_vary(template)
         except ConfigError as error:
-            raise ConfigError([f"{part}: {line}" for line in error.problems], source=name) from None
-        return recipe
+            raise ConfigError([f"{part}: {line}" for line in error.problems]) from None
 
     def _check_vary(self, template: Scene) -> None:
         """Raises `ConfigError` where a value that can be drawn for a field is not one of its values."""
@@ -380,29 +342,7 @@ class Recipe(Table):
         gate = {"start_ns": 0.0, "bin_width_ps": 1000.0 / self.gate.bins, "bins": self.gate.bins}
         return Scene.from_dict({**self.scene, "gate": gate})
 
-    def __eq__(self, other: object) -> bool:
-        """Equal in every field; where it came from does not matter."""
-        return isinstance(other, Recipe) and self.to_dict() == other.to_dict()
-
     __hash__ = None  # type: ignore[assignment]
-
-    def to_toml(self) -> str:
-        """The full text that `load_recipe` reads back to an equal recipe."""
-        return toml_text(self.to_dict())
-
-    def with_overrides(self, overrides: Mapping[str, Any] | list[str] | tuple[str, ...]) -> Recipe:
-        """A changed recipe: `["seed=7", "frames.per_scene=2"]` or `{"frames.per_scene": 2}`. Raises `ConfigError`."""
-        pairs = overrides.items() if isinstance(overrides, Mapping) else map(parse_override, overrides)
-        tables = self.to_dict()
-        for key, value in pairs:
-            parts = (key if isinstance(key, str) else ".".join(map(str, key))).split(".")
-            inner = tables
-            for part in parts[:-1]:
-                inner = inner.setdefault(part, {})
-                if not isinstance(inner, dict):
-                    raise ConfigError(f"{'.'.join(parts)} is not a field of a recipe")
-            inner[parts[-1]] = value
-        return Recipe.from_dict(tables, source=self.source)
 
 
 def load_recipe(path: str | os.PathLike[str]) -> Recipe:
@@ -417,20 +357,3 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
             "a scene, not a recipe; a recipe has such tables in [scene], see `spadwarp list datasets`", source=str(path)
         )
     return Recipe.from_dict(tables, source=path)
-
-
-def _with_paths(tables: Mapping[str, Any], source: str | os.PathLike[str] | None) -> dict[str, Any]:
-    """The tables with the paths of targets and of the trajectory made absolute."""
-    changed = dict(tables)
-    if source is None:
-        return changed
-
-    def placed(path: Any) -> Any:
-        return str(Path(source).absolute().parent / os.path.expanduser(path)) if isinstance(path, str) else path
-
-    if tables.get("trajectory"):
-        changed["trajectory"] = placed(tables["trajectory"])
-    if isinstance(targets := tables.get("targets"), Mapping):
-        lists = {name: targets[name] for name in ("meshes", "exports") if isinstance(targets.get(name), (list, tuple))}
-        changed["targets"] = {**targets, **{name: list(map(placed, paths)) for name, paths in lists.items()}}
-    return changed

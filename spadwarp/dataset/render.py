@@ -13,39 +13,24 @@ from numpy.typing import NDArray
 from spadwarp.analytic.model import pixel_maps, scene_optics
 from spadwarp.dataset.plan import Plan, SceneDraw
 from spadwarp.device import pick_device
-from spadwarp.errors import ConfigError, kernel_errors
 from spadwarp.frames import Frames, crlb, detect
 from spadwarp.result import Truth, analyser_channel, degree_of_polarisation
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import RunOptions, simulate, truth_maps
-from spadwarp.units import path_from_time
+from spadwarp.values import ConfigError, kernel_errors, path_from_time
 
 PROFILE_BINS = 64
 """Bins of `backscatter_profile`."""
 
-Profile = tuple[NDArray[np.float32], NDArray[np.float32]]
+_MOST_PULSES = 2**40
+_MOST_COUNTED_PULSES = 2**31 - 1  # the camera counts in 32 bits
+_COARSE = 8  # every eighth pixel of every eighth row decides the exposure
+
+Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class StoredFrames:
-    """Frames as they are stored.
-
-    Attributes:
-        depth, intensity: Codes, uint16 and uint8 `[K, H, W]`.
-        label: Packed bits, uint8 `[K, H, ceil(W/8)]`.
-        intensity_step: Recorded photons per unit of intensity.
-        counts: Of a traced scene, int32 `[K, H, W, T]`.
-    """
-
-    depth: NDArray[np.uint16]
-    intensity: NDArray[np.uint8]
-    label: NDArray[np.uint8]
-    intensity_step: float
-    counts: NDArray[np.int32] | None = None
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RenderedScene:
     """A scene's maps and its frames.
 
@@ -54,11 +39,14 @@ class RenderedScene:
         scene: The scene with its final number of pulses.
         truth: What the camera would see through clear water.
         bound: Cramér–Rao bound of the depth in one frame, float32 `[H, W]` [m]; NaN for no estimate.
-        profile: Density of the water's backscatter over depth on the axis [1/m], `[PROFILE_BINS]`, and the edges of its
-            bins [m].
+        density, edges: Of the water's backscatter over depth on the axis [1/m], `[PROFILE_BINS]`, and its bins' edges
+            [m].
         signal, backscatter: Expected detections per pulse, median over the target's pixels and over all.
-        frames: Codes of depth and intensity, labels, counts.
-        expected: Expected counts of a frame before pile-up, float16 `[H, W, T]`; None for a scene that was not traced.
+        depth, intensity: Of the frames as they are stored: codes, uint16 and uint8 `[K, H, W]`.
+        label: Packed bits, uint8 `[K, H, ceil(W/8)]`.
+        intensity_step: Recorded photons per unit of intensity.
+        counts: Of a traced scene, int32 `[K, H, W, T]`.
+        expected: Of a traced scene, expected counts of a frame before pile-up, float16 `[H, W, T]`.
         polarisation: Degree of polarisation of each bin, float16 `[H, W, T]`; None: the camera does not record it.
     """
 
@@ -66,10 +54,15 @@ class RenderedScene:
     scene: Scene
     truth: Truth
     bound: NDArray[np.float32]
-    profile: Profile
+    density: NDArray[np.float32]
+    edges: NDArray[np.float32]
     signal: float
     backscatter: float
-    frames: StoredFrames
+    depth: NDArray[np.uint16]
+    label: NDArray[np.uint8]
+    intensity: NDArray[np.uint8]
+    intensity_step: float
+    counts: NDArray[np.int32] | None = None
     expected: NDArray[np.float16] | None = None
     polarisation: NDArray[np.float16] | None = None
 
@@ -79,17 +72,17 @@ def intensity_step(brightest: float) -> float:
     return max(1.0, math.ceil((brightest + 6.0 * math.sqrt(brightest)) / 255.0))
 
 
-def backscatter_profile(scene: Scene, paths: NDArray[Any], cumulative: NDArray[Any]) -> Profile:
+def _profile(scene: Scene, paths: NDArray[Any], cumulative: NDArray[Any]) -> dict[str, Any]:
     """Density over depth on the axis [1/m] from a distribution over path [m], and the edges of its bins [m]."""
     axis = lines_of_sight(scene, np.array([0.0, 0.0, 1.0]))
     gate = path_from_time(np.array([scene.gate.start, scene.gate.stop]), scene.medium.group_index)
-    ends = axis.depth_from_range(axis.range_from_path(gate))
-    edges = np.linspace(ends[0], ends[1], PROFILE_BINS + 1)
+    start, stop = axis.depth_from_range(axis.range_from_path(gate))
+    edges = np.linspace(start, stop, PROFILE_BINS + 1)
     below = np.interp(edges, axis.depth_from_range(axis.range_from_path(paths)), cumulative)
-    return (np.diff(below) / np.diff(edges)).astype(np.float32), edges.astype(np.float32)
+    return {"density": (np.diff(below) / np.diff(edges)).astype(np.float32), "edges": edges.astype(np.float32)}
 
 
-def with_exposure(scene: Scene, draw: SceneDraw, detections: NDArray[np.float64], *, most: int) -> Scene:
+def with_exposure(scene: Scene, draw: SceneDraw, detections: Floats, *, most: int) -> Scene:
     """The scene with as many pulses, at most `most`, as give the median pixel the signal photons that were drawn.
 
     `detections`: of the return per pulse, in the pixels that see it. None drawn: the scene as it is. Raises
@@ -105,14 +98,10 @@ def with_exposure(scene: Scene, draw: SceneDraw, detections: NDArray[np.float64]
     return scene.with_overrides({"analytic.pulses_per_depth_frame": pulses})
 
 
-_MOST_PULSES = 2**40
-_COARSE = 8  # every eighth pixel of every eighth row decides the exposure
-
-
 def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> RenderedScene:
     """Truth, bound and frames of a drawn scene. Raises `ConfigError` for one without a return."""
-    scene, target = draw.scene, plan.targets[draw.target]
-    truth = truth_maps(scene, device=device) if target.export is None else target.truth(scene.camera)
+    scene = draw.scene
+    truth = truth_maps(scene, device=device) if draw.source.export is None else draw.source.truth(scene.camera)
     view = pixel_directions(scene.camera)
     by_rates = math.isnan(draw.fractions[0])
 
@@ -147,10 +136,10 @@ def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> Rende
         scene=scene,
         truth=truth,
         bound=bound.reshape(truth.depth.shape).astype(np.float32),
-        profile=backscatter_profile(scene, paths[0], cumulative[0]),
         signal=float(np.median(maps["signal"][seen])) if seen.any() else 0.0,
         backscatter=float(np.median(maps["backscatter"])),
-        frames=_draw_frames(plan, draw, scene, truth, maps, table, bound, device=device),
+        **_profile(scene, paths[0], cumulative[0]),
+        **_draw_frames(plan, draw, scene, truth, maps, table, bound, device=device),
     )
 
 
@@ -160,12 +149,12 @@ def _draw_frames(
     draw: SceneDraw,
     scene: Scene,
     truth: Truth,
-    maps: dict[str, NDArray[np.float64]],
-    table: tuple[NDArray[Any], NDArray[Any]],
-    bound: NDArray[np.float64],
+    maps: dict[str, Floats],
+    table: tuple[Any, Any],
+    bound: Floats,
     *,
     device: str | None,
-) -> StoredFrames:
+) -> dict[str, Any]:
     import warp as wp
 
     from spadwarp_kernels.analytic import FrameCoding, draw_frames
@@ -183,8 +172,8 @@ def _draw_frames(
     coding.laser = wp.vec3(*scene.beam.position)
     coding.nearest, coding.farthest = scene.gate.start * speed, scene.gate.stop * speed
     coding.width, coding.pixels = shape[1], truth.depth.size
-    coding.seed = wp.uint64(plan.split_seeds[plan.split_of(draw.index)])
-    coding.first_sample = wp.int64(draw.index * plan.frames_per_scene)
+    coding.seed = wp.uint64(draw.split_seed)
+    coding.first_sample = wp.int64(int(draw.samples[0]))
     coding.depth_offset, coding.depth_step = plan.depth_offset, plan.depth_step
     coding.pulses = float(pulses)
     coding.intensity_step = intensity_step(float((pulses * -np.expm1(-maps["alpha"])).max()))
@@ -197,17 +186,12 @@ def _draw_frames(
         ports=ports,
     )
     count = len(draw.fractions)
-    return StoredFrames(
-        depth=depth.numpy().reshape(count, *shape),
-        intensity=intensity.numpy().reshape(count, *shape),
-        label=labels.numpy().reshape(count, shape[0], -1),
-        intensity_step=coding.intensity_step,
-    )
+    images = {"depth": depth, "label": labels, "intensity": intensity}
+    frames = {name: image.numpy().reshape(count, shape[0], -1) for name, image in images.items()}
+    return {**frames, "intensity_step": coding.intensity_step}
 
 
-def _background(
-    scene: Scene, draw: SceneDraw, maps: dict[str, NDArray[np.float64]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _background(scene: Scene, draw: SceneDraw, maps: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
     """Per pixel the probability to report background and the share of it that is even over the gate; factors of the
     frames."""
     backscatter = maps["backscatter"]
@@ -221,9 +205,6 @@ def _background(
     probability = np.where(maps["fisher"] > 0, np.nan_to_num(maps["outlier_probability"]), alone)
     flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
     return probability, flat, np.ones(len(draw.fractions))
-
-
-_MOST_COUNTED_PULSES = 2**31 - 1  # the camera counts in 32 bits
 
 
 def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads: int | None) -> RenderedScene:
@@ -250,16 +231,16 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
         scene=scene,
         truth=result.truth,
         bound=np.where(seen, time_bound * per_time, np.nan).astype(np.float32),
-        profile=backscatter_profile(scene, result.path_edges, profile / max(profile[-1], 1e-300)),
         signal=float(np.median(returned[seen])) if seen.any() else 0.0,
         backscatter=float(np.median(water.sum(axis=-1))) * scale,
-        frames=_stored(plan, scene, frames, device=device),
+        **_profile(scene, result.path_edges, profile / max(profile[-1], 1e-300)),
+        **_stored(plan, scene, frames, device=device),
         expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16),
         polarisation=polarisation,
     )
 
 
-def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> StoredFrames:
+def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> dict[str, Any]:
     """Codes of the depth and the intensity of the counts; labels of the pixels that most likely report background."""
     time = frames.arrival_time(plan.recipe.monte_carlo.depth_method, device=device)
     start, stop = frames.gate_start, frames.gate_start + frames.expected.shape[-1] * frames.bin_width
@@ -268,16 +249,16 @@ def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> 
     codes = np.where(np.isnan(depth), 0, np.clip(code, 1, 65535)).astype(np.uint16)
     counts = frames.counts.sum(axis=-1, dtype=np.int64)
     step = intensity_step(float((frames.expected.sum(axis=-1) * frames.pulses).max()))
-    return StoredFrames(
-        depth=codes,
-        intensity=np.minimum(np.rint(counts / step), 255).astype(np.uint8),
-        label=np.packbits(_reports_background(frames, time), axis=-1),
-        intensity_step=step,
-        counts=frames.counts,
-    )
+    return {
+        "depth": codes,
+        "intensity": np.minimum(np.rint(counts / step), 255).astype(np.uint8),
+        "label": np.packbits(_reports_background(frames, time), axis=-1),
+        "intensity_step": step,
+        "counts": frames.counts,
+    }
 
 
-def _reports_background(frames: Frames, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _reports_background(frames: Frames, time: Floats) -> NDArray[np.bool_]:
     """Whether background is more likely than the target at the time that a pixel reports, `[K, H, W]`."""
     bins = frames.expected.shape[-1]
     at = np.nan_to_num((time - frames.gate_start) / frames.bin_width).astype(np.int64).clip(0, bins - 1)

@@ -11,10 +11,11 @@ import hashlib
 import math
 import os
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,81 +25,86 @@ from numpy.typing import NDArray
 from spadwarp.dataset.plan import Plan, Shard
 from spadwarp.dataset.render import PROFILE_BINS, RenderedScene, render_analytic, render_transport
 from spadwarp.device import core_count, pick_device
-from spadwarp.errors import DeviceError, FileError, SpadwarpError
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5, write_hdf5
 from spadwarp.io.paths import remove_temporaries
 from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.sight import port_advance
-from spadwarp.units import range_from_time
+from spadwarp.values import DeviceError, FileError, SpadwarpError, range_from_time
 
 FORMAT_VERSION = 1
 
-HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
-"""Cubes of a frame."""
-
 _LIBRARY = ("v110", "v110")  # one version of the file format, whichever HDF5 writes it
 _PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-_READ_OFTEN = ("depth", "bound")
+_READ_OFTEN = ("depth", "label", "intensity", "bound")
 _COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
-_READ_COLUMNS = (
-    "scene",
-    "sample",
-    "target",
-    "backscatter_fraction",
-    "attenuation_lengths",
-    "distance",
-    "intensity_step",
-)
-_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "reflectance": "reflectance"}
 
 
 @dataclass(frozen=True)
 class Column:
-    """A dataset of a file, or a field of an exported frame: type (`object`: text; a tuple: one of them), unit, meaning,
-    and the shape of a row."""
+    """A dataset of a file, or a field of a frame.
+
+    Attributes:
+        kind: Its type; `object`: text; a tuple: one of them.
+        unit, meaning: In words.
+        source: The attribute of a `RenderedScene` with its value; "": it is computed, or is none of a scene's.
+        shape: Of a row.
+        axis: Name of the first dimension of an image that has three.
+    """
 
     kind: Any
     unit: str
     meaning: str
+    source: str = ""
     shape: tuple[int, ...] = ()
+    axis: str = ""
 
     @property
     def is_text(self) -> bool:
         return self.kind is object
 
+    @property
+    def type(self) -> str:
+        """Type and shape, such as `float32 [24, 36]`."""
+        name = "text" if self.is_text else str(np.dtype(self.kind))
+        return f"{name} {list(self.shape)}" if self.shape else name
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        """What is written beside the values."""
+        return {"unit": self.unit, "description": self.meaning}
+
+
+_TARGET = Column(np.int32, "1", "index into the targets of manifest.json", "draw.target")
+_DISTANCE = ("m", "of the target's centre along the optical axis", "draw.distance")
+_LENGTHS = ("1", "extinction times distance, one way", "draw.attenuation_lengths")
+_FRACTION = "requested part of the pixels that report backscatter; NaN: the photon rates decide"
+_LABEL = "the pixel reports backscatter or other background: np.packbits along rows, first pixel highest"
 
 FRAME_COLUMNS: dict[str, Column] = {
-    "depth": Column(np.uint16, "m", "noisy planar depth = offset + step * code; code 0: no return"),
-    "label": Column(
-        np.uint8, "1", "the pixel reports backscatter or other background: np.packbits along rows, first pixel highest"
-    ),
-    "intensity": Column(np.uint8, "1", "recorded photons = intensity_step of the frame * code, cut at 255"),
-    "scene": Column(np.int32, "1", "index into scenes.h5"),
-    "sample": Column(np.int64, "1", "id of the frame in the whole dataset"),
-    "seed": Column(np.uint64, "1", "key of the frame's random numbers, together with its sample id"),
-    "target": Column(np.int32, "1", "index into the targets of manifest.json"),
-    "backscatter_fraction": Column(
-        np.float32, "1", "requested part of the pixels that report backscatter; NaN: the photon rates decide"
-    ),
-    "attenuation_lengths": Column(np.float32, "1", "extinction times distance, one way"),
-    "distance": Column(np.float32, "m", "of the target's centre along the optical axis"),
-    "pulses": Column(np.int64, "1", "laser pulses of the frame"),
-    "intensity_step": Column(np.float32, "1", "recorded photons per unit of intensity"),
+    "depth": Column(np.uint16, "m", "noisy planar depth = offset + step * code; code 0: no return", "depth"),
+    "label": Column(np.uint8, "1", _LABEL, "label"),
+    "intensity": Column(np.uint8, "1", "recorded photons = intensity_step * code, cut at 255", "intensity"),
+    "scene": Column(np.int32, "1", "index into scenes.h5", "draw.index"),
+    "sample": Column(np.int64, "1", "id of the frame in the whole dataset", "draw.samples"),
+    "seed": Column(np.uint64, "1", "with the sample id, key of the frame's random numbers", "draw.frame_seed"),
+    "target": _TARGET,
+    "backscatter_fraction": Column(np.float32, "1", _FRACTION, "draw.fractions"),
+    "attenuation_lengths": Column(np.float32, *_LENGTHS),
+    "distance": Column(np.float32, *_DISTANCE),
+    "pulses": Column(np.int64, "1", "laser pulses of the frame", "scene.pulses_per_depth_frame"),
+    "intensity_step": Column(np.float32, "1", "recorded photons per unit of intensity", "intensity_step"),
 }
 """Datasets of a frames file, all with one first dimension."""
 
+_EXPECTED = "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light"
+_POLARISATION = "degree of polarisation of each bin's light, by both channels; NaN where none arrives"
+
 HISTOGRAM_COLUMNS: dict[str, Column] = {
     "scene": FRAME_COLUMNS["scene"],
-    "expected": Column(
-        np.float16,
-        "1",
-        "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light",
-    ),
-    "polarisation": Column(
-        np.float16, "1", "degree of polarisation of each bin's light, by both channels; NaN where none arrives"
-    ),
-    "gate_start": Column(np.float64, "s", "start of bin 0 after the pulse left the laser"),
-    "bin_width": Column(np.float64, "s", "width of a bin"),
+    "expected": Column(np.float16, "1", _EXPECTED),
+    "polarisation": Column(np.float16, "1", _POLARISATION),
+    "gate_start": Column(np.float64, "s", "start of bin 0 after the pulse left the laser", "scene.gate.start"),
+    "bin_width": Column(np.float64, "s", "width of a bin", "scene.gate.bin_width"),
     "sample": FRAME_COLUMNS["sample"],
     "counts": Column(_COUNTS, "1", "counts of the frame"),
     "event_start": Column(np.int64, "1", "first event of each frame; one entry more than frames"),
@@ -107,48 +113,75 @@ HISTOGRAM_COLUMNS: dict[str, Column] = {
 }
 """Datasets of a histograms file."""
 
-_SCENE_NUMBERS: dict[str, tuple[str, str]] = {
-    "distance": ("m", "of the target's centre along the optical axis"),
-    "attenuation_lengths": ("1", "extinction times distance, one way"),
-    "absorption": ("1/m", "a"),
-    "scattering": ("1/m", "b"),
-    "extinction": ("1/m", "c = a + b"),
-    "anisotropy": ("1", "g, mean cosine of the scattering angle"),
-    "group_index": ("1", "light travels at 299792458 m/s over this"),
-    "gate_near": ("m", "range at which the gate opens"),
-    "gate_far": ("m", "range at which the gate closes"),
-    "target_reflectance": ("1", "of the target; NaN where each pixel has its own"),
-    "pulses": ("1", "laser pulses of a frame"),
-    "photons": ("1", "photons that were traced; 0: analytic"),
-    "signal": ("1", "expected detections of the return per pulse, median over the target's pixels"),
-    "backscatter": ("1", "expected backscatter detections per pulse within the gate, median over pixels"),
-    "pulse_energy": ("J", "of the laser"),
-    "pulse_fwhm": ("s", "of the laser"),
-    "jitter_fwhm": ("s", "of the detector"),
-    "pde": ("1", "photon detection efficiency"),
-    "dark_count_rate": ("1/s", "of a pixel"),
+# Unit, meaning and source.
+_SCENE_NUMBERS: dict[str, tuple[str, str, str]] = {
+    "distance": _DISTANCE,
+    "attenuation_lengths": _LENGTHS,
+    "absorption": ("1/m", "a", "scene.medium.absorption"),
+    "scattering": ("1/m", "b", "scene.medium.scattering"),
+    "extinction": ("1/m", "c = a + b", "scene.medium.extinction"),
+    "anisotropy": ("1", "g, mean cosine of the scattering angle", ""),
+    "group_index": ("1", "light travels at 299792458 m/s over this", "scene.medium.group_index"),
+    "gate_near": ("m", "range at which the gate opens", ""),
+    "gate_far": ("m", "range at which the gate closes", ""),
+    "target_reflectance": ("1", "of the target; NaN where each pixel has its own", ""),
+    "pulses": ("1", "laser pulses of a frame", "scene.pulses_per_depth_frame"),
+    "photons": ("1", "photons that were traced; 0: analytic", ""),
+    "signal": ("1", "expected detections of the return per pulse, median over the target's pixels", "signal"),
+    "backscatter": ("1", "expected backscatter detections per pulse within the gate, median", "backscatter"),
+    "pulse_energy": ("J", "of the laser", "scene.laser.pulse_energy"),
+    "pulse_fwhm": ("s", "of the laser", ""),
+    "jitter_fwhm": ("s", "of the detector", ""),
+    "pde": ("1", "photon detection efficiency", "scene.detections_per_photon"),
+    "dark_count_rate": ("1/s", "of a pixel", "scene.detector.dark_count_rate"),
 }
 
 
 def scene_columns(shape: tuple[int, int]) -> dict[str, Column]:
     """Datasets of `scenes.h5`, all with one first dimension; `shape`: height and width of the images."""
-    real, bins = np.float32, PROFILE_BINS
+    bins, real, half = PROFILE_BINS, np.float32, np.float16
+    density = "density of the water's backscatter over depth, on axis"
     return {
-        "depth": Column(real, "m", "true planar depth; NaN where nothing is hit", shape),
-        "bound": Column(real, "m", "Cramér–Rao bound of the depth in one frame; NaN for no estimate", shape),
-        "normal": Column(np.float16, "1", "unit normals towards the camera", (*shape, 3)),
-        "reflectance": Column(np.float16, "1", "Lambertian reflectance", shape),
-        "backscatter_profile": Column(real, "1/m", "density of the water's backscatter over depth, on axis", (bins,)),
-        "profile_edges": Column(real, "m", "edges of the profile's bins", (bins + 1,)),
-        "target": FRAME_COLUMNS["target"],
-        "target_name": Column("S64", "1", "its name"),
-        "translation": Column(real, "m", "of the target", (3,)),
-        "rotation_deg": Column(real, "deg", "of the target about its own x, y, z", (3,)),
-        "scale": Column(real, "1", "of the target", (3,)),
-        "laser_position": Column(real, "m", "in the camera frame", (3,)),
-        **{name: Column(np.float64, unit, text) for name, (unit, text) in _SCENE_NUMBERS.items()},
+        "depth": Column(real, "m", "true planar depth; NaN where nothing is hit", "truth.depth", shape),
+        "bound": Column(real, "m", "Cramér–Rao bound of the depth in one frame; NaN for no estimate", "bound", shape),
+        "normal": Column(half, "1", "unit normals towards the camera", "truth.normal", (*shape, 3)),
+        "reflectance": Column(half, "1", "Lambertian reflectance", "truth.reflectance", shape),
+        "backscatter_profile": Column(real, "1/m", density, "density", (bins,)),
+        "profile_edges": Column(real, "m", "edges of the profile's bins", "edges", (bins + 1,)),
+        "target": _TARGET,
+        "target_name": Column("S64", "1", "its name", "draw.source.name"),
+        "translation": Column(real, "m", "of the target", "", (3,)),
+        "rotation_deg": Column(real, "deg", "of the target about its own x, y, z", "", (3,)),
+        "scale": Column(real, "1", "of the target", "", (3,)),
+        "laser_position": Column(real, "m", "in the camera frame", "scene.beam.position", (3,)),
+        **{name: Column(np.float64, *numbers) for name, numbers in _SCENE_NUMBERS.items()},
         "config": Column("S8192", "1", "the scene as TOML"),
     }
+
+
+HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
+"""Cubes of a frame."""
+
+_TRACED = "[bin, height, width]; of traced scenes"
+_DEGREE = f"degree of polarisation by both channels, without the noise of counts, {_TRACED} with an analyser"
+# Unit, meaning, and the name of the first of three dimensions.
+_FIELDS = {
+    "noisy": ("m", "depth frame; NaN: no return", ""),
+    "clean": ("m", "true planar depth; NaN: nothing is hit", ""),
+    "label": ("1", "1: the pixel reports backscatter or other background, else 0", ""),
+    "intensity": ("1", "recorded photons", ""),
+    "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate", ""),
+    "normal": ("1", "unit normals towards the camera, [3, height, width]", "axis"),
+    "reflectance": ("1", "Lambertian reflectance", ""),
+    "prior": ("1/m", "density with which the water alone reports the depth in noisy; NaN where noisy is", ""),
+    "counts": ("1", f"histogram of the frame, {_TRACED}", "bin"),
+    "expected": ("1", f"expected histogram before pile-up, {_TRACED}", "bin"),
+    "polarisation": ("1", f"{_DEGREE}; NaN: no light", "bin"),
+}
+FIELDS = {name: Column(np.float32, unit, meaning, axis=axis) for name, (unit, meaning, axis) in _FIELDS.items()}
+"""Images that an item can hold, float32 `[1, H, W]` where no other shape is given."""
+
+_SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "reflectance": "reflectance"}
 
 
 def checksum(path: Path) -> dict[str, Any]:
@@ -168,15 +201,64 @@ def write_shard(
 
     They are put together in memory. Raises `FileError` where they cannot be written.
     """
-    names = plan.files_of(shard)
+    names, each = plan.files_of(shard), plan.frames_per_scene
     for name in names:
         remove_temporaries(folder / name)
+    of_scenes = scene_columns(plan.shape)
+    frames: dict[str, list[Any]] = {name: [] for name in FRAME_COLUMNS}
+    scenes: dict[str, list[Any]] = {name: [] for name in of_scenes}
     with ExitStack() as stack:
         files = [stack.enter_context(write_hdf5(folder / name, libver=_LIBRARY)) for name in names]
         for name, file in zip(names, files, strict=True):
             file.attrs.update(_attributes(plan, shard, name))
-        _fill(plan, shard, files, device=device, threads=threads)
+        histograms = _HistogramWriter(files[2], plan, shard) if len(files) > 2 else None
+        for rendered in _rendered(plan, shard, device, threads):
+            for name, column in FRAME_COLUMNS.items():
+                value = np.asarray(attrgetter(column.source)(rendered), column.kind)
+                frames[name].append(np.broadcast_to(value, (each, *value.shape[1:])))
+            computed = _computed(rendered)
+            for name, column in of_scenes.items():
+                scenes[name].append(attrgetter(column.source)(rendered) if column.source else computed[name])
+            if histograms is not None and rendered.expected is not None:
+                histograms.add(rendered)
+        if histograms is not None:
+            histograms.close()
+        packed = plan.recipe.frames.compression == "gzip"
+        for name, column in FRAME_COLUMNS.items():
+            _store(files[0], name, column, np.concatenate(frames[name]), packed)
+        files[0]["depth"].attrs.update({"step": plan.depth_step, "offset": plan.depth_offset})
+        files[0]["intensity"].attrs["step"] = 1.0
+        for name, column in of_scenes.items():
+            _store(files[1], name, column, np.array(scenes[name], dtype=column.kind), packed)
     return {name: checksum(folder / name) for name in names}
+
+
+def _store(file: Any, name: str, column: Column, data: NDArray[Any], packed: bool) -> None:
+    """Writes a column; what is read often is not packed unless the recipe says so."""
+    pack = name == "config" or (data.ndim > 2 and (packed or name not in _READ_OFTEN))
+    how = {"chunks": (1, *data.shape[1:]), **_PACKED} if pack else {}
+    file.create_dataset(name, data=data, track_times=False, **how).attrs.update(column.attributes)
+
+
+def _computed(rendered: RenderedScene) -> dict[str, Any]:
+    """Values of `scene_columns` that no attribute has."""
+    scene, draw = rendered.scene, rendered.draw
+    index, advance = scene.medium.group_index, port_advance(scene)
+    placed: Any = scene.targets[0] if scene.targets else None
+    config = scene.to_toml()
+    if draw.source.mesh is not None:
+        config = config.replace(str(draw.source.mesh), draw.source.mesh.name)  # without the folders of this machine
+    return {
+        **{name: getattr(placed, name, (np.nan,) * 3) for name in ("translation", "rotation_deg", "scale")},
+        "anisotropy": phase_function(scene.medium).mean_cosine,
+        "gate_near": range_from_time(scene.gate.start, index) + advance,
+        "gate_far": range_from_time(scene.gate.stop, index) + advance,
+        "target_reflectance": getattr(placed, "reflectance", np.nan),
+        "photons": draw.photons or 0,
+        "pulse_fwhm": 1e-12 * scene.laser.pulse_fwhm_ps,
+        "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,
+        "config": config.encode(),
+    }
 
 
 def write_scene_index(plan: Plan, folder: Path) -> None:
@@ -201,7 +283,7 @@ def write_scene_index(plan: Plan, folder: Path) -> None:
             if dtype.kind == "f":
                 layout.set_fill_value(np.array([np.nan], dtype))
             h5d.create(file.id, name.encode(), h5t.py_create(dtype, logical=True), h5s.create_simple(whole), layout)
-        _describe(file, columns)
+            file[name].attrs.update(column.attributes)
 
 
 def _attributes(plan: Plan, shard: Shard, name: str) -> dict[str, Any]:
@@ -222,108 +304,6 @@ def _attributes(plan: Plan, shard: Shard, name: str) -> dict[str, Any]:
     }
 
 
-def _describe(file: Any, columns: Mapping[str, Column]) -> None:
-    """Writes unit and meaning to the datasets that an open file holds."""
-    for name, stored in file.items():
-        stored.attrs.update({"unit": columns[name].unit, "description": columns[name].meaning})
-
-
-def _image_widths(width: int) -> dict[str, int]:
-    """Columns of the stored images of a frame."""
-    return {"depth": width, "label": (width + 7) // 8, "intensity": width}
-
-
-def _fill(plan: Plan, shard: Shard, files: list[Any], *, device: str | None, threads: int | None) -> None:
-    frames_file, scenes_file = files[:2]
-    each, (height, width) = plan.frames_per_scene, plan.shape
-    packed = plan.recipe.frames.compression == "gzip"
-    images = {}
-    for name, across in _image_widths(width).items():
-        how: dict[str, Any] = {"chunks": (1, height, across), **_PACKED} if packed else {}
-        shape = (shard.scenes * each, height, across)
-        images[name] = frames_file.create_dataset(name, shape, FRAME_COLUMNS[name].kind, track_times=False, **how)
-    images["depth"].attrs.update({"step": plan.depth_step, "offset": plan.depth_offset})
-    images["intensity"].attrs["step"] = 1.0
-    columns = scene_columns(plan.shape)
-    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in FRAME_COLUMNS if name not in images}
-    records: dict[str, list[Any]] = {name: [] for name in columns}
-    histograms = _HistogramWriter(files[2], plan, shard) if len(files) > 2 else None
-
-    for number, rendered in enumerate(_rendered(plan, shard, device, threads)):
-        for name, stored in images.items():
-            stored[number * each : (number + 1) * each] = getattr(rendered.frames, name)
-        for name, value in _frame_rows(plan, shard, rendered).items():
-            rows[name].append(np.broadcast_to(np.asarray(value, FRAME_COLUMNS[name].kind), each))
-        for name, value in _scene_row(plan, rendered).items():
-            records[name].append(value)
-        if histograms is not None and rendered.expected is not None:
-            histograms.add(rendered, rows["sample"][-1])
-
-    if histograms is not None:
-        histograms.close()
-    for name, parts in rows.items():
-        frames_file.create_dataset(name, data=np.concatenate(parts), track_times=False)
-    _describe(frames_file, FRAME_COLUMNS)
-    for name, column in columns.items():
-        pack = name == "config" or (len(column.shape) > 1 and (packed or name not in _READ_OFTEN))
-        how = {"chunks": (1, *column.shape), **_PACKED} if pack else {}
-        scenes_file.create_dataset(name, data=np.array(records[name], dtype=column.kind), track_times=False, **how)
-    _describe(scenes_file, columns)
-
-
-def _frame_rows(plan: Plan, shard: Shard, rendered: RenderedScene) -> dict[str, Any]:
-    """Values of `FRAME_COLUMNS` but images, for each frame or for all."""
-    draw, first = rendered.draw, rendered.draw.index * plan.frames_per_scene
-    return {
-        "scene": draw.index,
-        "sample": np.arange(first, first + plan.frames_per_scene),
-        "seed": plan.split_seeds[shard.split] if draw.photons is None else draw.seed,
-        "target": draw.target,
-        "backscatter_fraction": draw.fractions,
-        "attenuation_lengths": draw.attenuation_lengths,
-        "distance": draw.distance,
-        "pulses": rendered.scene.pulses_per_depth_frame,
-        "intensity_step": rendered.frames.intensity_step,
-    }
-
-
-def _scene_row(plan: Plan, rendered: RenderedScene) -> dict[str, Any]:
-    """A scene's values of `scene_columns`."""
-    scene, draw = rendered.scene, rendered.draw
-    medium, source, advance = scene.medium, plan.targets[draw.target], port_advance(scene)
-    placed: Any = scene.targets[0] if scene.targets else None
-    config = scene.to_toml()
-    if source.mesh is not None:
-        config = config.replace(str(source.mesh), source.mesh.name)  # without the folders of this machine
-    return {
-        "depth": rendered.truth.depth,
-        "bound": rendered.bound,
-        "normal": rendered.truth.normal,
-        "reflectance": rendered.truth.reflectance,
-        "backscatter_profile": rendered.profile[0],
-        "profile_edges": rendered.profile[1],
-        "target": draw.target,
-        "target_name": source.name,
-        **{name: getattr(placed, name, (np.nan,) * 3) for name in ("translation", "rotation_deg", "scale")},
-        "laser_position": scene.beam.position,
-        **{name: getattr(draw, name) for name in ("distance", "attenuation_lengths")},
-        **{name: getattr(medium, name) for name in ("absorption", "scattering", "extinction", "group_index")},
-        "anisotropy": phase_function(medium).mean_cosine,
-        "gate_near": range_from_time(scene.gate.start, medium.group_index) + advance,
-        "gate_far": range_from_time(scene.gate.stop, medium.group_index) + advance,
-        "target_reflectance": getattr(placed, "reflectance", np.nan),
-        "pulses": scene.pulses_per_depth_frame,
-        "photons": draw.photons or 0,
-        **{name: getattr(rendered, name) for name in ("signal", "backscatter")},
-        "pulse_energy": scene.laser.pulse_energy,
-        "pulse_fwhm": 1e-12 * scene.laser.pulse_fwhm_ps,
-        "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,
-        "pde": scene.detections_per_photon,
-        "dark_count_rate": scene.detector.dark_count_rate,
-        "config": config.encode(),
-    }
-
-
 class _HistogramWriter:
     """Takes the traced scenes of a shard one by one into an open file; `close` writes the rest."""
 
@@ -336,18 +316,17 @@ class _HistogramWriter:
         self._numbers: dict[str, list[Any]] = {"scene": [], "gate_start": [], "bin_width": [], "sample": []}
         self._events: list[tuple[NDArray[np.uint32], NDArray[np.int32]]] = []
 
-    def add(self, rendered: RenderedScene, samples: NDArray[np.int64]) -> None:
-        """The next scene, and the ids of its frames."""
-        counts, gate, row = rendered.frames.counts, rendered.scene.gate, len(self._numbers["scene"])
+    def add(self, rendered: RenderedScene) -> None:
+        """The next scene."""
+        counts, row = rendered.counts, len(self._numbers["scene"])
         assert counts is not None
         self._cubes["expected"][row] = rendered.expected
         if rendered.polarisation is not None:
             if "polarisation" not in self._cubes:  # NaN in scenes without
                 self._cubes["polarisation"] = self._create("polarisation", self._shape, np.float16, fillvalue=np.nan)
             self._cubes["polarisation"][row] = rendered.polarisation
-        for name, value in (("scene", rendered.draw.index), ("gate_start", gate.start), ("bin_width", gate.bin_width)):
-            self._numbers[name].append(value)
-        self._numbers["sample"].extend(samples)
+        for name, values in self._numbers.items():
+            values.extend(np.atleast_1d(attrgetter(HISTOGRAM_COLUMNS[name].source)(rendered)))
         if self._counts != "none":
             for frame in counts.reshape(len(counts), -1):
                 filled = np.flatnonzero(frame)
@@ -356,20 +335,19 @@ class _HistogramWriter:
     def close(self) -> None:
         """Writes what is only known at the end."""
         for name, values in self._numbers.items():
-            data = np.array(values, HISTOGRAM_COLUMNS[name].kind)
-            self._file.create_dataset(name, data=data, track_times=False)
+            self._file.create_dataset(name, data=np.array(values, HISTOGRAM_COLUMNS[name].kind), track_times=False)
         if self._events:
             self._write_counts()
-        _describe(self._file, HISTOGRAM_COLUMNS)
+        for name, stored in self._file.items():
+            stored.attrs.update(HISTOGRAM_COLUMNS[name].attributes)
 
     def _create(self, name: str, shape: tuple[int, ...], kind: Any, **choices: Any) -> Any:
         return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **_PACKED, **choices)
 
     def _write_counts(self) -> None:
         indices, counts = zip(*self._events, strict=True)
-        sizes = [part.size for part in counts]
-        kind = np.min_scalar_type(max((int(part.max(initial=0)) for part in counts), default=0))
-        shape = self._shape[1:]
+        sizes, shape = [part.size for part in counts], self._shape[1:]
+        kind = np.min_scalar_type(max(int(part.max(initial=0)) for part in counts))
         dense_bytes = len(counts) * math.prod(shape) * kind.itemsize
         if self._counts == "dense" or (self._counts == "smaller" and dense_bytes <= (4 + kind.itemsize) * sum(sizes)):
             stored = self._create("counts", (len(counts), *shape), kind)
@@ -434,11 +412,7 @@ class SceneFile:
     def __init__(self, folder: Path, name: str, shape: tuple[int, int]) -> None:
         self.file = _opened(folder / "scenes" / name.replace("frames-", "scenes-"), "spadwarp scenes")
         self._columns = scene_columns(shape)
-        try:
-            self.count = len(self.file.stored("distance", np.float64, (None,)))
-        except BaseException:
-            self.file.close()
-            raise
+        self.count = len(self.file.stored("distance", np.float64, (None,)))
 
     def stored(self, name: str) -> Any:
         """A column of `scene_columns`, its first dimension the scenes."""
@@ -468,18 +442,16 @@ class HistogramFile:
 
     def __init__(self, file: Hdf5File, shape: tuple[int, int]) -> None:
         self.path = file.path
-        self._rows = {
-            name: {int(number): row for row, number in enumerate(file.array(name, FRAME_COLUMNS[name].kind, (None,)))}
-            for name in ("scene", "sample")
-        }
-        scenes, samples = (len(file.stored(name, FRAME_COLUMNS[name].kind, (None,))) for name in self._rows)
-        expected = file.stored("expected", np.float16, (scenes, *shape, None))
-        self.shape: tuple[int, ...] = expected.shape[1:]
-        self._of_scenes = {"expected": expected}
+        numbers = {name: file.array(name, FRAME_COLUMNS[name].kind, (None,)) for name in ("scene", "sample")}
+        self._rows = {name: {int(id): row for row, id in enumerate(ids)} for name, ids in numbers.items()}
+        scenes, samples = map(len, numbers.values())
+        self._cubes = {"expected": file.stored("expected", np.float16, (scenes, *shape, None))}
+        self.shape: tuple[int, ...] = self._cubes["expected"].shape[1:]
         self.fields = HISTOGRAM_FIELDS if "polarisation" in file else HISTOGRAM_FIELDS[:-1]
         if "polarisation" in file:
-            self._of_scenes["polarisation"] = file.stored("polarisation", np.float16, expected.shape)
-        self._counts = file.stored("counts", _COUNTS, (samples, *self.shape)) if "counts" in file else None
+            self._cubes["polarisation"] = file.stored("polarisation", np.float16, (scenes, *self.shape))
+        if "counts" in file:
+            self._cubes["counts"] = file.stored("counts", _COUNTS, (samples, *self.shape))
         self._starts: NDArray[np.int64] | None = None
         if "event_start" in file:
             self._starts = file.array("event_start", np.int64, (samples + 1,))
@@ -491,18 +463,11 @@ class HistogramFile:
     def cube(self, name: str, *, scene: int, sample: int) -> NDArray[np.float32] | None:
         """Counts of a frame, or of a scene the expected counts of a frame or the degree of polarisation, `[H, W, T]`;
         None where there are none."""
-        if name == "counts":
-            return self._counts_of(sample)
-        row, stored = self._rows["scene"].get(scene), self._of_scenes.get(name)
-        return None if row is None or stored is None else stored[row].astype(np.float32)
-
-    def _counts_of(self, sample: int) -> NDArray[np.float32] | None:
-        row = self._rows["sample"].get(sample)
-        if row is None or (self._starts is None and self._counts is None):
+        row = self._rows["sample"].get(sample) if name == "counts" else self._rows["scene"].get(scene)
+        if row is None:
             return None
-        if self._starts is None:
-            assert self._counts is not None
-            return self._counts[row].astype(np.float32)
+        if name != "counts" or self._starts is None:
+            return self._cubes[name][row].astype(np.float32) if name in self._cubes else None
         part = slice(int(self._starts[row]), int(self._starts[row + 1]))
         index = self._index[part]
         if index.size and index.max() >= math.prod(self.shape):
@@ -520,31 +485,21 @@ class ShardFile:
     """
 
     def __init__(self, folder: Path, name: str, manifest: dict[str, Any]) -> None:
-        with ExitStack() as opened:  # closed again where one of them is refused
-            self._open(opened, folder, name, manifest)
-            opened.pop_all()
-
-    def _open(self, opened: ExitStack, folder: Path, name: str, manifest: dict[str, Any]) -> None:
-        shape, targets = (manifest["height"], manifest["width"]), len(manifest["targets"])
-        self.frames = opened.enter_context(closing(_opened(folder / name, "spadwarp frames")))
-        self.scenes = SceneFile(folder, name, shape)
-        opened.enter_context(closing(self.scenes.file))
+        height, self.width = shape = (manifest["height"], manifest["width"])
+        self.frames, self.scenes = _opened(folder / name, "spadwarp frames"), SceneFile(folder, name, shape)
         count = len(self.frames.stored("sample", np.int64, (None,)))
-        self.columns = {
-            column: self.frames.array(column, FRAME_COLUMNS[column].kind, (count,)) for column in _READ_COLUMNS
-        }
+        widths = {"depth": self.width, "label": (self.width + 7) // 8, "intensity": self.width}
+        numbers = [column for column in FRAME_COLUMNS if column not in widths]
+        self.columns = {column: self.frames.array(column, FRAME_COLUMNS[column].kind, (count,)) for column in numbers}
         self.first_scene = int(self.columns["scene"][0]) if count else 0
-        last = self.first_scene + self.scenes.count
-        if not 0 <= self.first_scene <= last <= manifest["scenes"] or not _within(
-            self.columns["scene"], range(self.first_scene, last)
-        ):
-            self.frames.refuse("scene", f"names scenes that are not among the {self.scenes.count} of the shard")
-        if not _within(self.columns["target"], range(targets)):
-            self.frames.refuse("target", f"names targets that are not among the {targets} of the dataset")
-        self.width = shape[1]
+        scenes, targets = range(self.first_scene, self.first_scene + self.scenes.count), range(len(manifest["targets"]))
+        if not 0 <= scenes.start <= scenes.stop <= manifest["scenes"] or not _within(self.columns["scene"], scenes):
+            self.frames.refuse("scene", f"names scenes that are not among the {len(scenes)} of the shard")
+        if not _within(self.columns["target"], targets):
+            self.frames.refuse("target", f"names targets that are not among the {len(targets)} of the dataset")
         self.stored = {
-            field: self.frames.stored(field, FRAME_COLUMNS[field].kind, (count, shape[0], across)).mapped()
-            for field, across in _image_widths(shape[1]).items()
+            field: self.frames.stored(field, FRAME_COLUMNS[field].kind, (count, height, across)).mapped()
+            for field, across in widths.items()
         }
         self.step = np.float32(self.frames.real("step", "(0, inf)", of="depth"))
         self.offset = np.float32(self.frames.real("offset", of="depth"))
@@ -552,14 +507,8 @@ class ShardFile:
         self.gate = self.scenes.gate()
         self.profiles, self.edges = self.scenes.array("backscatter_profile"), self.scenes.array("profile_edges")
         cubes = folder / name.replace("frames-", "histograms-")
-        self.histograms = None
-        if os.path.isfile(cubes):
-            file = opened.enter_context(closing(_opened(cubes, "spadwarp histograms")))
-            self.histograms = HistogramFile(file, shape)
-
-    def images(self, row: int, fields: Sequence[str], window: tuple[slice, slice]) -> dict[str, NDArray[np.float32]]:
-        """A frame's images by field, `[C, H, W]` each."""
-        return {name: self._image(name, row, window) for name in fields}
+        found = os.path.isfile(cubes)
+        self.histograms = HistogramFile(_opened(cubes, "spadwarp histograms"), shape) if found else None
 
     def numbers(self, row: int) -> dict[str, Any]:
         """The numbers of an item."""
@@ -574,14 +523,18 @@ class ShardFile:
         """Row of a frame's scene in `scenes`."""
         return int(self.columns["scene"][row]) - self.first_scene
 
-    def _image(self, name: str, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
+    def image(self, name: str, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
+        """A part of an image of a frame, by its name in `FIELDS`, `[C, H, W]`."""
         image: NDArray[Any]
         if name in HISTOGRAM_FIELDS:
             return np.moveaxis(self._histogram(name, row)[window], -1, 0)
-        if name == "noisy":
-            image = self._noisy(row, window)
-        elif name == "prior":
-            image = self._prior(self.scene_row(row), self._noisy(row, window))
+        if name in ("noisy", "prior"):
+            codes = self.stored["depth"][(row, *window)]
+            image = codes.astype(np.float32)
+            image *= self.step
+            image += self.offset
+            np.copyto(image, np.nan, where=codes == 0)
+            image = image if name == "noisy" else self._prior(self.scene_row(row), image)
         elif name == "label":
             rows, columns = window
             image = np.unpackbits(self.stored["label"][row, rows], axis=-1, count=self.width)[:, columns]
@@ -594,23 +547,13 @@ class ShardFile:
         return np.moveaxis(image, -1, 0) if name == "normal" else image[None]
 
     def _histogram(self, name: str, row: int) -> NDArray[np.float32]:
-        cube, path = None, self.frames.path
         scene, sample = (int(self.columns[column][row]) for column in ("scene", "sample"))
-        if self.histograms is not None:
-            cube = self.histograms.cube(name, scene=scene, sample=sample)
-            if name not in self.histograms.fields:
-                path = self.histograms.path
+        held = self.histograms
+        cube = None if held is None else held.cube(name, scene=scene, sample=sample)
         if cube is None:
+            path = self.frames.path if held is None or name in held.fields else held.path
             raise FileError(f"{path}: frame {sample} has no {name!r}")
         return cube
-
-    def _noisy(self, row: int, window: tuple[slice, slice]) -> NDArray[np.float32]:
-        codes = self.stored["depth"][(row, *window)]
-        depth = codes.astype(np.float32)
-        depth *= self.step
-        depth += self.offset
-        np.copyto(depth, np.nan, where=codes == 0)
-        return depth
 
     def _prior(self, scene: int, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         edges, profile = self.edges[scene], self.profiles[scene]

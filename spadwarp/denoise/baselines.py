@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.denoise.frames import DepthFrames, fill_missing
 from spadwarp.denoise.histogram_inputs import histogram_tensors
 from spadwarp.denoise.network_files import require_torch
-from spadwarp.errors import ArgumentError, SpadwarpError
-from spadwarp.limits import check_real
+from spadwarp.values import ArgumentError, SpadwarpError, check_real
 
 __all__ = ["BASELINES", "CLASSICAL", "MEDIAN_WINDOWS", "TUNINGS", "Classical", "bm3d_filter", "classical_depth"]
 __all__ += ["gated_filter", "median_filter", "unfiltered"]

@@ -19,8 +19,7 @@ from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames
 from spadwarp.denoise.metrics import LARGER_IS_BETTER, Scores, Steps, score, staircase_steps
 from spadwarp.denoise.network_files import own_weights
-from spadwarp.errors import ArgumentError, FileError
-from spadwarp.limits import check_choice, check_integer
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["Evaluation", "Sample", "evaluate"]
 

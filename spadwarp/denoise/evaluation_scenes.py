@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 
 __all__ = [
     "GATE",

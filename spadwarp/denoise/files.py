@@ -19,13 +19,11 @@ from spadwarp.denoise.inference import Estimate, estimate_frames, target_thresho
 from spadwarp.denoise.network_files import Precision, weights_metadata
 from spadwarp.denoise.reading import ENDINGS, DepthReading, backscatter_profile, depth_at, read_depth
 from spadwarp.denoise.second_return import second_return
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import holds_own_file, locate
 from spadwarp.frames.measured import Histograms
 from spadwarp.io.arrays import write_exr
 from spadwarp.io.paths import atomic_path
-from spadwarp.limits import check_real
-from spadwarp.units import percent
+from spadwarp.values import ArgumentError, FileError, check_real, percent
 from spadwarp.viz import draw_denoised
 
 __all__ = ["Denoised", "denoise_file", "depth_files"]

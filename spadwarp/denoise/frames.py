@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_real, shown
+from spadwarp.values import ArgumentError, check_real, shown
 
 __all__ = [
     "LOG_DENSITY_LIMIT",

@@ -12,9 +12,8 @@ from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.gates import bins_of_target
 from spadwarp.denoise.network_files import require_torch, torch_device
-from spadwarp.errors import ArgumentError
 from spadwarp.frames.measured import Histograms
-from spadwarp.units import percent
+from spadwarp.values import ArgumentError, percent
 
 __all__ = ["checked_histograms", "dim_pixels", "features_of_histograms", "histogram_tensors", "target_bins"]
 

@@ -16,8 +16,7 @@ from spadwarp.denoise.gates import narrowed_input
 from spadwarp.denoise.histogram_inputs import checked_histograms, features_of_histograms, target_bins
 from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.denoise.recipe import MODELS
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_choice, check_real
+from spadwarp.values import ArgumentError, check_choice, check_real
 
 __all__ = ["METHODS", "Estimate", "apply", "denoise_frames", "estimate", "estimate_frames", "target_threshold"]
 

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 
 __all__ = ["LARGER_IS_BETTER", "Scores", "Steps", "score", "staircase_steps"]
 

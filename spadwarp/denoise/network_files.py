@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from spadwarp.denoise.recipe import MODELS
-from spadwarp.errors import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory
 from spadwarp.io.paths import existing_file
 from spadwarp.io.text import parse_json
-from spadwarp.limits import shown
+from spadwarp.values import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory, shown
 
 __all__ = ["WEIGHTS", "Precision", "fast_precision", "load_network", "own_weights", "require_torch", "torch_device"]
 __all__ += ["weights_metadata"]

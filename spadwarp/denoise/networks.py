@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.pyramid import PyramidNet
 from spadwarp.denoise.repeatable import edge_padded
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 
 __all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds", "reads_histograms"]
 

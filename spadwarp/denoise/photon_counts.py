@@ -20,13 +20,11 @@ from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.histogram_inputs import features_of_histograms
 from spadwarp.denoise.inference import METHODS, denoise_frames
 from spadwarp.denoise.network_files import own_weights
-from spadwarp.errors import SpadwarpError
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import detector_response
-from spadwarp.limits import SEED, check_choice, check_integer, check_real
 from spadwarp.scene.sight import depth_from_time, port_advance
-from spadwarp.units import range_from_time
+from spadwarp.values import SEED, SpadwarpError, check_choice, check_integer, check_real, range_from_time
 from spadwarp.viz import evaluation as drawing
 
 if TYPE_CHECKING:

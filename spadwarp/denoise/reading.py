@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise.frames import checked_gate
 from spadwarp.denoise.histogram_inputs import dim_pixels
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, gate_of, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.depth import Method, depth_of
 from spadwarp.frames.file import SequenceFile
@@ -24,7 +23,7 @@ from spadwarp.io.paths import existing_file
 from spadwarp.result import Result
 from spadwarp.scene.sight import depth_from_time
 from spadwarp.transport import PhotonRecords
-from spadwarp.units import range_from_time
+from spadwarp.values import ArgumentError, FileError, range_from_time
 
 __all__ = ["ENDINGS", "DepthReading", "backscatter_profile", "depth_at", "read_depth"]
 

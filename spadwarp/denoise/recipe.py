@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import pydantic
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PrivateAttr
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from spadwarp.errors import ConfigError
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.scene.messages import describe
-from spadwarp.scene.sections import Whole
-from spadwarp.scene.tables import parse_override
+from spadwarp.scene.document import Document
+from spadwarp.scene.sections import Section, Whole
 
 __all__ = ["LEAST_CROP", "MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
 
@@ -24,10 +21,6 @@ LEAST_CROP = 32
 
 MODELS = ("pyramid", "histograms", "dncnn", "usdn")
 """Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
@@ -52,7 +45,7 @@ Positive = Annotated[tuple[Above0, Above0], *_CHECKS]
 Shares = Annotated[tuple[Share, Share], *_CHECKS]
 
 
-class Noise(_Table):
+class Noise(Section):
     """The noise of a training: `[lowest, highest]`, or a part of the samples."""
 
     backscatter: Shares = Field(
@@ -105,7 +98,7 @@ def _given(table: Any) -> Any:
     return {name: getattr(table, name) for name in table.model_fields_set} if isinstance(table, Noise) else table
 
 
-class Optimiser(_Table):
+class Optimiser(Section):
     """How the network is trained."""
 
     steps: Whole = Field(40_000, ge=1, le=10**12, description="updates of the weights")
@@ -132,7 +125,7 @@ class Optimiser(_Table):
     )
 
 
-class TrainingRecipe(_Table):
+class TrainingRecipe(Document):
     """Everything a training depends on, checked and frozen."""
 
     model: Literal["pyramid", "histograms", "dncnn", "usdn"] = Field(..., description="network")
@@ -146,7 +139,6 @@ class TrainingRecipe(_Table):
     noise: Noise = Noise()
     mixture: tuple[Part, ...] = Field((), description="parts of the samples with other noise; needs a pool")
     optimiser: Optimiser = Optimiser()
-    _source: Path | None = PrivateAttr(None)
 
     @pydantic.model_validator(mode="before")
     @classmethod
@@ -183,22 +175,6 @@ class TrainingRecipe(_Table):
         """The mixture; without one, all samples have the recipe's noise."""
         return self.mixture or (Part(share=1.0, **self.noise.model_dump()),)
 
-    @property
-    def source(self) -> Path | None:
-        """The file that the recipe came from."""
-        return self._source
-
-    @classmethod
-    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> TrainingRecipe:
-        """A recipe from tables as TOML gives them. Raises `ConfigError` with a line for each problem."""
-        try:
-            recipe = cls.model_validate(dict(tables))
-        except pydantic.ValidationError as error:
-            name = None if source is None else str(source)
-            raise ConfigError(describe(error, cls, {}), source=name) from None
-        recipe._source = None if source is None else Path(source)
-        return recipe
-
 
 def load_training_recipe(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> TrainingRecipe:
     """Reads a recipe, or by a bare name one of the package's; `overrides` are texts such as "optimiser.steps=2000".
@@ -206,10 +182,4 @@ def load_training_recipe(path: str | os.PathLike[str], overrides: Sequence[str] 
     Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
     """
     path = example_or_path(path, "training")
-    tables: dict[Any, Any] = read_toml(path)
-    for (*sections, field), value in map(parse_override, overrides):
-        inner = tables
-        for section in sections:
-            inner = inner.setdefault(section, {})
-        inner[field] = value
-    return TrainingRecipe.from_dict(tables, source=path)
+    return TrainingRecipe.from_dict(read_toml(path), overrides=overrides, source=path)

@@ -15,7 +15,7 @@ from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.device import physical_memory
-from spadwarp.errors import DeviceError
+from spadwarp.values import DeviceError
 
 __all__ = ["Fresh", "Pool", "Samples", "Scenes", "Sizes"]
 

@@ -30,7 +30,7 @@ from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, Estimate, denoise_frames, estimate_frames, target_threshold
 from spadwarp.denoise.metrics import staircase_steps
 from spadwarp.denoise.network_files import own_weights
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 
 __all__ = ["FrameScores", "SceneScores", "evaluate_scenes", "score_frame"]
 

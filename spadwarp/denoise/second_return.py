@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.histogram_inputs import histogram_tensors
 from spadwarp.denoise.network_files import require_torch
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 
 __all__ = ["second_return"]
 

@@ -20,8 +20,8 @@ from spadwarp.denoise.recipe import LEAST_CROP, Noise, TrainingRecipe
 from spadwarp.denoise.repeatable import fixed_order
 from spadwarp.denoise.synthetic_noise import CleanScenes, draw_batch, procedural_scenes
 from spadwarp.denoise.training_steps import Run, Trained, Workers
-from spadwarp.errors import ConfigError
 from spadwarp.parallel.worker import interruptible
+from spadwarp.values import ConfigError
 
 __all__ = ["LEVELS", "Trained", "fit"]
 

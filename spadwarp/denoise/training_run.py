@@ -15,8 +15,7 @@ from spadwarp.dataset import read_manifest
 from spadwarp.dataset.shards import SceneFile
 from spadwarp.denoise.network_files import require_torch
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
-from spadwarp.errors import FileError
-from spadwarp.limits import environment_integer
+from spadwarp.values import FileError, environment_integer
 from spadwarp.viz import draw_learning_curves
 
 if TYPE_CHECKING:

@@ -25,9 +25,8 @@ from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.samples import Samples, Sizes
 from spadwarp.denoise.selection import CHOICES
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.paths import atomic_path
-from spadwarp.limits import environment_integer
+from spadwarp.values import ConfigError, FileError, environment_integer
 
 __all__ = ["Run", "Trained", "Workers", "save_weights"]
 

@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic import AnalyticFile
 from spadwarp.dataset import FrameReader
-from spadwarp.errors import FileError
 from spadwarp.frames import FramesFile, Reduction, SequenceFile
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import file_within
 from spadwarp.result import Result, load_result
-from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight, port_advance
 from spadwarp.transport import PhotonRecords, load_records
-from spadwarp.units import range_from_time
+from spadwarp.values import FileError, range_from_time
 
 __all__ = ["Held", "gate_of", "holds_own_file", "is_own_file", "load", "locate", "stored_depth", "summary"]
 
@@ -150,75 +148,49 @@ def summary(held: Held) -> dict[str, Any]:
     """Facts about what a loaded file holds, in numbers and text that JSON can hold; `kind` names what it is."""
     if isinstance(held, Result):
         return {"kind": "result", **held.summary()}
-    if isinstance(held, FramesFile):
-        return {"kind": "frames", **_of_frames(held)}
-    if isinstance(held, SequenceFile):
-        return {"kind": "sequence", **_of_sequence(held)}
-    if isinstance(held, AnalyticFile):
-        return {"kind": "analytic", **_of_analytic(held)}
+    if isinstance(held, PhotonRecords):
+        ended = {name: int(np.count_nonzero(held.reason == number)) for number, name in enumerate(held.reasons)}
+        ended = {name: count for name, count in ended.items() if count}
+        return {"kind": "records", "photons": len(held.id), "ended": ended}
     if isinstance(held, FrameReader):
         shards, targets = held.shards, list(held.manifest["targets"])
-        facts = {"name": held.manifest["name"], "folder": str(held.path)}
+        facts = {"kind": "dataset", "name": held.manifest["name"], "folder": str(held.path)}
         facts |= {"shards": shards if len(shards) == 1 else len(shards), "frames": len(held)}
-        return {"kind": "dataset", **facts, **_image(held.shape[1], held.shape[0]), "targets": targets}
-    ended = {name: int(np.count_nonzero(held.reason == number)) for number, name in enumerate(held.reasons)}
-    ended = {name: count for name, count in ended.items() if count}
-    return {"kind": "records", "photons": len(held.id), "ended": ended}
-
-
-def _of_frames(file: FramesFile) -> dict[str, Any]:
-    mean = [float(file.intensity(number).mean()) for number in range(file.frames)]
-    return {
-        **_common(file.scene, file, len(file.edges) - 1),
-        "pulses": file.pulses,
-        "gate_start_ns": 1e9 * file.gate_start,
-        "bin_width_ps": 1e12 * file.bin_width,
-        "period_ns": None if file.period is None else 1e9 * file.period,
-        "counts_per_pixel": float(np.mean(mean)) if mean else None,
-        "depth_by": list(file.methods),
-        "response_fwhm_ps": 1e12 * file.irf.fwhm,
-        **({} if file.channel == "I" else {"channel": file.channel}),
+        return {**facts, "image": {"width": held.shape[1], "height": held.shape[0]}, "targets": targets}
+    scene = held.base if isinstance(held, SequenceFile) else held.scene
+    common = {
+        "scene": str(scene.source) if scene.source else None,
+        "frames": held.frames,
+        "seed": held.seed,
+        "image": {"width": scene.camera.width, "height": scene.camera.height},
+        "bins": scene.gate.bins if isinstance(held, AnalyticFile) else held.bins,
     }
-
-
-def _of_sequence(file: SequenceFile) -> dict[str, Any]:
-    times = file.trajectory.times
+    if isinstance(held, AnalyticFile):
+        return {"kind": "analytic", **common, **_of_analytic(held)}
+    if isinstance(held, SequenceFile):
+        times = held.trajectory.times
+        facts = {"times_s": [float(times[0]), float(times[-1])], "moving": list(held.trajectory.fields)}
+        return {"kind": "sequence", **common, "pulses": held.pulses, **facts, "depth_by": list(held.methods)}
+    mean = [float(held.intensity(number).mean()) for number in range(held.frames)]
     return {
-        **_common(file.base, file, file.bins),
-        "pulses": file.pulses,
-        "times_s": [float(times[0]), float(times[-1])],
-        "moving": list(file.trajectory.fields),
-        "depth_by": list(file.methods),
+        "kind": "frames",
+        **common,
+        "pulses": held.pulses,
+        "gate_start_ns": 1e9 * held.gate_start,
+        "bin_width_ps": 1e12 * held.bin_width,
+        "period_ns": None if held.period is None else 1e9 * held.period,
+        "counts_per_pixel": float(np.mean(mean)) if mean else None,
+        "depth_by": list(held.methods),
+        "response_fwhm_ps": 1e12 * held.irf.fwhm,
+        **({} if held.channel == "I" else {"channel": held.channel}),
     }
 
 
 def _of_analytic(file: AnalyticFile) -> dict[str, Any]:
     estimated, chosen = file.maps["fisher"] > 0, file.scene.analytic
-    medians = {
-        "signal_per_pulse": "signal",
-        "sigma_depth_m": "sigma_depth",
-        "outlier_probability": "outlier_probability",
-    }
-    return {
-        **_common(file.scene, file, file.scene.gate.bins),
-        **{name: getattr(chosen, name) for name in ("form", "backscatter", "count_law")},
-        "pixels_with_estimate": int(np.count_nonzero(estimated)),
-        **{
-            name: float(np.median(file.maps[field][estimated])) if estimated.any() else None
-            for name, field in medians.items()
-        },
-    }
-
-
-def _common(scene: Scene, file: FramesFile | SequenceFile | AnalyticFile, bins: int) -> dict[str, Any]:
-    return {
-        "scene": str(scene.source) if scene.source else None,
-        "frames": file.frames,
-        "seed": file.seed,
-        **_image(scene.camera.width, scene.camera.height),
-        "bins": bins,
-    }
-
-
-def _image(width: int, height: int) -> dict[str, Any]:
-    return {"image": {"width": width, "height": height}}
+    facts: dict[str, Any] = {name: getattr(chosen, name) for name in ("form", "backscatter", "count_law")}
+    facts["pixels_with_estimate"] = int(np.count_nonzero(estimated))
+    medians = {"signal_per_pulse": "signal", "sigma_depth_m": "sigma_depth"}
+    for name, field in (medians | {"outlier_probability": "outlier_probability"}).items():
+        facts[name] = float(np.median(file.maps[field][estimated])) if estimated.any() else None
+    return facts

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import functools
 import secrets
 import tempfile
 import warnings
@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.frames import Reduction, detector_response
-from spadwarp.io.arrays import point_cloud, point_normals, write_array, write_exr, write_ply
+from spadwarp.io.arrays import point_cloud, write_array, write_exr, write_ply
 from spadwarp.io.paths import file_within, remove_temporaries
 from spadwarp.io.text import write_text
-from spadwarp.limits import check_choice
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
 from spadwarp.result.file import read_head
+from spadwarp.result.result import difference
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.values import ArgumentError, FileError, check_choice
 
 if TYPE_CHECKING:
     from spadwarp.inverse import Fit, Unknown
@@ -57,11 +57,11 @@ class _Pictures:
     of: Any
     folder: Path
 
-    def plot(self, **options: Any) -> list[Callable[[], list[Path]]]:
-        """A call for each picture of a result."""
+    def plot(self, **options: Any) -> list[Path]:
+        """Draws those of a result; returns their paths."""
         import spadwarp
 
-        return spadwarp.viz.picture_calls(self.of, self.folder, **options)
+        return spadwarp.viz.draw_result(self.of, self.folder, **options)
 
     def save(self) -> Path:
         """Draws that of a fit; returns its path."""
@@ -116,7 +116,7 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
             if output.exr:
                 written.append(save_depth_exr(result, depth, folder / "depth.exr"))
                 written.append(save_truth_maps(result, folder / "truth.exr"))
-            written += itertools.chain.from_iterable(pictures.results())
+            written += [path for paths in pictures.results() for path in paths]
     finally:
         for name in _PICTURES:  # of processes that were ended
             remove_temporaries(folder / name)
@@ -137,8 +137,8 @@ def _depth(result: Result, device: str | None) -> NDArray[np.float64]:
 def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[Callable[[], list[Path]]]:
     output = result.scene.output
     formats = [ending for ending in _ENDINGS if getattr(output, ending)]
-    pictures = _Pictures(result, folder)
-    return pictures.plot(depth=depth, method=output.depth_method, formats=formats) if formats else []
+    draw = functools.partial(_Pictures(result, folder).plot, depth=depth, method=output.depth_method, formats=formats)
+    return [functools.partial(draw, kinds=(kind,)) for kind in _KINDS] if formats else []
 
 
 def _save(result: Result, path: Path) -> Path:
@@ -165,7 +165,8 @@ def load_resumable(path: str | Path) -> tuple[Result, Path]:
         return load_result(file), file
     try:
         checkpoint, result = map(read_head, files)
-        if checkpoint.is_of_run(result) and result.photons >= checkpoint.photons:
+        one_run = not difference(checkpoint, result) and checkpoint.requested[0] == result.requested[0]
+        if one_run and result.photons >= checkpoint.photons:
             files.reverse()
         return load_result(files[0]), files[0]
     except FileError as error:
@@ -238,18 +239,18 @@ def write_depth(
 def _write_points(reduction: Reduction, path: str | Path, frame: str, comment: str) -> Path:
     assert reduction.lines is not None
     distance = reduction.range[0]
-    view = reduction.lines.directions_to(distance)
-    points, valid = point_cloud(distance, view)
-    normals = point_normals(distance, view)
+    points: Any
+    normals: Any
+    points, normals = point_cloud(distance, reduction.lines.directions_to(distance))
     if not len(points):
         raise FileError(f"{path}: nothing returned in any pixel: there are no points to write")
     if frame == "world":
         assert reduction.camera is not None
-        points = to_world(reduction.camera, points).astype(np.float32)
-        normals = (normals @ rotation_matrix(reduction.camera.rotation_deg).T).astype(np.float32)
-    intensity = reduction.intensity[0][valid].astype(np.float32)
-    properties = {f"n{axis}": normals[:, index] for index, axis in enumerate("xyz")} | {"intensity": intensity}
-    return write_ply(path, points, properties, comment=f"{comment}; frame {_POINT_FRAMES[frame]}")
+        points = to_world(reduction.camera, points)
+        normals = normals @ rotation_matrix(reduction.camera.rotation_deg).T
+    columns = dict(zip(("x", "y", "z", "nx", "ny", "nz"), (*points.T, *normals.T), strict=True))
+    columns["intensity"] = reduction.intensity[0][np.isfinite(distance)]
+    return write_ply(path, columns, comment=f"{comment}; frame {_POINT_FRAMES[frame]}")
 
 
 # A fit

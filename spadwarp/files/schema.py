@@ -10,12 +10,11 @@ from pydantic import BaseModel
 
 from spadwarp.dataset import Recipe
 from spadwarp.mesh import builtin_names
-from spadwarp.scene import Scene, presets
-from spadwarp.scene.tables import COEFFICIENTS, ENERGIES
+from spadwarp.scene import Laser, Medium, Scene, presets
 
 __all__ = ["json_schema"]
 
-# A number with a unit, as in `spadwarp.units.quantity`; which unit goes with which field is not in the schema.
+# A number with a unit, as in `spadwarp.values.quantity`; which unit goes with which field is not in the schema.
 _QUANTITY = {
     "description": 'a number with a unit, such as "150 nJ"',
     "type": "string",
@@ -75,7 +74,7 @@ def _widened(name: str, field: dict[str, Any], table: str, *, scene: bool) -> di
     """A field with all that validators take beyond its type: units, words, one number for three, presets."""
     extra: dict[str, Any] = {key: field[key] for key in ("description", "default") if key in field}
     kind = {key: value for key, value in field.items() if key not in ("description", "default", "title")}
-    if name in (*COEFFICIENTS, *ENERGIES[1:]):
+    if name in (*Medium.alternatives, *Laser.alternatives[1:]):
         extra.pop("default", None)
     if name == "preset" and (names := [preset for preset in presets() if preset.split(".")[0] == _SECTIONS.get(table)]):
         return {"enum": [preset.partition(".")[2] for preset in names], **extra}

@@ -2,17 +2,14 @@
 
 from typing import TYPE_CHECKING
 
-from spadwarp.frames import cramer_rao, depth, file, frames, measured, receiver, record, response, spad
+from spadwarp.frames import cramer_rao, depth, file, measured, response, spad
 from spadwarp.frames.cramer_rao import *
 from spadwarp.frames.depth import *
 from spadwarp.frames.file import *
-from spadwarp.frames.frames import *
 from spadwarp.frames.measured import *
-from spadwarp.frames.receiver import *
-from spadwarp.frames.record import *
 from spadwarp.frames.response import *
 from spadwarp.frames.spad import *
 
-_MODULES = (cramer_rao, depth, file, frames, measured, receiver, record, response, spad)
+_MODULES = (cramer_rao, depth, file, measured, response, spad)
 if not TYPE_CHECKING:  # type checkers follow the stars
     __all__ = [name for module in _MODULES for name in module.__all__]

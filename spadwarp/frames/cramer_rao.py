@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError, kernel_errors
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
-from spadwarp.limits import BIN_WIDTH, check_choice, check_real
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.result import Result
 from spadwarp.scene import noise_rate
-from spadwarp.units import percent
+from spadwarp.values import BIN_WIDTH, ArgumentError, check_choice, check_real, kernel_errors, percent
 
 __all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
 
@@ -31,17 +29,8 @@ def crlb_from_histogram(
     """Cramér–Rao bound of the delay from the shape of expected histograms, pixel by pixel [s].
 
     F = Σ_k (dλ_k/dμ)²/λ_k with λ = signal + background; the delay μ moves the signal alone. Amplitude and background
-    count as known.
-
-    Args:
-        signal_cube, background_cube, bin_width, options: See `information_from_histogram`.
-        pulses: Of one depth frame, > 0.
-
-    Returns:
-        float64 `[...]` [s]; NaN where the histogram holds no information, inf where its noise makes up all of it.
-
-    Raises:
-        ArgumentError: Negative or non-finite cubes, shapes that do not fit, values out of range.
+    count as known. float64 `[...]`: NaN where the histogram holds no information, inf where its noise makes up all of
+    it. `pulses`: of one depth frame, > 0; the others: see `information_from_histogram`.
     """
     pulses = check_real("pulses", pulses, "(0, 1e30]")
     return _deviation(*information_from_histogram(signal_cube, background_cube, bin_width=bin_width, **options), pulses)
@@ -65,10 +54,8 @@ def information_from_histogram(
     signal_halves: tuple[ArrayLike, ArrayLike] | None = None,
     device: Any = None,
 ) -> tuple[Map, Map]:
-    """Fisher information on the delay per pulse, and its part that is noise of a Monte Carlo estimate, float64 `[...]`
-    [1/s²].
-
-    The noise is an estimate for all pixels together: in one pixel it may be larger than the information, or negative.
+    """Fisher information on the delay per pulse, and its part that is noise of a Monte Carlo estimate: float64 `[...]`
+    [1/s²]. The noise is one for all pixels together: in one it may be larger than the information, or negative.
 
     Args:
         signal_cube: Expected signal detections per pulse and bin, `[..., T]`, ≥ 0.
@@ -78,16 +65,14 @@ def information_from_histogram(
             value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
         law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
         signal_variance: Square of the standard error of `signal_cube`, of the same shape, where it is a Monte Carlo
-            estimate. Its noise would count as information, and the bound would be too small: a slope that is a sum of
-            bins with weights w has Σ w² var more in the mean of its square, which is subtracted, for independent bins
-            and to first order: the bound comes out too large, by 10 to 30 % where half of the information is noise, by
-            a factor where nearly all of it is.
+            estimate, whose noise would count as information: a slope that is a sum of bins with weights w has Σ w² var
+            more in the mean of its square. That is subtracted, for independent bins and to first order: the bound
+            comes out too large, by 10 to 30 % where half of the information is noise, by a factor where nearly all is.
         signal_halves: Two independent estimates whose mean is `signal_cube`, in place of `signal_variance`: a product
             of their slopes has no noise in its mean, whatever the bins share.
         device: Warp device; default: the first GPU, else the CPU.
 
-    Raises:
-        ArgumentError: Negative or non-finite cubes, shapes that do not fit, values out of range.
+    Raises `ArgumentError`: negative or non-finite cubes, shapes that do not fit, values out of range.
     """
     import warp as wp
 
@@ -105,21 +90,15 @@ def information_from_histogram(
     taps, slope_taps = _response_taps(irf, bin_width)
     device = pick_device(device)
     rows = np.ascontiguousarray(background.reshape(-1, bins) if background.ndim else background.reshape(1, 1))
-    information = kernels.histogram_information(
-        wp.array(signal.reshape(-1, bins), dtype=wp.float32, device=device),
-        wp.array(rows, dtype=wp.float32, device=device),
-        wp.array(taps, dtype=wp.float64, device=device),
-        wp.array(slope_taps, dtype=wp.float64, device=device),
-        first_photon=law == "first_photon",
-    ).numpy()
+    inputs: list[Any] = [wp.array(cube, dtype=wp.float32, device=device) for cube in (signal.reshape(-1, bins), rows)]
+    inputs += [wp.array(weights, dtype=wp.float64, device=device) for weights in (taps, slope_taps)]
+    information = kernels.histogram_information(*inputs, first_photon=law == "first_photon").numpy()
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)
     if signal_halves is not None:
-        first, second = (
-            _check_cube("signal_halves", np.asarray(half, np.float64), signal.shape) for half in signal_halves
-        )
+        halves = [_check_cube("signal_halves", np.asarray(half, np.float64), signal.shape) for half in signal_halves]
         # The product of two slopes is the square of their mean less the square of half their difference.
-        noise = _information_of_noise(0.5 * (first - second).reshape(-1, bins), total, taps, slope_taps, law)
+        noise = _information_of_noise(0.5 * (halves[0] - halves[1]).reshape(-1, bins), total, taps, slope_taps, law)
     elif signal_variance is not None:
         variance = _check_cube("signal_variance", np.asarray(signal_variance, np.float64), signal.shape)
         noise = _information_of_noise(variance.reshape(-1, bins), total, taps, slope_taps, law, is_variance=True)
@@ -145,10 +124,8 @@ def _information_of_noise(
     added = np.empty(len(total))
     for i, row in enumerate(total):  # one pixel at a time: cubes are large
         rate = convolve1d(row, taps, mode="constant")
-        if is_variance:
-            squares = convolve1d(noise[i], slope_taps**2, mode="nearest")
-        else:
-            squares = np.square(convolve1d(noise[i], slope_taps, mode="nearest"))
+        squares = convolve1d(noise[i], slope_taps**2 if is_variance else slope_taps, mode="nearest")
+        squares = squares if is_variance else np.square(squares)
         if law == "first_photon":
             squares, rate = squares * np.exp(-np.cumsum(rate)), -np.expm1(-rate)
         added[i] = np.divide(squares, rate, out=np.zeros_like(rate), where=rate > 0).sum()
@@ -158,11 +135,9 @@ def _information_of_noise(
 class ResultBound(NamedTuple):
     """The bound of a result, and what it is worth.
 
-    Attributes:
-        sigma: Of the delay, float64 `[H, W]` [s]; see `crlb`.
-        noise: Part of the information that was noise of the simulation and is subtracted, median over the target's
-            pixels; NaN where the result keeps no standard errors or no pixel has information.
-        problem: Why the bound is not to be used, in words, else None.
+    `sigma`: of the delay, float64 `[H, W]` [s], see `crlb`; `noise`: part of the information that was noise of the
+    simulation and is subtracted, median over the target's pixels, NaN where the result keeps no standard errors or no
+    pixel has information; `problem`: why the bound is not to be used, in words, else None.
     """
 
     sigma: Map
@@ -188,15 +163,9 @@ def bound_of_result(
         light = result.histogram * scale
         part = np.divide(signal, light, out=np.zeros_like(light), where=light > 0)
         variance = np.square(result.standard_error * scale) * part
-    information, noise = information_from_histogram(
-        signal,
-        background,
-        bin_width=scene.gate.bin_width,
-        irf=detector_response(scene.detector, scene.laser),
-        law=law,
-        signal_variance=variance,
-        device=device,
-    )
+    axis: dict[str, Any] = {"bin_width": scene.gate.bin_width, "irf": detector_response(scene.detector, scene.laser)}
+    options: dict[str, Any] = {**axis, "law": law, "signal_variance": variance, "device": device}
+    information, noise = information_from_histogram(signal, background, **options)
     pulses = check_real("pulses", scene.pulses_per_depth_frame if pulses is None else pulses, "(0, 1e30]")
     known = (information > 0) & np.isfinite(result.truth.depth)
     problem, part_of_noise = None, np.nan
@@ -228,18 +197,12 @@ def crlb(
     """Cramér–Rao bound of a Monte Carlo result's delay per pixel, float64 `[H, W]` [s]; NaN for no information.
 
     The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.
-    The scene's instrument response is applied. The noise of the simulation counts as information and makes the bound
-    too small; it is subtracted where the result keeps standard errors (`simulate(..., uncertainty=True)`): inf where
-    it is all there is.
+    The scene's instrument response is applied. Noise of the simulation, which counts as information, is subtracted
+    where the result keeps standard errors (`simulate(..., uncertainty=True)`): inf where it is all there is.
 
-    Args:
-        result: Of `spadwarp.simulate`, or its path.
-        pulses: Of one depth frame; default: the scene's, `Scene.pulses_per_depth_frame`.
-        law, device: See `crlb_from_histogram`.
-
-    Raises:
-        ArgumentError: Noise is more than half of the information in the median pixel of the target: the error says
-            how many photons are needed.
+    `result`: of `spadwarp.simulate`, or its path; `pulses`: of one depth frame; default: the scene's,
+    `Scene.pulses_per_depth_frame`; `law`, `device`: see `information_from_histogram`. Raises `ArgumentError` where
+    noise is more than half of the information in the median pixel of the target; it says how many photons are needed.
     """
     result = as_result(result)
     bound = bound_of_result(result, pulses=pulses, law=law, device=device)

@@ -10,12 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
-from spadwarp.errors import ArgumentError, kernel_errors
-from spadwarp.limits import BIN_WIDTH, TIME, check_choice, check_real, shown
 from spadwarp.scene import Camera, Medium, Scene
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
-from spadwarp.units import path_from_time
+from spadwarp.values import (
+    BIN_WIDTH,
+    TIME,
+    ArgumentError,
+    check_choice,
+    check_real,
+    kernel_errors,
+    path_from_time,
+    shown,
+)
 
 if TYPE_CHECKING:
     from spadwarp.frames.response import InstrumentResponse
@@ -29,16 +36,16 @@ METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Histograms:
-    """Histograms with what the file knows about them.
+    """Histograms with what their file knows about them; None for what it does not.
 
     Attributes:
         values: `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not.
-        bin_width: [s]; None where the file does not hold it.
+        bin_width: [s].
         gate_start: Time of flight at the lower edge of bin 0 [s].
-        background: Expected background in the unit of `values`, of a shape that `arrival_time` takes, or None.
-        irf: The response that the histograms contain; None: unknown, or none.
+        background: Expected background in the unit of `values`, of a shape that `arrival_time` takes.
+        irf: The response that the histograms contain.
         response: The response to filter with; differs from `irf` for expected histograms of infinitely short pulses.
-        scene: Of a simulation, else None.
+        scene: Of a simulation.
         notes: What was inferred from the file, in words.
     """
 
@@ -70,9 +77,8 @@ def arrival_time(
     background: Any = None,
     gate: tuple[float, float] | None = None,
 ) -> NDArray[np.float64]:
-    """Arrival time of the return in every pixel [s].
-
-    From a torch tensor comes a torch tensor, on its device.
+    """Arrival time of the return in every pixel [s], in the histogram's own time: float64 `histogram.shape[:-1]`; NaN
+    where nothing returned in the gate, or nothing above the background. From a torch tensor comes one, on its device.
 
     Args:
         histogram: `[..., bin]`, usually `[H, W, T]` or `[frames, H, W, T]`; NumPy, torch or Warp; counts (integer) or
@@ -83,21 +89,15 @@ def arrival_time(
             bins without one). `"matched"`: log-matched filter, argmax over μ of Σ n_k ln h_k(μ): maximum likelihood
             where there is no background. `"likelihood"`: argmax over μ and the signal S of
             Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), B = `background`. The last two resolve fractions of a bin.
-        irf: Instrument response: an `InstrumentResponse`, or an array of response per bin, whose time zero is then its
-            mean. Needed by `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its
-            mode and its mean.
+        irf: An `InstrumentResponse`, or an array of response per bin, whose time zero is then its mean. Needed by
+            `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its mode and its mean.
         device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
         background: Expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
             number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
             does not use it.
         gate: (start, stop) [s]: only bins whose centres lie in it are used.
 
-    Returns:
-        float64, `histogram.shape[:-1]`, in the histogram's own time [s]. NaN: nothing returned in the gate, or nothing
-        above the background.
-
-    Raises:
-        ArgumentError: Names the argument, its value and what is allowed.
+    Raises `ArgumentError`, which names the argument, its value and what is allowed.
     """
     from spadwarp_kernels import detection as kernels
 
@@ -110,7 +110,6 @@ def arrival_time(
             f"method = {method!r} needs an irf, the instrument response of the histogram: an InstrumentResponse, or an "
             "array of response per bin. Histograms of `simulate` have none yet: `detect` adds it, or take 'centroid'"
         )
-
     with in_torch_order(histogram, background):
         rows, shape = histogram_rows(histogram, name="histogram", device=device, dimensions=range(2, 16))
         frame, bins = shape[:-1], shape[-1]
@@ -122,18 +121,10 @@ def arrival_time(
             offset = {"peak": mode, "centroid": mean}.get(method, 0.0)
         if filtered:
             response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
-        bins_from_start = kernels.arrival_bins(
-            rows,
-            method=method,
-            background=None if background is None else _background_rows(background, rows, frame),
-            response=response,
-            lowest_tap=lowest_tap,
-            first=first,
-            stop=stop,
-            half_width=half_width,
-        )
-        position: Any = tensor_of(bins_from_start) if is_torch(histogram) else bins_from_start.numpy()
-    position = position.double() if is_torch(position) else position.astype(np.float64)
+        known = None if background is None else _background_rows(background, rows, frame)
+        options: dict[str, Any] = {"first": first, "stop": stop, "half_width": half_width, "lowest_tap": lowest_tap}
+        found = kernels.arrival_bins(rows, method=method, background=known, response=response, **options)
+        position: Any = tensor_of(found).double() if is_torch(histogram) else found.numpy().astype(np.float64)
     return gate_start + (position.reshape(frame) - offset) * bin_width
 
 
@@ -178,26 +169,19 @@ def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:
 
 def _response_table(irf: Any, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:
     """Fraction of the response per bin for returns at every sub-bin phase, and the bin of the first tap."""
+    curve = None
     if hasattr(irf, "cumulative"):
         lower, upper = (edge / bin_width for edge in irf.support)
-
-        def cumulative(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            return irf.cumulative(x * bin_width)
     else:
         weights = _array_response(irf)
         zero = float(weights @ (np.arange(weights.size) + 0.5))
         lower, upper = -zero, weights.size - zero
-        knots = np.arange(weights.size + 1) - zero
-        curve = _monotone_cubic(knots, np.concatenate([[0.0], np.cumsum(weights)]))
-
-        def cumulative(x: NDArray[np.float64]) -> NDArray[np.float64]:
-            return curve(np.clip(x, lower, upper))
-
+        curve = _monotone_cubic(np.arange(weights.size + 1) - zero, np.concatenate([[0.0], np.cumsum(weights)]))
     lowest = int(np.floor(lower))
     taps = int(np.ceil(upper)) + 1 - lowest
-    shift = np.arange(phases)[:, None] / phases
-    edges = lowest + np.arange(taps + 1)[None, :] - shift
-    return np.clip(np.diff(cumulative(edges), axis=1), 0.0, None), lowest
+    edges = lowest + np.arange(taps + 1)[None, :] - np.arange(phases)[:, None] / phases
+    below = irf.cumulative(edges * bin_width) if curve is None else curve(np.clip(edges, lower, upper))
+    return np.clip(np.diff(below, axis=1), 0.0, None), lowest
 
 
 def _array_response(irf: ArrayLike) -> NDArray[np.float64]:
@@ -227,11 +211,8 @@ def depth_frame(
 ) -> NDArray[np.float64]:
     """Depth frame of a simulation's histograms [m], float64 `[H, W]`; NaN where nothing returned.
 
-    Args:
-        result: From `spadwarp.simulate`.
-        method: `"peak"`, `"centroid"`, `"matched"` or `"likelihood"`; see `spadwarp.arrival_time`, which also takes
-            `options` (`irf`, `background`, `gate`, `device`).
-        quantity: `"depth"` is planar, z; `"range"` runs along the line of sight.
+    `method` and `options` (`irf`, `background`, `gate`, `device`): see `spadwarp.arrival_time`. `quantity`: "depth" is
+    planar, z; "range" runs along the line of sight.
     """
     check_choice("quantity", quantity, ("depth", "range"))
     scene, gate = result.scene, result.scene.gate
@@ -247,8 +228,7 @@ class Reduction:
 
     Attributes:
         quantity: `"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known.
-        values: float64 `[frames, H, W]` [m]; NaN where nothing returned.
-        range: The same along the line of sight.
+        values, range: float64 `[frames, H, W]` [m], and the same along the line of sight; NaN where nothing returned.
         intensity: Sum over the bins, `[frames, H, W]`.
         lines: Lines of sight `[H, W]`, or None.
         method: Estimator of the arrival time, or "stored" for depth that was read.
@@ -274,7 +254,7 @@ class Reduction:
         return self.values[0]
 
     def plot(self, path: str | Path, **options: Any) -> Path:
-        """Draws the first frame beside its intensity; returns the path; `options` as of `spadwarp.viz.draw_depth`."""
+        """Draws the first frame beside its intensity, see `spadwarp.viz.draw_depth`; returns the path."""
         import spadwarp
 
         return spadwarp.viz.draw_depth(self.first, self.intensity[0], path, **options)
@@ -289,7 +269,7 @@ def depth_of(
     background: float | Literal["median"] | None = None,
     device: Any = None,
 ) -> Reduction:
-    """Depth of histograms from a file.
+    """Depth of histograms from a file; measured ones count as of a laser in the lens, whose pulse leaves at time 0.
 
     Args:
         histograms: From `spadwarp.frames.read_histograms`.
@@ -300,10 +280,7 @@ def depth_of(
             pixel. Default: that of the file; else none, with `"likelihood"` the median.
         device: Warp device.
 
-    Measured histograms count as those of a laser in the lens, whose pulse leaves at time 0.
-
-    Raises:
-        ArgumentError: Something that is needed is missing, given twice or out of range.
+    Raises `ArgumentError`: something that is needed is missing, given twice or out of range.
     """
     if histograms.bin_width is None:
         raise ArgumentError("bin width is missing (bin_width): the file does not hold it")
@@ -316,17 +293,12 @@ def depth_of(
         raise ArgumentError(f"method = {method!r} needs an instrument response (irf)")
     known: Any = histograms.background if background is None else background
     if background == "median" or (known is None and method == "likelihood"):
-        known = _median_background(values)
-    time = arrival_time(
-        values,
-        gate_start=histograms.gate_start,
-        bin_width=histograms.bin_width,
-        method=method,
-        irf=response,
-        background=known,
-        device=device,
-    ).reshape(-1, height, width)
-    path = path_from_time(time, index)
+        # Of all frames together: that of sparse counts would be 0.
+        frames = values.reshape(-1, height, width, values.shape[-1])
+        known = (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)
+    axis: dict[str, Any] = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width}
+    time = arrival_time(values, **axis, method=method, irf=response, background=known, device=device)
+    path = path_from_time(time.reshape(-1, height, width), index)
     distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
         quantity="range" if lines is None else "depth",
@@ -344,26 +316,16 @@ def _geometry(
 ) -> tuple[float, LinesOfSight | None]:
     """Group index, and lines of sight where they are known."""
     scene = histograms.scene
-    if scene is None and group_index is None:
-        raise ArgumentError("group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
-    if scene is not None and (group_index is not None or horizontal_fov_deg is not None):
-        raise ArgumentError("group index and field of view are those of the file's scene")
-    index = check_real(
-        "group index",
-        scene.medium.group_index if scene is not None else group_index,
-        field_range(Medium, "group_index"),
-    )
     if scene is not None:
-        return index, lines_of_sight(scene)
+        if group_index is not None or horizontal_fov_deg is not None:
+            raise ArgumentError("group index and field of view are those of the file's scene")
+        return scene.medium.group_index, lines_of_sight(scene)
+    if group_index is None:
+        raise ArgumentError("group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
+    index = check_real("group index", group_index, field_range(Medium, "group_index"))
     if horizontal_fov_deg is None:
         return index, None
     check_real("horizontal field of view", horizontal_fov_deg, field_range(Camera, "horizontal_fov_deg"))
     height, width = histograms.values.shape[-3:-1]
     camera = Camera(width=width, height=height, horizontal_fov_deg=horizontal_fov_deg, aperture_diameter=1.0)
     return index, lines_of_camera(camera)
-
-
-def _median_background(values: NDArray[Any]) -> NDArray[np.float32]:
-    """Median bin of each pixel, of all frames together: that of sparse counts would be 0."""
-    frames = values.reshape(-1, *values.shape[-3:])
-    return (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)

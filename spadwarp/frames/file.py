@@ -1,59 +1,56 @@
-"""Frames of a camera on disk, of a scene that stands still or moves: the only file that knows their HDF5 layout."""
+"""Frames of a camera on disk, of a scene that stands still or moves: recorded part by part, and opened again."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.arrays import Variable
+from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
-from spadwarp.frames.frames import Frames
-from spadwarp.frames.response import InstrumentResponse
+from spadwarp.frames.response import InstrumentResponse, detector_response
+from spadwarp.frames.spad import Frames, MonteCarloNoise, detect, monte_carlo_noise
 from spadwarp.io.hdf5 import (
     PIXELS,
-    Coordinate,
     Hdf5File,
     hdf5_format,
     image_coordinates,
     name_dimensions,
     read_hdf5,
+    write_hdf5,
 )
 from spadwarp.result.result import Result, Truth
-from spadwarp.scene import Scene, Trajectory
+from spadwarp.scene import Scene, SceneLike, Trajectory, as_scene, load_trajectory
 from spadwarp.scene.camera import camera_attributes
+from spadwarp.scene.sight import depth_from_time, depth_per_time
+from spadwarp.values import SEED, ArgumentError, ConfigError, FileError, SpadwarpWarning, check_integer
 
-__all__ = ["FramesFile", "SequenceFile", "is_frames_file"]
+__all__ = ["FrameErrors", "FramesFile", "Recording", "SequenceFile", "is_frames_file", "record_frames"]
+__all__ += ["simulate_sequence"]
+
+Map = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
 
 FORMAT_VERSION = 1
 
 _PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-_CHUNK_BYTES = 1 << 20
-_CHUNK_TAGS = 1 << 16
+_CHUNK_BYTES, _CHUNK_TAGS = 1 << 20, 1 << 16
+_PART_BYTES = 1 << 28  # of counts that are held at a time
+_IMAGES, _DETECTION = ("frame", *PIXELS), "tags/detection"
 _TAGS: dict[str, Any] = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
-_TAG_DIMENSION = "tags/detection"
 _TRUTH = {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}
 _OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf", "monte_carlo_noise")
 
 _READ_ME = (
-    "counts: [frame, height, width, bin], detections in bin k, which covers gate_start + edges[k] to edges[k + 1] "
-    "seconds of flight. depth/NAME: [frame, height, width], planar depth in metres by that estimator, NaN where "
-    "nothing was detected. intensity: counts over all bins. bound/time and bound/depth: Cramér–Rao standard deviation "
-    "of one frame [s], [m], NaN where there is no information. expected, background: expected detections per pulse and "
-    "bin of all light and noise, and of what is not target. "
-    "tags, if present: detections one by one. Camera frame: +x right, +y down, +z forward."
-)
-_READ_ME_MOVING = (
-    "Frames of a scene that moves; in each frame it stands still, at frame_time [s]. counts: [frame, height, width, "
-    "bin], detections. depth/NAME: planar depth in metres by that estimator, NaN where nothing was detected. expected: "
-    "expected detections per pulse and bin before pile-up; background: its part that is not target, mean over pixels "
-    "and bins. truth/: of each frame, by ray casting. camera_position, camera_rotation: the lens and the camera's axes "
-    "(columns) in the world. trajectory: values of the fields named in its coordinate. config: the scene before the "
-    "trajectory. Camera frame: +x right, +y down, +z forward."
+    "Frames of a SPAD camera. Bin k covers gate_start + edges[k] to edges[k + 1] seconds of flight; without edges, "
+    "bins are bin_width wide. NaN: nothing was detected, or there is no information. config: the scene, of frames "
+    "in motion before the trajectory. Camera frame: +x right, +y down, +z forward. "
 )
 
 
@@ -62,18 +59,66 @@ def is_frames_file(path: str | Path) -> bool:
     return hdf5_format(path) == FramesFile.FORMAT
 
 
+# Opened
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class _StoredFrames:
-    """Frames in a file; counts and depth frames are read when they are asked for."""
+    """Frames in a file; what `_own` does not read is read when it is asked for."""
 
     FORMAT: ClassVar[str]
     path: Path
+    shape: tuple[int, int, int, int]
     pulses: int
     seed: int
     gate_start: float
     bin_width: float
     period: float | None
     methods: tuple[Method, ...]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Opens a file that `record_frames` or `simulate_sequence` wrote. Raises `FileError`."""
+        with read_hdf5(path, cls.FORMAT, version=FORMAT_VERSION) as file:
+            if "sample" in file:
+                raise FileError(f"{path}: a shard of a dataset; name the dataset's folder")
+            scene = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
+            shape = file.stored("counts", np.int32, (None, scene.camera.height, scene.camera.width, None)).shape
+            names, period = file.names("depth"), file.real("period", "(0, inf]")
+            for name in names:
+                if name not in METHODS:
+                    file.refuse(f"depth/{name}", f"is not by one of {', '.join(METHODS)}")
+                file.stored(f"depth/{name}", np.float32, shape[:3])
+            common: dict[str, Any] = {
+                "path": Path(path),
+                "shape": shape,
+                "pulses": file.integer("pulses", "[1, 9223372036854775807]"),
+                "seed": file.integer("seed"),
+                "gate_start": file.real("gate_start"),
+                "bin_width": file.real("bin_width", "(0, inf)"),
+                "period": period if np.isfinite(period) else None,
+                "methods": tuple(name for name in METHODS if name in names),
+            }
+            return cls(**common, **cls._own(file, scene, shape))
+
+    @classmethod
+    def _own(cls, file: Hdf5File, scene: Scene, shape: tuple[int, ...]) -> dict[str, Any]:
+        """The fields that files of one kind have."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        frames, height, width, _ = self.shape
+        return f"{type(self).__name__}({self.path}: {frames} frames of {self.pulses} pulses, {width} x {height} pixels)"
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return self.shape[0]
+
+    @property
+    def bins(self) -> int:
+        """Bins of a histogram."""
+        return self.shape[3]
 
     @property
     def best_method(self) -> Method | None:
@@ -82,7 +127,7 @@ class _StoredFrames:
 
     def counts(self, frame: int | None = None) -> NDArray[np.int32]:
         """Counts of one frame `[H, W, T]`, or of all `[frames, H, W, T]`."""
-        counts = self._read("counts", np.int32, frame, None)
+        counts = self._read("counts", np.int32, frame, self.bins)
         if counts.size and counts.min() < 0:
             raise FileError(f"{self.path}: counts are negative in some bins")
         return counts
@@ -95,37 +140,15 @@ class _StoredFrames:
         """Depth by one of `methods` [m], `[H, W]` or `[frames, H, W]`."""
         return self._read(f"depth/{method}", np.float32, frame)
 
-    @property
-    def _shape(self) -> tuple[int, int, int]:
-        """Number of frames, height and width."""
-        raise NotImplementedError
-
     def _check(self, frame: int | None) -> None:
-        if frame is not None and not 0 <= frame < self._shape[0]:
-            raise ArgumentError(f"frame = {frame} is outside [0, {self._shape[0]}), the frames of {self.path}")
+        if frame is not None and not 0 <= frame < self.frames:
+            raise ArgumentError(f"frame = {frame} is outside [0, {self.frames}), the frames of {self.path}")
 
-    def _read(self, name: str, kind: Any, frame: int | None, *rest: int | None) -> NDArray[Any]:
+    def _read(self, name: str, kind: Any, frame: int | None, *rest: int) -> NDArray[Any]:
         """An array `[frames, H, W, ...]`, or one frame of it."""
         self._check(frame)
         with read_hdf5(self.path, self.FORMAT) as file:
-            return np.asarray(file.stored(name, kind, (*self._shape, *rest))[... if frame is None else frame])
-
-    @staticmethod
-    def _common(file: Hdf5File, path: str | Path) -> dict[str, Any]:
-        """Fields that files of both kinds have."""
-        names = file.names("depth")
-        if unknown := [name for name in names if name not in METHODS]:
-            file.refuse(f"depth/{unknown[0]}", f"is not by one of {', '.join(METHODS)}")
-        period = file.real("period", "(0, inf]")
-        return {
-            "path": Path(path),
-            "pulses": file.integer("pulses", "[1, 9223372036854775807]"),
-            "seed": file.integer("seed"),
-            "gate_start": file.real("gate_start"),
-            "bin_width": file.real("bin_width", "(0, inf)"),
-            "period": period if np.isfinite(period) else None,
-            "methods": tuple(name for name in METHODS if name in names),
-        }
+            return np.asarray(file.stored(name, kind, (*self.shape[:3], *rest))[... if frame is None else frame])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -134,20 +157,14 @@ class FramesFile(_StoredFrames):
 
     Attributes:
         path: The file.
-        frames: Their number.
-        pulses: Per frame.
-        seed: Of the random numbers.
-        gate_start, bin_width, edges, period, irf, expected, background: As in `Frames`; expected and background are
-            None in a file that does not hold them.
-        scene: Of the result that the counts were drawn from.
-        truth_depth: float32 `[H, W]` [m].
+        shape: (frames, H, W, T).
         methods: Estimators whose depth frames the file holds.
-        monte_carlo_noise: As of `Frames`.
+        scene, truth_depth: Of the result that the counts were drawn from; float32 `[H, W]` [m].
         channel: Light that was counted: "I", all of it, or "co" or "cross" behind an analyser.
+        expected, background: As of `Frames`, as all others are; None in a file that does not hold them.
     """
 
     FORMAT = "spadwarp frames"
-    frames: int
     edges: NDArray[np.float64]
     irf: InstrumentResponse
     expected: NDArray[np.float32] | None
@@ -156,38 +173,37 @@ class FramesFile(_StoredFrames):
     truth_depth: NDArray[np.float32]
     monte_carlo_noise: float | None = None
     channel: str = "I"
-
-    def __repr__(self) -> str:
-        height, width = self.truth_depth.shape
-        return f"FramesFile({self.path}: {self.frames} frames of {self.pulses} pulses, {width} x {height} pixels)"
+    notes: tuple[str, ...] = ()
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Opens a file that `record_frames` wrote. Raises `FileError`."""
-        with read_hdf5(path, cls.FORMAT, version=FORMAT_VERSION) as file:
-            if "sample" in file:
-                raise FileError(f"{path}: a shard of a dataset; name the dataset's folder")
-            scene = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
-            edges = file.array("edges", np.float64, (None,))
-            if edges.size < 2 or not (np.isfinite(edges).all() and (np.diff(edges) > 0).all()):
-                file.refuse("edges", "are not two or more ascending times")
-            shape = (scene.camera.height, scene.camera.width, edges.size - 1)
-            common, frames = cls._common(file, path), len(file.stored("counts", np.int32, (None, *shape)))
-            for name in common["methods"]:
-                file.stored(f"depth/{name}", np.float32, (frames, *shape[:2]))
-            noise = file.attribute("monte_carlo_noise", None)
-            return cls(
-                **common,
-                frames=frames,
-                edges=edges,
-                irf=_response(file),
-                scene=scene,
-                truth_depth=file.array("truth/depth", np.float32, shape[:2]),
-                channel=file.text_attribute("channel", "I"),
-                expected=_expectation(file, "expected", shape),
-                background=_expectation(file, "background", shape),
-                monte_carlo_noise=None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
-            )
+    def _own(cls, file: Hdf5File, scene: Scene, shape: tuple[int, ...]) -> dict[str, Any]:
+        image, bins = shape[1:3], shape[3]
+        edges = file.array("edges", np.float64, (bins + 1,))
+        if not (bins and np.isfinite(edges).all() and (np.diff(edges) > 0).all()):
+            file.refuse("edges", "are not two or more ascending times")
+        if "irf" in file:
+            times, values = file.array("irf", np.float64, (2, None))
+            irf = InstrumentResponse(times=times, values=values)
+        else:
+            irf = InstrumentResponse(sigma=file.real("irf_sigma", "[0, inf)"), tail=file.real("irf_tail", "[0, inf)"))
+        is_even = "background" in file and file.stored("background", np.float32, (*image, None)).shape[2] == 1
+        sizes, expectations = {"expected": bins, "background": 1 if is_even else bins}, dict[str, Any]()
+        for name, size in sizes.items():
+            cube = file.array(name, np.float32, (*image, size)) if name in file else None
+            if cube is not None and not (np.isfinite(cube).all() and (cube >= 0).all()):
+                file.refuse(name, "is negative or not finite in some bins")
+            expectations[name] = cube
+        noise = file.attribute("monte_carlo_noise", None)
+        return {
+            "edges": edges,
+            "irf": irf,
+            "scene": scene,
+            "truth_depth": file.array("truth/depth", np.float32, image),
+            "channel": file.text_attribute("channel", "I"),
+            "notes": tuple(map(str, np.atleast_1d(file.attribute("notes", ())))),
+            "monte_carlo_noise": None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
+            **expectations,
+        }
 
     def plot(self, frame: int = 0, **options: Any) -> Any:
         """A figure of one frame: depth, error, bound, intensity, the counts of a pixel; see `spadwarp.viz.plot`."""
@@ -208,32 +224,10 @@ class FramesFile(_StoredFrames):
             **{name: getattr(self, name) for name in _OF_A_FRAME},
         )
 
-    def bound_depth(self) -> NDArray[np.float64]:
+    def bound_depth(self) -> Map:
         """Cramér–Rao bound of one frame [m], `[H, W]`; NaN where there is no information."""
         with read_hdf5(self.path, self.FORMAT) as file:
-            return file.array("bound/depth", np.float64, self.truth_depth.shape)
-
-    @property
-    def _shape(self) -> tuple[int, int, int]:
-        return self.frames, self.scene.camera.height, self.scene.camera.width
-
-
-def _response(file: Hdf5File) -> InstrumentResponse:
-    if "irf" in file:
-        times, values = file.array("irf", np.float64, (2, None))
-        return InstrumentResponse(times=times, values=values)
-    return InstrumentResponse(sigma=file.real("irf_sigma", "[0, inf)"), tail=file.real("irf_tail", "[0, inf)"))
-
-
-def _expectation(file: Hdf5File, name: str, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
-    """Expected detections `[H, W, T]`, or `[H, W, 1]`; None where the file has none."""
-    if name not in file:
-        return None
-    is_even = file.stored(name, np.float32, (*shape[:2], None)).shape[2] == 1 and name == "background"
-    values = file.array(name, np.float32, (*shape[:2], 1) if is_even else shape)
-    if not (np.isfinite(values).all() and (values >= 0).all()):
-        file.refuse(name, "is negative or not finite in some bins")
-    return values
+            return file.array("bound/depth", np.float64, self.shape[1:3])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -241,48 +235,23 @@ class SequenceFile(_StoredFrames):
     """Frames of a scene that moves. Arrays of a frame are read when they are asked for.
 
     Attributes:
-        path: The file.
         base: The scene before the trajectory.
-        trajectory: The row of each frame.
-        pulses: Of a frame.
-        seed: Of the random numbers.
-        bins: Of a histogram.
-        gate_start, bin_width: [s].
-        period: At which time wraps [s], or None.
-        methods: Estimators whose depth the file holds.
+        trajectory: The row of each frame. All others: as of `FramesFile`.
     """
 
     FORMAT = "spadwarp sequence"
     base: Scene
     trajectory: Trajectory
-    bins: int
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Opens a file that `simulate_sequence` wrote. Raises `FileError`."""
-        with read_hdf5(path, cls.FORMAT, version=FORMAT_VERSION) as file:
-            base = Scene.from_toml(file.text("config"), source=file.text_attribute("source", "") or None)
-            times = file.array("frame_time", np.float64, (None,))
-            names = tuple(map(str, np.atleast_1d(file.attribute("fields"))))
-            values = file.array("trajectory", np.float64, (len(times), len(names)))
-            if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
-                file.refuse("frame_time", "or the trajectory is no table of finite numbers by ascending time")
-            shape = (base.camera.height, base.camera.width)
-            return cls(
-                **cls._common(file, path),
-                base=base,
-                trajectory=Trajectory(times=times, fields=names, values=values, source=str(path)),
-                bins=file.stored("counts", np.int32, (len(times), *shape, None)).shape[-1],
-            )
-
-    def __repr__(self) -> str:
-        camera = self.base.camera
-        return f"SequenceFile({self.path}: {self.frames} frames in motion, {camera.width} x {camera.height} pixels)"
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return len(self.trajectory)
+    def _own(cls, file: Hdf5File, scene: Scene, shape: tuple[int, ...]) -> dict[str, Any]:
+        times, names = file.array("frame_time", np.float64, shape[:1]), np.atleast_1d(file.attribute("fields"))
+        values = file.array("trajectory", np.float64, (len(times), len(names)))
+        if not (np.isfinite(times).all() and np.isfinite(values).all() and (np.diff(times) > 0).all()):
+            file.refuse("frame_time", "or the trajectory is no table of finite numbers by ascending time")
+        fields = tuple(map(str, names))
+        moves = Trajectory(times=times, fields=fields, values=values, source=str(file.path))
+        return {"base": scene, "trajectory": moves}
 
     def scene(self, frame: int) -> Scene:
         """The scene at a frame."""
@@ -304,32 +273,53 @@ class SequenceFile(_StoredFrames):
         sides = {name: (3,) if name == "normal" else () for name in _TRUTH}
         return Truth(**{name: self._read(f"truth/{name}", np.float32, frame, *rest) for name, rest in sides.items()})
 
-    @property
-    def _shape(self) -> tuple[int, int, int]:
-        return self.frames, self.base.camera.height, self.base.camera.width
+
+# Recorded
 
 
-# Writing: everything but the frames at the first part, and then each part
+class _Layout(NamedTuple):
+    """What a file holds beside counts and depth, with coordinates of `name_dimensions`. Of arrays whose first dimension
+    is the frame the next rows; the rest is written with the first frames."""
+
+    arrays: dict[str, Variable]
+    attributes: dict[str, Any]
+    coordinates: dict[str, Any]
 
 
 class _Writer:
-    """Writes frames to an open file from `write_hdf5`, part by part."""
+    """Writes frames to an open file of `write_hdf5`, part by part, and all else with the first part."""
 
-    def __init__(self, file: Any) -> None:
-        self._file, self._written = file, 0
+    def __init__(self, file: Any, frames: int) -> None:
+        self._file, self._frames, self._written = file, frames, 0
 
-    def _begin(
-        self,
-        part: Frames,
-        scene: Scene,
-        frames: int,
-        methods: Sequence[Method],
-        attributes: Mapping[str, Any],
-        coordinates: Mapping[str, Coordinate | int | None],
-        arrays: Mapping[str, tuple[tuple[str, ...], str, str]],
-    ) -> None:
-        """Writes what files of both kinds hold, reserves space for the frames, and names the dimensions."""
-        file = self._file
+    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], layout: _Layout) -> None:
+        """Writes the next frames, their tags, and their depth by each estimator `[frames, H, W]` [m]."""
+        every: dict[str, Variable] = {
+            "counts": ((*_IMAGES, "time"), part.counts, "1", "detections in the bin"),
+            "intensity": (_IMAGES, part.intensity, "1", "counts over all bins"),
+            **layout.arrays,
+        }
+        for method, values in depth.items():
+            every[f"depth/{method}"] = (_IMAGES, values.astype(np.float32), "m", f"planar depth by {method}")
+        for name, column in ({} if part.tags is None else part.tags._asdict()).items():
+            every[f"tags/{name}"] = ((_DETECTION,), column.astype(_TAGS[name]), "1", f"{name} of the detection")
+        if not self._written:
+            self._begin(part, scene, layout._replace(arrays=every))
+        rows = slice(self._written, self._written + part.frames)
+        for name, (dimensions, values, _, _) in every.items():
+            stored = self._file[name]
+            if dimensions[0] == "frame":
+                stored[rows] = values
+            elif dimensions[0] == _DETECTION:
+                before = len(stored)
+                stored.resize((before + len(values),))
+                stored[before:] = values
+                self._file[_DETECTION].resize(stored.shape)
+        self._written = rows.stop
+
+    def _begin(self, part: Frames, scene: Scene, layout: _Layout) -> None:
+        """Writes what all frames share, reserves space for these, and names the dimensions."""
+        file, arrays = self._file, layout.arrays
         common = {
             "format_version": FORMAT_VERSION,
             "pulses": part.pulses,
@@ -340,173 +330,278 @@ class _Writer:
             "group_index": scene.medium.group_index,
             "source": str(scene.source or ""),
         }
-        file.attrs.update({**common, **attributes})
+        words = [f"{name} ({', '.join(axes)}): {meaning} [{unit}]" for name, (axes, _, unit, meaning) in arrays.items()]
+        file.attrs.update({**common, **layout.attributes, "read_me": _READ_ME + "; ".join(words)})
         file.create_dataset("config", data=scene.to_toml())
-        height, width, bins = part.expected.shape
-        self._reserve("counts", np.int32, frames, height, width, bins)
-        self._reserve("intensity", np.int64, frames, height, width)
-        for method in methods:
-            self._reserve(f"depth/{method}", np.float32, frames, height, width)
-        for name, kind in _TAGS.items() if part.tags is not None else ():
-            file.create_dataset(f"tags/{name}", (0,), kind, maxshape=(None,), chunks=(_CHUNK_TAGS,), **_PACKED)
-        edges, images = part.gate_start + part.edges, ("frame", *PIXELS)
-        name_dimensions(
-            file,
-            {
-                "frame": (np.arange(frames), "1", "number of the frame"),
-                **image_coordinates(height, width),
-                "time": (0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
-                **coordinates,
-                _TAG_DIMENSION: None,
-            },
-            {
-                "counts": ((*images, "time"), "1", "detections in the bin"),
-                "intensity": (images, "1", "counts over all bins"),
-                **{f"depth/{method}": (images, "m", f"planar depth by {method}") for method in methods},
-                **arrays,
-                **{f"tags/{name}": ((_TAG_DIMENSION,), "1", f"{name} of the detection") for name in _TAGS},
-            },
-        )
-
-    def _reserve(self, name: str, kind: Any, frames: int, height: int, width: int, *rest: int) -> None:
-        """An array `[frames, H, W, ...]` in chunks of a part of a frame."""
-        row = np.dtype(kind).itemsize * int(np.prod(rest))
-        columns = max(1, min(width, _CHUNK_BYTES // row))
-        lines = max(1, min(height, _CHUNK_BYTES // (row * columns)))
-        chunks = (1, lines, columns, *rest)
-        self._file.create_dataset(name, (frames, height, width, *rest), kind, chunks=chunks, **_PACKED)
-
-    def add(self, part: Frames, depth: Mapping[Method, NDArray[np.float64]]) -> None:
-        """Writes the next frames, and their depth by each estimator `[frames, H, W]` [m]."""
-        file, rows = self._file, slice(self._written, self._written + part.frames)
-        file["counts"][rows] = part.counts
-        file["intensity"][rows] = part.intensity
-        for method, frames in depth.items():
-            file[f"depth/{method}"][rows] = frames
-        for name, values in ({} if part.tags is None else part.tags._asdict()).items():
-            column = file[f"tags/{name}"]
-            before = column.shape[0]
-            column.resize((before + len(values),))
-            column[before:] = values
-            file[_TAG_DIMENSION].resize(column.shape)
-        self._written = rows.stop
-
-
-class FramesWriter(_Writer):
-    """Writes frames of a scene that stands still: `begin` once, then `add` for each part."""
-
-    def begin(
-        self, result: Result, part: Frames, *, frames: int, methods: Sequence[Method], **bound: NDArray[np.float64]
-    ) -> None:
-        """Writes everything but the frames, and reserves space for these.
-
-        Args:
-            result: From which the counts were drawn.
-            part: The first frames; tags are written if they have any.
-            frames: Number of all frames.
-            methods: Estimators of depth.
-            bound: `time` [s] and `depth` [m], Cramér–Rao bounds `[H, W]`.
-        """
-        file, scene = self._file, result.scene
-        attributes = {
-            "format": FramesFile.FORMAT,
-            "read_me": _READ_ME,
-            "frames": frames,
-            "laser_position": scene.beam.position,
-            "pixel_tangent": scene.camera.pixel_tangent,
-            **camera_attributes(scene.camera, result.focus_distance),
-            "irf_sigma": part.irf.sigma,
-            "irf_tail": part.irf.tail,
-            **({} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}),
-            "notes": list(part.notes),
-            "photons": result.photons,
-            "channel": result.provenance.get("channel", "I"),
+        for name, (dimensions, values, _, _) in arrays.items():
+            array = np.asarray(values)
+            if dimensions[0] == _DETECTION:
+                file.create_dataset(name, (0,), array.dtype, maxshape=(None,), chunks=(_CHUNK_TAGS,), **_PACKED)
+            elif dimensions[0] != "frame":
+                file.create_dataset(name, data=array, **(_PACKED if array.ndim > 1 else {}))
+            else:
+                shape, packed = (self._frames, *array.shape[1:]), dimensions[:3] == _IMAGES
+                chunks = {"chunks": _chunks(shape, array.itemsize), **_PACKED} if packed else {}
+                file.create_dataset(name, shape, array.dtype, **chunks)
+        edges, (height, width, _) = part.gate_start + part.edges, part.expected.shape
+        axes: dict[str, Any] = {
+            "frame": (np.arange(self._frames), "1", "number of the frame"),
+            **image_coordinates(height, width),
+            "time": (0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
+            _DETECTION: None,
+            **layout.coordinates,
         }
-        file.create_dataset("edges", data=part.edges)
-        if part.irf.times is not None:
-            file.create_dataset("irf", data=np.array([part.irf.times, part.irf.values], np.float64))
-        truth = result.truth.depth
-        for name, values in {"expected": part.expected, "background": part.background, "truth/depth": truth}.items():
-            file.create_dataset(name, data=values, **_PACKED)
-        for name, sigma in bound.items():
-            file.create_dataset(f"bound/{name}", data=sigma)
-        coordinates: dict[str, Coordinate | int | None] = {
-            "whole_gate": 1,
-            "edges": ("edges", "s", "edges of the bins after the start of the gate"),
-            "sample": 0 if part.irf.times is None else np.size(part.irf.times),
-            "quantity": (["time [s]", "value"], "1", "of the measured instrument response"),
-        }
-        bins = "whole_gate" if part.background.shape[-1] == 1 < part.expected.shape[-1] else "time"
-        arrays = {
-            "expected": ((*PIXELS, "time"), "1", "expected detections per pulse before pile-up"),
-            "background": ((*PIXELS, bins), "1", "the part of `expected` that is not target"),
-            "bound/time": (PIXELS, "s", "Cramér–Rao bound of one frame"),
-            "bound/depth": (PIXELS, "m", "Cramér–Rao bound of one frame"),
-            "truth/depth": (PIXELS, "m", "true planar depth"),
-            "irf": (("quantity", "sample"), "1", "measured instrument response"),
-        }
-        self._begin(part, scene, frames, methods, attributes, coordinates, arrays)
+        described = {}
+        for name, (dimensions, _, unit, meaning) in arrays.items():
+            if dimensions == (name,):  # a coordinate
+                axes[name] = (name, unit, meaning)
+            else:
+                described[name] = (dimensions, unit, meaning)
+        name_dimensions(file, axes, described)
 
 
-class SequenceWriter(_Writer):
-    """Writes one frame of a scene that moves after the other.
+def _chunks(shape: tuple[int, ...], item_bytes: int) -> tuple[int, ...]:
+    """Chunks of a part of a frame, of an array `[frames, H, W, ...]`."""
+    _, height, width, *rest = shape
+    row = item_bytes * int(np.prod(rest))
+    columns = max(1, min(width, _CHUNK_BYTES // row))
+    return (1, max(1, min(height, _CHUNK_BYTES // (row * columns))), columns, *rest)
 
-    Args:
-        file: From `write_hdf5`.
-        base: The scene before the trajectory.
-        trajectory: A row for each frame.
-        photons: Traced for each frame.
+
+@dataclass(frozen=True, kw_only=True)
+class FrameErrors:
+    """How far the depth frames of one estimator are from the truth, over all pixels and frames that have both: the
+    estimates over pixels with a target; median and 90th percentile of the absolute errors [m]."""
+
+    estimate_fraction: float
+    median: float
+    p90: float
+
+    @classmethod
+    def of(cls, depth: Map, truth: NDArray[np.float32]) -> Self:
+        """Of depth `[frames, H, W]` against the truth `[H, W]` [m]."""
+        error = np.abs(depth - truth)[:, np.isfinite(truth)]
+        known = error[np.isfinite(error)]
+        median, p90 = map(float, np.quantile(known, (0.5, 0.9)) if known.size else (np.nan, np.nan))
+        return cls(estimate_fraction=known.size / max(error.size, 1), median=median, p90=p90)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording:
+    """Summary of what `record_frames` wrote.
+
+    Attributes:
+        file: The file, opened.
+        errors: Of depth, by estimator; of at most the first 256 MiB of counts.
+        bound: Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say.
+        bound_photons: Photons that would make the noise in the bound a tenth.
+        detections: Counts of all frames.
+        monte_carlo: Noise of the simulation against the shot noise of one frame, see `monte_carlo_noise`.
     """
 
-    def __init__(self, file: Any, base: Scene, trajectory: Trajectory, *, photons: int) -> None:
-        super().__init__(file)
-        self._base, self._trajectory, self._photons = base, trajectory, photons
+    file: FramesFile
+    errors: dict[Method, FrameErrors]
+    bound: ResultBound
+    bound_photons: float
+    detections: int
+    monte_carlo: MonteCarloNoise | None
 
-    def add_frame(self, result: Result, part: Frames, depth: Mapping[Method, NDArray[np.float64]]) -> None:
-        """Writes the next frame: its simulation, its counts `[1, H, W, T]` and its depth `[1, H, W]`."""
-        file, row = self._file, self._written
-        if not row:
-            self._reserve_all(part, list(depth))
-        file["expected"][row] = part.expected
-        file["background"][row] = float(np.broadcast_to(part.background, part.expected.shape).mean(dtype=np.float64))
-        for name in _TRUTH:
-            file[f"truth/{name}"][row] = getattr(result.truth, name)
-        camera: Any = camera_attributes(result.scene.camera, result.focus_distance)
-        file["camera_position"][row] = camera["camera_position"]
-        file["camera_rotation"][row] = camera["camera_rotation"].reshape(3, 3)
-        self.add(part, depth)
 
-    def _reserve_all(self, part: Frames, methods: Sequence[Method]) -> None:
-        """Writes everything but the frames, and reserves space for these, which are like the first one."""
-        file, trajectory = self._file, self._trajectory
-        frames, (height, width, bins) = len(trajectory), part.expected.shape
-        file.create_dataset("frame_time", data=trajectory.times)
-        file.create_dataset("trajectory", data=trajectory.values)
-        self._reserve("expected", np.float32, frames, height, width, bins)
-        for name in _TRUTH:
-            self._reserve(f"truth/{name}", np.float32, frames, height, width, *((3,) if name == "normal" else ()))
-        for name, shape in {"background": (), "camera_position": (3,), "camera_rotation": (3, 3)}.items():
-            file.create_dataset(name, (frames, *shape), np.float64)
-        attributes = {
-            "format": SequenceFile.FORMAT,
-            "read_me": _READ_ME_MOVING,
-            "photons": self._photons,
-            "fields": list(trajectory.fields),
-        }
-        coordinates: dict[str, Coordinate | int | None] = {
-            "camera_axis": (["x", "y", "z"], "1", "of the camera"),
-            "field": (list(trajectory.fields), "1", "of the scene"),
-        }
-        images, axis = ("frame", *PIXELS), {"normal": ("axis",)}
-        arrays = {
-            "frame_time": (("frame",), "s", "time of the frame on the trajectory"),
-            "trajectory": (("frame", "field"), "", "values of the fields"),
-            "expected": ((*images, "time"), "1", "expected detections per pulse before pile-up"),
-            "background": (("frame",), "1", "part of `expected` that is not target, mean over pixels and bins"),
-            **{
-                f"truth/{name}": ((*images, *axis.get(name, ())), unit, f"true {name}") for name, unit in _TRUTH.items()
-            },
-            "camera_position": (("frame", "axis"), "m", "the lens in the world"),
-            "camera_rotation": (("frame", "axis", "camera_axis"), "1", "the camera's axes in the world as columns"),
-        }
-        self._begin(part, self._base, frames, methods, attributes, coordinates, arrays)
+def record_frames(
+    result: Result,
+    path: str | Path,
+    *,
+    pulses: int | None = None,
+    frames: int = 1,
+    seed: int,
+    methods: Sequence[Method] = METHODS,
+    undo_pile_up: bool = False,
+    tags: bool = False,
+    window: tuple[float, int] | None = None,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> Recording:
+    """Writes frames of counts that the camera would record, and their depth, to one HDF5 file, whole or not at all.
+
+    Frames are drawn in parts, the same as `spadwarp.detect` draws: memory does not grow with their number.
+
+    Args:
+        result: Of `spadwarp.simulate`; its scene has the camera.
+        path: The file.
+        pulses, frames, seed, tags, window, device: As of `spadwarp.detect`.
+        methods: Estimators of depth, see `spadwarp.arrival_time`. They know background and response.
+        undo_pile_up: Estimate from Coates' correction of the counts.
+        progress: Called with ("frames", done, frames).
+
+    Raises `ArgumentError`, and `FileError` where the file cannot be written.
+    """
+    frames = check_integer("frames", frames, "[1, 2147483647]")
+    scene = result.scene
+    pulses = scene.detector.pulses_per_frame if pulses is None else pulses
+    bins = scene.gate.bins if window is None else window[1]
+    size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
+    options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
+    bound = _bound(result, pulses, device)
+    notes = () if bound.problem is None else (f"no Cramér–Rao bound: {bound.problem}",)
+    errors: dict[Method, FrameErrors] = {}
+    detections = 0
+    with write_hdf5(path) as opened:
+        writer = _Writer(opened, frames)
+        for start in range(0, frames, size):
+            part = detect(result, frames=min(size, frames - start), first_frame=start, **options)
+            part = replace(part, notes=(*part.notes, *notes))
+            depth: dict[Method, Map] = {}
+            for method in methods:
+                time = part.arrival_time(method, undo_pile_up=undo_pile_up, device=device)
+                depth[method] = depth_from_time(time, scene=scene)
+            writer.add(part, scene, depth, _still(result, part, frames, bound.sigma))
+            detections += int(part.intensity.sum())
+            errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
+            if progress is not None:
+                progress("frames", start + part.frames, frames)
+    return Recording(
+        file=FramesFile.load(path),
+        errors=errors,
+        bound=bound,
+        bound_photons=photons_for_noise(result.photons, bound.noise, 0.1),
+        detections=detections,
+        monte_carlo=monte_carlo_noise(result, pulses=pulses),
+    )
+
+
+def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
+    """What the file of a scene that stands still holds beside its frames: see `_Layout`."""
+    scene, irf, distance = result.scene, part.irf, result.truth.range.astype(np.float64)
+    attributes = {
+        "format": FramesFile.FORMAT,
+        "frames": frames,
+        "laser_position": scene.beam.position,
+        "pixel_tangent": scene.camera.pixel_tangent,
+        **camera_attributes(scene.camera, result.focus_distance),
+        "irf_sigma": irf.sigma,
+        "irf_tail": irf.tail,
+        **({} if part.monte_carlo_noise is None else {"monte_carlo_noise": part.monte_carlo_noise}),
+        "notes": list(part.notes),
+        "photons": result.photons,
+        "channel": result.provenance.get("channel", "I"),
+    }
+    bins = "whole_gate" if part.background.shape[-1] == 1 < part.expected.shape[-1] else "time"
+    arrays: dict[str, Variable] = {
+        "expected": ((*PIXELS, "time"), part.expected, "1", "expected detections per pulse before pile-up"),
+        "background": ((*PIXELS, bins), part.background, "1", "the part of `expected` that is not target"),
+        "bound/time": (PIXELS, bound, "s", "Cramér–Rao bound of one frame"),
+        "bound/depth": (PIXELS, bound * depth_per_time(scene, distance), "m", "Cramér–Rao bound of one frame"),
+        "truth/depth": (PIXELS, result.truth.depth, "m", "true planar depth"),
+        "edges": (("edges",), part.edges, "s", "edges of the bins after the start of the gate"),
+    }
+    coordinates: dict[str, Any] = {"whole_gate": 1}
+    if irf.times is not None and irf.values is not None:
+        curve = np.array([irf.times, irf.values], np.float64)
+        arrays["irf"] = (("quantity", "sample"), curve, "1", "measured instrument response")
+        coordinates |= {"sample": curve.shape[1], "quantity": (["time [s]", "value"], "1", arrays["irf"][3])}
+    return _Layout(arrays, attributes, coordinates)
+
+
+def _bound(result: Result, pulses: int, device: Any) -> ResultBound:
+    """The bound of one frame, NaN for a response without a derivative or too few photons."""
+    missing = np.full(result.truth.range.shape, np.nan)
+    if not detector_response(result.scene.detector, result.scene.laser).is_smooth:
+        return ResultBound(missing, np.nan, None)
+    law: Any = "poisson" if result.scene.detector.mode == "free_running" else "first_photon"
+    bound = bound_of_result(result, pulses=pulses, law=law, device=device)
+    return bound if bound.problem is None else bound._replace(sigma=missing)
+
+
+def simulate_sequence(
+    scene: SceneLike,
+    trajectory: Trajectory | str | Path,
+    path: str | Path,
+    *,
+    frame_rate: float | None = None,
+    photons: int | None = None,
+    pulses: int | None = None,
+    seed: int | None = None,
+    methods: Sequence[Method] = ("matched",),
+    tags: bool = False,
+    device: str | None = None,
+    progress: Progress | None = None,
+) -> SequenceFile:
+    """Simulates a frame at each row of a trajectory and writes counts, depth and truth of all to one HDF5 file.
+
+    In a frame the scene stands still. The mesh stays on the device, and its tree is refitted where only poses change.
+    Frame n has random numbers of its own, of `seed` and n.
+
+    Args:
+        scene: Of which the trajectory changes fields.
+        trajectory: From `spadwarp.scene.load_trajectory`, or the path of its .csv file.
+        path: The file, whole or not at all.
+        frame_rate: Frames a second, at even times between the rows; None: a frame at each row.
+        photons: Traced for each frame; default: the scene's.
+        pulses, methods, tags, progress: As of `record_frames`.
+        seed: 64 bits; default: the scene's.
+        device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
+
+    Raises:
+        ConfigError: A row whose scene cannot be simulated; all rows are tried before the first photon.
+        FileError: A file cannot be read or written.
+    """
+    from spadwarp.transport import simulate
+
+    base = as_scene(scene)
+    moves = trajectory if isinstance(trajectory, Trajectory) else load_trajectory(trajectory)
+    if frame_rate is not None:
+        moves = moves.sampled(frame_rate)
+    scenes = list(moves.scenes(base))
+    fixed = ("camera.width", "camera.height", "gate.", "scan.")  # that all frames of a file share
+    if wrong := [name for name in moves.fields if name.startswith(fixed)]:
+        raise ConfigError([f"{wrong[0]} cannot change from frame to frame"], source=moves.source)
+    seed = base.transport.seed if seed is None else check_integer("seed", seed, SEED)
+    pulses = base.detector.pulses_per_frame if pulses is None else pulses
+    photons = base.transport.photons if photons is None else photons
+    # One device for all but the photons.
+    first = None if device is None else "cuda:0" if device == "cuda:all" else device.split(",")[0]
+    kept: dict[str, Any] = {}
+    with write_hdf5(path) as opened:
+        writer = _Writer(opened, len(moves))
+        for number, at in enumerate(scenes):
+            frame_seed = int(np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0])
+            with warnings.catch_warnings():
+                if number:  # said of the first frame
+                    warnings.simplefilter("ignore", SpadwarpWarning)
+                result = simulate(at, photons=photons, seed=frame_seed, device=device, mesh_cache=kept)
+                part = detect(result, first_frame=number, pulses=pulses, seed=seed, tags=tags, device=first)
+            times = {method: part.arrival_time(method, device=first) for method in methods}
+            depth = {method: depth_from_time(time, scene=at) for method, time in times.items()}
+            writer.add(part, base, depth, _moving(result, part, moves, number, photons))
+            if progress is not None:
+                progress("frames", number + 1, len(scenes))
+    return SequenceFile.load(path)
+
+
+def _moving(result: Result, part: Frames, moves: Trajectory, row: int, photons: int) -> _Layout:
+    """What the file of a scene that moves holds of a frame beside its counts: see `_Layout`."""
+    fields = list(moves.fields)
+    attributes = {"format": SequenceFile.FORMAT, "photons": photons, "fields": fields}
+    coordinates = {"camera_axis": (["x", "y", "z"], "1", "of the camera"), "field": (fields, "1", "of the scene")}
+    camera: Any = camera_attributes(result.scene.camera, result.focus_distance)
+    position, rotation = camera["camera_position"], camera["camera_rotation"].reshape(3, 3)
+    background = np.broadcast_to(part.background, part.expected.shape).mean(dtype=np.float64)
+    axes = ("frame", "axis", "camera_axis")
+    arrays: dict[str, Variable] = {
+        "frame_time": (("frame",), moves.times[row], "s", "time of the frame on the trajectory"),
+        "trajectory": (("frame", "field"), moves.values[row], "", "values of the fields"),
+        "expected": ((*_IMAGES, "time"), part.expected, "1", "expected detections per pulse before pile-up"),
+        "background": (("frame",), background, "1", "part of `expected` that is not target, mean over pixels and bins"),
+        "camera_position": (axes[:2], position, "m", "the lens in the world"),
+        "camera_rotation": (
+            ("frame", "axis", "camera_axis"),
+            rotation,
+            "1",
+            "the camera's axes in the world as columns",
+        ),
+    }
+    for name, unit in _TRUTH.items():
+        image = (*_IMAGES, "axis") if name == "normal" else _IMAGES
+        arrays[f"truth/{name}"] = (image, getattr(result.truth, name), unit, f"true {name}")
+    rows = {name: (axes, np.asarray(values)[None], unit, text) for name, (axes, values, unit, text) in arrays.items()}
+    return _Layout(rows, attributes, coordinates)

@@ -9,31 +9,30 @@ import logging
 import math
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, FileError, SpadwarpError, SpadwarpWarning
 from spadwarp.frames.depth import Histograms
 from spadwarp.frames.file import FramesFile, is_frames_file
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.io.arrays import read_npy
-from spadwarp.io.hdf5 import hdf5_format, read_hdf5
+from spadwarp.io.hdf5 import hdf5_format, open_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file
-from spadwarp.limits import check_real, shown
 from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.file import load_result
-
-if TYPE_CHECKING:
-    pass
+from spadwarp.values import ArgumentError, FileError, SpadwarpError, SpadwarpWarning, check_real, shown
 
 __all__ = ["read_histograms"]
 
-ENDINGS = (".h5", ".hdf5", ".npy", ".mat", ".ptu")
+_HDF5, _ARRAYS = (".h5", ".hdf5"), (".h5", ".hdf5", ".npy", ".mat")
+ENDINGS = (*_ARRAYS, ".ptu")
 """Of files that may hold histograms."""
 
 _LEAST_BINS = 8  # of a histogram that is worth one
@@ -43,17 +42,6 @@ _MOST_VALUES = 1 << 29  # 2 GiB of counts
 _MARKERS = 16  # of T3 records; four today
 # What ptufile says about a damaged file stands in our errors, too.
 logging.getLogger("ptufile").addHandler(logging.NullHandler())
-
-
-class _Request(NamedTuple):
-    """Facts that the caller states about a file, as in `read_histograms`."""
-
-    dataset: str | None
-    axes: str | None
-    image_size: tuple[int, int] | None
-    tag_unit: float | None
-    bin_width: float | None
-    sum_frames: bool
 
 
 class _Raw(NamedTuple):
@@ -96,7 +84,8 @@ def read_histograms(
         tag_unit: Of time tags in cells [s].
         bin_width: [s]; where the file holds it, this one counts. Of time tags: a multiple of their unit, default the
             unit.
-        gate_start: Time of flight at the start of bin 0, or at tag 0 [s].
+        gate_start: Time of flight at the start of bin 0, or at tag 0 [s]. A file that does not say when the pulse left
+            counts from bin 0 with a warning, unless it is given.
         irf: The response that the histograms contain.
         sum_frames: Add frames up.
         channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
@@ -105,8 +94,6 @@ def read_histograms(
         FileError: No such file, not readable, of an unknown kind, without such an array, or with values that are
             negative or not finite; a package that is needed to read it is not installed.
         ArgumentError: A fact that is missing, out of range, or that the file holds itself.
-
-    A file that does not say when the pulse left counts from bin 0 with a warning, unless `gate_start` is given.
     """
     path = existing_file(path)
     for name, value in {"tag_unit": tag_unit, "bin_width": bin_width}.items():
@@ -114,18 +101,19 @@ def read_histograms(
             check_real(f"{name} [s]", value, "(0, 0.001)")
     if gate_start is not None:
         check_real("gate_start [s]", gate_start, "[-1, 1]")
-    request = _Request(dataset, axes, image_size, tag_unit, bin_width, sum_frames)
-    ending = path.suffix.lower()
-    if ending in (".h5", ".hdf5") and _is_own(path):
-        arguments = {**request._asdict(), "gate_start": gate_start, "irf": irf}
-        if clash := [name.replace("_", " ") for name, value in arguments.items() if value]:
+    if _is_own(path):
+        arguments = {"dataset": dataset, "axes": axes, "image size": image_size, "tag unit": tag_unit, "irf": irf}
+        arguments |= {"bin width": bin_width, "sum frames": sum_frames, "gate start": gate_start}
+        if clash := [name for name, value in arguments.items() if value]:
             raise ArgumentError(f"{path}: the file has its own {', '.join(clash)}")
         return _read_own(path, channel)
     if channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels, not {path}")
-    raw = _read(path, ending, request)
-    _check(raw.values, path)
-    values, notes = raw.values, list(raw.notes)
+    if path.suffix.lower() == ".ptu":
+        raw = _reading(path, _read_ptu, image_size, sum_frames)
+    else:
+        raw = _reading(path, _read_arrays, dataset, image_size, tag_unit, bin_width)
+    values, notes = _checked(raw.values, path), list(raw.notes)
     if not raw.ordered:
         values, note = _ordered(values, axes)
         notes += note
@@ -138,9 +126,8 @@ def read_histograms(
     if values.ndim == 4 and sum_frames:
         values = values.sum(axis=0, dtype=np.int64 if values.dtype.kind in "iu" else np.float64)
     if gate_start is None and raw.gate_start is None:
-        origin = "tag 0" if raw.first else "bin 0"
-        text = f"{path.name}: gate start is not given (gate_start): {origin} is taken for the time of the pulse"
-        warnings.warn(text, SpadwarpWarning, stacklevel=2)
+        origin = f"{'tag' if raw.first else 'bin'} 0 is taken for the time of the pulse"
+        warnings.warn(f"{path.name}: gate start is not given (gate_start): {origin}", SpadwarpWarning, stacklevel=2)
     return Histograms(
         values=np.ascontiguousarray(values),
         bin_width=raw.bin_width if bin_width is None else bin_width,
@@ -152,8 +139,8 @@ def read_histograms(
 
 
 def _is_own(path: Path) -> bool:
-    """Whether spadwarp wrote this HDF5 file."""
-    return (hdf5_format(path) or "").startswith("spadwarp")
+    """Whether it is an HDF5 file that spadwarp wrote."""
+    return path.suffix.lower() in _HDF5 and (hdf5_format(path) or "").startswith("spadwarp")
 
 
 def _read_own(path: Path, channel: Channel) -> Histograms:
@@ -182,18 +169,12 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
     )
 
 
-def _read(path: Path, ending: str, request: _Request) -> _Raw:
-    readers: dict[str, Callable[[Path, _Request], _Raw]] = {
-        ".h5": _read_hdf5,
-        ".hdf5": _read_hdf5,
-        ".npy": lambda path, request: _Raw(read_npy(path)),
-        ".mat": _read_mat,
-        ".ptu": _read_ptu,
-    }
-    if ending not in readers:
+def _reading(path: Path, read: Callable[..., _Raw], *facts: Any) -> _Raw:
+    """What a reader reads from a path; whatever it raises becomes a `FileError`."""
+    if path.suffix.lower() not in ENDINGS:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
     try:
-        return readers[ending](path, request)
+        return read(path, *facts)
     except (SpadwarpError, MemoryError):
         raise
     except ModuleNotFoundError as error:
@@ -202,15 +183,15 @@ def _read(path: Path, ending: str, request: _Request) -> _Raw:
         raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
-def _check(values: NDArray[Any], path: Path) -> None:
+def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
     if values.ndim not in (3, 4) or values.size == 0 or values.dtype.kind not in "biuf":
-        raise FileError(
-            f"{path}: {values.dtype} {values.shape}; real numbers [H, W, T] or [frames, H, W, T] are needed"
-        )
+        needed = "real numbers [H, W, T] or [frames, H, W, T] are needed"
+        raise FileError(f"{path}: {values.dtype} {values.shape}; {needed}")
     if values.dtype.kind == "f" and np.isnan(values).any():
         raise FileError(f"{path}: holds NaN, as depth does; histograms are finite and not negative")
     if values.dtype.kind in "if" and not (values.min() >= 0 and math.isfinite(values.max())):
         raise FileError(f"{path}: holds {values.min()} … {values.max()}; finite values, not negative, are needed")
+    return values
 
 
 def _check_size(shape: Sequence[int], instead: str) -> None:
@@ -224,10 +205,7 @@ def _check_size(shape: Sequence[int], instead: str) -> None:
 
 
 def _ordered(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], list[str]]:
-    """Histograms `[H, W, T]` or `[frames, H, W, T]` from any order of axes, and a note of what was inferred.
-
-    Raises `ArgumentError` for letters that do not fit, or an order that is missing because two are plausible.
-    """
+    """Histograms `[H, W, T]` or `[frames, H, W, T]` from any order of axes, and a note of what was inferred."""
     letters, notes = "yxt" if values.ndim == 3 else "nyxt", []
     if axes is None:
         axes = _inferred(values.shape, letters)
@@ -239,19 +217,16 @@ def _ordered(values: NDArray[Any], axes: str | None) -> tuple[NDArray[Any], list
 
 def _inferred(shape: tuple[int, ...], letters: str) -> str:
     """Bins last or, before the image, first: the order whose image is clearly nearer to a square."""
-    orders = (letters, letters.replace("yxt", "tyx"))
-    plausible = {}
+    orders, ratio = (letters, letters.replace("yxt", "tyx")), {}
     for order in orders:
-        sizes = dict(zip(order, shape, strict=True))
-        if sizes["t"] >= _LEAST_BINS:
-            plausible[order] = max(sizes["y"], sizes["x"]) / max(min(sizes["y"], sizes["x"]), 1)
-    best = sorted(plausible, key=lambda order: plausible[order])
-    if len(best) == 1 or (best and plausible[best[0]] * _CLEARLY <= plausible[best[1]]):
+        size = dict(zip(order, shape, strict=True))
+        if size["t"] >= _LEAST_BINS:
+            ratio[order] = max(size["y"], size["x"]) / max(min(size["y"], size["x"]), 1)
+    best = sorted(ratio, key=lambda order: ratio[order])
+    if len(best) == 1 or (best and ratio[best[0]] * _CLEARLY <= ratio[best[1]]):
         return best[0]
-    raise ArgumentError(
-        f"the order of the axes is missing (axes): shape {shape} may be "
-        + " or ".join(f"{order} ({_in_words(shape, order)})" for order in orders)
-    )
+    choices = " or ".join(f"{order} ({_in_words(shape, order)})" for order in orders)
+    raise ArgumentError(f"the order of the axes is missing (axes): shape {shape} may be {choices}")
 
 
 def _in_words(shape: tuple[int, ...], axes: str) -> str:
@@ -260,80 +235,36 @@ def _in_words(shape: tuple[int, ...], axes: str) -> str:
     return f"{frames}{size['x']} x {size['y']} pixels, {size['t']} bins"
 
 
-# Arrays by their names, in HDF5 files of others and in MATLAB's
+# Arrays by their names, in NumPy's files, in HDF5 files of others and in MATLAB's
 
 
-def _named(path: Path, dataset: str | None, names: Sequence[str], candidates: Sequence[str], listed: str) -> str:
-    """The dataset that was asked for, else the first that was found. Raises `FileError` if it is not there."""
-    if dataset is None and not candidates:
-        others = ", sparse matrix or cells" if path.suffix.lower() == ".mat" else ""
-        raise FileError(f"{path}: no array of 3 or 4 dimensions{others}; it holds {listed}")
-    name = dataset or candidates[0]
-    if name not in names:
-        raise FileError(f"{path}: no array {name!r}; it holds {listed}")
-    return name
+@contextmanager
+def _arrays(path: Path) -> Iterator[dict[str, Variable]]:
+    """Arrays of numbers of a file by name, not yet read; that of NumPy's file has the name ""."""
+    ending = path.suffix.lower()
+    if ending == ".mat":
+        with open_mat(path) as variables:
+            yield variables
+    elif ending == ".npy":
+        array = read_npy(path)
+        yield {"": Variable("dense", array.shape, lambda: array)}
+    else:
+        with closing(open_hdf5(path)) as file:
+            yield {
+                name: Variable("dense", shape, partial(file.array, name, dtype, shape))
+                for name, (shape, dtype) in file.arrays().items()
+                if dtype.kind in "biuf"
+            }
 
 
-def _unnamed(path: Path, listed: str) -> ArgumentError:
+def _listed(variables: Mapping[str, Variable]) -> str:
+    kinds = {"dense": "", "sparse": " sparse", "cell": " cells"}
+    return ", ".join(f"{name} {one.shape}{kinds[one.kind]}" for name, one in variables.items()) or "no numbers"
+
+
+def _unnamed(path: Path, variables: Mapping[str, Variable]) -> ArgumentError:
     """The error for a file of several arrays of which none was named."""
-    return ArgumentError(f"{path}: the dataset is missing (dataset); the file holds {listed}")
-
-
-def _listed(shapes: Mapping[str, tuple[int, ...]]) -> str:
-    return ", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing"
-
-
-def _numeric_shapes(arrays: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]) -> dict[str, tuple[int, ...]]:
-    return {name: shape for name, (shape, dtype) in arrays.items() if dtype.kind in "biuf"}
-
-
-def _read_hdf5(path: Path, request: _Request) -> _Raw:
-    with read_hdf5(path) as file:
-        arrays = file.arrays()
-    listed = _listed({name: shape for name, (shape, _) in arrays.items()})
-    cubes = [name for name, shape in _numeric_shapes(arrays).items() if len(shape) in (3, 4)]
-    if request.dataset is None and len(cubes) > 1:
-        raise _unnamed(path, listed)
-    name = _named(path, request.dataset, list(arrays), cubes, listed)
-    shape, dtype = arrays[name]
-    _check_size(shape, "a part of the array")
-    with read_hdf5(path) as file:
-        return _Raw(file.array(name, dtype, shape), () if request.dataset else (f"reads {name}",))
-
-
-def _read_mat(path: Path, request: _Request) -> _Raw:
-    with open_mat(path) as variables:
-        listed = (
-            ", ".join(f"{name} {variable.shape} {variable.kind}" for name, variable in variables.items())
-            or "no numbers"
-        )
-        candidates = _histograms_in(variables)
-        name = _named(path, request.dataset, list(variables), candidates, listed)
-        chosen = variables[name]
-        if chosen.kind == "dense":
-            _check_size(chosen.shape, "a part of the array")
-        value = chosen.read()
-        facts = {
-            key: float(np.asarray(variables[key].read()).ravel()[0])
-            for key in ("bin_size", "gate_start")
-            if key in variables and variables[key].kind == "dense" and math.prod(variables[key].shape) == 1
-        }
-        shapes = [variable.shape for variable in variables.values() if variable.kind == "dense"]
-    notes = [] if request.dataset or len(candidates) == 1 else [f"reads {name}, not {', '.join(candidates[1:])}"]
-    if chosen.kind == "cell":
-        if request.tag_unit is None:
-            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
-        return _of_tags(value, request.tag_unit, request.bin_width, notes)
-    width = facts.get("bin_size")
-    width = width if width is not None and 1e-15 < width < 1e-3 else None
-    if request.bin_width is None and width is not None:
-        notes.append(f"bin width {width * 1e12:g} ps from bin_size")
-    if isinstance(value, SparseMatrix):
-        height, across = _image_shape(value.shape[0], request.image_size, shapes)
-        notes.append(f"{across} x {height} pixels, column by column")
-        cube = _dense(value, height, across)
-        return _Raw(cube, tuple(notes), width, facts.get("gate_start"), ordered=True)
-    return _Raw(value, tuple(notes), width, facts.get("gate_start"))
+    return ArgumentError(f"{path}: the dataset is missing (dataset); the file holds {_listed(variables)}")
 
 
 def _histograms_in(variables: Mapping[str, Variable]) -> list[str]:
@@ -347,26 +278,59 @@ def _histograms_in(variables: Mapping[str, Variable]) -> list[str]:
     return sorted(fits, key=lambda name: fits[name])
 
 
-def _image_shape(pixels: int, image_size: tuple[int, int] | None, shapes: list[tuple[int, ...]]) -> tuple[int, int]:
-    """(height, width) of an image of so many pixels: given, or the only shape of other arrays that has as many.
+def _read_arrays(
+    path: Path, dataset: str | None, image_size: tuple[int, int] | None, tag_unit: float | None, bin_width: float | None
+) -> _Raw:
+    is_mat = path.suffix.lower() == ".mat"
+    with _arrays(path) as variables:
+        candidates = [""] if "" in variables else _histograms_in(variables)
+        if dataset is None and not candidates:
+            others = ", sparse matrix or cells" if is_mat else ""
+            raise FileError(f"{path}: no array of 3 or 4 dimensions{others}; it holds {_listed(variables)}")
+        if dataset is None and len(candidates) > 1 and not is_mat:
+            raise _unnamed(path, variables)
+        name = "" if "" in variables else dataset or candidates[0]
+        if name not in variables:
+            raise FileError(f"{path}: no array {name!r}; it holds {_listed(variables)}")
+        chosen = variables[name]
+        if chosen.kind == "dense":
+            _check_size(chosen.shape, "a part of the array")
+        value = chosen.read()
+        numbers = {
+            key: float(np.asarray(variables[key].read()).ravel()[0])
+            for key in ("bin_size", "gate_start")
+            if is_mat and key in variables and variables[key].kind == "dense" and math.prod(variables[key].shape) == 1
+        }
+    others = f", not {', '.join(candidates[1:])}" if len(candidates) > 1 else ""
+    notes = [f"reads {name}{others}"] if name and not dataset and (others or not is_mat) else []
+    if chosen.kind == "cell":
+        if tag_unit is None:
+            raise ArgumentError(f"{path}: the unit of the time tags in {name} is missing (tag_unit)")
+        return _of_tags(value, tag_unit, bin_width, notes)
+    width = numbers.get("bin_size", 0.0)
+    known = width if 1e-15 < width < 1e-3 else None
+    if bin_width is None and known is not None:
+        notes.append(f"bin width {known * 1e12:g} ps from bin_size")
+    is_sparse = isinstance(value, SparseMatrix)
+    if is_sparse:
+        value = _of_sparse(value, image_size, variables)
+        notes.append(f"{value.shape[1]} x {value.shape[0]} pixels, column by column")
+    return _Raw(value, tuple(notes), known, numbers.get("gate_start"), ordered=is_sparse)
 
-    Raises `ArgumentError` where none or several do.
-    """
-    if image_size is not None:
-        height, width = image_size
-        if height * width != pixels:
-            raise ArgumentError(f"image size = {width} x {height} has {height * width} pixels, not {pixels}")
-        return image_size
-    fitting = {shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and shape[0] * shape[1] == pixels}
-    if len(fitting) != 1:
+
+def _of_sparse(
+    matrix: SparseMatrix, image_size: tuple[int, int] | None, variables: Mapping[str, Variable]
+) -> NDArray[Any]:
+    """`[H, W, T]` of a matrix `[pixels, T]`, pixels column by column as in MATLAB; the image's size is given, or is the
+    only shape of other arrays with as many pixels."""
+    pixels, bins = matrix.shape
+    shapes = {one.shape for one in variables.values() if one.kind == "dense"}
+    fitting = [shape for shape in shapes if len(shape) == 2 and min(shape) > 1 and math.prod(shape) == pixels]
+    if image_size is None and len(fitting) != 1:
         raise ArgumentError(f"the image's size is missing (image_size): {pixels} pixels, one after the other")
-    (height, width), *_ = fitting
-    return height, width
-
-
-def _dense(matrix: SparseMatrix, height: int, width: int) -> NDArray[Any]:
-    """`[H, W, T]` of a matrix `[pixels, T]` whose pixels stand column by column, as in MATLAB."""
-    bins = matrix.shape[1]
+    height, width = image_size or fitting[0]
+    if height * width != pixels:
+        raise ArgumentError(f"image size = {width} x {height} has {height * width} pixels, not {pixels}")
     _check_size((height, width, bins), "a part of the image")
     whole = bool((matrix.value == np.rint(matrix.value)).all() and (np.abs(matrix.value) < 2**31).all())
     cube = np.zeros((height, width, bins), np.int32 if whole else np.float32)
@@ -386,10 +350,11 @@ def _of_tags(cells: NDArray[Any], unit: float, bin_width: float | None, notes: l
     if not sizes.any():
         raise FileError("no pixel has a time tag")
     tags = np.concatenate([cell for cell in cells.flat if cell.size])
-    if tags.dtype.kind not in "fiu":
-        raise FileError(f"time tags are {tags.dtype}, not whole numbers")
-    if tags.dtype.kind == "f" and not ((tags == np.rint(tags)).all() and np.abs(tags).max() < 2**53):  # no NaN, no inf
-        raise FileError("time tags are not all whole numbers")
+    whole = tags.dtype.kind in "iu"
+    if tags.dtype.kind == "f":  # no NaN, no inf
+        whole = bool((tags == np.rint(tags)).all() and np.abs(tags).max() < 2**53)
+    if not whole:
+        raise FileError(f"time tags are not all whole numbers: {tags.dtype}")
     if not -(2**62) < int(tags.min()) <= int(tags.max()) < 2**62:
         raise FileError(f"time tags from {tags.min()} to {tags.max()} are beyond 2^62")
     tags = tags.astype(np.int64)
@@ -410,19 +375,57 @@ def _of_tags(cells: NDArray[Any], unit: float, bin_width: float | None, notes: l
     return _Raw(cube, (*notes, text), step * unit, first=first * unit, ordered=True)
 
 
+def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[NDArray[Any], str] | None:
+    """An image `[H, W]`, or if there may be `several` also images `[N, H, W]`, from `.npy`, `.mat` or `.h5`; None where
+    the file or the dataset of that name holds histograms. Without a name: of a `.mat` without histograms the largest,
+    of a `.h5` without them the only one. With it a text that names the image taken and those left; "" without a choice.
+
+    Raises `FileError`, and `ArgumentError` where several of a `.mat` are the largest, or a `.h5` has several.
+    """
+    ending = path.suffix.lower()
+    if ending not in _ARRAYS or _is_own(path):
+        return None
+    with _arrays(path) as variables:
+        dense = {name: one for name, one in variables.items() if one.kind == "dense"}
+        name, choice = "" if ending == ".npy" else dataset, ""
+        if name is None:
+            sizes = {name: one.shape for name, one in dense.items() if math.prod(one.shape) > 1}
+            holds_cubes = any(len(shape) in (3, 4) for shape in sizes.values())
+            sides: tuple[int, ...]
+            if ending == ".mat":
+                sides = () if _histograms_in(variables) and not several else (2, 3)
+            else:
+                sides = (2,) if not holds_cubes else (3,) if several else ()
+            found = [name for name, shape in sizes.items() if len(shape) in sides]
+            most = max((math.prod(sizes[name]) for name in found), default=0)
+            largest = [name for name in found if math.prod(sizes[name]) == most or ending != ".mat"]
+            if len(largest) > 1:
+                raise _unnamed(path, variables)
+            others = ", ".join(name for name in found if name not in largest)
+            name = largest[0] if largest else None
+            choice = f"{name}, not {others}" if others else ""
+        if name not in dense or len(dense[name].shape) not in ((2, 3) if several else (2,)):
+            return None
+        return np.asarray(dense[name].read()), choice
+
+
 # PicoQuant's files of T3 records: images, and other scans by their markers
 
 
-def _read_ptu(path: Path, request: _Request) -> _Raw:
+def _read_ptu(path: Path, image_size: tuple[int, int] | None, sum_frames: bool) -> _Raw:
     """Counts of all channels. Raises `ArgumentError` for a size that is missing or does not fit the markers."""
     import ptufile
 
     with ptufile.PtuFile(path) as file:
         _check_ptu(file, path)
-        if file.is_image and request.image_size is None:
-            counts, text = _ptu_image(file, request.sum_frames), "pixels by the image in its header"
+        if file.is_image and image_size is None:
+            frames, height, width, _, bins = file.shape
+            _check_size((1 if sum_frames else frames, height, width, bins), "adding up the frames (sum_frames)")
+            options: Any = {"frame": -1 if sum_frames or frames == 1 else None, "channel": -1}
+            image = file.decode_image(**options, dtype=np.uint32, keepdims=False)
+            counts, text = np.ascontiguousarray(image).view(np.int32), "pixels by the image in its header"
         else:
-            counts, text = _ptu_scan(file, request.image_size)
+            counts, text = _ptu_scan(file, image_size)
         if (channels := file.number_channels) > 1:
             text += f"; {channels} channels, added up"
         notes = [text, f"{len(counts)} frames; sum_frames adds them up"][: counts.ndim - 2]
@@ -448,14 +451,6 @@ def _check_ptu(file: Any, path: Path) -> None:
         raise FileError(f"{path}: cut: of {file.number_records} records {readable} are there")
     if not 1e-15 < (width := float(file.tcspc_resolution)) < 1e-3:
         raise FileError(f"{path}: MeasDesc_Resolution = {width} s is outside (1e-15, 1e-3)")
-
-
-def _ptu_image(file: Any, sum_frames: bool) -> NDArray[np.int32]:
-    frames, height, width, _, bins = file.shape
-    _check_size((1 if sum_frames else frames, height, width, bins), "adding up the frames (sum_frames)")
-    options: dict[str, Any] = {"channel": -1, "dtype": np.uint32, "keepdims": False}
-    counts = file.decode_image(frame=-1 if sum_frames or frames == 1 else None, **options)
-    return np.ascontiguousarray(counts).view(np.int32)
 
 
 def _ptu_scan(file: Any, image_size: tuple[int, int] | None) -> tuple[NDArray[np.int32], str]:
@@ -499,60 +494,3 @@ def _ptu_starts(records: Any, marks: NDArray[np.intp], height: int, width: int) 
         f"image size = {width} x {height}: {height * width} markers of one kind, or {height}, are needed; "
         f"the file has {markers}"
     )
-
-
-# Images
-
-
-def stored_images(path: Path, dataset: str | None, *, several: bool) -> tuple[NDArray[Any], str] | None:
-    """An image `[H, W]`, or if there may be `several` also images `[N, H, W]`, from `.npy`, `.mat` or `.h5`; None where
-    the file or the dataset of that name holds histograms. Without a name: of a `.mat` without histograms the largest,
-    of a `.h5` without them the only one. With it a text that names the image taken and those left; "" without a choice.
-
-    Raises `FileError`, and `ArgumentError` where several of a `.mat` are the largest, or a `.h5` has several.
-    """
-    ending, sides = path.suffix.lower(), (2, 3) if several else (2,)
-    if ending == ".npy":
-        array = read_npy(path)
-        return (array, "") if array.ndim in sides else None
-    if ending == ".mat":
-        with open_mat(path) as variables:
-            images = {
-                name: variable
-                for name, variable in variables.items()
-                if variable.kind == "dense" and len(variable.shape) in (2, 3)
-            }
-            name, choice = dataset, ""
-            if name is None and (several or not _histograms_in(variables)):
-                sizes = {name: variable.shape for name, variable in images.items() if math.prod(variable.shape) > 1}
-                name, choice = _largest(path, sizes)
-            if name not in images or len(images[name].shape) not in sides:
-                return None
-            return np.asarray(images[name].read()), choice
-    if ending in (".h5", ".hdf5") and not _is_own(path):
-        with read_hdf5(path) as file:
-            arrays = file.arrays()
-        shapes = _numeric_shapes(arrays)
-        cubes = [name for name, shape in shapes.items() if len(shape) in (3, 4)]
-        images_found = [name for name in cubes if several and len(shapes[name]) == 3]
-        if not cubes:
-            images_found = [name for name, shape in shapes.items() if len(shape) == 2 and math.prod(shape) > 1]
-        if dataset is None and len(images_found) > 1:
-            raise _unnamed(path, _listed({name: shape for name, (shape, _) in arrays.items()}))
-        name = images_found[0] if dataset is None and images_found else dataset
-        shape, dtype = arrays.get(name or "", ((), np.dtype(float)))
-        if name is not None and len(shape) in sides:
-            with read_hdf5(path) as file:
-                return file.array(name, dtype, shape), ""
-    return None
-
-
-def _largest(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> tuple[str | None, str]:
-    """Name of the largest image, None without any, and a text that names it and the others, "" without others. Raises
-    `ArgumentError` where several are the largest."""
-    most = max(map(math.prod, shapes.values()), default=0)
-    largest = [name for name, shape in shapes.items() if math.prod(shape) == most]
-    if len(largest) > 1:
-        raise _unnamed(path, _listed(shapes))
-    others = [name for name in shapes if name not in largest]
-    return (largest[0] if largest else None), f"{largest[0]}, not {', '.join(others)}" if others else ""

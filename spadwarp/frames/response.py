@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import real_array
-from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.arrays import read_npy
 from spadwarp.io.paths import file_problem
 from spadwarp.io.text import read_columns, read_text
-from spadwarp.limits import BIN_WIDTH, TIME, check_integer, check_real, shown
+from spadwarp.values import BIN_WIDTH, TIME, ArgumentError, ConfigError, FileError, check_integer, check_real, shown
 
 if TYPE_CHECKING:
     from spadwarp.scene import Detector, Laser
@@ -28,8 +27,6 @@ Floats = NDArray[np.float64]
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _SUPPORT_SIGMAS = 6.0  # 1e-9 of a Gaussian lies beyond on either side
 _SUPPORT_TAILS = 16.0  # 1e-7 of an exponential lies beyond
-
-
 _MOST_BINS = 1e7  # of a response on one side
 
 
@@ -83,11 +80,11 @@ class InstrumentResponse:
         t = np.asarray(time, np.float64)
         if self.times is not None:
             return np.interp(t, self._knots, self._heights, left=0.0, right=0.0)
-        if self.tail == 0:
-            if self.sigma == 0:
-                raise ArgumentError("a response without width has no density")
-            return np.exp(-0.5 * (t / self.sigma) ** 2) / (self.sigma * math.sqrt(2 * math.pi))
-        return self._tail_density(t)
+        if self.tail > 0:
+            return self._tail_density(t)
+        if self.sigma == 0:
+            raise ArgumentError("a response without width has no density")
+        return np.exp(-0.5 * (t / self.sigma) ** 2) / (self.sigma * math.sqrt(2 * math.pi))
 
     def cumulative(self, time: ArrayLike) -> Floats:
         """Integral of the density up to `time`."""
@@ -111,10 +108,6 @@ class InstrumentResponse:
             peak = np.exp(-0.5 * (t / self.sigma) ** 2) * (self.sigma / math.sqrt(2 * math.pi))
             gaussian = t * _gaussian_cumulative(t, self.sigma) + peak
         return gaussian if self.tail == 0 else gaussian - self.tail * self.cumulative(t)
-
-    def bin_fractions(self, edges: ArrayLike, *, arrival: float = 0.0) -> Floats:
-        """Fraction of the detections of light at time `arrival` in each bin between `edges` [s]: `[edges - 1]`."""
-        return np.diff(self.cumulative(np.asarray(edges, np.float64) - arrival))
 
     def per_bin(self, bin_width: float) -> Floats:
         """Fractions of a return in the bins about its own, `[2 r + 1]`, for returns spread evenly over a bin."""
@@ -151,32 +144,27 @@ class InstrumentResponse:
     @cached_property
     def mean(self) -> float:
         """Mean delay [s]."""
-        if self.times is None:
-            return self.tail
-        return float(self._knots[-1] - self._integral_at[-1])
+        return self.tail if self.times is None else float(self._knots[-1] - self._integral_at[-1])
 
     @cached_property
     def mode(self) -> float:
         """Delay at which the density is largest [s]."""
         if self.times is not None:
             return float(self._knots[self._heights.argmax()])
-        if self.tail == 0 or self.sigma == 0:
-            return 0.0
-        time, density = self._fine()
-        return float(time[density.argmax()])
+        return 0.0 if self.tail == 0 or self.sigma == 0 else self._peak[0]
 
     @cached_property
     def fwhm(self) -> float:
         """Full width at half of the largest density [s]."""
-        if self.times is None and self.tail == 0:
-            return FWHM_PER_SIGMA * self.sigma
-        time, density = self._fine()
-        above = np.flatnonzero(density >= 0.5 * density.max())
-        return float(time[above[-1]] - time[above[0]])
+        return FWHM_PER_SIGMA * self.sigma if self.times is None and self.tail == 0 else self._peak[1]
 
-    def _fine(self) -> tuple[Floats, Floats]:
+    @cached_property
+    def _peak(self) -> tuple[float, float]:
+        """Mode and FWHM on a fine grid."""
         time = np.linspace(*self.support, 20_001)
-        return time, self.density(time)
+        density = self.density(time)
+        above = np.flatnonzero(density >= 0.5 * density.max())
+        return float(time[density.argmax()]), float(time[above[-1]] - time[above[0]])
 
     # The exponential tail
 
@@ -206,9 +194,8 @@ class InstrumentResponse:
     @cached_property
     def _integral_at(self) -> Floats:
         width, height = np.diff(self._knots), self._heights
-        return np.append(
-            0.0, np.cumsum(width * (self._cumulative_at[:-1] + width * (2 * height[:-1] + height[1:]) / 6.0))
-        )
+        pieces = width * (self._cumulative_at[:-1] + width * (2 * height[:-1] + height[1:]) / 6.0)
+        return np.append(0.0, np.cumsum(pieces))
 
     def _segment(self, t: Floats) -> tuple[NDArray[np.intp], Floats]:
         """Index of the piece that holds `t` and the time since its start; outside all pieces, the nearer end."""
@@ -232,7 +219,7 @@ def instrument_response(
     shape: Literal["gaussian", "exponentially_modified_gaussian"] | str | Path = "gaussian",
     tail: float = 0.0,
 ) -> InstrumentResponse:
-    """Pulse ⊗ jitter.
+    """Pulse ⊗ jitter. Raises `ArgumentError`, which names the argument, or the file and the line.
 
     Args:
         pulse_fwhm, jitter_fwhm: Of laser pulse and detector [s], ≥ 0; as Gaussians their squares add.
@@ -240,18 +227,16 @@ def instrument_response(
             time_ps and value, a measured response (pulse included, so that the two widths are not used). The file's
             time 0 is the arrival of the photon; lines that start with # and one line of names are skipped.
         tail: Time constant of the exponential diffusion tail [s].
-
-    Raises:
-        ArgumentError: Names the argument, or the file and the line.
     """
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
         check_real(name, value, "[0, 1e6] s")
+    if shape not in ("gaussian", "exponentially_modified_gaussian"):
+        if file_problem(shape) is not None:
+            name = repr(str(shape)) if len(str(shape)) < 300 else shown(str(shape))
+            raise ArgumentError(f"irf = {name} is neither a known shape nor a file")
+        return read_response(shape)
     sigma = math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA
-    if shape == "gaussian":
-        return InstrumentResponse(sigma=sigma)
-    if shape == "exponentially_modified_gaussian":
-        return InstrumentResponse(sigma=sigma, tail=tail)
-    return _read_csv(Path(shape))
+    return InstrumentResponse(sigma=sigma, tail=0.0 if shape == "gaussian" else tail)
 
 
 def detector_response(detector: Detector, laser: Laser | None = None) -> InstrumentResponse:
@@ -264,22 +249,6 @@ def detector_response(detector: Detector, laser: Laser | None = None) -> Instrum
     )
 
 
-def _read_csv(path: Path) -> InstrumentResponse:
-    if file_problem(path) is not None:
-        name = str(path)
-        raise ArgumentError(
-            f"irf = {repr(name) if len(name) < 300 else shown(name)} is neither a known shape nor a file"
-        )
-    try:
-        times, values = read_columns(path, {"time_ps": "[-1e12, 1e12]", "value": "[0, 1e30]"}).T
-    except (ConfigError, FileError) as error:
-        raise ArgumentError(str(error)) from None
-    try:
-        return InstrumentResponse(times=times * 1e-12, values=values)
-    except ValueError as error:
-        raise ArgumentError(f"{path}: {error}") from None
-
-
 def _near_1(values: Floats) -> Floats:
     """Values times the power of two that brings the largest near 1: no bit of what is normalised later changes."""
     return np.ldexp(values, -int(np.frexp(values.max())[1]))
@@ -288,24 +257,23 @@ def _near_1(values: Floats) -> Floats:
 def read_response(path: str | Path, *, bin_width: float | None = None) -> InstrumentResponse:
     """A measured response from a file.
 
-    Args:
-        path: `.csv` of time_ps and value, whose time 0 is the arrival of the photon; or `.csv` or `.npy` of one value
-            for each bin, whose mean is taken for that time.
-        bin_width: Of these bins [s].
-
-    Raises:
-        ArgumentError: No such file, not a response, or values of bins without their width.
+    `path`: `.csv` of time_ps and value, whose time 0 is the arrival of the photon; or `.csv` or `.npy` of one value for
+    each bin of `bin_width` [s], whose mean is taken for that time. Raises `ArgumentError`: no such file, not a
+    response, or values of bins without their width.
     """
     place = Path(path)
     try:
         if place.suffix.lower() == ".npy":
             values = read_npy(place, largest=1 << 20).astype(np.float64)
         elif any("," in line for line in read_text(place).splitlines() if not line.lstrip().startswith("#")):
-            return _read_csv(place)
+            times, values = read_columns(place, {"time_ps": "[-1e12, 1e12]", "value": "[0, 1e30]"}).T
+            return InstrumentResponse(times=times * 1e-12, values=values)
         else:
             values = read_columns(place, {"value": "[0, 1e30]"})[:, 0]
     except (ConfigError, FileError) as error:
         raise ArgumentError(str(error)) from None
+    except ArgumentError as error:
+        raise ArgumentError(f"{path}: {error}") from None
     if values.ndim != 1 or values.size < 2 or not (np.isfinite(values).all() and values.min() >= 0 and values.any()):
         raise ArgumentError(f"{path}: {values.shape} is not a response: two values or more, not negative, not all 0")
     if bin_width is None:
@@ -336,22 +304,13 @@ def response_matrix(
 
     Light is even over a source bin; response and bins are integrated exactly, so neither needs to be narrow beside the
     other. With a period P the detector sees time modulo P: source time t and detector time t − mP are one, for all m.
-
-    Args:
-        irf: The response.
-        source_start, source_width, source_bins: The axis of the source [s].
-        edges: Of the detector bins [s], ascending, `[bins + 1]`.
-        period: Of the pulses [s]; None: time does not wrap.
-
-    Raises:
-        ArgumentError: Names the argument, its value and what is allowed.
+    `source_start`, `source_width`, `source_bins`: the axis of the source [s]; `edges`: of the detector bins [s],
+    ascending, `[bins + 1]`; `period`: of the pulses [s], None: time does not wrap. Raises `ArgumentError`.
     """
     if not isinstance(irf, InstrumentResponse):
         raise ArgumentError(f"irf = {shown(irf)} is not an InstrumentResponse")
-    source_start, source_width = (
-        check_real("source_start", source_start, TIME),
-        check_real("source_width", source_width, BIN_WIDTH),
-    )
+    source_start = check_real("source_start", source_start, TIME)
+    source_width = check_real("source_width", source_width, BIN_WIDTH)
     source_bins = check_integer("source_bins", source_bins, "[1, 2147483647]")
     period = None if period is None else check_real("period", period, BIN_WIDTH)
     e = real_array("edges", edges, np.float64)
@@ -363,7 +322,7 @@ def response_matrix(
         source_stop = source_start + source_bins * source_width
         first = math.ceil((source_start + lower - e[-1]) / period)
         wraps = range(first, math.floor((source_stop + upper - e[0]) / period) + 1)
-    rows, columns, weights = [], [], []
+    rows, columns, weights = [np.zeros(0, np.intp)], [np.zeros(0, np.int32)], [np.zeros(0)]
     for wrap in wraps:
         shifted = e + (wrap * period if period is not None else 0.0)
         begin = np.clip(np.floor((shifted[:-1] - upper - source_start) / source_width), 0, source_bins)
@@ -378,13 +337,8 @@ def response_matrix(
         rows.append(row)
         columns.append(index[row, tap].astype(np.int32))
         weights.append(weight[keep])
-    if not rows:
-        return SparseResponse(np.zeros(e.size, np.int32), np.zeros(0, np.int32), np.zeros(0, np.float32))
     every_row = np.concatenate(rows)
     order = np.argsort(every_row, kind="stable")
     entries = np.bincount(every_row, minlength=e.size - 1)
-    return SparseResponse(
-        np.append(0, np.cumsum(entries)).astype(np.int32),
-        np.concatenate(columns)[order],
-        np.concatenate(weights)[order].astype(np.float32),
-    )
+    row_start = np.append(0, np.cumsum(entries)).astype(np.int32)
+    return SparseResponse(row_start, np.concatenate(columns)[order], np.concatenate(weights)[order].astype(np.float32))

@@ -1,30 +1,54 @@
-"""The camera: counts and time tags of a SPAD array from expected detections, and the noise they have of a simulation.
+"""The camera: frames of counts of a SPAD array from expected detections, and the noise they have of a simulation.
 
 Expected detections per pulse, `[H, W, T]`, in unwrapped time → response (pulse ⊗ jitter), wrapping at the pulse period,
-dark counts, ambient light, crosstalk → hazard λ per detector bin → counts, drawn exactly.
+dark counts, ambient light, effects such as crosstalk → hazard λ per detector bin → counts, drawn exactly.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, on_host, output_tensor, tensor_of
-from spadwarp.errors import ArgumentError, SpadwarpWarning, kernel_errors
-from spadwarp.frames.frames import Frames, TimeTags
-from spadwarp.frames.receiver import Receiver, missing_light
-from spadwarp.frames.response import InstrumentResponse, detector_response
-from spadwarp.limits import BIN_WIDTH, SEED, TIME, check_integer, check_real, shown
+from spadwarp.arrays import (
+    Variable,
+    histogram_rows,
+    in_torch_order,
+    is_torch,
+    labelled,
+    on_host,
+    output_tensor,
+    tensor_of,
+)
+from spadwarp.frames.depth import Method, arrival_time
+from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
+from spadwarp.io.hdf5 import PIXELS, image_coordinates
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Detector, Laser, detection_efficiency, noise_rate
+from spadwarp.values import (
+    BIN_WIDTH,
+    SEED,
+    TIME,
+    ArgumentError,
+    SpadwarpWarning,
+    check_integer,
+    check_real,
+    kernel_errors,
+    shown,
+)
 
-__all__ = ["MonteCarloNoise", "detect", "monte_carlo_noise"]
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["Frames", "MonteCarloNoise", "Receiver", "TimeTags", "coates", "detect", "first_photon_probabilities"]
+__all__ += ["monte_carlo_noise", "to_xarray"]
 
 LIMIT = 0.5
 """Standard error of a pixel over its shot noise from which on it counts: variances then add up to 1.25 times."""
@@ -32,16 +56,411 @@ LIMIT = 0.5
 _PART = 0.95  # of the pixels that have to be below the limit
 
 
-@dataclass(frozen=True, kw_only=True)
-class MonteCarloNoise:
-    """The standard error of a result against the shot noise of one frame, both of the counts of a pixel.
+class Window(NamedTuple):
+    """Bins in which the detector is on, by their edges from the start; the first `recorded` are histogrammed.
+
+    `period`: from one window to the next. All times [s].
+    """
+
+    start: float
+    edges: NDArray[np.float64]
+    recorded: int
+    period: float
+
+    @classmethod
+    def of(
+        cls, detector: Detector, laser: Laser | None, window: tuple[float, int], bin_width: float, tdc_widths: Any
+    ) -> Self:
+        """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
+        if not (isinstance(window, tuple | list) and len(window) == 2):
+            raise ArgumentError(f"window = {shown(window)} is not (start [s], bins)")
+        start = check_real("start of window", window[0], TIME)
+        bins = check_integer("bins of window", window[1], "[1, 1000000]")
+        wrap, period = detector.wrap, math.inf if laser is None else 1.0 / laser.repetition_rate
+        if wrap:
+            # The detector knows no time beyond that from one pulse to the next.
+            bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))
+            if bins < 1:
+                raise ArgumentError(f"bin_width = {bin_width} s is longer than the pulse period, {period} s")
+        widths = np.ones(bins) if tdc_widths is None else np.asarray(tdc_widths, np.float64)
+        if widths.shape != (bins,):
+            raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
+        if not (np.isfinite(widths).all() and (widths > 0).all()):
+            raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
+        edges = np.append(0.0, np.cumsum(widths / widths.mean())) * bin_width
+        period = period if wrap else max(period, edges[-1])
+        rest = period - edges[-1]
+        if detector.mode == "free_running" and rest > 1e-9 * period:
+            # Between two windows the detector goes on detecting, unrecorded; where time does not wrap, noise alone.
+            extra = math.ceil(rest / bin_width) if wrap else 1
+            edges = np.append(edges, edges[-1] + rest * np.arange(1, extra + 1) / extra)
+        return cls(start, edges, bins, period)
+
+    def missing_light(self, gate_start: float) -> tuple[str, ...]:
+        """A note if light from before the source's first bin would fall into the window, some periods later."""
+        wrap = math.ceil((gate_start - self.start) / self.period - 1e-9) - 1
+        if gate_start <= 0 or self.start + wrap * self.period + self.edges[-1] <= 0:
+            return ()
+        text = "earlier light of later pulses, near-range backscatter above all, is missing in the window"
+        return (f"the source begins at {gate_start * 1e9:.6g} ns: {text} (start the source at 0 and give `window`)",)
+
+
+class Effect(ABC):
+    """An effect of the detector that changes λ, in place; a fit follows it by its slope. A new one takes fields in the
+    scene's section `detector`, maybe a kernel, and a class in `EFFECTS`."""
+
+    @abstractmethod
+    def apply(self, receiver: Receiver, hazard: Any) -> None:
+        """Changes λ, Warp float32 `[pixel, bin]`."""
+
+    @abstractmethod
+    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
+        """Changes a derivative of λ, of the same shape, by the derivative of the effect."""
+
+
+class _Crosstalk(Effect):
+    """λ gains a part of the detections of the four neighbours; a slope, as if their pile-up stayed as it is."""
+
+    def apply(self, receiver: Receiver, hazard: Any) -> None:
+        from spadwarp_kernels import detection as kernels
+
+        detector = receiver.detector
+        if detector.crosstalk_probability > 0 and detector.mode == "free_running":
+            dead_time, period = detector.dead_time_ns * 1e-9, receiver.window.period
+            self._add(receiver, hazard, kernels.free_running_probabilities(hazard, dead_time=dead_time, period=period))
+        elif detector.crosstalk_probability > 0:
+            self._add(receiver, hazard, kernels.first_photon_probabilities(hazard))
+
+    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
+        import warp as wp
+
+        if receiver.detector.crosstalk_probability > 0:
+            self._add(receiver, slope, wp.clone(slope))
+
+    def _add(self, receiver: Receiver, rates: Any, neighbours: Any) -> None:
+        from spadwarp_kernels import detection as kernels
+
+        probability = receiver.detector.crosstalk_probability
+        kernels.add_crosstalk(rates, neighbours, image_width=receiver.image[1], probability=probability)
+
+
+EFFECTS: tuple[Effect, ...] = (_Crosstalk(),)  # on λ, in the order in which they act
+DRAWN_EFFECTS = ("afterpulsing_probability", "max_count")  # on single detections, 0 without: a fit refuses them
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Receiver:
+    """The camera before it counts: expected detections of a detector, from expected light.
 
     Attributes:
-        pulses: Of the frame.
+        detector, window: The section of a scene, and its bins in time.
+        image: (height, width).
+        noise: Dark counts and ambient light of each pixel [1/s], Warp float32 `[pixel]`; where it lies, the others lie.
+        matrix: Fraction of the light of each source bin that is detected in each detector bin.
+        equal_bins: Whether all bins of the window are equally wide.
+    """
+
+    detector: Detector
+    window: Window
+    image: tuple[int, int]
+    noise: Any
+    matrix: SparseResponse
+    equal_bins: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        detector: Detector,
+        laser: Laser | None,
+        *,
+        shape: tuple[int, ...],
+        axis: tuple[float, float],
+        device: Any,
+        irf: InstrumentResponse | None = None,
+        window: tuple[float, int] | None = None,
+        tdc_widths: ArrayLike | None = None,
+        ambient: ArrayLike | None = None,
+        camera_seed: int = 0,
+    ) -> Self:
+        """The receiver of a source of `shape` `[H, W, T]` whose time axis is (start, bin width) [s].
+
+        `device` is a Warp device; the others are arguments of `spadwarp.detect`. Raises `ArgumentError`.
+        """
+        import warp as wp
+
+        from spadwarp_kernels import detection as kernels
+
+        seen = Window.of(detector, laser, window or (axis[0], shape[2]), axis[1], tdc_widths)
+        noise: Any = kernels.dark_count_rates(
+            shape[0] * shape[1],
+            median=detector.dark_count_rate,
+            spread=detector.dark_count_spread,
+            hot_fraction=detector.hot_pixel_fraction,
+            hot_rate=detector.hot_pixel_rate,
+            offset=detector.ambient_rate,
+            seed=camera_seed,
+            device=device,
+        )
+        if ambient is not None:
+            values: NDArray[np.float64] = np.asarray(ambient, np.float64)
+            if values.shape not in ((), shape[:2]):
+                raise ArgumentError(f"ambient has shape {values.shape}; a number or {shape[:2]} is needed")
+            if not (np.isfinite(values).all() and (values >= 0).all()):
+                raise ArgumentError("ambient holds a value outside [0, inf)")
+            rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
+            noise = wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
+        matrix = response_matrix(
+            detector_response(detector, laser) if irf is None else irf,
+            source_start=axis[0],
+            source_width=axis[1],
+            source_bins=shape[2],
+            edges=seen.start + seen.edges,
+            period=seen.period if detector.wrap else None,
+        )
+        image, even = (shape[0], shape[1]), tdc_widths is None
+        return cls(detector=detector, window=seen, image=image, noise=noise, matrix=matrix, equal_bins=even)
+
+    def light(self, rows: Any) -> Any:
+        """Light and noise in the detector's bins before its effects, Warp float32 `[pixel, bin]`, of source rows."""
+        return self._through(rows, self.noise)
+
+    def hazard(self, rows: Any) -> Any:
+        """λ: expected detections per pulse and bin of a detector that is always ready, Warp float32 `[pixel, bin]`."""
+        hazard = self.light(rows)
+        for effect in EFFECTS:
+            effect.apply(self, hazard)
+        return hazard
+
+    def slope(self, rows: Any) -> Any:
+        """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
+        import warp as wp
+
+        slope = self._through(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device))
+        for effect in EFFECTS:
+            effect.apply_to_slope(self, slope)
+        return slope
+
+    def noise_alone(self) -> Any:
+        """Dark counts and ambient light per pulse, `[pixel, T]`, or `[pixel, 1]` where all bins are equally wide."""
+        import warp as wp
+
+        widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
+        return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=self.noise.device)
+
+    def _through(self, rows: Any, noise: Any) -> Any:
+        from spadwarp_kernels import detection as kernels
+
+        widths = np.diff(self.window.edges)
+        return kernels.expected_detections(rows, **self.matrix._asdict(), width=widths, noise_rate=noise)
+
+
+# Frames, and the law of their pile-up
+
+
+def first_photon_probabilities(hazard: Any, *, device: Any = None) -> NDArray[np.float64]:
+    """Law of first-photon counting, with pile-up: P(k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)); same shape as `hazard` (λ).
+
+    `hazard`: expected detections per pulse and bin `[..., T]`, not negative; NumPy, torch or Warp; `device`: of Warp.
+    """
+    import warp as wp
+
+    from spadwarp_kernels import detection as kernels
+
+    with in_torch_order(hazard):
+        rows, shape = histogram_rows(hazard, name="hazard", device=device)
+        if rows.dtype not in (wp.float32, wp.float64):
+            rows = wp.array(rows.numpy().astype(np.float64), device=rows.device)
+        law = kernels.first_photon_probabilities(rows)
+        values: Any = tensor_of(law).double() if is_torch(hazard) else law.numpy().astype(np.float64)
+    return values.reshape(shape)
+
+
+def coates(counts: Any, *, pulses: int, device: Any = None) -> NDArray[np.float64]:
+    """Coates' correction of first-photon counts: λ̂_k = −ln(1 − n_k / (pulses − Σ_{j<k} n_j)), same shape as `counts`.
+
+    NaN from the bin on that takes the last pulse. Source: P. B. Coates, J. Phys. E 1, 878 (1968).
+
+    `counts`: integers `[..., T]`, not negative; NumPy, torch or Warp; `pulses`: of each histogram, which may hold no
+    more counts than that; `device`: of Warp.
+    """
+    import warp as wp
+
+    from spadwarp_kernels import detection as kernels
+
+    with in_torch_order(counts):
+        rows, shape = histogram_rows(counts, name="counts", device=device)
+        if rows.dtype not in (wp.int32, wp.int64):
+            raise ArgumentError(f"counts are {rows.dtype.__name__}; integers are needed")
+        values = rows.numpy()
+        if values.max() > 2**31 - 1:
+            raise ArgumentError(f"counts = {values.max()} is above {2**31 - 1}")
+        pulses = check_integer("pulses", pulses, "[1, 9007199254740992]")
+        if (most := int(values.sum(axis=1, dtype=np.int64).max())) > pulses:
+            raise ArgumentError(f"pulses = {pulses} is below the {most} counts of a histogram: more than one a pulse")
+        if rows.dtype != wp.int32:
+            rows = wp.array(values.astype(np.int32), dtype=wp.int32, device=rows.device)
+        corrected = kernels.coates(rows, pulses=pulses)
+        result: Any = tensor_of(corrected) if is_torch(counts) else corrected.numpy()
+    return result.reshape(shape)
+
+
+class TimeTags(NamedTuple):
+    """Detections one by one, in the order of frame, pixel and time; `bin` counts from the window's start."""
+
+    frame: NDArray[np.int64]
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    pulse: NDArray[np.int64]
+    bin: NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Frames:
+    """Counts that the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
+
+    Attributes:
+        counts: int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames.
+        pulses: Laser pulses per frame; frames: how many; first_frame: number of the first.
+        gate_start: Start of the detector's window [s]. Where time wraps, a count at time t stands for light at t plus
+            any number of periods.
+        bin_width: Nominal [s].
+        edges: `[T + 1]`, actual bin edges from `gate_start` [s] (differential non-linearity).
+        period: Of the pulses [s], where time wraps; else None.
+        irf: The response that was applied.
+        expected: float32 `[H, W, T]`, expected detections per pulse and bin before pile-up, from which the counts were
+            drawn: light through the response, dark counts, ambient light, crosstalk.
+        background: float32 `[H, W, 1 or T]`, expected background detections per pulse and bin before pile-up: dark
+            counts, ambient light and, where the source has it apart, backscatter.
+        seed: Of the random numbers.
+        tags: Every detection, where it was asked for.
+        monte_carlo_noise: Standard error of the simulation over the shot noise of a frame, at the 95th percentile of
+            the pixels; None where nobody knows it. Above 0.5 `expected` is not smooth where few photons were traced,
+            and no more are the counts that are drawn from it.
+        notes: What the source could not give, in words.
+    """
+
+    counts: NDArray[np.int32]
+    pulses: int
+    frames: int
+    first_frame: int
+    gate_start: float
+    bin_width: float
+    edges: NDArray[np.float64]
+    period: float | None
+    irf: InstrumentResponse
+    expected: NDArray[np.float32]
+    background: NDArray[np.float32]
+    seed: int
+    tags: TimeTags | None = None
+    monte_carlo_noise: float | None = None
+    notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        height, width, bins = self.counts.shape[-3:]
+        frames = f"{self.frames} frame" + "s" * (self.frames != 1) + (" added up" if self.summed else "")
+        return f"Frames({frames} of {self.pulses} pulses, seed {self.seed}, {width} x {height} pixels x {bins} bins)"
+
+    def plot(self, frame: int = 0, **options: Any) -> Any:
+        """A figure of one frame: time of the fullest bin, intensity, the counts of a pixel; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self, frame=frame, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
+
+    def to_xarray(self) -> Any:
+        """Counts and what they were drawn from, with coordinates and units: see `spadwarp.frames.to_xarray`."""
+        return to_xarray(self)
+
+    @property
+    def summed(self) -> bool:
+        """Whether the frames have been added up."""
+        return self.counts.ndim == 3
+
+    @property
+    def exposure(self) -> int:
+        """Pulses of each histogram of `counts`."""
+        return self.pulses * self.frames if self.summed else self.pulses
+
+    @property
+    def intensity(self) -> NDArray[np.int64]:
+        """Counts of each pixel over all bins: `[frames, H, W]` or `[H, W]`."""
+        return self.counts.sum(-1) if is_torch(self.counts) else self.counts.sum(axis=-1, dtype=np.int64)
+
+    def coates(self) -> NDArray[np.float64]:
+        """Detections per pulse and bin without pile-up; see `coates`."""
+        return coates(self.counts, pulses=self.exposure)
+
+    def arrival_time(
+        self,
+        method: Method = "centroid",
+        *,
+        irf: Any = None,
+        undo_pile_up: bool = False,
+        gate: tuple[float, float] | None = None,
+        device: Any = None,
+    ) -> NDArray[np.float64]:
+        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing returned.
+
+        All bins count as equally wide, as in a camera without calibration. The estimator knows the background.
+        `method`, `gate` (start, stop) [s], `device`: as of `spadwarp.arrival_time`; `irf`: that the estimator assumes;
+        default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the counts.
+        """
+        histogram: Any = self.counts
+        if undo_pile_up:
+            corrected: Any = self.coates()
+            histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
+        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
+        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
+        return arrival_time(histogram, **axis, method=method, irf=irf, background=known, device=device)
+
+
+def to_xarray(frames: Frames) -> xarray.Dataset:
+    """Counts, and the expectation that they were drawn from, as an xarray data set with coordinates and units.
+
+    `counts` has the dimensions (frame, y, x, time), without frame where they are added up; `expected` and `background`
+    are detections per pulse and bin before pile-up. Torch tensors are copied to the host. Raises `FileError` without
+    xarray.
+    """
+    counts, expected = on_host(frames.counts), on_host(frames.expected)
+    background = np.broadcast_to(on_host(frames.background), expected.shape)
+    height, width, _ = expected.shape
+    cube = ("y", "x", "time")
+    variables: dict[str, Variable] = {
+        "counts": (cube if frames.summed else ("frame", *cube), counts, "1", "detections in the bin"),
+        "expected": (cube, expected, "1", "expected detections per pulse and bin before pile-up"),
+        "background": (cube, background, "1", "the part of `expected` that is not target"),
+    }
+    edges = frames.gate_start + frames.edges
+    coordinates: dict[str, Variable] = {
+        "time": (("time",), 0.5 * (edges[:-1] + edges[1:]), "s", "time of flight at the centre of the bin"),
+        "bin_width": (("time",), np.diff(edges), "s", "width of the bin"),
+        **{name: ((name,), *image_coordinates(height, width)[name]) for name in PIXELS},
+    }
+    if not frames.summed:
+        numbers = np.arange(frames.first_frame, frames.first_frame + frames.frames)
+        coordinates["frame"] = (("frame",), numbers, "1", "number of the frame")
+    attributes = {
+        "pulses": frames.exposure,
+        "seed": str(frames.seed),
+        "period": np.inf if frames.period is None else frames.period,
+        "response_fwhm": frames.irf.fwhm,
+        "notes": list(frames.notes),
+    }
+    return labelled(variables, coordinates, attributes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonteCarloNoise:
+    """The standard error of a result against the shot noise of one frame of `pulses`, both of the counts of a pixel.
+
+    Attributes:
         ratio: Standard error over shot noise, at the 95th percentile of the pixels.
         pixels: Part of the pixels in which it is above 0.5.
-        photons: That were traced.
-        photons_needed: That would bring `ratio` to 0.5, from its fall with the square root of their number.
+        photons, photons_needed: That were traced, and that would bring `ratio` to 0.5: it falls with their root.
     """
 
     pulses: int
@@ -49,11 +468,6 @@ class MonteCarloNoise:
     pixels: float
     photons: int
     photons_needed: float
-
-    @property
-    def exceeds(self) -> bool:
-        """Whether the frames show it."""
-        return self.ratio > LIMIT
 
     def __str__(self) -> str:
         return (
@@ -81,12 +495,9 @@ def noise_caption(ratio: float | None) -> str:
 def monte_carlo_noise(
     result: Any, *, pulses: int, detector: Detector | None = None, laser: Laser | None = None
 ) -> MonteCarloNoise | None:
-    """The noise that frames of so many pulses inherit from a result; None where it keeps no standard errors.
+    """The noise that frames of so many pulses inherit from a `Result`; None where it keeps no standard errors.
 
-    Args:
-        result: A `Result`.
-        pulses: Of one frame.
-        detector, laser: Sections of a scene; default: those of the result's.
+    `detector`, `laser`: sections of a scene; default: those of the result's.
     """
     if not isinstance(result, Result) or result.second_moment is None or result.photons < 2 * result.batch_size:
         return None
@@ -95,28 +506,18 @@ def monte_carlo_noise(
     scale = laser.photons_per_pulse * detection_efficiency(laser, detector)
     # Bins are nearly independent: a history adds to few of those of one pixel.
     error = np.sqrt(np.square(result.standard_error).sum(axis=2)) * scale
-    seen = scene.model_copy(update={"detector": detector, "laser": laser})
-    noise = noise_rate(seen, result.truth)
-    expected = result.intensity * scale + (noise[..., 0] if np.ndim(noise) else noise) * (
-        scene.gate.stop - scene.gate.start
-    )
+    noise = noise_rate(scene.model_copy(update={"detector": detector, "laser": laser}), result.truth)
+    noise = noise[..., 0] if np.ndim(noise) else noise
+    expected = result.intensity * scale + noise * (scene.gate.stop - scene.gate.start)
     # A first-photon detector counts one a pulse at most, of light and error in the same measure.
     counted = pulses * (-np.expm1(-expected) if detector.mode == "first_photon" else expected)
     ratios = np.sqrt(counted) * np.divide(error, expected, out=np.zeros_like(error), where=expected > 0)
-    ratio = float(np.quantile(ratios, _PART))
-    return MonteCarloNoise(
-        pulses=pulses,
-        ratio=ratio,
-        pixels=float(np.mean(ratios > LIMIT)),
-        photons=result.photons,
-        photons_needed=result.photons * (ratio / LIMIT) ** 2,
-    )
+    ratio, share = float(np.quantile(ratios, _PART)), float(np.mean(ratios > LIMIT))
+    needed = result.photons * (ratio / LIMIT) ** 2
+    return MonteCarloNoise(pulses=pulses, ratio=ratio, pixels=share, photons=result.photons, photons_needed=needed)
 
 
-# Frames
-
-
-_LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]"}
+_LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]", "seed": SEED}
 
 
 @kernel_errors()
@@ -188,9 +589,7 @@ def detect(
             raise ArgumentError(f"{name} = {shown(value)} is not the section {name} of a scene")
     if scene is not None:
         if gate_start is not None or bin_width is not None:
-            raise ArgumentError(
-                "gate_start and bin_width are for arrays: a result has its own; window gives the camera's"
-            )
+            raise ArgumentError("gate_start and bin_width are for arrays: a result has its own; give window instead")
         detector, laser = detector or scene.detector, laser or scene.laser
         gate_start, bin_width = scene.gate.start, scene.gate.bin_width
         detections_per_photon = laser.photons_per_pulse * detection_efficiency(laser, detector)
@@ -204,14 +603,13 @@ def detect(
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses
     arguments = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}
-    numbers = {name: check_integer(name, value, _LIMITS.get(name, SEED)) for name, value in arguments.items()}
+    numbers = {name: check_integer(name, value, _LIMITS[name]) for name, value in arguments.items()}
     camera_seed = check_integer("camera_seed", camera_seed, SEED)
     if summed and (total := numbers["pulses"] * numbers["frames"]) > 2**31 - 1:
         raise ArgumentError(f"pulses · frames = {total} is above {2**31 - 1}: give fewer, or summed=False")
     if gate_start is None or bin_width is None:
         raise ArgumentError("gate_start or bin_width is missing: an array source needs both")
-    gate_start = check_real("gate_start", gate_start, TIME)
-    bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
+    axis = (check_real("gate_start", gate_start, TIME), check_real("bin_width", bin_width, BIN_WIDTH))
     if laser is None and (detector.wrap or detector.mode == "free_running" or tags):
         raise ArgumentError("laser is missing: the detector needs its repetition rate (unless wrap = false)")
     irf = detector_response(detector, laser) if irf is None else irf
@@ -219,10 +617,9 @@ def detect(
     form: Any = {"shape": "[H, W, T]", "dimensions": range(3, 4)}
     with in_torch_order(source, background, out):
         rows, shape = histogram_rows(source, name="source", device=device, **form)
-        axis = (gate_start, bin_width)
-        receiver = Receiver.of(
-            detector, laser, shape=shape, axis=axis, device=rows.device, camera_seed=camera_seed, **options
-        )
+        options |= {"shape": shape, "axis": axis, "device": rows.device, "camera_seed": camera_seed}
+        receiver = Receiver.of(detector, laser, **options)
+        seen, image = receiver.window, receiver.image
         hazard, known = receiver.hazard(rows), receiver.noise_alone()
         if background is not None:
             rows, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
@@ -231,26 +628,25 @@ def detect(
             known = receiver.light(rows)
         as_torch = is_torch(source) or out is not None
         if as_torch:
-            out_shape = (*(() if summed else (numbers["frames"],)), *receiver.image, receiver.window.recorded)
+            out_shape = (*(() if summed else (numbers["frames"],)), *image, seen.recorded)
             out = output_tensor(out, name="out", shape=out_shape, device=hazard.device)
-        counts, events = _draw(receiver, hazard, numbers, summed=summed, tags=tags, out=out)
+        counts, found = _draw(receiver, hazard, numbers, summed=summed, tags=tags, out=out)
         to_caller: Any = tensor_of if as_torch else wp.array.numpy
-        expected, known = to_caller(hazard), to_caller(known)
-    recorded = receiver.window.recorded
-    notes = missing_light(receiver.window, gate_start) if detector.wrap else ()
+        expected, known = (to_caller(rows)[:, : seen.recorded].reshape(*image, -1) for rows in (hazard, known))
+    notes = seen.missing_light(axis[0]) if detector.wrap else ()
     noise = None if scene is None else monte_carlo_noise(result, pulses=pulses, detector=detector, laser=laser)
-    if noise is not None and noise.exceeds:
+    if noise is not None and noise.ratio > LIMIT:
         warnings.warn(str(noise), SpadwarpWarning, stacklevel=3)
     return Frames(
         counts=counts,
-        expected=expected[:, :recorded].reshape(*receiver.image, -1),
-        background=known[:, :recorded].reshape(*receiver.image, -1),
-        gate_start=receiver.window.start,
-        bin_width=bin_width,
-        edges=receiver.window.edges[: recorded + 1],
-        period=receiver.window.period if detector.wrap else None,
+        expected=expected,
+        background=known,
+        gate_start=seen.start,
+        bin_width=axis[1],
+        edges=seen.edges[: seen.recorded + 1],
+        period=seen.period if detector.wrap else None,
         irf=irf,
-        tags=None if events is None else _time_tags(events, receiver.image, first_frame),
+        tags=found,
         notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
         monte_carlo_noise=None if noise is None else noise.ratio,
         **numbers,
@@ -259,19 +655,19 @@ def detect(
 
 def _draw(
     receiver: Receiver, hazard: Any, numbers: dict[str, int], *, summed: bool, tags: bool, out: Any
-) -> tuple[Any, dict[str, NDArray[Any]] | None]:
+) -> tuple[Any, TimeTags | None]:
     """Counts, in the tensor `out` where there is one, and for tags the detections one by one."""
     import warp as wp
 
     from spadwarp_kernels import detection as kernels
 
-    detector, window, frames = receiver.detector, receiver.window, numbers["frames"]
+    detector, window = receiver.detector, receiver.window
     by_event = detector.mode == "free_running" or tags or detector.afterpulsing_probability > 0
     add_frames = by_event and summed  # the kernel of events does not
     in_place = out is not None and not add_frames
-    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count}
-    common["counts"] = wp.from_torch(out).flatten() if in_place else None
-    events = None
+    given = wp.from_torch(out).flatten() if in_place else None
+    common: dict[str, Any] = {**numbers, "counter_depth": detector.max_count, "counts": given}
+    found = None
     if by_event:
         counts, events = kernels.event_counts(
             hazard,
@@ -285,17 +681,16 @@ def _draw(
             tags=tags,
             **common,
         )
+        if events is not None:
+            frame, pixel = np.divmod(events["row"], receiver.image[0] * receiver.image[1])
+            y, x = np.divmod(pixel, receiver.image[1])
+            found = TimeTags(frame + numbers["first_frame"], y, x, events["pulse"], events["bin"])
     else:
         counts = kernels.first_photon_counts(hazard, summed=summed, **common)
     if in_place:
-        return out, events
+        return out, found
     every: Any = counts.numpy() if out is None else tensor_of(counts)
-    every = every.reshape(*(() if summed and not add_frames else (frames,)), *receiver.image, window.recorded)
+    frames = () if summed and not add_frames else (numbers["frames"],)
+    every = every.reshape(*frames, *receiver.image, window.recorded)
     every = every.sum(0, dtype=every.dtype) if add_frames else every
-    return (every if out is None else out.copy_(every)), events
-
-
-def _time_tags(events: dict[str, NDArray], image: tuple[int, int], first_frame: int) -> TimeTags:
-    frame, pixel = np.divmod(events["row"], image[0] * image[1])
-    y, x = np.divmod(pixel, image[1])
-    return TimeTags(frame + first_frame, y, x, events["pulse"], events["bin"])
+    return (every if out is None else out.copy_(every)), found

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.inverse.equations import Pooled, planned_pulses, pseudo_inverse
-from spadwarp.inverse.estimates import correlations, not_identifiable
+from spadwarp.inverse.equations import pseudo_inverse
 from spadwarp.inverse.exposure import Exposure
-from spadwarp.inverse.fitting import BATCHES, SIMULATION, Fitter, State
+from spadwarp.inverse.fitting import BATCHES, SIMULATION, Fitter, Joint, Prior, State
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, scene_value
-from spadwarp.limits import check_integer
 from spadwarp.scene import SceneLike, as_scene
-from spadwarp.units import percent
+from spadwarp.values import check_integer, percent
 
 __all__ = ["Bound", "Bounds", "bounds"]
 
@@ -46,7 +44,7 @@ class Bound:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Bounds:
+class Bounds(Joint):
     """Cramér–Rao bounds of unknowns together.
 
     Attributes:
@@ -63,34 +61,15 @@ class Bounds:
     """
 
     bounds: Mapping[str, Bound]
-    names: Sequence[str]
-    covariance: Floats
     maps: Mapping[str, Floats]
     alone_maps: Mapping[str, Floats]
     counts: float
-    pulses: int
-    photons: int
     simulation: float
-    warnings: Sequence[str]
-
-    @property
-    def correlation(self) -> Floats:
-        """Correlations in the order of `names`."""
-        return correlations(self.covariance)
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers without maps, for JSON."""
-        return {
-            "bounds": {name: vars(item) for name, item in self.bounds.items()},
-            "names": list(self.names),
-            "covariance": self.covariance.tolist(),
-            "correlation": self.correlation.tolist(),
-            "counts": self.counts,
-            "pulses": self.pulses,
-            "photons": self.photons,
-            "simulation": self.simulation,
-            "warnings": list(self.warnings),
-        }
+        bounds = {name: vars(item) for name, item in self.bounds.items()}
+        return {"bounds": bounds, **super().to_dict(), "counts": self.counts, "simulation": self.simulation}
 
 
 def bounds(
@@ -98,7 +77,7 @@ def bounds(
     *,
     unknown: str | Sequence[str],
     pulses: int | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
+    prior: Prior | None = None,
     photons: int | None = None,
     seed: int = 0,
     device: str | None = None,
@@ -131,68 +110,56 @@ def bounds(
     number, level = max(most // 8, 8000), None
     while True:
         halves = render(state.values, photons=max(number // (2 * BATCHES), 1), batches=BATCHES)
-        pooled = fitter.solve(state, halves, None, level)
-        level, share = pooled.level, pooled.solution.simulation_share
+        level, equations, solution = fitter.solve(state, halves, None, level)
+        share = solution.simulation_share
         if share <= SIMULATION or 2 * number > most:
             break
         number = min(most, int(number * max(2.0, min(share / (0.8 * SIMULATION), 16.0))))
     assert render.truth is not None
-    bounds, maps, alone_maps = _table(fitter, state, pooled, np.isfinite(render.truth.depth))
-    covariance, names = pseudo_inverse(pooled.solution.information), [item.name for item in fitter.shared]
-    in_logarithm = [state.values[name] > 0 and name != DEPTH for name in names]
-    warnings = render.warnings() + not_identifiable(names, covariance, in_logarithm)
+    seen = np.isfinite(render.truth.depth)  # others have light that water has scattered: a bound that nobody asks for
+    covariance = pseudo_inverse(solution.information)
+    information = np.einsum("pii->pi", equations.slope)
+    rows: dict[str, Bound] = {}
+    maps, alone_maps = {}, {}
+    for i, item in enumerate(fitter.unknowns):
+        scale, value = float(state.scale(item)), float(state.values[item.name])
+        if item.per_pixel:
+            column = fitter.own.index(item)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                together = np.sqrt(solution.pixel_bound[:, column, column]) * scale
+                alone_map = scale / np.sqrt(np.where(information[:, i] > 0, information[:, i], np.nan))
+            maps[item.name], alone_maps[item.name] = together.reshape(seen.shape), alone_map.reshape(seen.shape)
+            counted = slice(None) if item.name == BACKGROUND or not seen.any() else seen.reshape(-1)
+            error, alone = (float(np.nanmedian(part[counted])) for part in (together, alone_map))
+        else:
+            row, total = fitter.shared.index(item), float(information[:, i].sum())
+            error = math.sqrt(max(float(covariance[row, row]), 0.0)) * scale
+            alone = scale / math.sqrt(total) if total > 0 else math.inf
+        rows[item.name] = Bound(
+            name=item.name,
+            value=value,
+            standard_error=error,
+            alone=alone,
+            relative=error / value if item.name != DEPTH and value else math.nan,
+            per_pixel=item.per_pixel,
+            unit=item.unit,
+        )
+    found = Bounds(
+        bounds=rows,
+        names=[item.name for item in fitter.shared],
+        covariance=covariance,
+        maps=maps,
+        alone_maps=alone_maps,
+        counts=float(law.mean(halves[0].rates, law.planned(halves[0].rates, pulses)).sum()),
+        pulses=pulses,
+        photons=render.photons,
+        simulation=share,
+        warnings=(),
+    )
+    in_logarithm = [state.values[name] > 0 and name != DEPTH for name in found.names]
+    warnings = render.warnings() + found.not_identifiable(in_logarithm)
     if share > SIMULATION:
         warnings.append(
             f"the noise of the simulation is {percent(share)} % of that of the counts, above 10 %: more photons"
         )
-    return Bounds(
-        bounds=bounds,
-        names=names,
-        covariance=covariance,
-        maps=maps,
-        alone_maps=alone_maps,
-        counts=float(law.mean(halves[0].rates, planned_pulses(law, halves[0].rates, pulses)).sum()),
-        pulses=pulses,
-        photons=render.photons,
-        simulation=share,
-        warnings=tuple(warnings),
-    )
-
-
-def _table(
-    fitter: Fitter, state: State, pooled: Pooled, seen: NDArray[np.bool_]
-) -> tuple[dict[str, Bound], dict[str, Floats], dict[str, Floats]]:
-    """Bounds by name, and maps of those of the pixels: with all unknown, and with all others known.
-
-    `seen` `[H, W]`: where a target is. Other pixels have light of the targets that the water has scattered, and so a
-    bound, but it is not what one asks for.
-    """
-    covariance = pseudo_inverse(pooled.solution.information)
-    information = np.einsum("pii->pi", pooled.equations.slope)
-    bounds, maps, alone_maps = {}, {}, {}
-    row = column = 0
-    for i, unknown in enumerate(fitter.unknowns):
-        scale, value = float(state.scale(unknown)), float(state.values[unknown.name])
-        if unknown.per_pixel:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                together = np.sqrt(pooled.solution.pixel_bound[:, column, column]) * scale
-                alone_map = scale / np.sqrt(np.where(information[:, i] > 0, information[:, i], np.nan))
-            maps[unknown.name], alone_maps[unknown.name] = together.reshape(seen.shape), alone_map.reshape(seen.shape)
-            rows = slice(None) if unknown.name == BACKGROUND or not seen.any() else seen.reshape(-1)
-            error, alone = (float(np.nanmedian(part[rows])) for part in (together, alone_map))
-            column += 1
-        else:
-            total = float(information[:, i].sum())
-            error = math.sqrt(max(float(covariance[row, row]), 0.0)) * scale
-            alone = scale / math.sqrt(total) if total > 0 else math.inf
-            row += 1
-        bounds[unknown.name] = Bound(
-            name=unknown.name,
-            value=value,
-            standard_error=error,
-            alone=alone,
-            relative=error / value if unknown.name != DEPTH and value else math.nan,
-            per_pixel=unknown.per_pixel,
-            unit=unknown.unit,
-        )
-    return bounds, maps, alone_maps
+    return replace(found, warnings=tuple(warnings))

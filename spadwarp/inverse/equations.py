@@ -26,8 +26,7 @@ from spadwarp.inverse.unknowns import DEPTH, Unknown
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
-Cell = tuple[int, int, int]
-"""Rows, columns and bins."""
+Cell = tuple[int, int, int]  # rows, columns and bins
 
 _PIXELS = 256  # of a part that a thread works on
 _LEVELS = (1, 2, 4, 8, 16)  # pixels along the side of a cell
@@ -35,18 +34,11 @@ _MOST_BINS = 4  # of a cell
 
 
 class Law(NamedTuple):
-    """How a detector counts.
+    """How a detector counts."""
 
-    Attributes:
-        first_photon: One count a pulse at most: in each bin a binomial of the pulses that no earlier bin has counted
-            in. Otherwise counts of all detections, Poisson.
-        dead_share: Dead time over the period between windows, for free-running counts.
-        recorded: Bins that are counted; later ones are there for the dead time alone.
-    """
-
-    first_photon: bool
-    dead_share: float
-    recorded: int
+    first_photon: bool  # in each bin a binomial of the pulses that no earlier bin has counted in; else Poisson, of all
+    dead_share: float  # dead time over the period between windows, for free-running counts
+    recorded: int  # bins that are counted; later ones are there for the dead time alone
 
     def mean(self, rates: Rows, trials: Rows) -> Rows:
         """Expected counts `[pixel, bin]` for λ `[pixel, bin]`; `trials`: pulses that can still count in each bin."""
@@ -70,70 +62,45 @@ class Law(NamedTuple):
         share: Any = np.divide(mean, trials, out=np.zeros_like(mean), where=trials > 0)
         return mean * (np.float32(1.0) - share)
 
-
-def planned_pulses(law: Law, rates: Rows, pulses: float) -> Rows:
-    """Mean of the pulses that no earlier bin has counted in, `[pixel, bin]`, where there are no counts to know it."""
-    if not law.first_photon:
-        return np.full((rates.shape[0], law.recorded), pulses, np.float32)
-    before = np.cumsum(rates, axis=1, dtype=np.float64) - rates
-    return (pulses * np.exp(-before)).astype(np.float32)
+    def planned(self, rates: Rows, pulses: float) -> Rows:
+        """Mean of the pulses that no earlier bin has counted in, `[pixel, bin]`: trials where there are no counts."""
+        if not self.first_photon:
+            return np.full((rates.shape[0], self.recorded), pulses, np.float32)
+        before = np.cumsum(rates, axis=1, dtype=np.float64) - rates
+        return (pulses * np.exp(-before)).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Sums over the bins of each pixel, float64.
+    """Sums over the bins of each pixel, float64; w are weights, m, n and v counts with their mean and variance."""
 
-    Attributes:
-        score: Σ w (n − m), `[pixel, unknown]`; 0 without counts.
-        slope: Σ w dm, `[pixel, unknown, unknown]`: minus the derivative of the score by the unknowns (last axis).
-        noise: Σ w w v, its covariance by the counts, `[pixel, unknown, unknown]`.
-        simulation: Σ w m of each batch of photons less their mean, of the two halves: `[half][batch, pixel, unknown]`.
-        weights: w, the mean of both halves', float32 `[pixel, unknown, bin]`; whatever the unknowns' units are, they
-            are those of the scene.
-    """
-
-    score: Floats
-    slope: Floats
-    noise: Floats
-    simulation: list[Floats]
-    weights: Rows
-
-    def times(self, scales: Floats) -> Equations:
-        """The equations for unknowns in other units: each unknown is `scales` `[pixel, unknown]` times the new one."""
-        left, right = scales[:, :, None], scales[:, None, :]
-        return Equations(
-            self.score * scales,
-            self.slope * left * right,
-            self.noise * left * right,
-            [part * scales for part in self.simulation],
-            self.weights,
-        )
+    score: Floats  # Σ w (n − m), [pixel, unknown]; 0 without counts
+    slope: Floats  # Σ w dm, [pixel, unknown, unknown]: minus the derivative of the score by the unknowns (last axis)
+    noise: Floats  # Σ w w v, its covariance by the counts, [pixel, unknown, unknown]
+    simulation: list[Floats]  # Σ w m of batches of photons less their mean, of two halves [batch, pixel, unknown]
+    weights: Rows  # the mean of both halves', float32 [pixel, unknown, bin], in units of the scene
 
 
 class Moments:
     """Means of the counts by two halves of photons, their derivatives and variance, float32: what equations are of.
 
-    Args:
-        law, halves: The detector; what the photons say.
-        trials: Pulses that can still count in each bin `[pixel, bin]`; None: their mean.
-        counts: `[pixel, bin]`; None for a plan.
-        pulses: In all.
-        image: (height, width).
+    `limits` are the renderer's; without `trials`, the pulses that can still count in each bin `[pixel, bin]`, their
+    mean is taken; without `counts` `[pixel, bin]` it is a plan of `pulses` in all.
     """
 
     def __init__(
         self,
         law: Law,
         halves: list[Half],
+        limits: Rows,
         trials: Rows | None,
         counts: NDArray[np.integer] | None,
-        *,
         pulses: float,
         image: tuple[int, int],
     ) -> None:
-        self.law, self.halves, self.image = law, halves, image
+        self.law, self.limits, self.image = law, limits, image
         self.rates = 0.5 * (halves[0].rates + halves[1].rates)
-        self.trials = planned_pulses(law, self.rates, pulses) if trials is None else trials
+        self.trials = law.planned(self.rates, pulses) if trials is None else trials
         pixels, unknowns = self.rates.shape[0], halves[0].slopes.shape[0]
 
         def rows() -> Rows:
@@ -148,47 +115,47 @@ class Moments:
             trials = self.trials[chosen]
             for i, half in enumerate(halves):
                 slopes = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
-                self.slopes[i][chosen] = law.slopes(half.first[chosen], slopes, trials)
+                self.slopes[i][chosen] = law.slopes(half.batches[0][chosen], slopes, trials)
                 for mean, rates in zip(self.batches[i], half.batches, strict=True):
                     mean[chosen] = law.mean(rates[chosen], trials)
                 if self.rest is not None and counts is not None:
                     self.rest[i][chosen] = counts[chosen] - law.mean(half.rates[chosen], trials)
             self.variance[chosen] = law.variance(law.mean(self.rates[chosen], trials), trials)
 
-        with ThreadPoolExecutor(core_count()) as pool:
-            list(pool.map(part, _parts(pixels)))
+        _in_threads(part, _parts(pixels))
 
-    def equations(self, cells: Sequence[Cell]) -> Equations:
+    def equations(self, cells: Sequence[Cell], scales: Floats) -> Equations:
         """The equations of the counts, or of a plan of them.
 
         `cells`: of each unknown the rows, columns and bins over which its weights are averaged. Any weights give
-        equations that are right in the mean; noisy ones are less precise.
+        equations that are right in the mean; noisy ones are less precise. `scales` `[pixel, unknown]`: its unit.
         """
         pixels, unknowns = self.slopes[0].shape[:2]
         score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
         noise = np.zeros_like(slope)
         simulation = [np.zeros((len(batches), pixels, unknowns)) for batches in self.batches]
         mean_weights = np.empty((pixels, unknowns, self.law.recorded), np.float32)
-        with ThreadPoolExecutor(core_count()) as pool:
-            weights = [self._weights(i, cells, pool) for i in (0, 1)]
+        weights = [self._weights(i, cells) for i in (0, 1)]
 
-            def part(chosen: slice) -> None:
-                for i, weight in enumerate(half[chosen] for half in weights):
-                    slope[chosen] += 0.5 * np.matmul(weight, self.slopes[1 - i][chosen].transpose(0, 2, 1))
-                    if self.rest is not None:
-                        score[chosen] += 0.5 * np.matmul(weight, self.rest[1 - i][chosen, :, None])[..., 0]
-                    for batch, mean in enumerate(self.batches[1 - i]):
-                        simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
-                both = mean_weights[chosen]
-                np.multiply(weights[0][chosen] + weights[1][chosen], np.float32(0.5), out=both)
-                noise[chosen] = np.matmul(both * self.variance[chosen, None], both.transpose(0, 2, 1))
+        def part(chosen: slice) -> None:
+            for i, weight in enumerate(half[chosen] for half in weights):
+                slope[chosen] += 0.5 * np.matmul(weight, self.slopes[1 - i][chosen].transpose(0, 2, 1))
+                if self.rest is not None:
+                    score[chosen] += 0.5 * np.matmul(weight, self.rest[1 - i][chosen, :, None])[..., 0]
+                for batch, mean in enumerate(self.batches[1 - i]):
+                    simulation[1 - i][batch, chosen] = np.matmul(weight, mean[chosen, :, None])[..., 0]
+            both = mean_weights[chosen]
+            np.multiply(weights[0][chosen] + weights[1][chosen], np.float32(0.5), out=both)
+            noise[chosen] = np.matmul(both * self.variance[chosen, None], both.transpose(0, 2, 1))
 
-            list(pool.map(part, _parts(pixels)))
-        return Equations(score, slope, noise, [part - part.mean(axis=0) for part in simulation], mean_weights)
+        _in_threads(part, _parts(pixels))
+        left, right = scales[:, :, None], scales[:, None, :]
+        simulation = [(part - part.mean(axis=0)) * scales for part in simulation]
+        return Equations(score * scales, slope * left * right, noise * left * right, simulation, mean_weights)
 
-    def _weights(self, number: int, cells: Sequence[Cell], pool: ThreadPoolExecutor) -> Rows:
+    def _weights(self, number: int, cells: Sequence[Cell]) -> Rows:
         """By a half: derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
-        slopes, limits = self.slopes[number], self.halves[number].limits
+        slopes, limits = self.slopes[number], self.limits
         variance = self.law.variance(self.batches[number][0], self.trials)
         below = {cell: _in_cells(variance, self.image, cell) for cell in set(cells)}
         weights = np.empty_like(slopes)
@@ -199,8 +166,13 @@ class Moments:
             np.clip(weight, -limits[i], limits[i], out=weight)
             weights[:, i] = _expanded(weight, self.image, cells[i], slopes.shape[2])
 
-        list(pool.map(unknown, range(len(cells))))
+        _in_threads(unknown, range(len(cells)))
         return weights
+
+
+def _in_threads(work: Callable[[Any], None], items: Sequence[Any]) -> None:
+    with ThreadPoolExecutor(core_count()) as pool:
+        list(pool.map(work, items))
 
 
 def _parts(pixels: int) -> list[slice]:
@@ -229,45 +201,29 @@ def _expanded(cube: Rows, image: tuple[int, int], cell: Cell, bins: int) -> Rows
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A step towards the solution and its covariance; in the unit of the equations.
+    """A step towards the solution and its covariance, in the unit of the equations.
 
-    Attributes:
-        shared: Step of what all pixels share, `[S]`.
-        pixels: Steps of the pixels' own unknowns, `[pixel, Q]`; NaN where a pixel knows nothing of them.
-        information: Fisher information of the shared unknowns when the own ones are unknown too, `[S, S]`.
-        covariance: Of the shared, counts and simulation together, `[S, S]`.
-        simulation: The part of it that is noise of the simulation.
-        pixel_covariance: `[pixel, Q, Q]`.
-        pixel_bound: Their Cramér–Rao bound, `[pixel, Q, Q]`.
-        simulation_share: Largest variance by the simulation over that by the counts, of the shared unknowns;
-            without any, of the median pixel.
-        gain: What the step adds to the log-likelihood, of the shared unknowns in their covariance.
-        slope_ratio: The depth's slope over that of the renderer's wide difference; 1 where no difference was seen; 0
-            where it is not known how far the depth can move without a change of the counts.
+    S unknowns are shared by all pixels, Q are a pixel's own; a pixel that knows nothing of its own has NaN.
     """
 
-    shared: Floats
-    pixels: Floats
-    information: Floats
-    covariance: Floats
-    simulation: Floats
-    pixel_covariance: Floats
-    pixel_bound: Floats
-    simulation_share: float
-    gain: float
+    shared: Floats  # step of the shared, [S]
+    pixels: Floats  # steps of the own, [pixel, Q]
+    information: Floats  # Fisher information of the shared when the own ones are unknown too, [S, S]
+    covariance: Floats  # of the shared, by counts and simulation together, [S, S]
+    simulation: Floats  # the part of it that is noise of the simulation
+    pixel_covariance: Floats  # [pixel, Q, Q]
+    pixel_bound: Floats  # Cramér–Rao bound of the own, [pixel, Q, Q]
+    simulation_share: float  # largest variance by the simulation over that by the counts; without shared: median pixel
+    gain: float  # what the step adds to the log-likelihood, of the shared in their covariance
+    # The depth's slope over that of the renderer's wide difference; 1: no difference was seen; 0: it is not known how
+    # far the depth can move without a change of the counts.
     slope_ratio: float = 1.0
 
 
 def solve(
     equations: Equations, is_per_pixel: NDArray[np.bool_], prior: tuple[Floats, Floats] | None = None
 ) -> Solution:
-    """The Newton step of the equations.
-
-    Args:
-        equations: Of `Moments`.
-        is_per_pixel: Which unknowns each pixel has for itself, `[unknown]`.
-        prior: Score and information on the shared unknowns from elsewhere, `[S]` both.
-    """
+    """The Newton step of equations; `prior`: score and information on the shared from elsewhere, `[S]` both."""
     s, q = np.flatnonzero(~is_per_pixel), np.flatnonzero(is_per_pixel)
     slope, score = equations.slope, equations.score
     pull, known_before = (np.zeros(s.size), np.zeros(s.size)) if prior is None else prior
@@ -344,55 +300,40 @@ def _largest_ratio(parts: Floats, wholes: Floats) -> float:
     return float(np.max(np.divide(parts, wholes, out=np.zeros_like(parts), where=wholes > 0), initial=0.0))
 
 
-class Pooled(NamedTuple):
-    """Equations with cells of `level` pixels on a side, and their solution."""
-
-    level: int
-    equations: Equations
-    solution: Solution
-
-
 def solve_pooled(
     unknowns: Sequence[Unknown],
     moments: Moments,
     scales: Floats,
     solve: Callable[[Equations], Solution],
-    *,
     pooling_level: int | None,
-) -> Pooled:
-    """The equations with the cells that have the least standard errors, from coarse to fine.
+) -> tuple[int, Equations, Solution]:
+    """The equations with the cells, of so many pixels on a side, that have the least standard errors; their solution.
 
-    Fine weights of the score are sharp but noisy, coarse ones know little of edges.
-
-    Args:
-        unknowns: In the order of the slopes.
-        moments: Of a rendering.
-        scales: Units of the unknowns, `[pixel, unknown]`.
-        solve: Solves equations in these units.
-        pooling_level: The coarsest that is tried, as that of an earlier rendering; None: the coarsest of all.
+    From coarse to fine: fine weights of the score are sharp but noisy, coarse ones know little of edges. Sides are at
+    most `pooling_level`, that of an earlier rendering. `solve` takes units of `scales` `[pixel, unknown]`.
     """
+
+    def cell(unknown: Unknown, size: int) -> Cell:
+        """A pixel's own unknown has weights of its own; a shift in time needs every bin."""
+        if unknown.per_pixel:
+            return (1, 1, 1)
+        return (size, size, 1 if unknown.name == DEPTH else min(size, _MOST_BINS))
+
     coarsest = max(moments.image) if pooling_level is None else pooling_level
     levels = [size for size in _LEVELS if size <= coarsest]
     if all(unknown.per_pixel for unknown in unknowns):
         levels = [1]
     best, least, worse = None, np.inf, 0
     for size in reversed(levels):
-        equations = moments.equations([_cell(unknown, size) for unknown in unknowns]).times(scales)
+        equations = moments.equations([cell(unknown, size) for unknown in unknowns], scales)
         solution = solve(equations)
         variances = np.diag(solution.covariance)
         total = float(np.log(np.maximum(variances, 1e-300)).sum()) if (variances > 0).all() else np.inf
         if best is None or total < least:
-            best, least, worse = Pooled(size, equations, solution), total, 0
+            best, least, worse = (size, equations, solution), total, 0
         elif np.isfinite(least):
             worse += 1
         if worse == 2:  # the noise of the errors can hide one better level behind a worse one
             break
     assert best is not None
     return best
-
-
-def _cell(unknown: Unknown, size: int) -> Cell:
-    """A pixel's own unknown has weights of its own; a shift in time needs every bin."""
-    if unknown.per_pixel:
-        return (1, 1, 1)
-    return (size, size, 1 if unknown.name == DEPTH else min(size, _MOST_BINS))

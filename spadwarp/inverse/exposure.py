@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError
 from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
 from spadwarp.frames.spad import LIMIT
-from spadwarp.limits import check_integer
 from spadwarp.scene import phase_function
 from spadwarp.transport import truth_maps
+from spadwarp.values import ArgumentError, check_integer
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -85,20 +84,18 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         ArgumentError: Counts that do not fit the scene, or are no counts.
         FileError: A file that cannot be read.
     """
-    name = "counts"
+    name, gate = "counts", scene.gate
     if isinstance(counts, str | os.PathLike):
         path = Path(counts)
         name = str(path)
         is_frames = path.suffix.lower() in (".h5", ".hdf5") and is_frames_file(path)
         counts = FramesFile.load(path) if is_frames else read_histograms(path, **facts)
-    gate = scene.gate
-    start, width, irf, widths = gate.start, gate.bin_width, None, None
-    values, noise = counts, None
+    values, start, width, irf, widths, noise = counts, gate.start, gate.bin_width, None, None, None
     if isinstance(counts, Frames | FramesFile):
-        start, width, irf = counts.gate_start, counts.bin_width, counts.irf
+        start, width, irf, noise = counts.gate_start, counts.bin_width, counts.irf, counts.monte_carlo_noise
         steps = np.diff(counts.edges)
         widths = None if np.allclose(steps, steps[0], rtol=1e-9) else steps
-        pulses, noise = counts.pulses if pulses is None else pulses, counts.monte_carlo_noise
+        pulses = counts.pulses if pulses is None else pulses
         if isinstance(counts, Frames) and counts.summed:
             pulses *= counts.frames
             noise = None if noise is None else noise * math.sqrt(counts.frames)
@@ -124,19 +121,17 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
 
 def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], int]:
     """Counts `[pixel, bin]` over all frames, and the number of these; `name`: of the counts, for messages."""
-    array = np.asarray(values)
+    array, image = np.asarray(values), (scene.camera.height, scene.camera.width)
     if array.ndim not in (3, 4) or array.size == 0 or array.dtype.kind not in "biuf":
         raise ArgumentError(f"{name}: {array.dtype} {array.shape}; [H, W, T] or [frames, H, W, T] is needed")
-    image = (scene.camera.height, scene.camera.width)
     if array.shape[-3:-1] != image:
         raise ArgumentError(f"{name}: an image of {array.shape[-3:-1]}; that of the scene, {image}, is needed")
     if array.dtype.kind == "f" and not np.array_equal(array, np.rint(array)):
         raise ArgumentError(f"{name}: rates, not whole counts; how sure they are is not known")
     if array.min() < 0:
         raise ArgumentError(f"{name}: {array.min()} is outside [0, inf)")
-    frames = array.shape[0] if array.ndim == 4 else 1
     total = array.sum(axis=0, dtype=np.int64) if array.ndim == 4 else array.astype(np.int64)
-    return total.reshape(-1, total.shape[-1]), frames
+    return total.reshape(-1, total.shape[-1]), len(array) if array.ndim == 4 else 1
 
 
 def lidar_initial_guess(scene: Scene, exposure: Exposure, *, device: str | None = None) -> dict[str, float]:
@@ -161,12 +156,10 @@ def lidar_initial_guess(scene: Scene, exposure: Exposure, *, device: str | None 
     inside &= left > 0.05 * exposure.pulses * len(exposure.counts)
     rate = -np.log1p(-np.minimum(counts / left, 0.99)) - scene.detector.noise_rate * dt
     inside &= (rate > 0) & (counts > 0)
-    if inside.sum() < _LEAST_BINS or counts[inside].sum() < _LEAST_COUNTS:
+    x, counted = distance[inside], counts[inside]
+    if x.size < _LEAST_BINS or counted.sum() < _LEAST_COUNTS or x[-1] < _LEAST_SPAN * x[0]:
         return {}
-    if distance[inside][-1] < _LEAST_SPAN * distance[inside][0]:
-        return {}
-    x, y = distance[inside], np.log(rate[inside] * distance[inside] ** 2)
-    slope, level = np.polyfit(x, y, 1, w=np.sqrt(counts[inside]))
+    slope, level = np.polyfit(x, np.log(rate[inside] * x**2), 1, w=np.sqrt(counted))
     camera = scene.camera
     view = camera.pixel_tangent**2  # of a pixel [sr]
     beam = 2.0 * math.pi * (1.0 - math.cos(scene.laser.half_angle))
@@ -175,7 +168,4 @@ def lidar_initial_guess(scene: Scene, exposure: Exposure, *, device: str | None 
     scattering = math.exp(level) / (caught * camera.aperture_area * backward * 0.5 * speed * dt)
     decay = max(-0.5 * slope, 0.02)
     scattering = min(max(scattering, 0.05 * decay), 10.0 * decay)
-    return {
-        "medium.absorption": max(decay - _SHARE * scattering, 0.2 * decay),
-        "medium.scattering": scattering,
-    }
+    return {"medium.absorption": max(decay - _SHARE * scattering, 0.2 * decay), "medium.scattering": scattering}

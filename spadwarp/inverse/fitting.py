@@ -17,31 +17,31 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.inverse.equations import Equations, Law, Moments, Pooled, Solution, solve, solve_pooled
-from spadwarp.inverse.estimates import NORMAL_95, Estimate, EstimateMap, Fit, Iteration, not_identifiable
+from spadwarp.device import pick_device
+from spadwarp.frames.spad import DRAWN_EFFECTS
+from spadwarp.inverse.equations import Equations, Law, Moments, Solution, solve, solve_pooled
 from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposure
 from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
-from spadwarp.limits import SEED, check_integer, check_real
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport import truth_maps
-from spadwarp.units import percent
+from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, check_real, percent
 
 if TYPE_CHECKING:
-    from spadwarp.scene import Detector
+    from spadwarp.scene import Detector, Scene
 
-__all__ = ["Fitter", "fit"]
+__all__ = ["Estimate", "EstimateMap", "Fit", "Fitter", "Iteration", "fit"]
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 Progress = Callable[[str, int, int], None]
+Prior = Mapping[str, tuple[float, float]]
 
 BATCHES = 4  # of photons in each half, and of a difference of depths
 SIMULATION = 0.1  # of the variance by the counts
@@ -66,6 +66,155 @@ _STRAIGHT = 0.75  # ratio of two slopes; below, a warning
 _SURE = 3.0  # standard errors by which a slope has to differ from the wide one
 _ONE_SIDED = 0.5  # ratio of the slopes of both sides: below, the flatter one decides
 
+_NORMAL_95 = 1.959963984540054
+_CORRELATED, _UNSURE = 0.99, 0.5  # correlation, and standard error of a logarithm, from which a warning says so
+
+
+# Estimates
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One value for the whole exposure.
+
+    Attributes:
+        name: Of the unknown; depth is that of the target in the pixel nearest to the middle of the image.
+        value: The estimate, in SI units.
+        standard_error: Of counts and simulation together.
+        interval: 95 %; of positive values from the standard error of the logarithm.
+        simulation: The part of the variance that is noise of the simulation.
+        initial_guess: Where the search began.
+        unit: "" for a plain number.
+    """
+
+    name: str
+    value: float
+    standard_error: float
+    interval: tuple[float, float]
+    simulation: float
+    initial_guess: float
+    unit: str = ""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EstimateMap:
+    """A value for each pixel, float64 `[H, W]`; NaN where the counts say nothing of it."""
+
+    name: str
+    value: Floats
+    standard_error: Floats
+    unit: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Iteration:
+    """A rendering and the step from it: `gain` is the log-likelihood that the step promises."""
+
+    values: Mapping[str, float]
+    gain: float
+    photons: int
+    coarse: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Joint:
+    """What a fit and bounds have in common: unknowns of the whole exposure with their covariance."""
+
+    names: Sequence[str]
+    covariance: Floats
+    warnings: Sequence[str]
+    pulses: int
+    photons: int
+
+    @property
+    def correlation(self) -> Floats:
+        """Correlations in the order of `names`; 0 where a variance is 0."""
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        scale = np.where(scale > 0, scale, np.inf)
+        return self.covariance / np.outer(scale, scale)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The numbers without maps, for JSON."""
+        return {
+            "names": list(self.names),
+            "covariance": self.covariance.tolist(),
+            "correlation": self.correlation.tolist(),
+            "warnings": list(self.warnings),
+            "pulses": self.pulses,
+            "photons": self.photons,
+        }
+
+    def not_identifiable(self, is_positive: Sequence[bool]) -> list[str]:
+        """Sentences on unknowns that the counts do not tell apart, or not at all."""
+        sentences, correlation = [], self.correlation
+        for i, name in enumerate(self.names):
+            for j in range(i):
+                if abs(correlation[i, j]) > _CORRELATED:
+                    sentences.append(
+                        f"{self.names[j]} and {name} are hardly told apart (correlation {correlation[i, j]:+.4f}): "
+                        "hold one of them fixed, or give it a prior"
+                    )
+            if is_positive[i] and np.sqrt(self.covariance[i, i]) > _UNSURE:
+                error = percent(self.covariance[i, i] ** 0.5)
+                sentences.append(f"{name}: the counts say little of it (standard error {error} %)")
+        return sentences
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Joint):
+    """A maximum-likelihood fit of counts.
+
+    Attributes:
+        scene: With the estimates in place of the unknowns.
+        estimates: By name, what is one value for the whole exposure.
+        maps: By name, what is a value for each pixel.
+        names, covariance: Of the estimates on the scale that is searched, the logarithm for positive values.
+        iterations: In order.
+        converged: Whether the last step promised less than the noise of the likelihood.
+        warnings: What may mislead, in words.
+        depth: Depth of the targets by the fit, float64 `[H, W]` [m], NaN without a target; None unless it was unknown.
+        counts, expected: `[H, W, T]`: what was fitted, and its mean by the last rendering, float32.
+        edges: Of the bins in time of flight [s].
+        pulses: In all.
+        photons: Traced by the whole fit.
+        seconds: It took.
+    """
+
+    scene: Scene
+    estimates: Mapping[str, Estimate]
+    maps: Mapping[str, EstimateMap]
+    iterations: Sequence[Iteration]
+    converged: bool
+    depth: Floats | None
+    counts: NDArray[np.integer] = field(repr=False)
+    expected: NDArray[np.float32] = field(repr=False)
+    edges: Floats = field(repr=False)
+    seconds: float
+
+    def __repr__(self) -> str:
+        values = [f"{item.name} {item.value:.4g} ± {item.standard_error:.2g}" for item in self.estimates.values()]
+        return f"Fit({', '.join([*values, *(f'{name} of each pixel' for name in self.maps)])})"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The numbers without maps, for JSON."""
+        return {
+            "estimates": {name: vars(item) for name, item in self.estimates.items()},
+            **super().to_dict(),
+            "converged": self.converged,
+            "iterations": [{**vars(item), "values": dict(item.values)} for item in self.iterations],
+            "counts": int(self.counts.sum()),
+            "seconds": self.seconds,
+        }
+
+    def plot(self, **options: Any) -> Any:
+        """A figure of counts, fit and residuals; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self, **options)
+
+
+# The fit
+
 
 def fit(
     counts: Any,
@@ -73,7 +222,7 @@ def fit(
     *,
     unknown: str | Sequence[str],
     initial_guess: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
+    prior: Prior | None = None,
     pulses: int | None = None,
     photons: int | None = None,
     seed: int = 0,
@@ -117,12 +266,9 @@ def fit(
 
 def _detector_law(detector: Detector, window: Any) -> Law:
     """How a detector counts in the model. Raises `ConfigError` for what it leaves out."""
-    if detector.afterpulsing_probability > 0:
-        raise ConfigError(
-            f"detector.afterpulsing_probability = {detector.afterpulsing_probability}: a fit does not model it"
-        )
-    if detector.max_count > 0:
-        raise ConfigError(f"detector.max_count = {detector.max_count}: a fit does not model full counters")
+    for name in DRAWN_EFFECTS:
+        if (value := getattr(detector, name)) != 0:
+            raise ConfigError(f"detector.{name} = {value}: a fit does not model it")
     free = detector.mode == "free_running"
     return Law(not free, detector.dead_time_ns * 1e-9 / window.period if free else 0.0, window.recorded)
 
@@ -141,29 +287,26 @@ class State:
 
     def scales(self, unknowns: Sequence[Unknown], pixels: int) -> Floats:
         """The same of several, `[pixel, unknown]`."""
-        scales = np.ones((pixels, len(unknowns)))
-        for column, unknown in enumerate(unknowns):
-            scales[:, column] = self.scale(unknown)
-        return scales
+        return np.stack([np.broadcast_to(self.scale(unknown), pixels) for unknown in unknowns], axis=1)
 
     def means(self) -> dict[str, float]:
         """One number for each name: that of a map is its mean."""
         return {name: float(np.nanmean(value)) for name, value in self.values.items()}
 
-    def text(self, digits: int) -> str:
-        """For a report of progress."""
-        return ", ".join(f"{name} {value:.{digits}g}" for name, value in self.means().items())
-
-    def move(self, unknown: Unknown, step: Any) -> None:
-        """Takes a step on the scale that is searched."""
-        step = np.clip(np.nan_to_num(step), -unknown.largest_step, unknown.largest_step)
-        value = self.values[unknown.name]
-        value = value * np.exp(step) if unknown.is_positive else value + step
-        if unknown.name.endswith("reflectance"):
-            value = np.minimum(value, 1.0)
-        if unknown.name == "medium.anisotropy":
-            value = np.clip(value, -0.99, 0.99)
-        self.values[unknown.name] = value if unknown.per_pixel else float(value)
+    def step(self, iteration: Iteration, steps: Mapping[str, Any]) -> str:
+        """Takes a step on the scale that is searched, by name, at the end of an iteration; returns a report of it."""
+        self.iterations.append(iteration)
+        for name, step in steps.items():
+            unknown, value = Unknown(name), self.values[name]
+            step = np.clip(np.nan_to_num(step), -unknown.largest_step, unknown.largest_step)
+            value = value * np.exp(step) if unknown.is_positive else value + step
+            if name.endswith("reflectance"):
+                value = np.minimum(value, 1.0)
+            if name == "medium.anisotropy":
+                value = np.clip(value, -0.99, 0.99)
+            self.values[name] = value if np.ndim(value) else float(value)
+        digits = 4 if iteration.coarse else 5
+        return "fit: " + ", ".join(f"{name} {value:.{digits}g}" for name, value in self.means().items())
 
 
 class Fitter:
@@ -180,16 +323,15 @@ class Fitter:
         unknown: str | Sequence[str],
         exposure: Exposure,
         *,
-        prior: Mapping[str, tuple[float, float]] | None = None,
+        prior: Prior | None = None,
         photons: int | None = None,
         seed: int = 0,
         device: str | None = None,
     ) -> None:
-        from spadwarp.device import pick_device
-
         self.scene = as_scene(scene)
         self.unknowns = read_unknowns(self.scene, unknown)
         self.shared = [unknown for unknown in self.unknowns if not unknown.per_pixel]
+        self.own = [unknown for unknown in self.unknowns if unknown.per_pixel]
         self.exposure, self.device = exposure, device
         kind = "cuda" if pick_device(device).is_cuda else "cpu"
         self.photons = _PHOTONS[kind] if photons is None else check_integer("photons", photons, "[1000, 1e12]")
@@ -199,10 +341,9 @@ class Fitter:
         self.law = _detector_law(self.scene.detector, self.render.window)
         self.image = (self.scene.camera.height, self.scene.camera.width)
 
-    def _checked(self, prior: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    def _checked(self, prior: Prior) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation by name. Raises `ArgumentError`."""
-        names = [unknown.name for unknown in self.shared]
-        result = {}
+        names, result = [unknown.name for unknown in self.shared], {}
         for name, pair in prior.items():
             if name not in names:
                 known = ", ".join(names)
@@ -217,40 +358,46 @@ class Fitter:
         self, *, initial_guess: Mapping[str, float] | None = None, near: bool = False, progress: Progress | None = None
     ) -> Fit:
         """Fits the exposure as `spadwarp.fit` does; `near`: the guess is within some standard errors already."""
-        began, first = time.perf_counter(), self.render.photons
-        state = self._initial_state(initial_guess)
-        begin = state.means()
-        report = (lambda text: None) if progress is None else lambda text: progress(f"fit: {text}", 0, 0)
-        assert self.exposure.counts is not None
-        trials = np.full(self.exposure.counts.shape, self.exposure.pulses, np.float32)
-        if self.law.first_photon:
-            trials = self.exposure.left()
-        if not near:
+        began, first, exposure = time.perf_counter(), self.render.photons, self.exposure
+        state = self._initial_state(dict(initial_guess or {}))
+        begin, counts = state.means(), exposure.counts
+        assert counts is not None
+
+        def report(text: str) -> None:
+            if progress is not None:
+                progress(text, 0, 0)
+
+        trials = exposure.left() if self.law.first_photon else np.full(counts.shape, exposure.pulses, np.float32)
+        if not near and self.shared:
             self._approach(state, trials, report)
         halves, solution, converged = self._refine(state, trials, report)
-        warnings = [*self.render.warnings(), *self._slope_warnings(solution.slope_ratio), *self.exposure.warnings()]
-        warnings += self._warnings(solution, converged)
-        seconds, photons = time.perf_counter() - began, self.render.photons - first
-        return self._result(
-            state,
-            begin,
-            solution,
+        expected = self.law.mean(0.5 * (halves[0].rates + halves[1].rates), trials).reshape(*self.image, -1)
+        estimates, maps, depth = self._estimates(state, begin, solution)
+        found = Fit(
+            scene=with_values(self.scene, state.means()),
+            estimates=estimates,
+            maps=maps,
+            names=[unknown.name for unknown in self.shared],
+            covariance=solution.covariance,
             iterations=tuple(state.iterations),
             converged=converged,
-            warnings=tuple(warnings),
-            expected=self.law.mean(0.5 * (halves[0].rates + halves[1].rates), trials).reshape(*self.image, -1),
-            photons=photons,
-            seconds=seconds,
+            warnings=(),
+            depth=depth,
+            counts=counts.reshape(*self.image, -1),
+            expected=expected,
+            edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
+            pulses=exposure.pulses,
+            photons=self.render.photons - first,
+            seconds=time.perf_counter() - began,
         )
+        return replace(found, warnings=tuple(self._warnings(found, solution)))
 
-    def _initial_state(self, initial_guess: Mapping[str, float] | None) -> State:
-        guess = {} if initial_guess is None else dict(initial_guess)
+    def _initial_state(self, guess: dict[str, float]) -> State:
         names = {unknown.name for unknown in self.unknowns}
         for name in guess:
             if name not in names:
                 raise ArgumentError(f"initial_guess: {name} is not an unknown; these are {', '.join(sorted(names))}")
-        water = {"medium.absorption", "medium.scattering"} & names - set(guess)
-        if water:
+        if water := {"medium.absorption", "medium.scattering"} & names - set(guess):
             lidar = lidar_initial_guess(self.scene, self.exposure, device=self.device)
             guess = {**{name: value for name, value in lidar.items() if name in water}, **guess}
         values: dict[str, Any] = {}
@@ -266,23 +413,19 @@ class Fitter:
 
     def _approach(self, state: State, trials: Rows, report: Callable[[str], None]) -> None:
         """Coarse steps of the shared unknowns, with few photons at first, until Fisher scoring can do the rest."""
-        if not self.shared:
-            return
         photons, columns = self.photons // _FEWEST, [self.unknowns.index(unknown) for unknown in self.shared]
         largest = np.array([0.7 if unknown.is_positive else 0.02 for unknown in self.shared])
         assert self.exposure.counts is not None
         for _ in range(_COARSE):
             photons = max(photons, 1000)
             (half,) = self.render(state.values, photons=photons, halves=1)
-            half = replace(half, slopes=half.slopes[columns], limits=half.limits[columns])
-            scales = state.scales(self.shared, 1)[0]
-            blocks = _in_blocks(self.law, half, trials, self.exposure.counts, scales, self.image)
+            scales, limits = state.scales(self.shared, 1)[0], self.render.limits[columns]
+            half = half._replace(slopes=half.slopes[columns])
+            blocks = _in_blocks(self.law, half, trials, self.exposure.counts, scales, limits, self.image)
             step, error = _coarse_step(*blocks, largest, self.prior_at(state))
             gain = 0.5 * float(np.sum((step / np.maximum(error, 1e-12)) ** 2))
-            state.iterations.append(Iteration(values=state.means(), gain=gain, photons=photons, coarse=True))
-            for unknown, part in zip(self.shared, step, strict=True):
-                state.move(unknown, part)
-            report(state.text(4))
+            iteration = Iteration(values=state.means(), gain=gain, photons=photons, coarse=True)
+            report(state.step(iteration, {one.name: part for one, part in zip(self.shared, step, strict=True)}))
             if (np.abs(step) < np.maximum(2.0 * error, _SETTLED * largest)).all():
                 return
             photons = min(2 * photons, self.photons // _FEWER)
@@ -298,11 +441,9 @@ class Fitter:
                 solution = self._locally_solved(equations, solution, state, halves, trials, batch)
             bent = bent or solution.slope_ratio != 1.0
             converged, left = self._converged(solution), self._left(solution)
-            state.iterations.append(Iteration(values=state.means(), gain=solution.gain, photons=photons, coarse=False))
-            shared, pixels = iter(solution.shared), iter(solution.pixels.T)
-            for unknown in self.unknowns:
-                state.move(unknown, next(pixels) if unknown.per_pixel else next(shared))
-            report(state.text(5))
+            iteration = Iteration(values=state.means(), gain=solution.gain, photons=photons, coarse=False)
+            steps = zip((*self.shared, *self.own), (*solution.shared, *solution.pixels.T), strict=True)
+            report(state.step(iteration, {unknown.name: step for unknown, step in steps}))
             needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
             more = min(needed, self.photons, needed if left <= _CONVERGED * max(len(self.shared), 1) else 4 * photons)
             noisy = solution.simulation_share > SIMULATION and more > 1.2 * photons
@@ -311,12 +452,15 @@ class Fitter:
             photons = max(photons, more)
         return halves, solution, converged
 
-    def solve(self, state: State, halves: list[Half], trials: Rows | None, pooling_level: int | None) -> Pooled:
-        """The step from a rendering; without `trials` of a plan of the exposure."""
-        counts, pulses = self.exposure.counts, self.exposure.pulses
-        moments = Moments(self.law, halves, trials, counts, pulses=pulses, image=self.image)
+    def solve(
+        self, state: State, halves: list[Half], trials: Rows | None, pooling_level: int | None
+    ) -> tuple[int, Equations, Solution]:
+        """The step from a rendering, see `solve_pooled`; without `trials` of a plan of the exposure."""
+        moments = Moments(
+            self.law, halves, self.render.limits, trials, self.exposure.counts, self.exposure.pulses, self.image
+        )
         scales = state.scales(self.unknowns, self.image[0] * self.image[1])
-        return solve_pooled(self.unknowns, moments, scales, self._solver(state), pooling_level=pooling_level)
+        return solve_pooled(self.unknowns, moments, scales, self._solver(state), pooling_level)
 
     def _solver(self, state: State) -> Callable[[Equations], Solution]:
         is_per_pixel, prior = np.array([unknown.per_pixel for unknown in self.unknowns]), self.prior_at(state)
@@ -354,23 +498,12 @@ class Fitter:
         return pull, information
 
     def _locally_solved(
-        self,
-        equations: Equations,
-        solution: Solution,
-        state: State,
-        halves: list[Half],
-        trials: Rows,
-        photons: int,
+        self, equations: Equations, solution: Solution, state: State, halves: list[Half], trials: Rows, photons: int
     ) -> Solution:
-        """Solves again with the slope by the common depth between the ends of its 95 % interval.
+        """Solves again with the slope by the common depth over its 95 % interval, not over the wide difference.
 
-        Where no interval shorter than the wide difference has a slope that belongs to it, the light can move inside a
-        bin: the depth's variance then is that of two places anywhere in the same bin.
-
-        Args:
-            equations, solution: With the renderer's wide difference, on the scale that is searched.
-            state, halves, trials: What the equations are made of.
-            photons: Of a difference.
+        Where no shorter interval has a slope that belongs to it, the light can move inside a bin: the depth's variance
+        then is that of two places anywhere in the same bin. `photons`: of a difference.
         """
         depth = [unknown.name for unknown in self.shared]
         if DEPTH not in depth:
@@ -380,7 +513,7 @@ class Fitter:
         least = _LEAST * 0.5 * self.scene.medium.pulse_speed * self.scene.gate.stop
 
         def interval(solution: Solution) -> float:
-            return max(NORMAL_95 * math.sqrt(max(solution.covariance[row, row], 0.0)), least)
+            return max(_NORMAL_95 * math.sqrt(max(solution.covariance[row, row], 0.0)), least)
 
         def slopes(shift: float, step: float) -> Floats:
             each = max(photons // BATCHES, 1)
@@ -439,20 +572,23 @@ class Fitter:
 
     # The result
 
-    def _result(self, state: State, begin: Mapping[str, float], solution: Solution, **facts: Any) -> Fit:
-        """The fit from its last values and the solution of its equations there."""
-        truth = truth_maps(self.scene, device=self.device)
-        middle, values = _middle_depth(truth.depth), state.values
-        estimates, maps = {}, {}
+    def _estimates(
+        self, state: State, begin: Mapping[str, float], solution: Solution
+    ) -> tuple[dict[str, Estimate], dict[str, EstimateMap], Floats | None]:
+        """Values with their errors, maps of those of the pixels, and the depth, from the equations' solution."""
+        truth, values = truth_maps(self.scene, device=self.device), state.values
+        estimates, maps, depth = {}, {}, None
         for row, unknown in enumerate(self.shared):
-            offset = middle if unknown.name == DEPTH else 0.0
+            offset = 0.0
+            if unknown.name == DEPTH:
+                offset, depth = _middle_depth(truth.depth), truth.depth + values[DEPTH]
             variance = solution.covariance[row, row]
             value, error = values[unknown.name] + offset, math.sqrt(max(variance, 0.0))
             if unknown.is_positive:  # the error is of the logarithm
-                factor = math.exp(min(NORMAL_95 * error, 700.0))
+                factor = math.exp(min(_NORMAL_95 * error, 700.0))
                 interval, error = (value / factor, value * factor), error * value
             else:
-                interval = (value - NORMAL_95 * error, value + NORMAL_95 * error)
+                interval = (value - _NORMAL_95 * error, value + _NORMAL_95 * error)
             estimates[unknown.name] = Estimate(
                 name=unknown.name,
                 value=value,
@@ -462,45 +598,26 @@ class Fitter:
                 initial_guess=begin[unknown.name] + offset,
                 unit=unknown.unit,
             )
-        for column, unknown in enumerate(unknown for unknown in self.unknowns if unknown.per_pixel):
+        for column, unknown in enumerate(self.own):
             errors = np.sqrt(np.maximum(solution.pixel_covariance[:, column, column], 0.0)) * state.scale(unknown)
             value = np.where(np.isnan(solution.pixels[:, column]), np.nan, values[unknown.name]).reshape(self.image)
-            maps[unknown.name] = EstimateMap(
-                name=unknown.name,
-                value=value + truth.depth if unknown.name == DEPTH else value,
-                standard_error=errors.reshape(self.image),
-                unit=unknown.unit,
-            )
-        depth = maps[DEPTH].value if DEPTH in maps else None
-        if DEPTH in estimates:
-            depth = truth.depth + values[DEPTH]
-        assert self.exposure.counts is not None
-        return Fit(
-            scene=with_values(self.scene, state.means()),
-            estimates=estimates,
-            maps=maps,
-            names=[unknown.name for unknown in self.shared],
-            covariance=solution.covariance,
-            depth=depth,
-            counts=self.exposure.counts.reshape(*self.image, -1),
-            edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
-            pulses=self.exposure.pulses,
-            **facts,
-        )
+            if unknown.name == DEPTH:
+                value = depth = value + truth.depth
+            errors = errors.reshape(self.image)
+            maps[unknown.name] = EstimateMap(name=unknown.name, value=value, standard_error=errors, unit=unknown.unit)
+        return estimates, maps, depth
 
-    def _warnings(self, solution: Solution, converged: bool) -> list[str]:
-        sentences = []
-        if not converged:
+    def _warnings(self, found: Fit, solution: Solution) -> list[str]:
+        sentences = [*self.render.warnings(), *self._slope_warnings(solution.slope_ratio), *self.exposure.warnings()]
+        if not found.converged:
             sentences.append("not converged: the last step still promised more likelihood than the noise of the counts")
         if solution.simulation_share > SIMULATION:
             sentences.append(
                 f"the noise of the simulation is {percent(solution.simulation_share)} % of that of the counts in the "
                 "variances, above 10 %: give more photons; the standard errors contain it"
             )
-        names = [unknown.name for unknown in self.shared]
-        if any(name not in self.prior for name in names):
-            positive = [unknown.is_positive for unknown in self.shared]
-            sentences += not_identifiable(names, solution.covariance, positive)
+        if any(name not in self.prior for name in found.names):
+            sentences += found.not_identifiable([unknown.is_positive for unknown in self.shared])
         return sentences
 
 
@@ -508,11 +625,11 @@ class Fitter:
 
 
 def _in_blocks(
-    law: Law, half: Half, trials: Rows, counts: NDArray[Any], scales: Floats, image: tuple[int, int]
+    law: Law, half: Half, trials: Rows, counts: NDArray[Any], scales: Floats, limits: Rows, image: tuple[int, int]
 ) -> tuple[Floats, Floats, Floats]:
     """Counts, their mean `[block, bin]` and its relative derivatives `[unknown, block, bin]` in blocks of pixels.
 
-    `scales` `[unknown]`: units of the unknowns.
+    `scales` `[unknown]`: units of the unknowns; `limits`: of the derivatives by the unknowns of the scene.
     """
     rows, columns = (np.arange(size) * min(_ACROSS, size) // size for size in image)
     blocks = (rows[:, None] * (columns[-1] + 1) + columns).reshape(-1)
@@ -526,17 +643,15 @@ def _in_blocks(
         mean[block] = law.mean(half.rates[chosen], trials[chosen]).sum(axis=0)
         slopes[:, block] = law.slopes(half.rates[chosen], by_unknowns, trials[chosen]).sum(axis=0) * scales[:, None]
     mean += 1e-3  # of a count: a block that no photon has reached can still have one
-    limits = (half.limits * scales)[:, None, None]
-    return observed, mean, np.clip(slopes / mean, -limits, limits)
+    bounds = (limits * scales)[:, None, None]
+    return observed, mean, np.clip(slopes / mean, -bounds, bounds)
 
 
 def _coarse_step(
     counts: Floats, mean: Floats, slopes: Floats, largest: Floats, prior: tuple[Floats, Floats]
 ) -> tuple[Floats, Floats]:
-    """Step of the unknowns within ± `largest` `[unknown]` that maximises the likelihood, and its standard errors.
-
-    The exponential model: means times exp(Σ relative derivative · step). `prior`: score and information from elsewhere.
-    """
+    """Step within ± `largest` `[unknown]` that maximises an exponential model's likelihood, and its standard errors:
+    means times exp(Σ relative derivative · step). `prior`: score and information from elsewhere."""
     from scipy.optimize import minimize
 
     pull, known = prior

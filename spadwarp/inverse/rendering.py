@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.frames import Receiver, detector_response
-from spadwarp.frames.receiver import Window
+from spadwarp.frames.spad import Window
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, moved, with_values
 from spadwarp.scene import noise_rate
 from spadwarp.scene.sight import lines_of_sight
@@ -28,49 +28,26 @@ Values = Mapping[str, Any]
 """By name a number, or for an unknown of each pixel `[pixel]`; depth as a shift from the scene's [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Half:
-    """Rates and derivatives by one group of photons.
+class Half(NamedTuple):
+    """Rates and derivatives by one group of photons."""
 
-    Attributes:
-        rates: λ, expected detections per pulse, float32 `[pixel, bin]`.
-        slopes: dλ/d(unknown), float32 `[unknown, pixel, bin]`, of the first batch of the group.
-        first: λ of that batch.
-        limits: Largest |dλ|/λ that a weight takes, `[unknown]`. A scored derivative is λ times a mean of what its
-            photons scored, and needs none; a difference of two places is noise alone where λ is hardly known.
-        batches: λ of each batch; their mean is `rates`.
-    """
-
-    rates: Rows
-    slopes: Rows
-    first: Rows
-    limits: Rows
-    batches: list[Rows]
+    rates: Rows  # λ, expected detections per pulse, float32 [pixel, bin]: the mean of the batches
+    slopes: Rows  # dλ/d(unknown), float32 [unknown, pixel, bin], of the first batch
+    batches: list[Rows]  # λ of each batch
 
 
 @dataclass(eq=False)
 class Renderer:
-    """Renders a scene at values of its unknowns; every call takes photons that no other call has taken.
+    """Renders a scene at values of its unknowns; every call takes photons that no other call has taken."""
 
-    Attributes:
-        scene: With the values that are known.
-        unknowns: In the order of the slopes.
-        exposure: Time axis and response of the counts.
-        device: As in `simulate`.
-        seed: Key of the random numbers.
-        depth_step: Half of the distance between the two places of central differences [m].
-        truth: Truth maps of the scene at the values rendered last.
-        photons: Emitted so far.
-    """
-
-    scene: Scene
-    unknowns: tuple[Unknown, ...]
-    exposure: Exposure
+    scene: Scene  # with the values that are known
+    unknowns: tuple[Unknown, ...]  # in the order of the slopes
+    exposure: Exposure  # time axis and response of the counts
     device: str | None = None
     seed: int = 0
-    depth_step: float = 0.0
-    truth: Truth | None = None
-    photons: int = 0
+    depth_step: float = 0.0  # half of the distance between the two places of central differences [m]
+    truth: Truth | None = None  # truth maps of the scene at the values rendered last
+    photons: int = 0  # emitted so far
     _kept: dict[str, Any] = field(default_factory=dict)
     _tally: Any = None
 
@@ -102,6 +79,15 @@ class Renderer:
         """The detector's bins in time."""
         return self._receiver(self.scene, {}).window
 
+    @property
+    def limits(self) -> NDArray[np.float32]:
+        """Largest |dλ|/λ that a weight takes, `[unknown]`.
+
+        A scored derivative is λ times a mean of what its photons scored, and needs none; a difference of two places is
+        noise alone where λ is hardly known.
+        """
+        return np.array([1.0 / self.depth_step if one.name == DEPTH else 1e30 for one in self.unknowns], np.float32)
+
     def __call__(self, values: Values, *, photons: int, halves: int = 2, batches: int = 1) -> list[Half]:
         """Groups of `photons` · `batches` photons each, which are independent of each other."""
         scene = self._at(values)
@@ -113,20 +99,17 @@ class Renderer:
             depth = self._depth_difference(scene, self.depth_step, photons)
         self.truth = scored.truth
         receiver = self._placed(scene, values)
-        limits = [1.0 / self.depth_step if unknown.name == DEPTH else 1e30 for unknown in self.unknowns]
         groups = []
         for _ in range(halves):
             number = self._take(photons)
             light, slopes = scored(number, photons)
             if depth is not None:
                 slopes[DEPTH] = depth(number)
-            first = receiver.rates(light)
-            group = [first]
+            group = [receiver.rates(light)]
             for _ in range(batches - 1):
                 group.append(receiver.rates(plain(self._take(photons), photons)[0]))
-            rates: Rows = first if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
-            unknowns = receiver.slopes(slopes, self.unknowns)
-            groups.append(Half(rates, unknowns, first, np.array(limits, np.float32), group))
+            rates: Rows = group[0] if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
+            groups.append(Half(rates, receiver.slopes(slopes, self.unknowns), group))
         return groups
 
     def depth_slopes(self, values: Values, *, shift: float, step: float, photons: int, batches: int) -> list[Rows]:
@@ -139,10 +122,23 @@ class Renderer:
         return [receiver.slopes({DEPTH: light}, depth)[0] for light in lights]
 
     def _at(self, values: Values) -> Scene:
-        """The scene with one number for each unknown."""
-        return self._with_focus(
-            with_values(self.scene, {name: float(np.mean(value)) for name, value in values.items()})
-        )
+        """The scene with one number for each unknown.
+
+        The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved, and so does
+        the view: with a focus in metres, the distance of the sensor would follow it.
+        """
+        from spadwarp.mesh import build_mesh, focus_distance
+
+        scene = with_values(self.scene, {name: float(np.mean(value)) for name, value in values.items()})
+        if "focus" not in self._kept:
+            self._kept["focus"] = focus_distance(self.scene, build_mesh(self.scene))
+        focus, camera = self._kept["focus"], scene.camera
+        if focus is None or camera.focus_distance != "target":
+            return scene
+        changes: dict[str, Any] = {"focus_distance": focus}
+        if camera.pixel_pitch_um is not None:
+            changes |= {"fx": camera.focal_pixels[0], "pixel_pitch_um": None}
+        return scene.model_copy(update={"camera": camera.model_copy(update=changes)})
 
     def _take(self, photons: int) -> int:
         """The first of photons that were not traced before."""
@@ -158,52 +154,31 @@ class Renderer:
     def _depth_difference(self, scene: Scene, step: float, photons: int) -> Callable[[int], ExpectedLight]:
         """Derivative by the depth of the targets [1/m] from a first photon on: of two runs with the same photons and
         the targets at ± `step` [m]."""
-        far, near = (
+        import warp as wp
+
+        tracers = [
             LightTracer(
                 moved(scene, shift), mesh_cache=self._kept.setdefault(name, {}), photons=photons, **self._choices
             )
             for name, shift in (("far", step), ("near", -step))
-        )
+        ]
 
         def slope(far: Any, near: Any) -> Any:
-            import warp as wp
-
             if far is None:
                 return None
             return wp.array((far.numpy() - near.numpy()) * (0.5 / step), dtype=wp.float32, device=far.device)
 
         def difference(first: int) -> ExpectedLight:
-            beyond, before = (tracer(first, photons)[0] for tracer in (far, near))
-            return ExpectedLight(slope(beyond.total, before.total), slope(beyond.target, before.target))
+            far, near = (tracer(first, photons)[0] for tracer in tracers)
+            return ExpectedLight(slope(far.total, near.total), slope(far.target, near.target))
 
         return difference
 
     @property
-    def _apart(self) -> bool:
-        """Whether light of the targets is held apart, because each pixel places it."""
-        return any(unknown.per_pixel and unknown.name != BACKGROUND for unknown in self.unknowns)
-
-    @property
     def _choices(self) -> dict[str, Any]:
-        """Of all tracers; one tally serves them in turn."""
-        return {"seed": self.seed, "device": self.device, "separate_targets": self._apart, "tally": self._tally}
-
-    def _with_focus(self, scene: Scene) -> Scene:
-        """The lens keeps the focus that it has in the scene as it is given, wherever the targets are moved.
-
-        The view stays that of the scene, too: with a focus in metres, the distance of the sensor would follow it.
-        """
-        from spadwarp.mesh import build_mesh, focus_distance
-
-        if "focus" not in self._kept:
-            self._kept["focus"] = focus_distance(self.scene, build_mesh(self.scene))
-        focus, camera = self._kept["focus"], scene.camera
-        if focus is None or camera.focus_distance != "target":
-            return scene
-        changes: dict[str, Any] = {"focus_distance": focus}
-        if camera.pixel_pitch_um is not None:
-            changes |= {"fx": camera.focal_pixels[0], "pixel_pitch_um": None}
-        return scene.model_copy(update={"camera": camera.model_copy(update=changes)})
+        """Of all tracers; one tally serves them in turn. Light of the targets is apart where each pixel places it."""
+        separate = any(unknown.per_pixel and unknown.name != BACKGROUND for unknown in self.unknowns)
+        return {"seed": self.seed, "device": self.device, "separate_targets": separate, "tally": self._tally}
 
     def _receiver(self, scene: Scene, values: Values) -> Receiver:
         gate, camera, detector = scene.gate, scene.camera, scene.detector
@@ -229,51 +204,49 @@ class Renderer:
 
     def _placed(self, scene: Scene, values: Values) -> _PlacedReceiver:
         receiver = self._receiver(scene, values)
-        if not self._apart:
+        moving = [unknown for unknown in self.unknowns if unknown.per_pixel and unknown.name != BACKGROUND]
+        if not moving:
             return _PlacedReceiver(receiver)
-        pixels = scene.camera.width * scene.camera.height
-        delay, factor = np.zeros(pixels), np.ones(pixels)
-        for unknown in self.unknowns:
-            value = values[unknown.name]
-            if unknown.per_pixel and unknown.name == DEPTH:
-                delay += (np.asarray(value) - float(np.mean(value))) * _bins_per_metre(scene).reshape(-1)
-            elif unknown.per_pixel and unknown.name != BACKGROUND:
-                factor *= np.asarray(value) / float(np.mean(value))
-        return _PlacedReceiver(receiver, delay, factor)
+        delay, factor = np.zeros(scene.camera.width * scene.camera.height), np.ones(1)
+        for unknown in moving:
+            value = np.asarray(values[unknown.name])
+            if unknown.name == DEPTH:
+                delay = (value - float(np.mean(value))) * _bins_per_metre(scene).reshape(-1)
+            else:
+                factor = factor * (value / float(np.mean(value)))
+        return _PlacedReceiver(receiver, delay, np.broadcast_to(factor, delay.shape).astype(np.float32))
 
 
-@dataclass(frozen=True, eq=False)
-class _PlacedReceiver:
+class _PlacedReceiver(NamedTuple):
     """The receiver, and how each pixel changes the light of the targets: a delay in bins and a factor, `[pixel]`."""
 
     receiver: Receiver
     delay: NDArray[np.float64] | None = None
-    factor: NDArray[np.float64] | None = None
+    factor: Rows | None = None
 
     def rates(self, light: ExpectedLight) -> Rows:
         """λ of light."""
-        rates: Rows = self.receiver.hazard(light.total).numpy()
-        return rates if self.delay is None else rates + self._change(light)
+        return self._with_change(self.receiver.hazard(light.total).numpy(), light)
 
     def slopes(self, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown]) -> Rows:
         """Derivatives of λ, `[unknown, pixel, bin]`."""
         widths = np.diff(self.receiver.window.edges).astype(np.float32)
-        pixels = self.receiver.image[0] * self.receiver.image[1]
-        result = np.empty((len(unknowns), pixels, widths.size), np.float32)
+        result = np.empty((len(unknowns), self.receiver.image[0] * self.receiver.image[1], widths.size), np.float32)
         for row, unknown in zip(result, unknowns, strict=True):
             if unknown.name == BACKGROUND:
                 row[:] = widths
-                continue
-            row[:] = self.receiver.slope(slopes[unknown.name].total).numpy()
-            if self.delay is not None:
-                row += self._change(slopes[unknown.name])
+            else:
+                light = slopes[unknown.name]
+                row[:] = self._with_change(self.receiver.slope(light.total).numpy(), light)
         return result
 
-    def _change(self, light: ExpectedLight) -> Rows:
-        """What is added to λ, or to its derivative: the light of the targets in its new place, less that in the old."""
-        assert light.target is not None and self.delay is not None and self.factor is not None
+    def _with_change(self, rows: Rows, light: ExpectedLight) -> Rows:
+        """With the light of the targets in its new place, less that in the old."""
+        if self.delay is None:
+            return rows
+        assert light.target is not None and self.factor is not None
         target: Rows = self.receiver.slope(light.target).numpy()
-        return subbin_shift(target, self.delay) * self.factor.astype(np.float32)[:, None] - target
+        return rows + (subbin_shift(target, self.delay) * self.factor[:, None] - target)
 
 
 def _bins_per_metre(scene: Scene) -> NDArray[np.float64]:

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.inverse.unknowns import read_unknowns, with_values
-from spadwarp.limits import SEED, check_integer
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.grid import Grid
 from spadwarp.scene.medium import grid_cells
 from spadwarp.transport import RunOptions, resolve_derivatives, simulate
 from spadwarp.transport.derivatives import is_block_name
+from spadwarp.values import SEED, ArgumentError, FileError, check_integer
 
 if TYPE_CHECKING:
     import torch
@@ -103,18 +102,16 @@ def _checked(scene: Scene, parameters: Mapping[str, torch.Tensor]) -> tuple[list
     unknowns = dict(zip(plain, read_unknowns(scene, plain), strict=True)) if plain else {}
     names, shapes = list[str](), set[tuple[int, ...]]()
     for name, value in parameters.items():
-        if name not in unknowns:
-            if not isinstance(value, torch.Tensor) or value.ndim != 3:
+        unknown, is_tensor = unknowns.get(name), isinstance(value, torch.Tensor)
+        if unknown is None:
+            if not is_tensor or value.ndim != 3:
                 raise ArgumentError(f"parameters: {name} is not a tensor [x, y, z] of blocks")
             shapes.add(tuple(value.shape))
-            names.append(name)
-            continue
-        unknown = unknowns[name]
-        if not unknown.is_light or unknown.per_pixel:
+        elif not unknown.is_light or unknown.per_pixel:
             raise ArgumentError(f"parameters: {unknown} has no scored derivative")
-        if not isinstance(value, torch.Tensor) or value.numel() != 1:
+        elif not is_tensor or value.numel() != 1:
             raise ArgumentError(f"parameters: {unknown} is not a tensor of one number")
-        names.append(unknown.name)
+        names.append(unknown.name if unknown else name)
     if len(shapes) > 1:
         raise ArgumentError(f"parameters: blocks of different numbers, {sorted(shapes)}")
     shape = shapes.pop() if shapes else None

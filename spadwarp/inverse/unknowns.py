@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.limits import shown, suggestion
 from spadwarp.scene.camera import to_world
+from spadwarp.values import ArgumentError, ConfigError, shown, suggestion
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -73,15 +72,15 @@ def read_unknowns(scene: Scene, names: str | Sequence[str]) -> tuple[Unknown, ..
         ConfigError: The scene has no such value to start from: its layers, its albedo, its phase function.
     """
     words = [word.strip() for word in names.split(",")] if isinstance(names, str) else list(names)
-    unknowns: list[Unknown] = []
+    unknowns: dict[str, Unknown] = {}
     for word in words:
         unknown = _read(scene, word)
-        if unknown.name in [other.name for other in unknowns]:
+        if unknown.name in unknowns:
             raise ArgumentError(f"unknown: {unknown.name} is named twice")
-        unknowns.append(unknown)
+        unknowns[unknown.name] = unknown
     if not unknowns:
         raise ArgumentError("unknown: no name is given")
-    return tuple(unknowns)
+    return tuple(unknowns.values())
 
 
 def _read(scene: Scene, word: Any) -> Unknown:
@@ -101,25 +100,27 @@ def _read(scene: Scene, word: Any) -> Unknown:
         raise ArgumentError(f"unknown: {shown(name)} is not one of {', '.join(known)}{suggestion(name, known)}")
     if spread and name.startswith("medium."):
         raise ArgumentError(f"unknown: {name} is one of the whole water, not of a pixel")
-    _check_scene(scene, name, None if field is None or field[2] is None else int(field[2]))
+    if problem := _without_derivative(scene, name, field[2] if field else None):
+        raise ConfigError(f"unknown: {name}{problem}")
     return Unknown(name, bool(spread))
 
 
-def _check_scene(scene: Scene, name: str, target: int | None) -> None:
-    """Raises `ConfigError` for what has no derivative."""
+def _without_derivative(scene: Scene, name: str, target: str | None) -> str:
+    """Why the scene has no derivative by an unknown; empty where it has."""
     if name == DEPTH and not scene.targets:
-        raise ConfigError("unknown: depth, but the scene has no targets")
+        return ", but the scene has no targets"
     if target is not None:
-        if target >= len(scene.targets):
-            raise ConfigError(f"unknown: {name}, but the scene has {len(scene.targets)} targets")
-        if isinstance(scene.targets[target].reflectance, str):
-            raise ConfigError(f"unknown: {name} is from_file; a number is needed")
+        if int(target) >= len(scene.targets):
+            return f", but the scene has {len(scene.targets)} targets"
+        if isinstance(scene.targets[int(target)].reflectance, str):
+            return " is from_file; a number is needed"
     if name.startswith("medium."):
         if scene.medium.albedo == "lu2024":
-            raise ConfigError(f"unknown: {name}, but medium.albedo is 'lu2024', random at each collision")
-        if name == "medium.anisotropy" and scene.medium.phase_function != "henyey_greenstein":
-            law = scene.medium.phase_function
-            raise ConfigError(f"unknown: {name} goes with phase_function = 'henyey_greenstein', not {law!r}")
+            return ", but medium.albedo is 'lu2024', random at each collision"
+        law = scene.medium.phase_function
+        if name == "medium.anisotropy" and law != "henyey_greenstein":
+            return f" goes with phase_function = 'henyey_greenstein', not {law!r}"
+    return ""
 
 
 def scene_value(scene: Scene, unknown: Unknown) -> float:

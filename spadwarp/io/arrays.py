@@ -12,26 +12,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.paths import atomic_path, existing_file
+from spadwarp.values import ArgumentError, FileError
 
-__all__ = ["point_cloud", "point_normals", "read_exr", "read_npy", "read_npz", "write_array", "write_exr", "write_ply"]
+__all__ = ["point_cloud", "read_exr", "read_npy", "read_npz", "write_array", "write_exr", "write_ply"]
 
 # Names in an EXR's header that are its own.
 _STRUCTURE = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio"}
 _STRUCTURE |= {"screenWindowCenter", "screenWindowWidth", "type"}
 _LARGEST_IMAGE = 1 << 28  # values that are read
 _DEFLATE, _SMALL = 1100, 1 << 16  # no compression of EXR makes an image smaller by more than this, its header aside
-_KINDS = {"f4": "float", "f8": "double", "i4": "int", "u4": "uint", "u1": "uchar"}  # of PLY
 
 
 def write_exr(
     path: str | Path, channels: Mapping[str, ArrayLike], metadata: Mapping[str, str | int | float] | None = None
 ) -> Path:
-    """Writes an EXR image, losslessly compressed; returns its path.
+    """Writes an EXR image, losslessly compressed, whole or not at all; returns its path.
 
     Args:
-        path: The file; an existing one is replaced when the new one is whole.
+        path: The file.
         channels: Name → `[H, W]`, all of one shape; float16, float32 and uint32 as they are, float64 as float32.
         metadata: Name → value. Stored as text, because EXR's own numbers have 32 bits.
 
@@ -72,12 +71,8 @@ def _exr_pixels(name: str, array: ArrayLike) -> NDArray[Any]:
 def read_exr(path: str | Path, *, largest: int = _LARGEST_IMAGE) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Channels (name → `[H, W]`, float16, float32 or uint32 as stored) and metadata of an EXR image's first part.
 
-    Args:
-        path: The file.
-        largest: Allowed number of values, of all channels and parts.
-
-    Raises:
-        FileError: No such file, not an EXR, damaged, or larger than allowed.
+    `largest`: allowed number of values, of all channels and parts. Raises `FileError`: no such file, not an EXR,
+    damaged, or larger than allowed.
     """
     import OpenEXR
 
@@ -116,12 +111,8 @@ def write_array(path: str | Path, array: ArrayLike) -> Path:
 def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
     """The array of a `.npy` file: real or complex numbers or booleans; pickles are never loaded.
 
-    Args:
-        path: The file.
-        largest: Allowed number of values; None: any.
-
-    Raises:
-        FileError: No such file, not a `.npy` file, shorter than its header says, of another type, or too large.
+    `largest`: allowed number of values; None: any. Raises `FileError`: no such file, not a `.npy` file, shorter than
+    its header says, of another type, or too large.
     """
     place = existing_file(path)
     try:
@@ -139,13 +130,8 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
 def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
     """Those arrays of a `.npz` archive that have one of the names; real numbers or booleans; pickles are never loaded.
 
-    Args:
-        path: The file.
-        names: What to read; anything else in the archive is passed over.
-        largest: Allowed number of values of an array.
-
-    Raises:
-        FileError: No such file, not a `.npz` archive, shorter than a header says, of another type, or too large.
+    `largest`: allowed number of values of an array. Raises `FileError`: no such file, not a `.npz` archive, shorter
+    than a header says, of another type, or too large.
     """
     place = existing_file(path)
     arrays: dict[str, NDArray[Any]] = {}
@@ -183,32 +169,20 @@ def _array(file: Any, where: str, size: int, kinds: str, largest: int | None) ->
 # Point clouds
 
 
-def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Points of a range image in the camera frame (+x right, +y down, +z forward) [m].
+def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points of a range image in the camera frame (+x right, +y down, +z forward) [m], and their unit normals towards
+    the camera: two of float32 `[P, 3]`, row after row of the pixels that have a range.
+
+    A normal is the cross product of the steps to a neighbour in the row and to one in the column, of both the one whose
+    range is nearer; where a pixel has no neighbour in one of them, the direction to the camera.
 
     Args:
         distance: Along the lines of sight `[H, W]` [m]; NaN where there is nothing.
         directions: Unit vectors `[H, W, 3]`, such as `spadwarp.scene.geometry.pixel_directions` gives.
-
-    Returns:
-        float32 `[P, 3]`, row after row of the pixels that have a range, and their mask, bool `[H, W]`.
     """
-    along = np.asarray(distance, np.float64)
-    view = np.asarray(directions, np.float64)
+    along, view = np.asarray(distance, np.float64), np.asarray(directions, np.float64)
     if along.ndim != 2 or view.shape != (*along.shape, 3):
         raise ArgumentError(f"distance {along.shape} and directions {view.shape} are not [H, W] and [H, W, 3]")
-    returned = np.isfinite(along)
-    return (along[returned][:, None] * view[returned]).astype(np.float32), returned
-
-
-def point_normals(distance: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
-    """Unit normals of the points of `point_cloud`, towards the camera: float32 `[P, 3]`.
-
-    By the cross product of the steps to a neighbour in the row and to one in the column, of both the one whose range is
-    nearer; where a pixel has no neighbour in one of them, the direction to the camera.
-    """
-    along = np.asarray(distance, np.float64)
-    view = np.asarray(directions, np.float64)
     image = along[..., None] * view
 
     def step(axis: int) -> NDArray[np.float64]:
@@ -222,49 +196,27 @@ def point_normals(distance: ArrayLike, directions: ArrayLike) -> NDArray[np.floa
         return np.where(use_behind[..., None], behind, ahead)
 
     normal = np.cross(step(1), step(0))
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
-        normal /= length
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     normal *= np.where((normal * view).sum(axis=-1) > 0, -1.0, 1.0)[..., None]
     normal = np.where(np.isfinite(normal), normal, -view)
-    return normal[np.isfinite(along)].astype(np.float32)
+    returned = np.isfinite(along)
+    return image[returned].astype(np.float32), normal[returned].astype(np.float32)
 
 
-def write_ply(
-    path: str | Path, points: ArrayLike, properties: Mapping[str, ArrayLike] | None = None, *, comment: str = ""
-) -> Path:
-    """Writes points as a binary little-endian PLY file, whole or not at all; returns its path.
+def write_ply(path: str | Path, columns: Mapping[str, ArrayLike], *, comment: str = "") -> Path:
+    """Writes points as a binary little-endian PLY file of float32, whole or not at all; returns its path.
 
     Args:
         path: The file.
-        points: `[P, 3]`, written as float32 x, y, z.
-        properties: Name → `[P]`: float32, float64, int32, uint32 or uint8 as they are, other real numbers as float32.
+        columns: Name → `[P]`: x, y, z and properties of the points.
         comment: One line for the header.
 
-    Raises:
-        ArgumentError: Points or properties of another shape, or a name that PLY cannot have.
-        FileError: The file cannot be written.
+    Raises `FileError`.
     """
-    xyz = np.asarray(points, np.float32)
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise ArgumentError(f"points have shape {xyz.shape}; [P, 3] is needed")
-    columns = {name: xyz[:, axis] for axis, name in enumerate("xyz")}
-    for name, value in (properties or {}).items():
-        values = np.asarray(value)
-        if values.shape != (len(xyz),):
-            raise ArgumentError(f"property {name!r} has shape {values.shape}; ({len(xyz)},) is needed")
-        if not name.isidentifier() or name in columns:
-            raise ArgumentError(f"property name {name!r} is not a new single word")
-        known = values.dtype.kind + str(values.dtype.itemsize) in _KINDS
-        columns[name] = values if known else values.astype(np.float32)
-    kinds = {name: values.dtype.kind + str(values.dtype.itemsize) for name, values in columns.items()}
-    table = np.empty(len(xyz), [(name, "<" + kind) for name, kind in kinds.items()])
-    for name, values in columns.items():
-        table[name] = values
-    header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"comment {' '.join(comment.split())}"] if comment else []
-    header += [f"element vertex {len(xyz)}"]
-    header += [f"property {_KINDS[kind]} {name}" for name, kind in kinds.items()]
+    table = np.column_stack([np.asarray(column, "<f4") for column in columns.values()])
+    header = ["ply", "format binary_little_endian 1.0", f"comment {' '.join(comment.split())}"]
+    header += [f"element vertex {len(table)}", *(f"property float {name}" for name in columns), "end_header", ""]
     with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join([*header, "end_header", ""]).encode("ascii", "replace") + table.tobytes())
+        temporary.write_bytes("\n".join(header).encode("ascii", "replace") + table.tobytes())
     return Path(path)

@@ -19,15 +19,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, NoReturn, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError
 from spadwarp.io.paths import atomic_path, existing_file, used
 from spadwarp.io.text import parse_json
-from spadwarp.limits import check_integer, check_real
+from spadwarp.values import FileError, check_integer, check_real
 
 if TYPE_CHECKING:
     import h5py
@@ -42,8 +41,7 @@ _FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32"}
 _MOST_ARRAYS, _DEEPEST = 10_000, 32  # that are listed; groups in each other
 _REQUIRED: Any = object()
 
-P = ParamSpec("P")
-R = TypeVar("R")
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 # Reading
@@ -53,24 +51,17 @@ R = TypeVar("R")
 def read_hdf5(path: str | Path, format: str | None = None, *, version: int | None = None) -> Iterator[Hdf5File]:
     """An HDF5 file to read from, for the length of a block that does nothing else.
 
-    Args:
-        path: The file.
-        format: What its attribute `format` has to be, such as "spadwarp result"; None: anything.
-        version: The newest `format_version` that can be read; None: any.
-
-    Raises:
-        FileError: No such file, not HDF5, of another format or a newer version, damaged, or without something that the
-            block looked for (whatever error it raised); says which.
+    `format`: what its attribute of this name has to be, such as "spadwarp result"; `version`: the newest
+    `format_version` that can be read; None: any. Raises `FileError`: no such file, not HDF5, of another format or a
+    newer version, damaged, or without something that the block looked for (whatever error it raised); says which.
     """
-    file = open_hdf5(path, format, version=version)
-    try:
-        yield file
-    except (FileError, MemoryError):
-        raise
-    except Exception as error:
-        raise FileError(f"{path}: not a whole {file.kind}: {error}") from error
-    finally:
-        file.close()
+    with closing(open_hdf5(path, format, version=version)) as file:
+        try:
+            yield file
+        except (FileError, MemoryError):
+            raise
+        except Exception as error:
+            raise FileError(f"{path}: not a whole {file.kind}: {error}") from error
 
 
 def open_hdf5(path: str | Path, format: str | None = None, *, version: int | None = None) -> Hdf5File:
@@ -85,12 +76,10 @@ def open_hdf5(path: str | Path, format: str | None = None, *, version: int | Non
         raise FileError(f"{path}: {problem}") from error
     file = Hdf5File(opened, path, format or "HDF5 file of this kind")
     try:
-        stored_format = file.attribute("format", "unknown")
-        if format is not None and not (isinstance(stored_format, str) and stored_format == format):
+        stored = file.attribute("format", "unknown")
+        if format is not None and not (isinstance(stored, str) and stored == format):
             hint = "; give the directory of a run of `spadwarp simulate`" if format == "spadwarp result" else ""
-            raise FileError(
-                f"{path}: an HDF5 file, but not a {format}: its format is {stored_format!r}, not {format!r}{hint}"
-            )
+            raise FileError(f"{path}: an HDF5 file, but not a {format}: its format is {stored!r}, not {format!r}{hint}")
         if version is not None and (newer := file.integer("format_version")) > version:
             raise FileError(f"{path}: format version {newer} is newer than {version}, the newest that can be read")
     except BaseException:
@@ -100,23 +89,17 @@ def open_hdf5(path: str | Path, format: str | None = None, *, version: int | Non
 
 
 def hdf5_format(path: str | Path) -> str | None:
-    """The attribute `format` of an HDF5 file, such as "spadwarp frames"; None without one.
-
-    Raises:
-        FileError: No such file, or not HDF5.
-    """
+    """The attribute `format` of an HDF5 file, such as "spadwarp frames", or None. Raises `FileError`."""
     with read_hdf5(path) as file:
         value = file.attribute("format", None)
         return value if isinstance(value, str) else None
 
 
-def _checked(
-    method: Callable[Concatenate[Hdf5File, str, P], R],
-) -> Callable[Concatenate[Hdf5File, str, P], R]:
+def _checked(method: Method) -> Method:
     """A method whose errors name the file and its first argument, whatever h5py raises for a damaged file."""
 
     @functools.wraps(method)
-    def checked(self: Hdf5File, name: str, /, *args: P.args, **options: P.kwargs) -> R:
+    def checked(self: Any, name: str, /, *args: Any, **options: Any) -> Any:
         try:
             return method(self, name, *args, **options)
         except (FileError, MemoryError):
@@ -124,15 +107,11 @@ def _checked(
         except Exception as error:  # OSError, RuntimeError, KeyError, ValueError, TypeError, ... by the kind of damage
             self.refuse(name, f"is damaged or not readable: {error}")
 
-    return checked
+    return cast(Method, checked)
 
 
 class Stored:
-    """A checked array of an open file; what is asked for is read when it is asked for.
-
-    Attributes:
-        shape, dtype: Of the array.
-    """
+    """A checked array of an open file, with its `shape` and `dtype`; what is asked for is read when it is asked for."""
 
     def __init__(self, dataset: Any, name: str, file: Hdf5File) -> None:
         self._dataset, self._name, self._file = dataset, name, file
@@ -143,7 +122,7 @@ class Stored:
         return self.shape[0]
 
     def __getitem__(self, key: Any) -> Any:
-        return self._file.values(self._name, self._dataset, key)
+        return self._file.part(self._name, self._dataset, key)
 
     def mapped(self) -> Any:
         """The same values without a copy where they lie in one piece in the file, else itself."""
@@ -223,7 +202,6 @@ class Hdf5File:
         cells = np.empty(references.size, object)
         for index, reference in enumerate(references):
             item = self._dataset(name, self._file[reference])
-            self._check_size(name, item)
             cells[index] = np.empty(0) if "MATLAB_empty" in item.attrs else np.ravel(item[...])
         return cells
 
@@ -275,28 +253,23 @@ class Hdf5File:
 
     @_checked
     def stored(self, name: str, kind: Any, shape: Sequence[int | None]) -> Stored:
-        """A dataset, checked and not yet read.
+        """A dataset such as "truth/depth", checked and not yet read.
 
-        Args:
-            name: Where it is, such as "truth/depth".
-            kind: Its dtype, or several that it may have; "S" for text of any length.
-            shape: Its shape; None for a side of any length.
+        `kind`: its dtype, or several that it may have, "S" for text of any length; `shape`: None for a side of any
+        length.
         """
         dataset = self._dataset(name, self._object(name))
         kinds = kind if isinstance(kind, tuple) else (kind,)
         fits = dataset.shape is not None and len(dataset.shape) == len(shape)
         fits = fits and all(b in (a, None) for a, b in zip(dataset.shape, shape, strict=True))
-        if not fits or not any(
-            dataset.dtype.kind == "S" if dtype == "S" else dataset.dtype == dtype for dtype in kinds
-        ):
-            needed = " or ".join("text" if dtype == "S" else str(np.dtype(dtype)) for dtype in kinds)
+        if not fits or not any(dataset.dtype.kind == "S" if one == "S" else dataset.dtype == one for one in kinds):
+            needed = " or ".join("text" if one == "S" else str(np.dtype(one)) for one in kinds)
             sides = ", ".join("any" if side is None else str(side) for side in shape)
             self.refuse(name, f"is {dataset.dtype} {dataset.shape}; {needed} ({sides}) is needed")
-        self._check_size(name, dataset)
         return Stored(dataset, name, self)
 
     @_checked
-    def values(self, name: str, dataset: Any, key: Any) -> Any:
+    def part(self, name: str, dataset: Any, key: Any) -> Any:
         """A part of a dataset of h5py that was checked."""
         return dataset[key]
 
@@ -313,7 +286,6 @@ class Hdf5File:
         self._check_text(name)
         if h5py.check_string_dtype(dataset.dtype) is None or dataset.shape != ():
             self.refuse(name, f"is {dataset.dtype} {dataset.shape}; one text is needed")
-        self._check_size(name, dataset)
         return dataset.asstr()[()]
 
     @_checked
@@ -355,7 +327,8 @@ class Hdf5File:
         return place
 
     def _dataset(self, name: str, item: Any) -> Any:
-        """An object, if it is a dataset that lies in this file and is packed by what HDF5 knows itself."""
+        """An object, if it is a dataset that lies in this file, is packed by what HDF5 knows itself, and can be as
+        large as it says."""
         import h5py
 
         if not isinstance(item, h5py.Dataset):
@@ -368,18 +341,14 @@ class Hdf5File:
             if number not in _FILTERS:
                 text = title.decode(errors="replace") or number
                 self.refuse(name, f"is packed by the filter {text}; {', '.join(_FILTERS.values())} are known")
-        return item
-
-    def _check_size(self, name: str, dataset: Any) -> None:
-        """Compares what a dataset declares with what is stored of it."""
-        declared, stored = dataset.nbytes, dataset.id.get_storage_size()
-        packed = dataset.compression is not None
-        if declared > _SMALL and declared > stored * (_DEFLATE if packed else 1):
-            self.refuse(name, f"has shape {dataset.shape}, {declared} bytes, of which the file holds {stored}")
-        if stored > dataset.file.id.get_filesize():
+        declared, stored = 0 if item.shape is None else item.nbytes, item.id.get_storage_size()
+        if declared > _SMALL and declared > stored * (_DEFLATE if item.compression is not None else 1):
+            self.refuse(name, f"has shape {item.shape}, {declared} bytes, of which the file holds {stored}")
+        if stored > item.file.id.get_filesize():
             self.refuse(name, f"takes {stored} bytes, more than the file has")
-        if dataset.chunks and math.prod(dataset.chunks) * dataset.dtype.itemsize > max(_LARGEST_CHUNK, declared):
-            self.refuse(name, f"has chunks of shape {dataset.chunks}, larger than itself")
+        if item.chunks and math.prod(item.chunks) * item.dtype.itemsize > max(_LARGEST_CHUNK, declared):
+            self.refuse(name, f"has chunks of shape {item.chunks}, larger than itself")
+        return item
 
     def _check_text(self, name: str) -> None:
         """Refuses text with which HDF5 would come to no end; each state of a file is looked at once."""
@@ -497,18 +466,13 @@ _NO_COORDINATE = "This is a netCDF dimension but not a netCDF variable.{:10d}"  
 
 
 def name_dimensions(
-    file: Any,
-    coordinates: Mapping[str, Coordinate | int | None],
-    arrays: Mapping[str, tuple[Sequence[str], str, str]],
+    file: Any, coordinates: Mapping[str, Coordinate | int | None], arrays: Mapping[str, tuple[Sequence[str], str, str]]
 ) -> None:
     """Writes dimension scales, as netCDF-4 has them, to an open file and attaches them to its arrays.
 
-    Args:
-        file: From `write_hdf5`.
-        coordinates: Dimension → its coordinate, or its size alone; None: a size of 0 that grows with its arrays, which
-            the caller resizes.
-        arrays: Name → its dimensions, unit and meaning; those that the file does not hold are passed over. Dimensions
-            that no array has are not written, but arrays that are coordinates of themselves are marked as such.
+    `coordinates`: dimension → its coordinate, or its size alone; None: a size of 0 that grows with its arrays, which
+    the caller resizes. `arrays`: name → its dimensions, unit and meaning; those that the file does not hold are passed
+    over. Dimensions that no array has are not written, but arrays that are coordinates of themselves are marked so.
     """
     held = {name: described for name, described in arrays.items() if name in file}
     needed = {dimension for dimensions, _, _ in held.values() for dimension in dimensions}
@@ -550,27 +514,23 @@ _LARGE = 1 << 22  # bytes from which threads are worth their start
 
 
 def write_packed(file: Any, name: str, array: NDArray[Any], *, chunks: Sequence[int], compression: int) -> Any:
-    """Writes an array to an open file with HDF5's filters shuffle, gzip and fletcher32; returns the dataset.
-
-    Args:
-        file: From `write_hdf5`.
-        name: Of the dataset.
-        array: Of numbers.
-        chunks: Shape of a chunk; about 1 MB.
-        compression: Level of gzip, 1 to 9.
-    """
-    options = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
+    """Writes an array of numbers to an open file with HDF5's filters shuffle and gzip (and its checksum); returns the
+    dataset. `chunks`: shape of a chunk, about 1 MB; `compression`: level of gzip, 1 to 9."""
+    options = {"compression": "gzip", "compression_opts": compression, "shuffle": True}
     if array.nbytes < _LARGE:
         return file.create_dataset(name, data=array, chunks=tuple(chunks), **options)
     made = file.create_dataset(name, array.shape, array.dtype, chunks=tuple(chunks), **options)
-    empty = _packed(np.zeros(chunks, array.dtype), compression)
+
+    def packed(part: NDArray[Any]) -> bytes:
+        beyond = [(0, size - side) for size, side in zip(chunks, part.shape, strict=True)]  # at the edges
+        numbers = np.ascontiguousarray(np.pad(part, beyond))
+        return zlib.compress(numbers.view(np.uint8).reshape(-1, array.itemsize).T.tobytes(), compression)
+
+    empty = packed(np.zeros(chunks, array.dtype))
 
     def pack(start: tuple[int, ...]) -> bytes:
         part = array[tuple(slice(first, first + size) for first, size in zip(start, chunks, strict=True))]
-        if not part.any():
-            return empty
-        beyond = [(0, size - side) for size, side in zip(chunks, part.shape, strict=True)]  # at the edges
-        return _packed(np.pad(part, beyond), compression)
+        return packed(part) if part.any() else empty
 
     starts = itertools.product(*(range(0, size, step) for size, step in zip(array.shape, chunks, strict=True)))
     threads = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, _THREADS)
@@ -579,23 +539,3 @@ def write_packed(file: Any, name: str, array: NDArray[Any], *, chunks: Sequence[
             for start, data in zip(some, pool.map(pack, some), strict=True):
                 made.id.write_direct_chunk(start, data)
     return made
-
-
-def _packed(part: NDArray[Any], compression: int) -> bytes:
-    """A chunk after the three filters."""
-    numbers = np.ascontiguousarray(part)
-    shuffled = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, part.dtype.itemsize).T)
-    data = zlib.compress(shuffled.data, compression)
-    return data + _fletcher32(data).to_bytes(4, "little")
-
-
-def _fletcher32(data: bytes) -> int:
-    """HDF5's checksum: Fletcher's with words of 16 bits, the high byte first, and sums from 1 to 65535 (0: all zero).
-
-    Source: `H5_checksum_fletcher32` of HDF5, whose sums are those modulo 65535.
-    """
-    words = np.frombuffer(data + b"\0" * (len(data) % 2), ">u2").astype(np.uint64)
-    weights = np.arange(len(words), 0, -1, dtype=np.uint64)  # times word, up to 2^20 words: below 2^56
-    sums = int(words.sum()), int((words * weights % np.uint64(65535)).sum())
-    low, high = ((total - 1) % 65535 + 1 if total else 0 for total in sums)
-    return (high << 16) | low

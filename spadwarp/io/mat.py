@@ -1,4 +1,4 @@
-"""MATLAB files, versions 4 to 7.3: arrays, sparse matrices and cells of numbers.
+"""MATLAB files, versions 5 and 7.3: arrays, sparse matrices and cells of numbers.
 
 SciPy's reader follows types and sizes of a damaged file into memory that is not its own; here they are compared with
 the file first, and what remains is a view of its bytes. Layout: MATLAB, "MAT-File Format" (R2023a).
@@ -12,7 +12,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -20,8 +20,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import FileError, SpadwarpError
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5
+from spadwarp.values import FileError, SpadwarpError
 
 __all__ = ["SparseMatrix", "Variable", "open_mat"]
 
@@ -29,7 +29,6 @@ _MATRIX, _COMPRESSED = 14, 15
 _CELL, _SPARSE = 1, 5
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-_OLD_KINDS = ("f8", "f4", "i4", "i2", "u2", "u1")
 _COMPLEX, _LOGICAL = 0x0800, 0x0200
 _HEAD = 1 << 16  # bytes of a compressed array that hold its name and shape
 
@@ -45,13 +44,8 @@ class SparseMatrix(NamedTuple):
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable whose numbers are not yet read.
-
-    Attributes:
-        kind: "dense", "sparse" or "cell".
-        shape: As MATLAB shows it.
-        read: The array; a `SparseMatrix`; or for cells an object array of arrays, one dimension each.
-    """
+    """A variable whose numbers are not yet read, of a shape as MATLAB shows it; `read` gives the array, a
+    `SparseMatrix`, or for cells an object array of arrays, one dimension each."""
 
     kind: Literal["dense", "sparse", "cell"]
     shape: tuple[int, ...]
@@ -72,7 +66,7 @@ def open_mat(path: Path) -> Iterator[dict[str, Variable]]:
                 yield dict(_version_7(file))
         else:
             with open(path, "rb") as source, mmap.mmap(source.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                yield dict(_version_4(content) if 0 in content[:4] else _version_5(content))
+                yield dict(_version_5(content))
     except (SpadwarpError, MemoryError):
         raise
     except (OSError, ValueError, TypeError, LookupError, struct.error, zlib.error, OverflowError) as error:
@@ -98,21 +92,17 @@ def _version_7(file: Hdf5File) -> Iterator[tuple[str, Variable]]:
     arrays = {name: array for name, array in file.arrays().items() if not name.startswith("#")}
     for name, (shape, dtype) in arrays.items():
         if "/" not in name and file.attribute("MATLAB_class", b"", of=name) == b"cell":
-            yield name, Variable("cell", shape[::-1], partial(_cells_7, file, name, shape))
+            yield name, Variable("cell", shape[::-1], partial(_transposed, shape, file.referenced, name))
         elif "/" not in name and dtype.kind in "biuf":
-            yield name, Variable("dense", shape[::-1], partial(_dense_7, file, name, dtype, shape))
+            yield name, Variable("dense", shape[::-1], partial(_transposed, shape, file.array, name, dtype, shape))
         elif name.endswith("/jc") and {f"{name[:-2]}ir", f"{name[:-2]}data"} <= arrays.keys():
             sides = (int(file.attribute("MATLAB_sparse", of=name[:-3])), shape[0] - 1)
             parts = {part: arrays[name[:-2] + part] for part in ("ir", "jc", "data")}
             yield name[:-3], Variable("sparse", sides, partial(_sparse_7, file, name[:-2], sides, parts))
 
 
-def _cells_7(file: Hdf5File, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
-    return file.referenced(name).reshape(shape).T
-
-
-def _dense_7(file: Hdf5File, name: str, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
-    return file.array(name, dtype, shape).T
+def _transposed(shape: tuple[int, ...], read: Callable[..., NDArray[Any]], *arguments: Any) -> NDArray[Any]:
+    return read(*arguments).reshape(shape).T
 
 
 def _sparse_7(file: Hdf5File, group: str, shape: tuple[int, int], parts: Mapping[str, Any]) -> SparseMatrix:
@@ -120,12 +110,9 @@ def _sparse_7(file: Hdf5File, group: str, shape: tuple[int, int], parts: Mapping
     return _sparse(shape, row, start.astype(np.int64), value)
 
 
-# Version 5
-
-
 def _version_5(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
     if content[126:128] not in (b"IM", b"MI"):
-        raise ValueError("not a file of MATLAB")
+        raise ValueError("not a file of MATLAB 5 or later")
     order = "<" if content[126:128] == b"IM" else ">"
     place = 128
     while place + 8 <= len(content):
@@ -153,11 +140,10 @@ def _compressed(packed: bytes, order: str) -> tuple[str, Variable] | None:
         return None
 
     def read() -> Any:
-        whole = _matrix(zlib.decompressobj().decompress(packed, 8 + size)[8:], order, size)
-        assert whole is not None
+        whole: Any = _matrix(zlib.decompressobj().decompress(packed, 8 + size)[8:], order, size)
         return whole[1].read()
 
-    return variable[0], Variable(variable[1].kind, variable[1].shape, read)
+    return variable[0], replace(variable[1], read=read)
 
 
 def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | None:
@@ -178,13 +164,13 @@ def _matrix(content: bytes, order: str, size: int) -> tuple[str, Variable] | Non
         raise ValueError(f"array {name!r} of shape {sides} is not in {size} bytes")
     if class_ == _CELL:
         return name, Variable("cell", sides, partial(_cells_5, content, place, order, sides))
-    kind = "?" if int(flags) & _LOGICAL else _CLASSES[class_]
-    return name, Variable("dense", sides, partial(_dense_5, content, place, order, sides, kind))
 
+    def dense() -> NDArray[Any]:
+        values, _ = _field(content, place, order, _STORED, math.prod(sides))
+        kind = "?" if int(flags) & _LOGICAL else _CLASSES[class_]
+        return values.astype(kind).reshape(sides, order="F")
 
-def _dense_5(content: bytes, place: int, order: str, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
-    values, _ = _field(content, place, order, _STORED, math.prod(shape))
-    return values.astype(kind).reshape(shape, order="F")
+    return name, Variable("dense", sides, dense)
 
 
 def _sparse_5(content: bytes, place: int, order: str, shape: tuple[int, ...]) -> SparseMatrix:
@@ -220,29 +206,3 @@ def _field(
     if size % dtype.itemsize or count not in (None, size // dtype.itemsize):
         raise ValueError(f"{size} bytes of {dtype} where {count} numbers are needed")
     return np.frombuffer(content, dtype, size // dtype.itemsize, start), following
-
-
-# Version 4
-
-
-def _version_4(content: mmap.mmap) -> Iterator[tuple[str, Variable]]:
-    order = "<" if struct.unpack_from("<i", content)[0] < 5000 else ">"
-    place = 0
-    while place < len(content):
-        code, rows, columns, imaginary, letters = struct.unpack_from(order + "5i", content, place)
-        kind, type_ = code // 10 % 10, code % 10
-        if min(code, rows, columns) < 0 or kind >= len(_OLD_KINDS) or not 1 <= letters <= 1000:
-            raise ValueError(f"no array of MATLAB at byte {place}")
-        dtype = np.dtype(order + _OLD_KINDS[kind])
-        start = place + 20 + letters
-        place = start + rows * columns * dtype.itemsize * (2 if imaginary else 1)
-        if place > len(content):
-            raise ValueError(f"cut: {place - len(content)} bytes are missing")
-        name = content[start - letters : start].rstrip(b"\0").decode("latin-1")
-        if type_ == 0 and not imaginary:
-            sides = (rows, columns)
-            yield name, Variable("dense", sides, partial(_dense_4, content, start, place, dtype, sides))
-
-
-def _dense_4(content: mmap.mmap, start: int, stop: int, dtype: np.dtype[Any], shape: tuple[int, int]) -> NDArray[Any]:
-    return np.frombuffer(content[start:stop], dtype).reshape(shape, order="F")

@@ -15,8 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from spadwarp.errors import FileError, SpadwarpError
-from spadwarp.limits import suggestion
+from spadwarp.values import FileError, SpadwarpError, suggestion
 
 __all__ = ["MESH_ENDINGS", "atomic_path", "check_apart", "example_or_path", "examples", "existing_file", "file_problem"]
 __all__ += ["file_within", "is_stream", "lock", "remove_temporaries", "similar", "used"]
@@ -33,20 +32,14 @@ _PAUSE = 0.1  # seconds between two attempts to obtain a lock
 
 
 def examples(kind: str) -> dict[str, Path]:
-    """Files of a kind, "scenes", "datasets" or "training", by name.
-
-    In a checkout those of `configs/`, else the copies in the package.
-    """
+    """Files of one of `KINDS` by name: in a checkout those of `configs/`, else the copies in the package."""
     package = Path(__file__).parents[1]
     folder = next((place for place in (package / "configs", package.parent / "configs") if place.is_dir()), package)
     return {path.stem: path for path in sorted((folder / kind).glob("*.toml"))}
 
 
 def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
-    """A path as it is; but a bare name for which there is no file is that of an example.
-
-    Raises `FileError` for a bare name that is neither.
-    """
+    """A path as it is; a bare name for which there is no file is that of an example. Raises `FileError` for neither."""
     place = Path(path)
     if place.suffix or place.name != str(path) or os.path.exists(place):
         return place
@@ -60,8 +53,7 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
 
 
 def similar(path: str | os.PathLike[str]) -> str:
-    """Addition to an error about a missing file: `; did you mean 'planned.toml'?`, if one of that ending is beside
-    it."""
+    """Addition to an error about a missing file, `; did you mean 'planned.toml'?`: one of that ending beside it."""
     place = Path(path)
     try:
         beside = [name for name in os.listdir(place.parent) if name.endswith(place.suffix)]
@@ -145,7 +137,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     if not target.name:
         raise FileError(f"{target}: is no name of a file")
     try:
-        with _stream(target) if is_stream(target) else _beside(target) as temporary:
+        with (_stream if is_stream(target) else _beside)(target) as temporary:
             yield temporary
     except SpadwarpError:
         raise
@@ -197,14 +189,9 @@ def _prefix(target: Path) -> str:
 def lock(path: str | Path, *, wait: Callable[[], bool] = lambda: False) -> Iterator[bool]:
     """Holds a lock between processes that share a file system for the length of a block; yields whether it did so.
 
-    The system releases the lock of a process that ends, however it ends: none is left behind.
-
-    Args:
-        path: The lock's file, removed at the end.
-        wait: Asked again and again, while another process holds the lock, whether to wait for it.
-
-    Raises:
-        FileError: The file cannot be made.
+    The system releases the lock of a process that ends, however it ends: none is left behind. The lock's file is
+    removed at the end. `wait` is asked again and again, while another process holds the lock, whether to wait for it.
+    Raises `FileError`: the file cannot be made.
     """
     from filelock import FileLock, Timeout
 

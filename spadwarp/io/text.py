@@ -11,16 +11,15 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.paths import atomic_path, similar, used
-from spadwarp.limits import Interval, parse_number, shown
-from spadwarp.units import UNITS
+from spadwarp.values import UNITS, ConfigError, FileError, Interval, parse_number, shown
 
 __all__ = ["json_text", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml", "write_csv", "write_json"]
 __all__ += ["write_text"]
@@ -138,19 +137,18 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
         for cells in lines:
             if not cells or cells[0].lstrip().startswith("#"):
                 continue
-            try:
+            row: list[float] = []
+            with suppress(ValueError):
                 row = [parse_number(cell) for cell, _ in zip(cells, columns, strict=False)]
-            except ValueError:
-                row = []
-            if len(row) < len(columns):
-                if rows or named:
-                    raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
+            if len(row) == len(columns):
+                for value, (name, within) in zip(row, columns.items(), strict=True):
+                    if value not in Interval.read(within):
+                        raise ValueError(f"{name} = {value:g} is outside {within}")
+                rows.append(row)
+            elif rows or named:
+                raise ValueError(f"{shown(','.join(cells))} is not {','.join(columns)} in finite numbers")
+            else:
                 named = True
-                continue
-            for value, (name, within) in zip(row, columns.items(), strict=True):
-                if value not in Interval.read(within):
-                    raise ValueError(f"{name} = {value:g} is outside {within}")
-            rows.append(row)
     except (ValueError, csv.Error) as error:  # the latter: a cell of more than 131 072 characters
         raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
     return np.array(rows, np.float64).reshape(-1, len(columns))

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import MeshError
+from spadwarp.values import MeshError
 
 if TYPE_CHECKING:
     import trimesh
-
 
 _JSON_CHUNK = 0x4E4F534A
 
@@ -160,9 +159,8 @@ def _parts(path: Path, ending: str, name: str) -> Iterator[tuple[trimesh.Trimesh
     from trimesh.resolvers import FilePathResolver
 
     if ending not in ("ply", "obj", "glb", "off"):
-        raise MeshError(
-            f"{name}: reflectance = 'from_file' cannot be combined with {path.suffix or 'this file'}; {_KNOWN}"
-        )
+        given = path.suffix or "this file"
+        raise MeshError(f"{name}: reflectance = 'from_file' cannot be combined with {given}; {_KNOWN}")
     if ending == "obj":
         _check_materials(path, name)
     check_sizes(path, name)
@@ -192,9 +190,8 @@ def _parts(path: Path, ending: str, name: str) -> Iterator[tuple[trimesh.Trimesh
         check_triangles(mesh, name)
         colours = mesh.face_attributes.get("colour")
         if colours is not None and len(colours) != len(mesh.faces):
-            raise MeshError(
-                f"{name}: {len(colours)} colours of faces for {len(mesh.faces)} triangles; triangulate the file"
-            )
+            number = len(mesh.faces)
+            raise MeshError(f"{name}: {len(colours)} colours of faces for {number} triangles; triangulate the file")
         yield mesh, np.asarray(where, dtype=np.float64)
 
 
@@ -208,30 +205,31 @@ def _check_materials(path: Path, name: str) -> None:
             if not materials.is_file():
                 raise MeshError(f"{name}: its material file {os.fspath(materials)!r} is missing")
             for entry in materials.read_text(errors="replace").splitlines():
-                _check_material_line(entry.strip(), materials, name)
+                if problem := _material_problem(entry.strip(), materials.parent):
+                    raise MeshError(f"{name}: {materials.name} {problem}")
 
 
-def _check_material_line(entry: str, materials: Path, name: str) -> None:
-    """Refuses what makes trimesh pass over a material, or over its image."""
+def _material_problem(entry: str, folder: Path) -> str:
+    """What makes trimesh pass over a material, or over its image, or nothing."""
     import PIL.Image
 
     words = entry.split()
-    match words[0].lower() if words else None:
-        case "kd":
-            try:
-                colour = [float(word) for word in words[1:]]
-            except ValueError:
-                colour = []
-            if len(colour) != 3:
-                raise MeshError(f"{name}: {materials.name} has {entry[:80]!r}, which is not red, green and blue")
-        case "map_kd":
-            image = materials.parent / entry[len("map_kd") :].strip()
-            if not image.is_file():
-                raise MeshError(f"{name}: {materials.name} names an image that is missing: {entry!r}")
-            try:
-                PIL.Image.open(image).close()
-            except Exception as error:  # what Pillow raises depends on the format
-                raise MeshError(f"{name}: {materials.name} names {entry!r}, which is no image: {error}") from error
+    key = words[0].lower() if words else ""
+    if key == "kd":
+        try:
+            whole = len([float(word) for word in words[1:]]) == 3
+        except ValueError:
+            whole = False
+        return "" if whole else f"has {entry[:80]!r}, which is not red, green and blue"
+    if key == "map_kd":
+        image = folder / entry[len(key) :].strip()
+        if not image.is_file():
+            return f"names an image that is missing: {entry!r}"
+        try:
+            PIL.Image.open(image).close()
+        except Exception as error:  # what Pillow raises depends on the format
+            return f"names {entry!r}, which is no image: {error}"
+    return ""
 
 
 def _read_off(text: str) -> dict[str, Any]:
@@ -273,9 +271,8 @@ def _as_fraction(colours: NDArray[Any], name: str) -> Array:
     values = colours.astype(np.float64)
     if colours.dtype.kind in "iu":
         values /= np.iinfo(colours.dtype).max
-    if not ((values >= 0.0) & (values <= 1.0)).all():
-        wrong = values[~((values >= 0.0) & (values <= 1.0))].flat[0]
-        raise MeshError(f"{name}: a colour component of {wrong:g} is outside [0, 1]")
+    if (wrong := values[~((values >= 0.0) & (values <= 1.0))]).size:
+        raise MeshError(f"{name}: a colour component of {wrong.flat[0]:g} is outside [0, 1]")
     return values
 
 
@@ -310,7 +307,6 @@ def _what_it_has(visual: Any) -> str:
 
 # OpenUSD
 
-
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 
 _MOST_FACES = 1 << 27
@@ -323,14 +319,8 @@ def read_usd(path: Path, name: str) -> trimesh.Trimesh:
     """All visible meshes and simple shapes of a USD stage at its first time as one mesh [m], in the stage's own axes.
 
     Transforms of the prims, instances, point instancers and `metersPerUnit` are applied; polygons are divided into
-    triangles. Layers and payloads that the file refers to are read, too.
-
-    Args:
-        path: Ends in one of `USD_ENDINGS`.
-        name: How errors name the target.
-
-    Raises:
-        MeshError: No readable stage, nothing to see in it, or usd-core is not installed.
+    triangles. Layers and payloads that the file refers to are read, too. `name`: how errors name the target.
+    Raises `MeshError` where there is no readable stage, nothing to see in it, or usd-core is not installed.
     """
     import trimesh
 
@@ -362,9 +352,8 @@ def _usd_parts(root: Any, cache: Any, time: Any, within: Any = None) -> Iterator
     prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
     for prim in prims:
         shape = UsdGeom.Imageable(prim)
-        if shape and (
-            shape.ComputeVisibility(time) == UsdGeom.Tokens.invisible or shape.ComputePurpose() not in _PURPOSES
-        ):
+        hidden = shape and shape.ComputeVisibility(time) == UsdGeom.Tokens.invisible
+        if hidden or (shape and shape.ComputePurpose() not in _PURPOSES):
             prims.PruneChildren()
             continue
         world = cache.GetLocalToWorldTransform

@@ -32,9 +32,8 @@ def box(size: Point, at: Point = (0, 0, 0), *, rounding: float = 0.0) -> Manifol
     """Box with side lengths `size` centred at `at`, its edges and corners rounded with radius `rounding`."""
     if rounding == 0.0:
         return Manifold.cube(size, center=True).translate(at)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (
-        np.asarray(size) / 2 - rounding
-    )
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = signs * (np.asarray(size) / 2 - rounding)
     return Manifold.batch_hull([ball(rounding, corner, segments=24) for corner in corners]).translate(at)
 
 

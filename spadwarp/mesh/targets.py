@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError, MeshError
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
-from spadwarp.limits import suggestion
 from spadwarp.mesh.files import USD_ENDINGS, Images, Pattern, check_sizes, check_triangles, read_coloured_mesh, read_usd
 from spadwarp.scene import Scene, Target
 from spadwarp.scene.camera import to_camera
@@ -24,25 +22,17 @@ from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sight import points_inside, view_planes
+from spadwarp.values import ArgumentError, ConfigError, MeshError, suggestion
 
-__all__ = [
-    "BUILTINS",
-    "SIZED_BUILTINS",
-    "MeshSummary",
-    "TriangleMesh",
-    "build_mesh",
-    "builtin_names",
-    "describe_mesh",
-    "focus_distance",
-    "guess_unit",
-    "load_target",
-    "make_builtin",
-]
+__all__ = ["BUILTINS", "SIZED_BUILTINS", "MeshSummary", "TriangleMesh", "build_mesh", "builtin_names", "describe_mesh"]
+__all__ += ["focus_distance", "guess_unit", "load_target", "make_builtin"]
 
 if TYPE_CHECKING:
     import trimesh
 
 
+BUILTINS = ("staircase", "plane", "box", "sphere")
+"""The geometric built-ins."""
 SIZED_BUILTINS = ("plane", "box", "sphere")
 """Built-ins of 1 m that `size` stretches; the others have sizes of their own."""
 
@@ -66,11 +56,21 @@ def make_builtin(name: str) -> trimesh.Trimesh:
 
 @cache
 def _built(name: str) -> trimesh.Trimesh:
-    if name in BUILTINS:
-        return BUILTINS[name]()
+    import trimesh
+
     from spadwarp.mesh.shapes import SHAPES
     from spadwarp.mesh.solids import to_trimesh
 
+    match name:
+        case "staircase":
+            return _staircase()
+        case "plane":  # at z = 0, facing −z
+            corners = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
+            return trimesh.Trimesh(corners, [(0, 2, 1), (0, 3, 2)], process=False)
+        case "box":
+            return trimesh.creation.box(extents=(1.0, 1.0, 1.0))
+        case "sphere":  # 1280 triangles with their corners on it
+            return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     return to_trimesh(SHAPES[name]())
 
 
@@ -81,51 +81,16 @@ def _staircase() -> trimesh.Trimesh:
     bars, the lowest ending at mid-height. Lower right quarter: three vertical bars. Where the bars leave 3 cm of a half
     free, the strip is at the middle of the plate, as in the depth maps that the paper's authors published.
     """
+    import trimesh
+
     plate = ((-2.0, -2.0, 0.0), (2.0, 2.0, 0.1))
     left = [((x, -2.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((-2.0, 0.6), (-1.33, 0.5), (-0.66, 0.4))]
     upper = [((0.0, y, -proud), (2.0, y + 0.6, 0.1)) for y, proud in ((-2.0, 0.3), (-1.3, 0.2), (-0.6, 0.1))]
     lower = [((x, 0.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((0.03, 0.3), (0.7, 0.2), (1.37, 0.1))]
-    return _union([plate, *left, *upper, *lower])
-
-
-def _union(boxes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> trimesh.Trimesh:
-    """One closed mesh of axis-aligned boxes, each given by its lowest and its highest corner."""
-    import trimesh
-
-    mesh = trimesh.boolean.union([trimesh.creation.box(bounds=bounds) for bounds in boxes], engine="manifold")
+    boxes = [trimesh.creation.box(bounds=bounds) for bounds in (plate, *left, *upper, *lower)]
+    mesh = trimesh.boolean.union(boxes, engine="manifold")
     mesh.vertices = np.round(mesh.vertices, 6)  # the union came back in float32
     return mesh
-
-
-def _plane() -> trimesh.Trimesh:
-    """A square of side 1 m at z = 0 that faces −z, two triangles."""
-    import trimesh
-
-    corners = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
-    return trimesh.Trimesh(corners, [(0, 2, 1), (0, 3, 2)], process=False)
-
-
-def _box() -> trimesh.Trimesh:
-    """A cube of side 1 m about the origin, twelve triangles."""
-    import trimesh
-
-    return trimesh.creation.box(extents=(1.0, 1.0, 1.0))
-
-
-def _sphere() -> trimesh.Trimesh:
-    """A ball of diameter 1 m about the origin: an icosahedron subdivided three times, 1280 triangles, corners on it."""
-    import trimesh
-
-    return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-
-
-BUILTINS: dict[str, Callable[[], trimesh.Trimesh]] = {
-    "staircase": _staircase,
-    "plane": _plane,
-    "box": _box,
-    "sphere": _sphere,
-}
-"""The geometric built-ins: functions without arguments that make a new mesh in its own frame [m]."""
 
 
 # What trimesh says about a damaged file, with a stack, is for those who have set up logging; an error says the rest.
@@ -255,17 +220,11 @@ def _join(patterns: Sequence[Pattern]) -> Pattern | None:
 
 
 def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
-    """One target as a mesh in the world [m].
+    """One target as a mesh in the world [m]; `field`: how errors and warnings name it, if empty by its file.
 
     In this order: subdivided, stretched by `size` and `scale`, rotated, translated. `rotation_deg` (x, y, z) rotates it
     about its own axes, first x, then the new y, then the new z (intrinsic; R = Rx·Ry·Rz). A mesh file's axes are taken
-    as they are.
-
-    Faces that have no area in float32 are dropped, those of a mesh file with a warning that counts them.
-
-    Args:
-        target: What and where.
-        field: How errors and warnings name the target; if empty, they name its file.
+    as they are. Faces that have no area in float32 are dropped, those of a mesh file with a warning that counts them.
 
     Raises:
         ConfigError: An unknown built-in, or a size for one that has its own.
@@ -391,8 +350,8 @@ class MeshSummary:
 
     path: Path
     faces: int
-    extent: tuple[float, float, float]
-    centre: tuple[float, float, float]
+    extent: tuple[float, ...]
+    centre: tuple[float, ...]
     unit: str | None
     scale: float
     longest: float
@@ -424,42 +383,36 @@ class MeshSummary:
 
 def describe_mesh(path: str | Path) -> MeshSummary:
     """Size, unit, orientation and closedness of a mesh file (STL, OBJ, PLY, OFF, GLB, USD). Raises `MeshError`."""
+    import trimesh
+
     mesh = load_target(Target(mesh=str(path)), field="")
     low, high = np.asarray(mesh.bounds, np.float64)
     extent, centre = high - low, 0.5 * (low + high)
-    guess = guess_unit(float(extent.max()))
-    closed = bool(mesh.is_watertight)
+    unit, scale = guess_unit(float(extent.max())) or (None, 1.0)
+    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     return MeshSummary(
         path=Path(path),
         faces=len(mesh.faces),
-        extent=(float(extent[0]), float(extent[1]), float(extent[2])),
-        centre=(float(centre[0]), float(centre[1]), float(centre[2])),
-        unit=None if guess is None else guess[0],
-        scale=1.0 if guess is None else guess[1],
-        longest=float(extent.max()) * (1.0 if guess is None else guess[1]),
-        is_watertight=closed,
-        is_inside_out=closed and float(mesh.volume) < 0.0,
-        bodies=_bodies(mesh),
+        extent=tuple(extent.tolist()),
+        centre=tuple(centre.tolist()),
+        unit=unit,
+        scale=scale,
+        longest=float(extent.max()) * scale,
+        is_watertight=bool(mesh.is_watertight),
+        is_inside_out=bool(mesh.is_watertight and mesh.volume < 0.0),
+        bodies=int(labels.max(initial=-1)) + 1,
     )
 
 
 def guess_unit(longest: float) -> tuple[str, float] | None:
     """Name and metres of the likeliest unit of a mesh whose longest side is `longest`; None if none fits."""
-    fitting = [(name, metres) for name, metres in _UNITS.items() if _SIDES[0] <= longest * metres <= _SIDES[1]]
-    return fitting[0] if fitting else None
-
-
-def _bodies(mesh: trimesh.Trimesh) -> int:
-    import trimesh
-
-    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
-    return int(labels.max()) + 1 if len(labels) else 0
+    fitting = ((name, metres) for name, metres in _UNITS.items() if _SIDES[0] <= longest * metres <= _SIDES[1])
+    return next(fitting, None)
 
 
 # Focus
 
-# Stands for infinity behind a port [m].
-_FAR = 1e6
+_FAR = 1e6  # stands for infinity behind a port [m]
 
 
 def focus_distance(scene: Scene, mesh: TriangleMesh | None) -> float | None:
@@ -468,11 +421,7 @@ def focus_distance(scene: Scene, mesh: TriangleMesh | None) -> float | None:
     `camera.focus_distance`, or for "target" the depth of the first face on the optical axis; without one there, that of
     the point in view which is seen closest to the axis; without any, infinity. Nothing nearer than the focal length and
     the aperture's radius counts: no lens can be focused there. Behind a port, it is the depth in air at which the lens
-    sees that point: 0.75 of it behind a flat one, some radii behind a dome.
-
-    Args:
-        scene: Whose camera.
-        mesh: From `spadwarp.mesh.build_mesh`.
+    sees that point: 0.75 of it behind a flat one, some radii behind a dome. `mesh`: from `build_mesh`.
     """
     camera, port = scene.camera, camera_port(scene)
     if camera.pinhole:
@@ -493,8 +442,7 @@ def _apparent_distance(scene: Scene, port: PortGeometry, mesh: TriangleMesh | No
     start, axis, _, _ = port.enter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     depth = None
     if mesh is not None:
-        frame = np.linalg.svd(axis[None])[2]
-        frame = np.stack([frame[1], frame[2], axis])
+        frame = np.stack([*np.linalg.svd(axis[None])[2][1:], axis])
         triangles = (mesh.vertices[mesh.faces].astype(np.float64) - start) @ frame.T
         depth = _first_depth(triangles, lambda: triangles.reshape(-1, 3), 0.0)
     return port.apparent_distance(start + (depth or _FAR) * axis)

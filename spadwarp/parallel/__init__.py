@@ -2,10 +2,9 @@
 
 from typing import TYPE_CHECKING
 
-from spadwarp.parallel import forked, jobs, worker
-from spadwarp.parallel.forked import *
+from spadwarp.parallel import jobs, worker
 from spadwarp.parallel.jobs import *
 from spadwarp.parallel.worker import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = forked.__all__ + jobs.__all__ + worker.__all__
+    __all__ = jobs.__all__ + worker.__all__

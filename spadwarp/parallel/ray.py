@@ -11,28 +11,21 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from spadwarp.device import core_count, physical_memory, pick_device, processor_name
-from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.parallel.worker import Event, Ray, Worker
+from spadwarp.values import ConfigError, DeviceError
 
-Job = TypeVar("Job")
-Value = TypeVar("Value")
-Note = Callable[[str], None]
+__all__ = ["RayWorkers"]
 
-__all__ = ["RayWorker", "RayWorkers", "run_on_ray"]
+RETRIES = 3
+"""How often a job whose worker was lost runs again; a job that loses more is likely what kills them."""
 
-# How often a job whose worker was lost runs again; a job that loses more is likely what kills them.
-_RETRIES = 3
-
-# Seconds without any worker after which a remark says so.
-_PATIENCE = 30.0
-
-_MIB = 1 << 20
+_PATIENCE = 30.0  # seconds without any worker after which a remark says so
 
 
 class _Actor:
@@ -42,15 +35,13 @@ class _Actor:
         self._cuda, self._threads = cuda, threads
 
     def join(self, prepare: Callable[[Worker], None] | None) -> dict[str, Any]:
-        device, name = "cpu", processor_name()
-        if self._cuda:
-            # Ray shows a process no GPU but its own.
-            cuda = pick_device("cuda:0")
-            device, name = cuda.alias, processor_name(cuda)
+        cuda = pick_device("cuda:0") if self._cuda else None  # Ray shows a process no GPU but its own
+        device = "cpu" if cuda is None else cuda.alias
         self._worker = Worker(device, None if self._cuda else self._threads)
         if prepare is not None:
             prepare(self._worker)
-        return {"host": socket.gethostname(), "pid": os.getpid(), "device": device, "device_name": name}
+        found = {"host": socket.gethostname(), "pid": os.getpid()}
+        return {**found, "device": device, "device_name": processor_name(cuda)}
 
     def run(self, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         return work(*arguments, self._worker)
@@ -88,15 +79,15 @@ class RayWorkers:
         *,
         prepare: Callable[[Worker], None] | None = None,
         value_bytes: int = 0,
-        note: Note | None = None,
+        note: Callable[[str], None] | None = None,
     ) -> None:
         if device not in (None, "cpu", "cuda", "cuda:all"):
-            text = "cannot be combined with Ray, which gives each worker its GPU: cpu or cuda"
-            raise ConfigError(f"device = {device!r} {text}")
+            raise ConfigError(f"device = {device!r} cannot be combined with Ray, which gives each worker its GPU")
         self._engine, self._device, self._prepare = engine, device, prepare
         self._value_bytes, self._note = value_bytes, note or (lambda text: None)
         self._pending: dict[Any, tuple[Literal["joined", "returned"], RayWorker]] = {}
         self.workers: list[RayWorker] = []
+        self.joined: list[dict[str, Any]] = []
         self._losses = 0  # since something was returned
         self._patience = math.inf
 
@@ -148,17 +139,10 @@ class RayWorkers:
         share = next(k for k in range(int(max(cores)), 0, -1) if k == 1 or sum(n // k for n in cores) >= count)
         return {"num_cpus": int(share)}, count
 
-    def _resources(self) -> str:
-        found = self._ray.cluster_resources()
-        return ", ".join(f"{found.get(name, 0):g} {name}" for name in ("CPU", "GPU"))
-
     def _start_worker(self) -> None:
-        ray = self._ray
-        actor = (
-            ray.remote(_Actor)
-            .options(max_concurrency=2, max_restarts=0, scheduling_strategy="SPREAD", **self._options)
-            .remote(self.cuda, self._options["num_cpus"])
-        )
+        options = {"max_concurrency": 2, "max_restarts": 0, "scheduling_strategy": "SPREAD", **self._options}
+        kind: Any = self._ray.remote(_Actor)
+        actor = kind.options(**options).remote(self.cuda, self._options["num_cpus"])
         worker = RayWorker(actor)
         self.workers.append(worker)
         self._pending[actor.join.remote(self._prepare)] = "joined", worker
@@ -177,7 +161,9 @@ class RayWorkers:
         """Events, waiting for `timeout` seconds at most: a worker "joined", "returned" a value, or was "lost" with what
         it was doing. Raises what a worker raised."""
         if self._patience < time.monotonic() and all(worker.metadata is None for worker in self.workers):
-            self._note(f"no worker has joined yet; the cluster has {self._resources()}")
+            found = self._ray.cluster_resources()
+            has = ", ".join(f"{found.get(name, 0):g} {name}" for name in ("CPU", "GPU"))
+            self._note(f"no worker has joined yet; the cluster has {has}")
             self._patience = math.inf
         done, _ = self._ray.wait(list(self._pending), num_returns=1, timeout=timeout)
         return [self._event(reference) for reference in done]
@@ -194,6 +180,7 @@ class RayWorkers:
             return Event("lost", worker)
         if kind == "joined":
             worker.metadata = value
+            self.joined.append(value)
             self._note(f"worker {_description(worker)}")
         else:
             self._losses = 0
@@ -204,7 +191,7 @@ class RayWorkers:
         with contextlib.suppress(Exception):
             self._ray.kill(worker.actor)
         self._losses += 1
-        if self._losses > (_RETRIES + 1) * (len(self.workers) + 1):
+        if self._losses > (RETRIES + 1) * (len(self.workers) + 1):
             raise DeviceError(f"Ray lost {self._losses} workers in a row: {_first_line(error)}") from error
         self._note(f"lost the worker {_description(worker)}; a new one is started")
         self._start_worker()
@@ -214,45 +201,6 @@ class RayWorkers:
         for worker in self.workers:
             if worker.metadata is not None:
                 worker.actor.stop.remote()
-
-
-def run_on_ray(
-    work: Callable[[Job, Worker], Value],
-    jobs: Iterable[Job],
-    *,
-    engine: Ray,
-    device: str | None,
-    stopped: threading.Event,
-    note: Note | None,
-) -> Iterator[tuple[Job, Value]]:
-    """`run_jobs` on Ray. A job whose worker was lost is run again."""
-    queue, again = iter(jobs), list[tuple[Job, int]]()
-    running: dict[RayWorker, tuple[Job, int]] = {}
-    stop_sent = False
-    with RayWorkers(engine, device, note=note) as workers:
-        while True:
-            for worker in workers.idle if not stopped.is_set() else ():
-                try:
-                    job, retries = again.pop() if again else (next(queue), _RETRIES)
-                except StopIteration:
-                    break
-                running[worker] = job, retries
-                workers.send(worker, work, job)
-            if stopped.is_set() and not stop_sent:
-                workers.stop()
-                stop_sent = True
-            if not running and (stopped.is_set() or workers.idle):
-                return
-            for event in workers.wait(0.2):
-                if event.worker not in running:  # it has joined, or was lost before
-                    continue
-                job, retries = running.pop(event.worker)
-                if event.kind == "returned":
-                    yield job, event.value
-                elif retries:
-                    again.append((job, retries - 1))
-                else:
-                    raise DeviceError(f"a job is given up: {_RETRIES + 1} workers were lost while they ran it")
 
 
 def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
@@ -265,7 +213,7 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
     if address is None:
         _require_token()
         # For a value of each worker and what is being written; a third of the memory is Ray's own default.
-        reserve = max(256 * _MIB, int(1.25 * value_bytes * ((engine.workers or 8) + 2)))
+        reserve = max(256 << 20, int(1.25 * value_bytes * ((engine.workers or 8) + 2)))
         reserve = min(reserve, (physical_memory() or 3 * reserve) // 3)
         options = {
             "address": "local",
@@ -303,9 +251,8 @@ def _require_token() -> None:
 
 
 def _description(worker: RayWorker) -> str:
-    if worker.metadata is None:
-        return "that had not joined yet"
-    return "{host} {device} ({device_name}), process {pid}".format_map(worker.metadata)
+    text = "that had not joined yet" if worker.metadata is None else "{host} {device} ({device_name}), process {pid}"
+    return text.format_map(worker.metadata or {})
 
 
 def _first_line(error: BaseException) -> str:

@@ -10,8 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_integer, shown
+from spadwarp.values import ArgumentError, check_integer, shown
 
 __all__ = ["Ray", "Worker", "interruptible"]
 
@@ -54,7 +53,7 @@ class Worker:
 
 
 class Event(NamedTuple):
-    """Something that a worker did."""
+    """Something that a worker did; see `RayWorkers.wait`."""
 
     kind: str
     worker: Any

@@ -2,14 +2,13 @@
 
 from typing import TYPE_CHECKING
 
-from spadwarp.result import conversion, file, merging, rendered_truth, result, tallies
+from spadwarp.result import conversion, file, rendered_truth, result, tallies
 from spadwarp.result.conversion import *
 from spadwarp.result.file import *
-from spadwarp.result.merging import *
 from spadwarp.result.rendered_truth import *
 from spadwarp.result.result import *
 from spadwarp.result.tallies import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _modules = (conversion, file, merging, rendered_truth, result, tallies)
+    _modules = (conversion, file, rendered_truth, result, tallies)
     __all__ = [name for module in _modules for name in module.__all__]

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 
-from spadwarp.arrays import is_torch
-from spadwarp.errors import ArgumentError
-from spadwarp.interop import Variable, labelled
-from spadwarp.limits import check_choice
-from spadwarp.result.result import COMPONENTS, Component, Result, Truth
+from spadwarp.arrays import Variable, is_torch, labelled
+from spadwarp.result.result import ARRAYS, COMPONENTS, Component, Result, coordinates_of
+from spadwarp.values import ArgumentError, check_choice
 
 if TYPE_CHECKING:
     import torch
@@ -36,7 +34,7 @@ class TorchTruth(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorchResult:
-    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`.
+    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`. Methods as of `Result`, of float64.
 
     Attributes:
         scene, unit, photons: As in `Result`.
@@ -54,25 +52,23 @@ class TorchResult:
 
     @cached_property
     def histogram(self) -> torch.Tensor:
-        """Expected fraction of emitted photons that arrive in each pixel and bin, float64 `[H, W, T]`."""
-        return self._fraction(self.tallies.sum(dim=0))
+        """`[H, W, T]`."""
+        return self.tallies.sum(dim=0) * self.tally_value[..., None]
 
     def component(self, name: Component) -> torch.Tensor:
-        """One part of the histogram, float64 `[H, W, T]`; see `Result.component`."""
-        return self._fraction(self.tallies[COMPONENTS.index(check_choice("component", name, COMPONENTS))])
+        """`[H, W, T]`."""
+        chosen = COMPONENTS.index(check_choice("component", name, COMPONENTS))
+        return self.tallies[chosen] * self.tally_value[..., None]
 
     @property
     def detections(self) -> torch.Tensor:
-        """Expected detections per pulse, float64 `[H, W, T]`: histogram · photons per pulse · PDE."""
+        """`[H, W, T]`."""
         return self.histogram * (self.scene.laser.photons_per_pulse * self.scene.detections_per_photon)
 
     @property
     def intensity(self) -> torch.Tensor:
-        """Expected fraction of emitted photons that arrive in each pixel within the gate, float64 `[H, W]`."""
+        """`[H, W]`."""
         return self.histogram.sum(dim=-1)
-
-    def _fraction(self, tallies: torch.Tensor) -> torch.Tensor:
-        return tallies.double() * self.tally_value.unsqueeze(-1)
 
 
 @overload
@@ -97,15 +93,13 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
     import torch
 
     if not isinstance(source, Result):
-        return replace(
-            source, **{name: _shared(getattr(source, name)) for name in ("counts", "expected", "background")}
-        )
-    if tallies is None:
-        tallies = _shared(source.tallies)
+        names = ("counts", "expected", "background")
+        return replace(source, **{name: _shared(getattr(source, name)) for name in names})
+    tallies = _shared(source.tallies) if tallies is None else tallies
     shape = source.tallies.shape
     if tallies.dtype != torch.int64 or tallies.numel() != source.tallies.size:
         raise ArgumentError(f"tallies are {tallies.dtype} {tuple(tallies.shape)}; torch.int64 {shape} is needed")
-    maps = {name: _shared(getattr(source.truth, name)).to(tallies.device) for name in Truth.__dataclass_fields__}
+    maps = {name: _shared(array).to(tallies.device) for name, array in vars(source.truth).items()}
     return TorchResult(
         scene=source.scene,
         tallies=tallies.view(shape),
@@ -135,37 +129,28 @@ def to_xarray(result: Result) -> xarray.Dataset:
     Raises:
         FileError: xarray is not installed.
     """
-    image, cube = ("y", "x"), ("component", "y", "x", "time")
-    height, width = result.truth.depth.shape
+    cube = ("component", "y", "x", "time")
     values = np.stack([result.component(name) for name in COMPONENTS])
-    truth = result.truth
     variables: dict[str, Variable] = {
         "histogram": (cube, values, "1", "expected fraction of the emitted photons per pixel and bin"),
         "detections_per_photon": ((), result.scene.detections_per_photon, "1", "detection efficiency with the filter"),
-        "depth": (image, truth.depth, "m", "true planar depth"),
-        "range": (image, truth.range, "m", "true distance along the line of sight"),
-        "normal": ((*image, "axis"), truth.normal, "1", "unit normals towards the camera"),
-        "reflectance": (image, truth.reflectance, "1", "Lambertian reflectance"),
     }
+    for name, array in vars(result.truth).items():
+        variables[name] = (ARRAYS[f"truth/{name}"][1], array, *ARRAYS[f"truth/{name}"][2:])
     if result.second_moment is not None and result.photons >= 2 * result.batch_size:
-        variables["standard_error"] = ((*image, "time"), result.standard_error, "1", "of the histogram of all light")
-    coordinates: dict[str, Variable] = {}
+        variables["standard_error"] = (cube[1:], result.standard_error, "1", "of the histogram of all light")
     if result.derivatives:
         slopes = np.stack([*result.derivatives.values()])
         variables["derivative"] = (("parameter", *cube), slopes, "1", "of the histogram, per unit of the parameter")
-        coordinates["parameter"] = (("parameter",), list(result.derivatives), "1", "by which it is differentiated")
     if result.channels:
         channels = np.stack([*result.channels.values()])
         variables["polarisation"] = (("channel", *cube), channels, "1", "fraction of the emitted photons in a channel")
-        coordinates["channel"] = (("channel",), list(result.channels), "1", "of the receiver of polarised light")
-    coordinates |= {
-        "component": (("component",), list(COMPONENTS), "1", "history of the light"),
-        "time": (("time",), result.bin_centres, "s", "time of flight at the centre of the bin"),
-        "path": (("time",), result.bin_centres * result.pulse_speed, "m", "geometric path, laser to target to lens"),
-        "y": (("y",), np.arange(height), "1", "row of pixels, downwards"),
-        "x": (("x",), np.arange(width), "1", "column of pixels, to the right"),
-        "axis": (("axis",), ["x", "y", "z"], "1", "of the camera frame: right, down, away"),
-    }
+    known = coordinates_of(result)
+    known["channel"] = (list(result.channels), *known["channel"][1:])
+    used = {dimension for dimensions, *_ in variables.values() for dimension in dimensions}
+    coordinates: dict[str, Variable] = {name: ((name,), *known[name]) for name in known if name in used}
+    path = result.bin_centres * result.pulse_speed
+    coordinates["path"] = (("time",), path, "m", "geometric path, laser to target to lens")
     attributes = {
         "photons": result.photons,
         "photons_per_pulse": result.scene.laser.photons_per_pulse,

@@ -1,53 +1,48 @@
-"""A result as one HDF5 file; its depth and truth as EXR."""
+"""A result as one HDF5 file; results added up; depth and truth as EXR."""
 
 from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io.arrays import read_exr, write_exr
-from spadwarp.io.hdf5 import (
-    PIXELS,
-    Coordinate,
-    Hdf5File,
-    image_coordinates,
-    name_dimensions,
-    read_hdf5,
-    write_hdf5,
-    write_packed,
-)
+from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
-from spadwarp.limits import check_integer, shown
-from spadwarp.result.photon_ids import Ranges, joined
-from spadwarp.result.result import COMPONENTS, Result, Truth, physics_of
-from spadwarp.result.tallies import SignedTallies, moments_of
+from spadwarp.result.result import (
+    ARRAYS,
+    COMPONENTS,
+    Result,
+    ResultHead,
+    Truth,
+    arrays_of,
+    coordinates_of,
+    difference,
+    shape_of,
+    signed_of,
+    water_of,
+)
+from spadwarp.result.tallies import Range, SignedTallies, added, joined, moments_of, total_of
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes
+from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, shown
 
-__all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps"]
+__all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps", "merge"]
 __all__ += ["save_depth_exr", "save_result", "save_truth_maps"]
 
 FORMAT = "spadwarp result"
 FORMAT_VERSION = 1
 
 _CHUNK_BYTES = 1 << 20  # HDF5's default chunk cache
-_PHOTONS = f"[1, {2**64 - 1}]"
 _UNITS = "[1e-30, 1e30]"  # photons
-_RECORDS = (
-    "energy_balance",
-    "counters",
-    "batch_moments",
-    "timing",
-    "provenance",
-)  # as JSON: its integers have no limit
-_TRUTH = ("depth", "range", "normal", "reflectance")
+# As JSON: its integers have no limit.
+_RECORDS = ("energy_balance", "counters", "batch_moments", "timing", "provenance")
 _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
     "times laser_photons_per_pulse * detector_pde (with the filter before it) it is the expected detections per pulse. "
@@ -66,6 +61,13 @@ _READ_ME = (
 )
 
 
+_DIMENSIONS = {name: entry[1:] for name, entry in ARRAYS.items()} | {
+    "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
+    "photon_ranges": (("run", "limit"), "1", "ids of the photons"),
+    "requested": (("limit",), "1", "ids of the requested photons"),
+}
+
+
 def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Path:
     """Writes a result to one HDF5 file from which `load_result` makes an equal one; returns its path.
 
@@ -80,87 +82,36 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     compression = check_integer("compression", compression, "[1, 9]")
     _, height, width, bins = result.tallies.shape
     columns = max(1, min(width, _CHUNK_BYTES // (bins * 8)))
-    rows = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8)))
-    chunk = (rows, columns, bins)
+    chunk = max(1, min(height, _CHUNK_BYTES // (columns * bins * 8))), columns, bins
     options = {"compression": "gzip", "compression_opts": compression, "shuffle": True, "fletcher32": True}
-    signed = {"derivatives": result.derivative_tallies, "channels": result.channel_tallies}
-
-    with write_hdf5(path) as file:
-        file.attrs.update(
-            {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, **_attributes(result)}
-        )
-        arrays: dict[str, Any] = {"tallies": result.tallies, "second_moment": result.second_moment}
-        for group, found in signed.items():
-            if found is not None:
-                file.attrs[group] = list(found.names)
-                arrays |= {f"{group}/tallies": found.tallies, f"{group}/second_moment": found.second_moment}
-                file.create_dataset(f"{group}/unit", data=np.array(found.units))
-        for name, array in arrays.items():
-            if array is not None:
-                chunks = (*[1] * (array.ndim - len(chunk)), *chunk)
-                write_packed(file, name, array, chunks=chunks, compression=compression)
-        file.create_dataset("bin_edges", data=result.bin_edges)
-        if result.scene.scan_positions > 1:
-            file.create_dataset("photons_per_position", data=result.unit / result.tally_value, **options)
-        file.create_dataset("photon_ranges", data=np.array(result.photon_ranges, dtype=np.uint64))
-        file.create_dataset("requested", data=np.array(result.requested, dtype=np.uint64))
-        file.create_dataset("config", data=result.scene.to_toml())
-        for name in _RECORDS:
-            file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
-        for name in _TRUTH:
-            file.create_dataset(f"truth/{name}", data=getattr(result.truth, name), **options)
-        name_dimensions(file, _coordinates(result), _DIMENSIONS)
-    return Path(path)
-
-
-def _coordinates(result: Result) -> dict[str, Coordinate | int | None]:
-    return {
-        "component": (COMPONENTS, "1", "history of the light"),
-        **image_coordinates(*result.truth.depth.shape),
-        "time": (result.bin_centres, "s", "time of flight at the centre of the bin"),
+    arrays = arrays_of(result)
+    if result.scene.scan_positions > 1:
+        arrays["photons_per_position"] = result.unit / result.tally_value
+    arrays |= {name: np.array(getattr(result, name), dtype=np.uint64) for name in ("photon_ranges", "requested")}
+    coordinates: dict[str, Coordinate | int | None] = {
+        **coordinates_of(result),
         "bin_edges": ("bin_edges", "s", "time of flight at the edges of the bins"),
         "word": (["low", "high"], "1", "64 bits of a number of 128"),
-        "parameter": (list(result.derivatives), "1", "by which the histogram is differentiated"),
-        "channel": (list(result.scene.camera.tallied_channels), "1", "of the receiver of polarised light"),
         "run": len(result.photon_ranges),
         "limit": (["start", "stop"], "1", "of photon ids"),
     }
-
-
-_VOXELS = (*PIXELS, "time")
-_DIMENSIONS = {
-    "tallies": (("component", *_VOXELS), "1", "times unit over photons: fraction of the emitted photons"),
-    "second_moment": (("word", *_VOXELS), "1", "sum over batches of the squared tally"),
-    "derivatives/tallies": (
-        ("parameter", "component", *_VOXELS),
-        "1",
-        "times derivatives/unit over photons: derivative of the fraction of the emitted photons",
-    ),
-    "derivatives/second_moment": (
-        ("word", "parameter", *_VOXELS),
-        "1",
-        "sum over batches of the squared tally of the derivative",
-    ),
-    "derivatives/unit": (("parameter",), "1", "of the tallies of each parameter"),
-    "channels/tallies": (
-        ("channel", "component", *_VOXELS),
-        "1",
-        "times channels/unit over photons: fraction of the emitted photons in each channel",
-    ),
-    "channels/second_moment": (
-        ("word", "channel", *_VOXELS),
-        "1",
-        "sum over batches of the squared tally of the channel",
-    ),
-    "channels/unit": (("channel",), "1", "of the tallies of each channel"),
-    "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
-    "photon_ranges": (("run", "limit"), "1", "ids of the photons"),
-    "requested": (("limit",), "1", "ids of the requested photons"),
-    "truth/depth": (PIXELS, "m", "true planar depth"),
-    "truth/range": (PIXELS, "m", "true distance along the line of sight"),
-    "truth/normal": ((*PIXELS, "axis"), "1", "unit normals towards the camera"),
-    "truth/reflectance": (PIXELS, "1", "Lambertian reflectance"),
-}
+    with write_hdf5(path) as file:
+        head = {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME}
+        names = {group: list(found.names) for group, found in signed_of(result).items()}
+        file.attrs.update({**head, **_attributes(result), **names})
+        for name, array in arrays.items():
+            dimensions = _DIMENSIONS[name][0]
+            if "time" in dimensions:
+                chunks = (*[1] * (array.ndim - len(chunk)), *chunk)
+                write_packed(file, name, array, chunks=chunks, compression=compression)
+            else:
+                file.create_dataset(name, data=array, **(options if "y" in dimensions else {}))
+        file.create_dataset("bin_edges", data=result.bin_edges)
+        file.create_dataset("config", data=result.scene.to_toml())
+        for name in _RECORDS:
+            file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
+        name_dimensions(file, coordinates, _DIMENSIONS)
+    return Path(path)
 
 
 def load_result(path: str | Path) -> Result:
@@ -172,29 +123,48 @@ def load_result(path: str | Path) -> Result:
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         head = _head(file)
-        scene, batches = head.scene, head.batch_size > 0
-        shape = (len(COMPONENTS), scene.camera.height, scene.camera.width, scene.gate.bins)
-        tallies = file.array("tallies", np.int64, shape)
+        names = {group: _names(file, group) for group in ("derivatives", "channels")}
+        counts = {"parameter": len(names["derivatives"]), "channel": len(names["channels"])}
+        camera, counts["time"] = head.scene.camera, head.scene.gate.bins
+
+        def array(name: str) -> Any:
+            return file.array(name, ARRAYS[name][0], shape_of(name, camera.height, camera.width, **counts))
+
+        def moment(name: str) -> Any:
+            return array(name) if head.batch_size else None
+
+        def signed(group: str) -> SignedTallies | None:
+            if not names[group]:
+                return None
+            units = tuple(map(float, array(f"{group}/unit")))
+            return SignedTallies(names[group], array(f"{group}/tallies"), units, moment(f"{group}/second_moment"))
+
+        tallies = array("tallies")
         if tallies.min() < 0:
             file.refuse("tallies", "are negative in some bins")
-        if ("second_moment" in file) != batches:
-            file.refuse("second_moment", f"does not go with batches of {head.batch_size} photons")
-        channels = _signed_tallies(file, "channels", shape, batches)
-        expected = scene.camera.tallied_channels
-        if (() if channels is None else channels.names) != expected:
-            file.refuse("channels", f"are not {', '.join(expected) or 'none'}, those of the scene's camera")
+        maps = {name: array(f"truth/{name}") for name in Truth.__dataclass_fields__}
+        for name, values in maps.items():
+            if np.isinf(values).any():
+                file.refuse(f"truth/{name}", "is infinite in some pixels")
+        moments = file.integers("batch_moments", bits=256)
+        if moments and moments.keys() != moments_of(COMPONENTS, [0] * len(COMPONENTS)).keys():
+            file.refuse("batch_moments", "are not those of the components")
+        made = file.table("provenance")
+        parts = made.get("parts", [])
+        if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
+            file.refuse("provenance", "holds parts that are no tables")
         return Result(
             **vars(head),
             tallies=tallies,
-            second_moment=file.array("second_moment", np.uint64, (2, *shape[1:])) if batches else None,
-            truth=_truth(file, shape[1:3]),
+            second_moment=moment("second_moment"),
+            truth=Truth(**maps),
             energy_balance=file.integers("energy_balance"),
             counters=file.integers("counters"),
-            batch_moments=_batch_moments(file),
-            derivative_tallies=_signed_tallies(file, "derivatives", shape, batches),
-            channel_tallies=channels,
+            batch_moments=moments,
+            derivative_tallies=signed("derivatives"),
+            channel_tallies=signed("channels"),
             timing=file.numbers("timing"),
-            provenance=_provenance(file),
+            provenance=made,
         )
 
 
@@ -213,29 +183,6 @@ def as_result(result: ResultLike, name: str = "result") -> Result:
     return result
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResultHead:
-    """Which photons of which run a file holds: the fields of `Result` without its arrays."""
-
-    scene: Scene
-    unit: float
-    photons: int
-    seed: int
-    energy_balance_unit: float
-    partial: bool
-    batch_size: int
-    photon_ranges: Ranges
-    requested: tuple[int, int]
-    focus_distance: float | None
-
-    def is_of_run(self, other: ResultHead) -> bool:
-        """Whether both hold photons of one run: the one with fewer is an earlier state of it."""
-        names = ("seed", "unit", "batch_size", "focus_distance")
-        same = all(getattr(self, name) == getattr(other, name) for name in names)
-        same = same and self.requested[0] == other.requested[0]
-        return same and physics_of(self.scene) == physics_of(other.scene)
-
-
 def read_head(path: str | Path) -> ResultHead:
     """Of the result in a file. Raises `FileError`."""
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
@@ -244,7 +191,6 @@ def read_head(path: str | Path) -> ResultHead:
 
 def _head(file: Hdf5File) -> ResultHead:
     ranges = tuple((int(start), int(stop)) for start, stop in file.array("photon_ranges", np.uint64, (None, 2)))
-    photons = file.integer("photons", _PHOTONS)
     if not ranges or any(start >= stop for start, stop in ranges) or len(joined(ranges)) > len(ranges):
         file.refuse("photon_ranges", "are not ranges of photon ids")
     start, stop = map(int, file.array("requested", np.uint64, (2,)))
@@ -255,59 +201,23 @@ def _head(file: Hdf5File) -> ResultHead:
     return ResultHead(
         scene=Scene.from_toml(file.text("config"), source=file.text_attribute("source", None)),
         unit=file.real("unit", _UNITS),
-        photons=photons,
+        photons=file.integer("photons"),
         seed=file.integer("seed"),
         energy_balance_unit=file.real("energy_balance_unit", _UNITS),
         partial=file.flag("partial"),
-        batch_size=file.integer("batch_size", _PHOTONS.replace("[1", "[0"), default=0),
+        batch_size=file.integer("batch_size", default=0),
         photon_ranges=ranges,
         requested=(start, stop),
         focus_distance=None if np.isnan(focus) else focus,
     )
 
 
-def _signed_tallies(file: Hdf5File, group: str, shape: tuple[int, ...], batches: bool) -> SignedTallies | None:
-    """Of a group beside tallies of a shape, with second moments where there are batches; None without the group."""
-    if group not in file:
-        return None
-    names = tuple(np.ravel(file.attribute(group)).tolist())
-    count = len(names)
-    if not all(isinstance(name, str) for name in names) or len(set(names)) < count:
+def _names(file: Hdf5File, group: str) -> tuple[str, ...]:
+    """Of the derivatives or channels of a file; none without the group."""
+    names = tuple(np.ravel(file.attribute(group)).tolist()) if group in file else ()
+    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
         file.refuse(group, "are not names")
-    units = file.array(f"{group}/unit", np.float64, (count,))
-    if not all(unit > 0 and np.frexp(unit)[0] == 0.5 for unit in units):
-        file.refuse(f"{group}/unit", "are not powers of two")
-    return SignedTallies(
-        names,
-        file.array(f"{group}/tallies", np.int64, (count, *shape)),
-        tuple(map(float, units)),
-        file.array(f"{group}/second_moment", np.uint64, (2, count, *shape[1:])) if batches else None,
-    )
-
-
-def _batch_moments(file: Hdf5File) -> dict[str, int]:
-    moments = file.integers("batch_moments", bits=256)
-    if moments and moments.keys() != moments_of(COMPONENTS, [0] * len(COMPONENTS)).keys():
-        file.refuse("batch_moments", "are not those of the components")
-    return moments
-
-
-def _truth(file: Hdf5File, shape: tuple[int, int]) -> Truth:
-    maps = {
-        name: file.array(f"truth/{name}", np.float32, (*shape, 3) if name == "normal" else shape) for name in _TRUTH
-    }
-    for name, values in maps.items():
-        if np.isinf(values).any():
-            file.refuse(f"truth/{name}", "is infinite in some pixels")
-    return Truth(**maps)
-
-
-def _provenance(file: Hdf5File) -> dict[str, Any]:
-    made = file.table("provenance")
-    parts = made.get("parts", [])
-    if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
-        file.refuse("provenance", "holds parts that are no tables")
-    return made
+    return names
 
 
 def _attributes(result: Result) -> dict[str, Any]:
@@ -324,14 +234,8 @@ def _attributes(result: Result) -> dict[str, Any]:
         "components": list(COMPONENTS),
         "gate_start": gate.start,
         "bin_width": gate.bin_width,
-        "absorption": medium.absorption,
-        "scattering": medium.scattering,
-        "extinction": medium.extinction,
-        "albedo": medium.albedo,
-        "phase_function": medium.phase_function,
+        **water_of(scene),
         "molecular_share": medium.molecular_share,
-        **medium.phase_parameters,
-        "group_index": medium.group_index,
         "phase_index": medium.phase_index,
         "laser_position": scene.beam.position,
         "laser_axis": scene.beam.axis,
@@ -349,6 +253,59 @@ def _attributes(result: Result) -> dict[str, Any]:
         "detector_irf": detector.irf,
     }
     return values if scene.source is None else {**values, "source": str(scene.source)}
+
+
+# Results added up: tallies are integers, so that the order and the devices make no difference
+
+
+def merge(results: Iterable[ResultLike]) -> Result:
+    """Adds results of the same scene, seed and unit with disjoint photon ids; bit-identical to one run of all the ids.
+
+    `results` are results or their paths.
+
+    The ids may leave gaps, which `simulate(resume=)` fills. Each part's provenance is in `provenance["parts"]`,
+    with its ids.
+
+    Raises:
+        ArgumentError: No list of results.
+        ConfigError: Different scenes (photons and output aside), seeds, units or batches, or ids that overlap.
+    """
+    if isinstance(results, str | os.PathLike | Result) or not isinstance(results, Iterable):
+        raise ArgumentError(f"results = {shown(results)} is not a list of results or of their paths")
+    parts = [as_result(item, "results: an item") for item in results]
+    if not parts:
+        raise ConfigError("merge: no results given")
+    first = parts[0]
+    for other in parts[1:]:
+        if problem := difference(first, other):
+            raise ConfigError(f"merge: {problem}")
+    try:
+        ranges = joined(ids for part in parts for ids in part.photon_ranges)
+    except ConfigError as error:
+        raise ConfigError(f"merge: {error}") from error
+    return replace(
+        first,
+        **vars(total_of(*parts)),
+        photons=sum(part.photons for part in parts),
+        timing=added(*(part.timing for part in parts)),
+        provenance=_joined_provenance((part.provenance, part.photon_ranges) for part in parts),
+        partial=any(part.partial for part in parts),
+        photon_ranges=ranges,
+        requested=(min(part.requested[0] for part in parts), max(part.requested[1] for part in parts)),
+    )
+
+
+def _joined_provenance(parts: Iterable[tuple[Mapping[str, Any], Iterable[Range]]]) -> dict[str, Any]:
+    """The first provenance, and under `parts` each with its photon ids."""
+    each: list[dict[str, Any]] = []
+    for provenance, ranges in parts:
+        made = dict(provenance)
+        each += made.pop("parts", None) or [{**made, "photon_ranges": [list(ids) for ids in ranges]}]
+    head = {name: value for name, value in each[0].items() if name != "photon_ranges"}
+    return head if len(each) == 1 else {**head, "parts": each}
+
+
+# Images
 
 
 def save_truth_maps(result: Result, path: str | Path) -> Path:

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, FileError
-from spadwarp.limits import check_choice, check_real
+from spadwarp.io.arrays import read_exr
 from spadwarp.result.result import Truth
 from spadwarp.scene.sight import pixel_directions
+from spadwarp.values import ArgumentError, FileError, check_choice, check_real
 
 __all__ = ["EXR_PRESETS", "ExrPreset", "load_truth_exr"]
 
 
-@dataclass(frozen=True)
-class ExrPreset:
+class ExrPreset(NamedTuple):
     """How a program writes depth, normals and albedo.
 
     Attributes:
-        depth_channels: Where depth is looked for, in this order.
+        depth_channels, normal_channels, albedo_channels: Where depth, the components of the world normal and albedo are
+            looked for, in this order; green first, in the middle of which lies 532 nm.
         depth_scale: Metres per unit of depth.
         sky: Stored depths from here on mean that nothing was hit.
-        normal_channels: Where the components of the world normal are looked for.
-        albedo_channels: Where albedo is looked for; green first, in the middle of which lies 532 nm.
         axes: The camera's right, down and forward in the program's world, for a camera that is not rotated.
     """
 
@@ -102,11 +99,8 @@ def load_truth_exr(
     check_choice("preset", preset, [*EXR_PRESETS])
     if camera.port is not None:
         raise ArgumentError("camera.port: rendered truth is of cameras that see along straight lines")
-    how = EXR_PRESETS[preset]
-    scale = how.depth_scale if depth_scale is None else depth_scale
-    scale = check_real("depth_scale", scale, "[1e-9, 1e9]")
-    shape = (camera.height, camera.width)
-    view = pixel_directions(camera)
+    how, shape, view = EXR_PRESETS[preset], (camera.height, camera.width), pixel_directions(camera)
+    scale = check_real("depth_scale", how.depth_scale if depth_scale is None else depth_scale, "[1e-9, 1e9]")
 
     stored = _channel(depth, (depth_channel,) if depth_channel else how.depth_channels, shape)
     sky = min(how.sky, _HALF_MAX) if stored.dtype == np.float16 else how.sky
@@ -145,11 +139,10 @@ def _normals(
     if rows.shape != (3, 3) or not np.allclose(rows @ rows.T, np.eye(3), atol=1e-4):
         raise ArgumentError(f"axes = {rows.tolist()} are not three orthogonal unit vectors")
     components = [_channel(path, names, hit.shape) for names in zip(*how.normal_channels, strict=True)]
-    world = np.stack(components, axis=-1).astype(np.float64)
-    normals = world @ rows.T
+    normals = np.stack(components, axis=-1).astype(np.float64) @ rows.T
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    if (hit & ~(length[..., 0] > 0.1)).any():
-        row, column = np.argwhere(hit & ~(length[..., 0] > 0.1))[0]
+    if (missing := hit & ~(length[..., 0] > 0.1)).any():
+        row, column = np.argwhere(missing)[0]
         raise FileError(f"{path}: no normal at pixel ({row}, {column}), which has a depth")
     with np.errstate(invalid="ignore", divide="ignore"):
         normals = normals / length
@@ -158,9 +151,9 @@ def _normals(
 
 def _channel(path: str | Path, names: Sequence[str], shape: tuple[int, ...]) -> NDArray[Any]:
     """The first of the named channels, or the only one that ends in `.name`; float, `[H, W]`."""
-    from spadwarp.io.arrays import read_exr
-
-    channels, _ = read_exr(_existing(path))
+    path = Path(path)
+    other = path.with_suffix(path.suffix.swapcase())  # engines write `.EXR`
+    channels, _ = read_exr(other if other.exists() and not path.exists() else path)
     for name in names:
         found = [key for key in channels if key == name] or [key for key in channels if key.endswith(f".{name}")]
         if len(found) > 1:
@@ -168,15 +161,7 @@ def _channel(path: str | Path, names: Sequence[str], shape: tuple[int, ...]) -> 
         if found:
             values = channels[found[0]]
             if values.shape != shape:
-                raise FileError(
-                    f"{path}: {values.shape[1]} x {values.shape[0]} pixels; the camera has {shape[1]} x {shape[0]}"
-                )
+                sizes = f"{values.shape[1]} x {values.shape[0]} pixels; the camera has {shape[1]} x {shape[0]}"
+                raise FileError(f"{path}: {sizes}")
             return values
     raise FileError(f"{path}: no channel {' or '.join(map(repr, names))}; it has {', '.join(channels)}")
-
-
-def _existing(path: str | Path) -> Path:
-    """The path, or the same with its ending in the other case: engines write `.EXR`."""
-    path = Path(path)
-    other = path.with_suffix(path.suffix.swapcase())
-    return other if other.exists() and not path.exists() else path

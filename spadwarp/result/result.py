@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, ConfigError
-from spadwarp.limits import check_choice
-from spadwarp.result.photon_ids import photons_per_position
-from spadwarp.result.tallies import SignedTallies, Tallies, standard_error
+from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
+from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.units import percent
+from spadwarp.values import ArgumentError, ConfigError, check_choice, percent
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "ComponentError", "Result", "Truth"]
-__all__ += ["analyser_channel", "component_errors", "degree_of_polarisation", "dominance_warnings"]
+__all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "Result", "Truth"]
+__all__ += ["analyser_channel", "component_errors", "degree_of_polarisation"]
 
 Component = Literal["ballistic", "forward_scattered", "backscatter"]
 COMPONENTS: tuple[Component, ...] = get_args(Component)
@@ -46,6 +44,51 @@ _NO_BATCHES = "the result holds no batches; simulate with uncertainty=True and m
 _CAMERAS = "simulate with camera.polarisation = 'analyser' or 'stokes'"
 
 
+_VOXELS = (*PIXELS, "time")
+_SIGNED = {
+    "derivatives": ("parameter", "derivative of the fraction of the emitted photons"),
+    "channels": ("channel", "fraction of the emitted photons in each channel"),
+}
+
+ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
+    "tallies": (np.int64, ("component", *_VOXELS), "1", "times unit over photons: fraction of the emitted photons"),
+    "second_moment": (np.uint64, ("word", *_VOXELS), "1", "sum over batches of the squared tally"),
+    "truth/depth": (np.float32, PIXELS, "m", "true planar depth"),
+    "truth/range": (np.float32, PIXELS, "m", "true distance along the line of sight"),
+    "truth/normal": (np.float32, (*PIXELS, "axis"), "1", "unit normals towards the camera"),
+    "truth/reflectance": (np.float32, PIXELS, "1", "Lambertian reflectance"),
+}
+"""Those of a result by their names in its file: type, dimensions, unit, meaning."""
+for _group, (_dimension, _meaning) in _SIGNED.items():
+    ARRAYS |= {
+        f"{_group}/tallies": (
+            np.int64,
+            (_dimension, "component", *_VOXELS),
+            "1",
+            f"times {_group}/unit over photons: {_meaning}",
+        ),
+        f"{_group}/second_moment": (
+            np.uint64,
+            ("word", _dimension, *_VOXELS),
+            "1",
+            f"sum over batches of the squared tally of the {_dimension}",
+        ),
+        f"{_group}/unit": (np.float64, (_dimension,), "1", f"of the tallies of each {_dimension}"),
+    }
+
+
+def shape_of(name: str, height: int, width: int, **counts: int) -> tuple[int, ...]:
+    """Of an array, from the size of the image and those of time, parameter and channel."""
+    sizes = {"component": len(COMPONENTS), "word": 2, "axis": 3, "y": height, "x": width, **counts}
+    return tuple(sizes[dimension] for dimension in ARRAYS[name][1])
+
+
+def _check_array(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    kind = np.dtype(ARRAYS[name][0])
+    if array.dtype != kind or array.shape != shape:
+        raise ArgumentError(f"{name.replace('/', '.')}: {array.dtype} {array.shape}; {kind} {shape} is needed")
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Truth:
     """What the camera would see through clear water, at pixel centres; NaN where the line of sight hits nothing.
@@ -63,11 +106,10 @@ class Truth:
     reflectance: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        shape = self.depth.shape
-        if len(shape) != 2:
-            raise ArgumentError(f"truth.depth has {len(shape)} dimensions; 2 are needed")
-        for name, expected in {"depth": shape, "range": shape, "normal": (*shape, 3), "reflectance": shape}.items():
-            _check_array(f"truth.{name}", getattr(self, name), np.float32, expected)
+        if self.depth.ndim != 2:
+            raise ArgumentError(f"truth.depth has {self.depth.ndim} dimensions; 2 are needed")
+        for name, array in vars(self).items():
+            _check_array(f"truth/{name}", array, shape_of(f"truth/{name}", *self.depth.shape))
 
     def __repr__(self) -> str:
         height, width = self.depth.shape
@@ -76,8 +118,24 @@ class Truth:
         return f"Truth({width} x {height} pixels: depth {depth} pixels)"
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ResultHead:
+    """Which photons of which run a result holds: its fields without arrays, as in `Result`."""
+
+    scene: Scene
+    unit: float
+    photons: int
+    seed: int
+    energy_balance_unit: float
+    partial: bool = False
+    photon_ranges: Sequence[tuple[int, int]] = ()
+    batch_size: int = 0
+    requested: tuple[int, int] = (0, 0)
+    focus_distance: float | None = None
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Result(Tallies):
+class Result(ResultHead, Tallies):
     """Expected photon histograms of one scene in fixed point, and all that is needed to interpret them.
 
     The attributes of `Tallies`, of which value = tally · unit / photons, see `tally_value`, and:
@@ -98,59 +156,38 @@ class Result(Tallies):
         batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
     """
 
-    scene: Scene
-    unit: float
-    photons: int
-    seed: int
-    energy_balance_unit: float
     truth: Truth
     timing: Mapping[str, float] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
-    partial: bool = False
-    photon_ranges: Sequence[tuple[int, int]] = ()
-    batch_size: int = 0
-    requested: tuple[int, int] = (0, 0)
-    focus_distance: float | None = None
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:
             object.__setattr__(self, "photon_ranges", ((0, self.photons),))
         if self.requested == (0, 0):
             object.__setattr__(self, "requested", (self.photon_ranges[0][0], self.photon_ranges[-1][1]))
-        camera, gate = self.scene.camera, self.scene.gate
-        shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
-        _check_array("tallies", self.tallies, np.int64, shape)
-        _check_array("truth.depth", self.truth.depth, np.float32, shape[1:3])
-        counted = sum(stop - start for start, stop in self.photon_ranges)
-        if self.photons <= 0 or counted != self.photons:
-            raise ArgumentError(
-                f"photons = {self.photons}; the {counted} ids of photon_ranges, more than 0, are needed"
-            )
-        if self.second_moment is not None:
-            _check_array("second_moment", self.second_moment, np.uint64, (2, *shape[1:]))
-            if self.batch_size <= 0 or any((stop - start) % self.batch_size for start, stop in self.photon_ranges):
-                raise ArgumentError(f"photon_ranges = {self.photon_ranges} are not whole batches of {self.batch_size}")
-        channels = () if self.channel_tallies is None else self.channel_tallies.names
-        if channels != camera.tallied_channels:
-            raise ArgumentError(f"channel_tallies are of {channels}; {camera.tallied_channels} are the camera's")
-        for name in ("derivative_tallies", "channel_tallies"):
-            self._check_signed(name, getattr(self, name), shape)
-        for name in ("unit", "energy_balance_unit"):
-            value = getattr(self, name)
-            if not (value > 0 and math.frexp(value)[0] == 0.5):
-                raise ArgumentError(f"{name} = {value} is not a power of two")
-
-    def _check_signed(self, name: str, found: SignedTallies | None, shape: tuple[int, ...]) -> None:
-        if found is None:
-            return
-        count = len(found.names)
-        _check_array(f"{name}.tallies", found.tallies, np.int64, (count, *shape))
-        if len(found.units) != count:
-            raise ArgumentError(f"{name}: {len(found.units)} units; {count} are needed")
-        if (found.second_moment is None) != (self.second_moment is None):
-            raise ArgumentError(f"{name} and tallies: both have a second moment, or none of them")
-        if found.second_moment is not None:
-            _check_array(f"{name}.second_moment", found.second_moment, np.uint64, (2, count, *shape[1:]))
+        ids, batch = self.photon_ranges, self.batch_size
+        if self.photons <= 0 or count(ids) != self.photons:
+            text = f"the {count(ids)} ids of photon_ranges, more than 0, are needed"
+            raise ArgumentError(f"photons = {self.photons}; {text}")
+        if self.second_moment is not None and (batch <= 0 or any((stop - start) % batch for start, stop in ids)):
+            raise ArgumentError(f"photon_ranges = {ids} are not whole batches of {batch}")
+        signed, expected = signed_of(self), self.scene.camera.tallied_channels
+        channels = signed["channels"].names if "channels" in signed else ()
+        if channels != expected:
+            text = f"channels are {', '.join(channels) or 'none'}; those of the scene's camera are"
+            raise ArgumentError(f"{text} {', '.join(expected) or 'none'}")
+        counts = {_SIGNED[group][0]: len(found.names) for group, found in signed.items()}
+        camera, counts["time"] = self.scene.camera, self.scene.gate.bins
+        for name, array in arrays_of(self).items():
+            _check_array(name, array, shape_of(name, camera.height, camera.width, **counts))
+        units = {"unit": self.unit, "energy_balance_unit": self.energy_balance_unit}
+        for group, found in signed.items():
+            if (found.second_moment is None) != (self.second_moment is None):
+                raise ArgumentError(f"{group} and tallies: both have a second moment, or none of them")
+            units |= {f"{group}: unit of {name}": unit for name, unit in zip(found.names, found.units, strict=True)}
+        for name, unit in units.items():
+            if not (unit > 0 and math.frexp(unit)[0] == 0.5):
+                raise ArgumentError(f"{name} = {unit} is not a power of two")
 
     def __repr__(self) -> str:
         name = self.scene.source.stem if self.scene.source else "Python"
@@ -219,8 +256,8 @@ class Result(Tallies):
         Raises:
             ConfigError: The run has no batches, or only one.
         """
-        moments, count = _batches_of(self)
-        return standard_error(self.tallies, moments, count) * self.tally_value[..., None]
+        moments, batches = _batches_of(self)
+        return standard_error(self.tallies, moments, batches) * self.tally_value[..., None]
 
     @property
     def derivative_errors(self) -> Mapping[str, Floats]:
@@ -237,12 +274,12 @@ class Result(Tallies):
     def relative_error(self) -> float:
         """Relative standard error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of
         the pixels that hold a target, or of all without any, in which anything returned. Infinite if nothing did."""
-        moments, count = _batches_of(self)
+        moments, batches = _batches_of(self)
         # Row by row: of a large histogram nothing is copied.
         peak = np.stack([row.sum(axis=0).argmax(axis=1) for row in self.tallies.swapaxes(0, 1)])[None, ..., None]
         tallies = np.take_along_axis(self.tallies, peak, axis=3)[..., 0]
         value = tallies.sum(axis=0)
-        error = standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], count)
+        error = standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], batches)
         target = np.isfinite(self.truth.depth)
         returned = (value > 0) & (target | ~target.any())
         return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
@@ -253,7 +290,21 @@ class Result(Tallies):
 
         They show in results with batches (`uncertainty=True`, or `relative_error`).
         """
-        return tuple(dominance_warnings(self))
+        transport, ways = self.scene.transport, ["more photons"]
+        if transport.estimator != "guided":
+            ways.append('estimator = "guided"')
+        elif self.scene.targets:
+            ways.append('in clear water between bright surfaces estimator = "next_event"')
+        if transport.termination == "roulette":
+            ways.append('termination = "cutoff"')
+        batches = self.photons // max(self.batch_size, 1)
+        return tuple(
+            f"{name}: one of {batches} batches has {100 * share:.0f} % of the variance of its light (relative standard "
+            f"error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "
+            f"helps: {', '.join(ways)}"
+            for name, (error, share) in component_errors(self).items()
+            if error > _SMALL_ERROR and share > _threshold(batches)
+        )
 
     @property
     def rounding_error(self) -> dict[str, float]:
@@ -290,8 +341,6 @@ class Result(Tallies):
     def pulse_speed(self) -> float:
         """Speed of a pulse, c0 over the group index [m/s]."""
         return self.scene.medium.pulse_speed
-
-    # Depth
 
     def depth(
         self, *, method: Any = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
@@ -342,13 +391,7 @@ class Result(Tallies):
                 "path_m": [float(self.path_edges[0]), float(self.path_edges[-1])],
             },
             "medium": {
-                "absorption": scene.medium.absorption,
-                "scattering": scene.medium.scattering,
-                "extinction": scene.medium.extinction,
-                "albedo": scene.medium.albedo,
-                "phase_function": scene.medium.phase_function,
-                **scene.medium.phase_parameters,
-                "group_index": scene.medium.group_index,
+                **water_of(scene),
                 **({"layers": len(scene.medium.layers)} if scene.medium.layers else {}),
                 **({} if scene.medium.grid is None else {"grid": scene.medium.grid.shape or scene.medium.grid.file}),
             },
@@ -365,7 +408,7 @@ class Result(Tallies):
             "counters": dict(self.counters),
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "warnings": list(self.warnings),
-            **({"derivatives": _short_names(tuple(self.derivatives))} if self.derivatives else {}),
+            **({"derivatives": _short_names(self.derivatives)} if self.derivatives else {}),
             **_polarisation_summary(self),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
@@ -395,15 +438,72 @@ class Result(Tallies):
         return spadwarp.result.save_result(self, path)
 
 
-def _check_array(name: str, array: NDArray[Any], kind: type, shape: tuple[int, ...]) -> None:
-    if array.dtype != kind or array.shape != shape:
-        raise ArgumentError(f"{name}: {array.dtype} {array.shape}; {np.dtype(kind)} {shape} is needed")
+def signed_of(result: Result) -> dict[str, SignedTallies]:
+    """Those of derivatives and channels that there are."""
+    groups = {"derivatives": result.derivative_tallies, "channels": result.channel_tallies}
+    return {group: found for group, found in groups.items() if found is not None}
 
 
-def physics_of(scene: Scene) -> Scene:
+def arrays_of(result: Result) -> dict[str, NDArray[Any]]:
+    """The arrays of a result, of those of `ARRAYS`."""
+    found: dict[str, Any] = {"tallies": result.tallies, "second_moment": result.second_moment}
+    for group, signed in signed_of(result).items():
+        found |= {f"{group}/tallies": signed.tallies, f"{group}/second_moment": signed.second_moment}
+        found[f"{group}/unit"] = np.array(signed.units)
+    found |= {f"truth/{name}": values for name, values in vars(result.truth).items()}
+    return {name: array for name, array in found.items() if array is not None}
+
+
+def coordinates_of(result: Result) -> dict[str, Coordinate]:
+    """Values, unit and meaning of the dimensions of `ARRAYS`."""
+    return {
+        "component": (list(COMPONENTS), "1", "history of the light"),
+        **image_coordinates(*result.truth.depth.shape),
+        "time": (result.bin_centres, "s", "time of flight at the centre of the bin"),
+        "parameter": (list(result.derivatives), "1", "by which the histogram is differentiated"),
+        "channel": (list(result.scene.camera.tallied_channels), "1", "of the receiver of polarised light"),
+    }
+
+
+def water_of(scene: Scene) -> dict[str, Any]:
+    """Coefficients of a scene's medium, by name."""
+    names = ("absorption", "scattering", "extinction", "albedo", "phase_function", "group_index")
+    return {**{name: getattr(scene.medium, name) for name in names}, **scene.medium.phase_parameters}
+
+
+def _physics(scene: Scene) -> Scene:
     """The scene without what does not change a photon's history."""
     transport = scene.transport.model_copy(update={"photons": 1, "seed": 0})
     return scene.model_copy(update={"transport": transport, "output": type(scene.output)()})
+
+
+def difference(a: ResultHead, b: ResultHead) -> str:
+    """What shows that two hold photons of different runs; empty where they are of one."""
+    one, other = _physics(a.scene), _physics(b.scene)
+    if one != other:
+        sections = [name for name in type(one).model_fields if getattr(one, name) != getattr(other, name)]
+        return f"the scene of the results differs in {', '.join(sections)}: only photons and output may differ"
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit", "batch_size")}
+    if isinstance(a, Result) and isinstance(b, Result):
+        pairs["list of derivatives"] = tuple(a.derivatives), tuple(b.derivatives)
+        pairs["channel"] = a.provenance.get("channel"), b.provenance.get("channel")
+        if not same_targets(a.truth, b.truth):
+            return TARGETS_DIFFER
+    for name, (mine, its) in pairs.items():
+        if mine != its:
+            return f"the {name.replace('_', ' ')} of the results differs ({mine} and {its})"
+    mine, its = a.focus_distance, b.focus_distance
+    if mine != its and (mine is None or its is None or not np.isclose(mine, its, rtol=1e-4, atol=0.0)):
+        return f"the lenses of the results differ: focus_distance is {mine} and {its} m"
+    return ""
+
+
+TARGETS_DIFFER = "the targets of the results differ, by their truth maps: was a mesh file changed?"
+
+
+def same_targets(a: Truth, b: Truth) -> bool:
+    """Whether two truth maps are of the same targets."""
+    return np.allclose(a.range, b.range, rtol=1e-4, equal_nan=True)
 
 
 # Derivatives and channels
@@ -411,39 +511,53 @@ def physics_of(scene: Scene) -> Scene:
 _BLOCK = re.compile(r"\[(\d+),(\d+),(\d+)\]")
 
 
+class _Cube(NamedTuple):
+    """Tallies of light or of a derivative by component, their unit, and their second moment, if there is one."""
+
+    tallies: NDArray[np.int64]
+    unit: float
+    second_moment: NDArray[np.uint64] | None
+
+
+def _cubes_of(result: Result, group: str) -> dict[str, _Cube]:
+    """Of derivatives or of the camera's channels, by name; the channel "I" is the histogram."""
+    found, cubes = signed_of(result).get(group), dict[str, _Cube]()
+    if group == "channels" and "I" in result.scene.camera.channels:
+        cubes["I"] = _Cube(result.tallies, result.unit, result.second_moment)
+    if found is not None:
+        moments = [None] * len(found.names) if found.second_moment is None else found.second_moment.swapaxes(0, 1)
+        parts = zip(found.names, found.tallies, found.units, moments, strict=True)
+        cubes |= {name: _Cube(*cube) for name, *cube in parts}
+    return cubes
+
+
 class _SignedValues(Mapping[str, Floats]):
     """Name → array, made from integers when it is asked for; that of a derivative without its block stands for all of
     them, `[x, y, z, ...]`. With `errors` standard errors of the sum over components."""
 
-    def __init__(self, result: Result, kind: Literal["derivatives", "channels"], *, errors: bool = False) -> None:
-        self._result, self._kind, self._errors = result, kind, errors
-        self._tallies = result.derivative_tallies if kind == "derivatives" else result.channel_tallies
-        self._names: tuple[str, ...] = () if self._tallies is None else self._tallies.names
-        if kind == "channels":
-            self._names = result.scene.camera.channels
+    def __init__(self, result: Result, group: str, *, errors: bool = False) -> None:
+        self._result, self._group, self._errors = result, group, errors
+        self._cubes = _cubes_of(result, group)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
+        return iter(self._cubes)
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self._cubes)
 
     def __getitem__(self, name: str) -> Floats:
-        result, tallies = self._result, self._tallies
-        if blocks := _blocks(self._names, name):
-            parts = np.stack([self[f"{name}[{i},{j},{k}]"] for i, j, k in blocks])
+        if blocks := _blocks(self, name):
+            parts = np.stack([self[f"{name}[{','.join(map(str, block))}]"] for block in blocks])
             return parts.reshape(*_shape(blocks), *parts.shape[1:])
-        if name not in self._names:
-            raise KeyError(f"{name!r} is not one of the {self._kind}: {', '.join(self) or 'none were asked for'}")
-        if tallies is None or name not in tallies.names:  # the intensity, which is the histogram
-            return result.standard_error if self._errors else result.tallies * result.tally_value[..., None]
-        p = tallies.names.index(name)
-        value = (tallies.units[p] / result.unit * result.tally_value)[..., None]
+        if name not in self._cubes:
+            raise KeyError(f"{name!r} is not one of the {self._group}: {', '.join(self) or 'none were asked for'}")
+        result, (tallies, unit, moments) = self._result, self._cubes[name]
+        value = (unit / result.unit * result.tally_value)[..., None]
         if not self._errors:
-            return tallies.tallies[p] * value
-        _, count = _batches_of(result)
-        assert tallies.second_moment is not None
-        return standard_error(tallies.tallies[p], tallies.second_moment[:, p], count) * value
+            return tallies * value
+        _, batches = _batches_of(result)
+        assert moments is not None
+        return standard_error(tallies, moments, batches) * value
 
     def __repr__(self) -> str:
         return f"{{{', '.join(map(repr, self))}}}"
@@ -453,13 +567,13 @@ def _shape(blocks: list[tuple[int, ...]]) -> list[int]:
     return [max(indices) + 1 for indices in zip(*blocks, strict=True)]
 
 
-def _blocks(names: Sequence[str], name: str) -> list[tuple[int, ...]]:
+def _blocks(names: Iterable[str], name: str) -> list[tuple[int, ...]]:
     """Indices of the blocks by whose coefficient `name` a histogram is differentiated."""
     matches = [_BLOCK.fullmatch(other.removeprefix(name)) for other in names if other.startswith(f"{name}[")]
     return [tuple(map(int, match.groups())) for match in matches if match is not None]
 
 
-def _short_names(names: tuple[str, ...]) -> list[str]:
+def _short_names(names: Iterable[str]) -> list[str]:
     """For a reader: one text for all blocks, such as "medium.grid.absorption of 4 x 4 x 2 blocks"."""
     texts = dict[str, None]()
     for name in names:
@@ -472,59 +586,42 @@ def _short_names(names: tuple[str, ...]) -> list[str]:
 # Errors
 
 
-@dataclass(frozen=True)
-class ComponentError:
-    """How well a component's total is known.
+def component_errors(result: Result) -> dict[str, tuple[float, float]]:
+    """How well the total of each component is known; empty without batches, and for components without light.
 
-    Attributes:
-        relative_error: Relative standard error of the component's light, all pixels and bins together.
-        largest_share: Squared deviation of the batch furthest from the mean, over the largest that it could have at the
-            same variance, in [0, 1]: about 5/batches where many photons matter equally, near 1 where one decides.
-        batches: Number of batches.
+    Returns:
+        By component the relative standard error of its light, all pixels and bins together, and the squared deviation
+        of the batch furthest from the mean, over the largest that it could have at the same variance, in [0, 1]: about
+        5/batches where many photons matter equally, near 1 where one decides.
     """
-
-    relative_error: float
-    largest_share: float
-    batches: int
-
-    @property
-    def is_dominated(self) -> bool:
-        """Whether one batch decides the standard error, so that it may be far too small."""
-        return self.relative_error > _SMALL_ERROR and self.largest_share > _threshold(self.batches)
-
-
-def component_errors(result: Result) -> dict[str, ComponentError]:
-    """By component; empty without batches, and for components without light."""
-    errors = {}
-    for name, (count, total, spread, furthest) in _spreads(result).items():
-        error = math.sqrt(spread / (count - 1)) / total
-        errors[name] = ComponentError(error, furthest * furthest / ((count - 1) * spread), count)
-    return errors
+    return {
+        name: (math.sqrt(spread / (n - 1)) / total, furthest * furthest / ((n - 1) * spread))
+        for name, (n, total, spread, furthest) in _spreads(result).items()
+    }
 
 
 def largest_share(result: Result) -> float:
-    """As `ComponentError.largest_share`, of the variance of all components together; 1 where nothing is known."""
+    """As the second of `component_errors`, of the variance of all components together; 1 where nothing is known."""
     spreads = list(_spreads(result).values())
     together = sum(spread for _, _, spread, _ in spreads)
-    return max((furthest * furthest / ((count - 1) * together) for count, _, _, furthest in spreads), default=1.0)
+    return max((furthest * furthest / ((n - 1) * together) for n, _, _, furthest in spreads), default=1.0)
 
 
-def _spreads(result: Result) -> dict[str, tuple[int, int, int, int]]:
+def _spreads(result: Result) -> dict[Component, tuple[int, int, int, int]]:
     """Of components that vary: number n of batches, total, n times the sum of squared deviations of the batches from
     their mean, n times the largest deviation."""
     moments = result.batch_moments
     if not moments or result.photons < 2 * result.batch_size:
         return {}
-    names = [name.removesuffix("_squares") for name in moments if name.endswith("_squares")]
-    count, found = result.photons // result.batch_size, {}
-    for name, tally in zip(names, result.tallies, strict=True):
+    batches, found = result.photons // result.batch_size, {}
+    for name, tally in zip(COMPONENTS, result.tallies, strict=True):
         # In rows and halves, since a sum over all voxels may exceed 64 bits.
         total = sum((int((row >> 32).sum()) << 32) + int((row & 0xFFFFFFFF).sum()) for row in tally)
-        # count times the sum of squared deviations, in integers: no cancellation.
-        spread = count * moments[f"{name}_squares"] - total * total
-        furthest = max(count * moments[f"{name}_largest"] - total, total - count * moments[f"{name}_smallest"])
+        # In integers: no cancellation.
+        spread = batches * moments[f"{name}_squares"] - total * total
+        furthest = max(batches * moments[f"{name}_largest"] - total, total - batches * moments[f"{name}_smallest"])
         if total > 0 and spread > 0:
-            found[name] = count, total, spread, furthest
+            found[name] = batches, total, spread, furthest
     return found
 
 
@@ -537,32 +634,12 @@ def _batches_of(result: Result) -> tuple[NDArray[np.uint64], int]:
 
 def pixel_standard_error(result: Result, row: int, column: int) -> Floats:
     """`Result.standard_error` of one pixel, float64 `[T]`, without that of the others."""
-    moments, count = _batches_of(result)
-    error = standard_error(result.tallies[:, row, column], moments[:, row, column], count)
+    moments, batches = _batches_of(result)
+    error = standard_error(result.tallies[:, row, column], moments[:, row, column], batches)
     return np.asarray(error * result.tally_value[row, column])
 
 
-def dominance_warnings(result: Result) -> list[str]:
-    """A sentence for each component whose standard error rests on one batch."""
-    transport, texts = result.scene.transport, []
-    ways = ["more photons"]
-    if transport.estimator != "guided":
-        ways.append('estimator = "guided"')
-    elif result.scene.targets:
-        ways.append('in clear water between bright surfaces estimator = "next_event"')
-    if transport.termination == "roulette":
-        ways.append('termination = "cutoff"')
-    for name, error in component_errors(result).items():
-        if error.is_dominated:
-            texts.append(
-                f"{name}: one of {error.batches} batches has {100 * error.largest_share:.0f} % of the variance of its "
-                f"light (relative standard error {percent(error.relative_error)} %): few heavy photons decide it, and "
-                f"errors may be larger than they seem; what helps: {', '.join(ways)}"
-            )
-    return texts
-
-
-def _threshold(count: int) -> float:
+def _threshold(batches: int) -> float:
     """The share that equal batches exceed with a probability of _FALSE_ALARM at most, but _DECIDING_SHARE at least.
 
     The squared deviation of one of n normal numbers from their mean, over n - 1 times their variance, times n/(n - 1),
@@ -570,10 +647,9 @@ def _threshold(count: int) -> float:
     """
     from scipy.special import betaincinv
 
-    if count < 4:
+    if batches < 4:
         return 1.0
-    law = float(betaincinv(0.5, 0.5 * count - 1.0, 1.0 - _FALSE_ALARM / count))
-    return max(_DECIDING_SHARE, law)
+    return max(_DECIDING_SHARE, float(betaincinv(0.5, 0.5 * batches - 1.0, 1.0 - _FALSE_ALARM / batches)))
 
 
 # Channels of polarised light
@@ -595,17 +671,12 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
     if check_choice("channel", channel, CHANNELS) == "I":
         return result
     if not result.channels:
-        problem = f"the result has none; {_CAMERAS}"
-        if own := result.provenance.get("channel"):
-            problem = f"the result holds {own!r} alone; take that of the run"
-        raise ConfigError(
-            f"channel = {channel!r}: {problem}",
-            source=None if result.scene.source is None else str(result.scene.source),
-        )
+        own = result.provenance.get("channel")
+        problem = f"the result holds {own!r} alone; take that of the run" if own else f"the result has none; {_CAMERAS}"
+        raise ConfigError(f"channel = {channel!r}: {problem}", source=result.scene.source)
     tallies, unit = _channel_tallies(result, channel)
-    stored, moments = result.channel_tallies, None
-    if stored is not None and stored.second_moment is not None and channel in stored.names:
-        moments = stored.second_moment[:, stored.names.index(channel)].copy()
+    cube = _cubes_of(result, "channels").get(channel)
+    moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
     return replace(
         result,
         scene=_behind_analyser(result.scene),
@@ -628,17 +699,14 @@ def pixel_channel(result: Result, channel: Channel, row: int, column: int) -> Fl
 
 def _channel_tallies(result: Result, channel: Channel, at: tuple[Any, ...] = ()) -> tuple[NDArray[np.int64], float]:
     """Tallies of co- or cross-polarised light, or a part of them, and their unit."""
-    stored, camera = result.channel_tallies, result.scene.camera
-    assert stored is not None
-    if channel in stored.names:
-        k = stored.names.index(channel)
-        return np.maximum(stored.tallies[(k, *at)], 0), stored.units[k]
+    cubes, camera = _cubes_of(result, "channels"), result.scene.camera
+    if channel in cubes:
+        return np.maximum(cubes[channel].tallies[at], 0), cubes[channel].unit
     leak, angle = 1.0 / camera.analyser_extinction_ratio, 2.0 * math.radians(camera.analyser_angle_deg)
     sign = 1.0 if channel == "co" else -1.0
     light = (1.0 + leak) * result.tallies[at]
     for name, share in {"Q": math.cos(angle), "U": math.sin(angle)}.items():
-        k = stored.names.index(name)
-        light += sign * (1.0 - leak) * share * (stored.units[k] / result.unit) * stored.tallies[(k, *at)]
+        light += sign * (1.0 - leak) * share * (cubes[name].unit / result.unit) * cubes[name].tallies[at]
     # In halves of a unit.
     return np.rint(np.maximum(light, 0.0)).astype(np.int64), 0.5 * result.unit
 
@@ -654,7 +722,7 @@ def degree_of_polarisation(result: Result, *, gated: bool = False) -> Floats:
     """
     if not result.channels:
         raise ConfigError(f"the degree of polarisation needs channels; {_CAMERAS}")
-    return _degree(_sums(result, (0, 3) if gated else (0,)), 1.0 / result.scene.camera.analyser_extinction_ratio)
+    return _degree(result, _sums(result, (0, 3) if gated else (0,)))
 
 
 def _polarisation_summary(result: Result) -> dict[str, Any]:
@@ -665,22 +733,19 @@ def _polarisation_summary(result: Result) -> dict[str, Any]:
     if not result.channels:
         return {}
     sums = _sums(result, (0, 1, 2, 3))
-    degree = float(_degree(sums, 1.0 / result.scene.camera.analyser_extinction_ratio))
-    light = {name: float(sums[name]) / result.photons for name in result.channels}
+    degree = float(_degree(result, sums))
+    light = {name: float(total) / result.photons for name, total in sums.items()}
     return {"channels": light, "degree_of_polarisation": degree if math.isfinite(degree) else None}
 
 
 def _sums(result: Result, axes: tuple[int, ...]) -> dict[str, Floats]:
     """Channel → its light, times the photons."""
-    stored = result.channel_tallies
-    assert stored is not None
-    sums = {"I": result.tallies.sum(axis=axes, dtype=np.float64) * result.unit}
-    for name, tallies, unit in zip(stored.names, stored.tallies, stored.units, strict=True):
-        sums[name] = tallies.sum(axis=axes, dtype=np.float64) * unit
-    return sums
+    cubes = _cubes_of(result, "channels").items()
+    return {name: cube.tallies.sum(axis=axes, dtype=np.float64) * cube.unit for name, cube in cubes}
 
 
-def _degree(sums: dict[str, Floats], leak: float) -> Floats:
+def _degree(result: Result, sums: dict[str, Floats]) -> Floats:
+    leak = 1.0 / result.scene.camera.analyser_extinction_ratio
     with np.errstate(divide="ignore", invalid="ignore"):
         if "Q" in sums:
             return np.minimum(np.sqrt(sums["Q"] ** 2 + sums["U"] ** 2 + sums["V"] ** 2) / sums["I"], 1.0)

@@ -1,15 +1,19 @@
-"""Tallies of photons as integers: sums that do not depend on their order, moments of batches, signed tallies."""
+"""Tallies of photons as integers, whose sums do not depend on their order, and the ids of the photons."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError, SpadwarpError
+from spadwarp.values import ConfigError, SpadwarpError
+
+if TYPE_CHECKING:
+    from spadwarp.scene import Scene
 
 __all__ = ["SignedTallies", "Tallies"]
 
@@ -18,7 +22,7 @@ OVERFLOW = (
     "and average their histograms"
 )
 
-_JOINS: dict[str, Callable[[int, int], int]] = {"squares": operator.add, "smallest": min, "largest": max}
+Number = TypeVar("Number", int, float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,24 +40,6 @@ class SignedTallies:
     tallies: NDArray[np.int64]
     units: tuple[float, ...]
     second_moment: NDArray[np.uint64] | None = None
-
-    def copy(self) -> SignedTallies:
-        """The same with arrays of its own."""
-        moments = None if self.second_moment is None else self.second_moment.copy()
-        return replace(self, tallies=self.tallies.copy(), second_moment=moments)
-
-    def add(self, other: SignedTallies) -> None:
-        """Adds those of other photons. Raises `ConfigError` where they are of other parameters."""
-        if (self.names, self.units) != (other.names, other.units):
-            first, second = (", ".join(one.names) or "nothing" for one in (self, other))
-            raise ConfigError(f"the results have tallies of {first} and of {second}")
-        self.tallies[...] += other.tallies
-        if np.abs(self.tallies.sum(axis=1, dtype=np.float64)).max(initial=0.0) >= 2.0**62:
-            raise SpadwarpError(
-                "a bin of a derivative or a channel overflowed; run fewer photons at a time and average the results"
-            )
-        if self.second_moment is not None and other.second_moment is not None:
-            _add_moments(self.second_moment, other.second_moment)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,52 +71,63 @@ class Tallies:
     channel_tallies: SignedTallies | None = None
 
 
-def total_of(first: Tallies, *others: Tallies) -> Tallies:
+def total_of(*parts: Tallies) -> Tallies:
     """The sum of tallies of disjoint photons, with arrays of its own.
 
     Raises `ConfigError` where they count different things, `SpadwarpError` where a bin overflows.
     """
-    check_capacity(first.tallies, *(other.tallies for other in others))
-    signed = [None if found is None else found.copy() for found in (first.derivative_tallies, first.channel_tallies)]
-    total, counts = first.tallies.copy(), {name: dict(getattr(first, name)) for name in ("energy_balance", "counters")}
-    second_moment = None if first.second_moment is None else first.second_moment.copy()
-    batch_moments = first.batch_moments
-    for other in others:
-        for name, entries in counts.items():
-            more = getattr(other, name)
-            if strange := entries.keys() ^ more.keys():
-                raise ConfigError(f"the results count different things in their {name}: {', '.join(sorted(strange))}")
-            counts[name] = added(entries, more)
-        total += other.tallies
-        if second_moment is not None:
-            assert other.second_moment is not None
-            _add_moments(second_moment, other.second_moment)
-        for mine, theirs in zip(signed, (other.derivative_tallies, other.channel_tallies), strict=True):
-            if mine is not None:
-                assert theirs is not None
-                mine.add(theirs)
-        batch_moments = joined_moments(batch_moments, other.batch_moments)
+    check_capacity(*(part.tallies for part in parts))
+    counts = {}
+    for name in ("energy_balance", "counters"):
+        each = [getattr(part, name) for part in parts]
+        if strange := set[str]().union(*each) - set(each[0]).intersection(*each):
+            raise ConfigError(f"the results count different things in their {name}: {', '.join(sorted(strange))}")
+        counts[name] = added(*each)
+    tallies, second_moment = _added_arrays(parts)
     return Tallies(
-        tallies=total,
+        tallies=tallies,
         **counts,
         second_moment=second_moment,
-        batch_moments=batch_moments,
-        derivative_tallies=signed[0],
-        channel_tallies=signed[1],
+        batch_moments=joined_moments(*(part.batch_moments for part in parts)),
+        derivative_tallies=_signed_total([part.derivative_tallies for part in parts]),
+        channel_tallies=_signed_total([part.channel_tallies for part in parts]),
     )
 
 
-def added(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
-    """Entry by entry the sum of both, which have the same names."""
-    return {name: value + b[name] for name, value in a.items()}
+def _signed_total(parts: Sequence[SignedTallies | None]) -> SignedTallies | None:
+    found = [part for part in parts if part is not None]
+    if not found:
+        return None
+    first = found[0]
+    if len(found) < len(parts) or any((part.names, part.units) != (first.names, first.units) for part in found):
+        raise ConfigError("the results have tallies of different derivatives or channels")
+    tallies, second_moment = _added_arrays(found)
+    if np.abs(tallies.sum(axis=1, dtype=np.float64)).max(initial=0.0) >= 2.0**62:
+        raise SpadwarpError(
+            "a bin of a derivative or a channel overflowed; run fewer photons at a time and average the results"
+        )
+    return replace(first, tallies=tallies, second_moment=second_moment)
 
 
-def _add_moments(total: NDArray[np.uint64], more: NDArray[np.uint64]) -> None:
-    """Adds 128-bit integers in place; both `[2, ...]`, low and high halves."""
-    low, high = total
-    low += more[0]
-    high += more[1]
-    high += low < more[0]  # the carry
+def _added_arrays(parts: Sequence[Tallies | SignedTallies]) -> tuple[NDArray[np.int64], NDArray[np.uint64] | None]:
+    """The sum of the tallies, and of the second moments where all have one: 128-bit integers, low and high halves."""
+    total = parts[0].tallies.copy()
+    for part in parts[1:]:
+        total += part.tallies
+    moments = [part.second_moment for part in parts if part.second_moment is not None]
+    if len(moments) < len(parts):
+        return total, None
+    low, high = squares = moments[0].copy()
+    for more in moments[1:]:
+        low += more[0]
+        high += more[1]
+        high += low < more[0]  # the carry
+    return total, squares
+
+
+def added(*parts: Mapping[str, Number]) -> dict[str, Number]:
+    """The sum of the entries of each name of the first."""
+    return {name: sum((part.get(name, 0) for part in parts[1:]), start) for name, start in parts[0].items()}
 
 
 def check_capacity(*tallies: NDArray[np.int64]) -> None:
@@ -144,19 +141,25 @@ def check_capacity(*tallies: NDArray[np.int64]) -> None:
             raise SpadwarpError(OVERFLOW)
 
 
+# Moments of batches
+
+_JOINS: dict[str, Callable[[int, int], int]] = {"squares": operator.add, "smallest": min, "largest": max}
+
+
 def moments_of(names: Sequence[str], totals: Sequence[int]) -> dict[str, int]:
     """`Tallies.batch_moments` of one batch, from its components' names and totals [tally units]."""
     values = zip(names, totals, strict=True)
     return {
-        f"{name}_{kind}": value
-        for name, total in values
-        for kind, value in (("squares", total * total), ("smallest", total), ("largest", total))
+        f"{name}_{kind}": total * total if kind == "squares" else total for name, total in values for kind in _JOINS
     }
 
 
-def joined_moments(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
-    """`Tallies.batch_moments` of the batches of both."""
-    return {name: _JOINS[name.rpartition("_")[2]](value, b[name]) for name, value in a.items()}
+def joined_moments(first: Mapping[str, int], *others: Mapping[str, int]) -> dict[str, int]:
+    """`Tallies.batch_moments` of the batches of all."""
+    total = dict(first)
+    for other in others:
+        total = {name: _JOINS[name.rpartition("_")[2]](value, other[name]) for name, value in total.items()}
+    return total
 
 
 def standard_error(tallies: NDArray[np.int64], second_moment: NDArray[np.uint64], batches: int) -> NDArray[np.float64]:
@@ -165,3 +168,95 @@ def standard_error(tallies: NDArray[np.int64], second_moment: NDArray[np.uint64]
     squares = second_moment[1] * 2.0**64 + second_moment[0]
     variance = np.maximum(squares - total**2 / batches, 0.0) / (batches - 1)
     return np.sqrt(batches * variance)
+
+
+# Photon ids, as [start, stop)
+
+Range = tuple[int, int]
+Ranges = tuple[Range, ...]
+
+
+def joined(ranges: Iterable[Range]) -> Ranges:
+    """The ranges in order, adjoining ones made one.
+
+    Raises:
+        ConfigError: Ids are in more than one of them.
+    """
+    whole: list[Range] = []
+    for start, stop in sorted(ranges):
+        if whole and start < whole[-1][1]:
+            raise ConfigError(f"photon ids {start} to {min(stop, whole[-1][1]) - 1} are in more than one result")
+        if whole and start == whole[-1][1]:
+            whole[-1] = (whole[-1][0], stop)
+        elif start < stop:
+            whole.append((start, stop))
+    return tuple(whole)
+
+
+def without(span: Range, done: Ranges) -> Ranges:
+    """The parts of a span that are not in `done`, which are joined ranges."""
+    left: list[Range] = []
+    start, stop = span
+    for first, last in done:
+        if start < min(first, stop):
+            left.append((start, min(first, stop)))
+        start = max(start, last)
+    if start < stop:
+        left.append((start, stop))
+    return tuple(left)
+
+
+def count(ranges: Iterable[Range]) -> int:
+    """How many ids there are."""
+    return sum(stop - start for start, stop in ranges)
+
+
+def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
+    """Part `shard[0]`, from 1, of `shard[1]` equal parts of a span of whole units.
+
+    Raises:
+        ConfigError: There are more parts than units.
+    """
+    (number, parts), (start, stop) = shard, span
+    units = (stop - start) // unit
+    if units < parts:
+        raise ConfigError(f"shard = {number}/{parts}: {stop - start} photons are {units} units of {unit}, too few")
+    return start + unit * (units * (number - 1) // parts), start + unit * (units * number // parts)
+
+
+class IdQueue:
+    """Ids that wait, taken from the front; those of lost workers are put back."""
+
+    def __init__(self, ranges: Iterable[Range]) -> None:
+        self._ranges = list[Range]()
+        self.put_back(ranges)
+
+    def take(self, size: int) -> Range | None:
+        """At most `size` ids; None if none are left."""
+        if not self._ranges:
+            return None
+        start, stop = self._ranges.pop()
+        if stop - start > size:
+            self._ranges.append((start + size, stop))
+            stop = start + size
+        self.left -= stop - start
+        return start, stop
+
+    def put_back(self, ranges: Iterable[Range]) -> None:
+        """Ids that are to be done again."""
+        self._ranges = sorted([*self._ranges, *ranges], reverse=True)
+        self.left = count(self._ranges)
+
+
+def photons_per_position(scene: Scene, photon_ranges: Sequence[Range]) -> NDArray[np.float64]:
+    """Photons whose light each pixel may hold, float64 `[H, W]`: all of them, or in a scan those of its position, but 1
+    at least."""
+    shape = (scene.camera.height, scene.camera.width)
+    if scene.scan_positions == 1:
+        return np.full(shape, float(count(photon_ranges)))
+    pixels = shape[0] * shape[1]
+    position = np.arange(pixels)
+    photons = np.zeros(pixels)
+    for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
+        photons += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
+    return np.maximum(photons, 1.0).reshape(shape)

@@ -8,19 +8,14 @@ from typing import TYPE_CHECKING
 
 from spadwarp.scene.ambient_light import *
 from spadwarp.scene.camera import *
-from spadwarp.scene.detector import *
+from spadwarp.scene.document import *
 from spadwarp.scene.laser import *
 from spadwarp.scene.medium import *
 from spadwarp.scene.pose import *
-from spadwarp.scene.scattering import *
 from spadwarp.scene.scene import *
+from spadwarp.scene.sections import *
 from spadwarp.scene.settings import *
-from spadwarp.scene.spectrum import *
-from spadwarp.scene.surroundings import *
-from spadwarp.scene.tables import *
-from spadwarp.scene.trajectory import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _MODULES = (ambient_light, camera, detector, laser, medium, pose, scattering)
-    _MODULES += (scene, settings, spectrum, surroundings, tables, trajectory)
+    _MODULES = (ambient_light, camera, document, laser, medium, pose, scene, sections, settings)
     __all__ = [name for module in _MODULES for name in module.__all__]

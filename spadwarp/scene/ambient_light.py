@@ -14,15 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ConfigError
-from spadwarp.limits import Interval
-from spadwarp.scene.medium import Medium
+from spadwarp.scene.laser import filter_band, filter_transmission, widths_of
+from spadwarp.scene.medium import Medium, PhaseFunction, phase_function
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.scattering import PhaseFunction, phase_function
 from spadwarp.scene.scene import Scene, camera_port
 from spadwarp.scene.sight import pixel_directions
-from spadwarp.scene.spectrum import filter_band, filter_transmission, widths_of
-from spadwarp.units import PLANCK, SPEED_OF_LIGHT
+from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, Interval
 from spadwarp.water.daylight import (
     SKY_REFLECTANCE,
     clear_sky_irradiance,
@@ -42,38 +39,20 @@ _PART_PIXELS = 1 << 16
 
 
 class _Field(NamedTuple):
-    """The light at the lens at one wavelength, per nm; directions in the camera frame.
+    """The light at the lens at one wavelength, per nm; directions in the camera frame."""
 
-    Attributes:
-        attenuation: κ = a + b_b along a line of sight [1/m].
-        decay: K_d with depth [1/m].
-        sun: Irradiance across the sun's light [W/m²].
-        sky: Radiance within Snell's window [W/m²/sr].
-        window: Cosine of its half angle.
-        towards: Direction in which the sun's light goes.
-        down: Away from the surface.
-        scattered: b·p(Θ) over `_ANGLES` [1/m/sr].
-        by_sky: What the sky sends into directions of propagation, over the cosine with `down` from -1 to 1.
-    """
-
-    attenuation: float
-    decay: float
-    sun: float
-    sky: float
-    window: float
-    towards: Floats
-    down: Floats
-    scattered: Floats
-    by_sky: Floats
-
-    def source(self, view: Floats) -> Floats:
-        """J towards the lens on lines of sight `[..., 3]` [W/m³/sr]."""
-        angle = np.arccos(np.clip(view @ -self.towards, -1.0, 1.0))
-        of_sky = np.interp(-(view @ self.down), np.linspace(-1.0, 1.0, self.by_sky.size), self.by_sky)
-        return self.sun * np.interp(angle, _ANGLES, self.scattered) + of_sky
+    attenuation: float  # κ = a + b_b along a line of sight [1/m]
+    decay: float  # K_d with depth [1/m]
+    sun: float  # irradiance across the sun's light [W/m²]
+    sky: float  # radiance within Snell's window [W/m²/sr]
+    window: float  # cosine of its half angle
+    towards: Floats  # direction in which the sun's light goes
+    down: Floats  # away from the surface
+    scattered: Floats  # b·p(Θ) over `_ANGLES` [1/m/sr]
+    by_sky: Floats  # what the sky sends into directions of propagation, over the cosine with `down` from -1 to 1
 
     def of_water(self, view: Floats, distance: Floats, depth: Floats | float) -> Floats:
-        """Radiance of the water up to a distance on lines of sight; up to the surface at most [W/m²/sr]."""
+        """Radiance of the water up to a distance on lines of sight `[..., 3]`; up to the surface at most [W/m²/sr]."""
         downwards = view @ self.down
         to_surface = np.where(downwards < -1e-9, depth / np.maximum(-downwards, 1e-9), np.inf)
         length = np.minimum(distance, to_surface)
@@ -82,11 +61,57 @@ class _Field(NamedTuple):
         product = np.where(np.isinf(length), np.inf, rate * np.where(np.isinf(length), 0.0, length))
         small = np.abs(product) < 1e-8
         safe = np.where(np.abs(rate) < 1e-12, 1e-12, rate)
-        return self.source(view) * np.where(small, length, -np.expm1(-np.where(small, 0.0, product)) / safe)
+        # J towards the lens [W/m³/sr].
+        angle = np.arccos(np.clip(view @ -self.towards, -1.0, 1.0))
+        of_sky = np.interp(-downwards, np.linspace(-1.0, 1.0, self.by_sky.size), self.by_sky)
+        source = self.sun * np.interp(angle, _ANGLES, self.scattered) + of_sky
+        return source * np.where(small, length, -np.expm1(-np.where(small, 0.0, product)) / safe)
 
-    def of_sky(self, view: Floats) -> Floats:
-        """Radiance of the sky within Snell's window, at the lens."""
-        return np.where(-(view @ self.down) > self.window, self.sky, 0.0)
+    def radiance(self, seen: _Seen, depth: float) -> Floats:
+        """Radiance that comes to the lens [W/m²/nm/sr], `[P]`."""
+        hit, begin = np.isfinite(seen.distance), np.maximum(depth + seen.deeper, 0.0)
+        of_sky = np.where(-(seen.view @ self.down) > self.window, self.sky, 0.0)  # within Snell's window
+        total = self.of_water(seen.view, seen.distance, begin) + np.where(hit, 0.0, of_sky)
+        if hit.any():
+            below = seen.distance[hit] * (seen.view[hit] @ self.down)
+            along = np.exp(-self.attenuation * seen.distance[hit] - self.decay * np.maximum(below, -begin[hit]))
+            total[hit] += seen.reflectance[hit] / math.pi * self._on_faces(seen.normal[hit], depth) * along
+        return total * np.exp(-self.decay * seen.deeper) * seen.passed
+
+    def _on_faces(self, normals: Floats, depth: float) -> Floats:
+        """Irradiance on faces of unit normals `[P, 3]` at the depth of the lens [W/m²/nm]: sun, sky, and the light that
+        the water sends up."""
+        rings, azimuths = 16, 24
+        down = self.down
+        first = np.cross(down, [1.0, 0.0, 0.0] if abs(down[0]) < 0.9 else [0.0, 1.0, 0.0])
+        first /= np.linalg.norm(first)
+        second = np.cross(down, first)
+        z = (2.0 * np.arange(rings) + 1.0) / rings - 1.0
+        phi = 2.0 * math.pi * (np.arange(azimuths) + 0.5) / azimuths
+        across = np.cos(phi)[:, None] * first + np.sin(phi)[:, None] * second
+        seen = (z[:, None, None] * down + np.sqrt(1.0 - z**2)[:, None, None] * across).reshape(-1, 3)
+        water = self.of_water(seen, np.full(len(seen), np.inf), depth)
+        # All light that goes down, scattered or not, is in what K_d leaves of sun and sky.
+        water[seen @ down < 0.0] = 0.0
+        # The window's edge is not on the rings: its own irradiance sets the scale.
+        inside = -seen @ down > self.window
+        whole = math.pi * (1.0 - self.window**2) * self.sky
+        sky = np.where(inside, whole / max((-seen @ down)[inside].sum(), 1e-9), 0.0)
+        # Faces of a mesh share normals.
+        kinds, index = np.unique(np.round(normals, 4), axis=0, return_inverse=True)
+        total = np.maximum(kinds @ seen.T, 0.0) @ (water * (4.0 * math.pi / len(seen)) + sky)
+        return (total + self.sun * np.maximum(kinds @ -self.towards, 0.0))[index.reshape(-1)]
+
+
+class _Seen(NamedTuple):
+    """Pixels and what is before them, `[P]` each."""
+
+    view: Floats  # lines of sight in the water `[P, 3]`
+    distance: Floats  # along them [m], infinite in open water
+    normal: Floats  # of surfaces `[P, 3]`
+    reflectance: Floats
+    deeper: Floats  # by how much deeper than the lens the lines begin [m]
+    passed: Floats  # radiance in front of the lens over that in the water
 
 
 def downwelling_irradiance(scene: Scene, wavelength_nm: ArrayLike, depth: float | None = None) -> Any:
@@ -113,21 +138,17 @@ def daylight_radiance(
     """Spectral radiance that comes to the lens along lines of sight [W/m²/nm/sr].
 
     Behind a port that is the transmission times (n_0/n_w)² of the radiance in the water, n_0 being the index inside.
+    Raises `ConfigError` for a scene without `[daylight]`, `ArgumentError` outside 400 to 700 nm.
 
     Args:
-        scene: With `[daylight]`.
-        wavelength_nm: 400 to 700 [nm].
+        scene, wavelength_nm: With `[daylight]`; 400 to 700 [nm].
         view: Unit vectors in the camera frame in which the lens sees `[..., 3]`.
         distance: Range of a surface `[...]` [m]; NaN or 0 for open water; default: open water.
-        normal: Of the surface, unit vectors towards the camera `[..., 3]`.
-        reflectance: Of it, Lambertian `[...]`.
-
-    Raises:
-        ConfigError: A scene without `[daylight]`.
-        ArgumentError: A wavelength out of range.
+        normal, reflectance: Of the surface: unit vectors towards the camera `[..., 3]`, Lambertian `[...]`.
     """
-    seen = _Seen.of(scene, np.asarray(view, np.float64), distance, normal, reflectance)
-    return _radiance(_field(scene, wavelength_nm), seen, _daylight(scene).depth)
+    view = np.asarray(view, np.float64)
+    seen = _seen(scene, view, distance, normal, reflectance)
+    return _field(scene, wavelength_nm).radiance(seen, _daylight(scene).depth).reshape(view.shape[:-1])
 
 
 def daylight_rate(
@@ -152,13 +173,13 @@ def daylight_rate(
     passed = widths_of(nodes) * filter_transmission(scene.laser, scene.detector, nodes)
     photons = passed * nodes * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
     fields = [(_field(scene, float(nm)), weight) for nm, weight in zip(nodes, photons, strict=True) if weight > 0.0]
-    seen = _Seen.of(scene, view, distance, normal, reflectance)
+    seen = _seen(scene, view, distance, normal, reflectance)
     total = np.zeros(len(seen.view))
     for first in range(0, len(total), _PART_PIXELS):
         part = slice(first, first + _PART_PIXELS)
-        pixels = seen.part(part)
+        pixels = _Seen(*(values[part] for values in seen))
         for field, weight in fields:
-            total[part] += _radiance(field, pixels, scene.daylight.depth) * weight
+            total[part] += field.radiance(pixels, scene.daylight.depth) * weight
     etendue = camera.aperture_area * camera.pixel_tangent**2 * view[..., 2] ** 4
     return total.reshape(view.shape[:-1]) * etendue * scene.detector.pde
 
@@ -177,60 +198,25 @@ def noise_rate(scene: Scene, truth: Any = None) -> Any:
 # Parts
 
 
-class _Seen(NamedTuple):
-    """Pixels and what is before them: lines of sight in the water `[P, 3]`, distance along them `[P]` (infinite in open
-    water), of surfaces the normal and the reflectance; by how much deeper than the lens the lines begin [m], and the
-    radiance in front of the lens over that in the water."""
-
-    view: Floats
-    distance: Floats
-    normal: Floats
-    reflectance: Floats
-    deeper: Floats | float
-    passed: Floats | float
-    shape: tuple[int, ...]
-
-    @classmethod
-    def of(cls, scene: Scene, view: Floats, distance: Any, normal: Any, reflectance: Any) -> _Seen:
-        shape, count = view.shape[:-1], view[..., 0].size
-        far = np.full(count, np.inf)
-        faces, shade = np.zeros((count, 3)), np.zeros(count)
-        if distance is not None:
-            given = np.nan_to_num(np.asarray(distance, np.float64), nan=0.0).reshape(-1)
-            far = np.where(given > 0.0, given, np.inf)
-            faces = np.nan_to_num(np.asarray(normal, np.float64)).reshape(-1, 3)
-            shade = np.nan_to_num(np.asarray(reflectance, np.float64)).reshape(-1)
-        view, port = view.reshape(-1, 3), camera_port(scene)
-        if port is None:
-            return cls(view, far, faces, shade, 0.0, 1.0, shape)
-        down = _daylight(scene).down @ rotation_matrix(scene.camera.rotation_deg)
-        start, direction, lead, _ = port.enter(np.zeros(3), view)
-        passes = np.isfinite(lead)
-        passed = port.transmission(np.zeros(3), view) * (port.index[0] / port.index[2]) ** 2
-        # Rays that do not get through see nothing.
-        direction = np.where(passes[:, None], direction, view)
-        deeper = np.where(passes, start @ down, 0.0)
-        along = np.maximum(far - np.where(passes, lead, 0.0), 0.0)
-        return cls(direction, along, faces, shade, deeper, np.where(passes, passed, 0.0), shape)
-
-    def part(self, pixels: slice) -> _Seen:
-        """Some of the pixels."""
-        view, distance = self.view[pixels], self.distance[pixels]
-        deeper, passed = (x if isinstance(x, float) else x[pixels] for x in (self.deeper, self.passed))
-        return _Seen(view, distance, self.normal[pixels], self.reflectance[pixels], deeper, passed, distance.shape)
-
-
-def _radiance(field: _Field, seen: _Seen, depth: float) -> Floats:
-    """Radiance that comes to the lens [W/m²/nm/sr], of the shape of what is seen."""
-    hit = np.isfinite(seen.distance)
-    begin = np.maximum(depth + seen.deeper, 0.0)
-    total = field.of_water(seen.view, seen.distance, begin) + np.where(hit, 0.0, field.of_sky(seen.view))
-    if hit.any():
-        below = seen.distance[hit] * (seen.view[hit] @ field.down)
-        above = -np.broadcast_to(begin, hit.shape)[hit]
-        along = np.exp(-field.attenuation * seen.distance[hit] - field.decay * np.maximum(below, above))
-        total[hit] += seen.reflectance[hit] / math.pi * _on_faces(field, seen.normal[hit], depth) * along
-    return (total * np.exp(-field.decay * seen.deeper) * seen.passed).reshape(seen.shape)
+def _seen(scene: Scene, view: Floats, distance: Any, normal: Any, reflectance: Any) -> _Seen:
+    """What pixels see along unit vectors `[..., 3]`, through the camera's port."""
+    view, port = view.reshape(-1, 3), camera_port(scene)
+    far, faces, shade = np.full(len(view), np.inf), np.zeros(view.shape), np.zeros(len(view))
+    if distance is not None:
+        given = np.nan_to_num(np.asarray(distance, np.float64), nan=0.0).reshape(-1)
+        far = np.where(given > 0.0, given, np.inf)
+        faces = np.nan_to_num(np.asarray(normal, np.float64)).reshape(-1, 3)
+        shade = np.nan_to_num(np.asarray(reflectance, np.float64)).reshape(-1)
+    if port is None:
+        return _Seen(view, far, faces, shade, np.zeros(len(view)), np.ones(len(view)))
+    down = _daylight(scene).down @ rotation_matrix(scene.camera.rotation_deg)
+    start, direction, lead, _ = port.enter(np.zeros(3), view)
+    passed = port.transmission(np.zeros(3), view) * (port.index[0] / port.index[2]) ** 2
+    passes = np.isfinite(lead)  # rays that do not get through see nothing
+    direction = np.where(passes[:, None], direction, view)
+    along = np.maximum(far - np.where(passes, lead, 0.0), 0.0)
+    deeper = np.where(passes, start @ down, 0.0)
+    return _Seen(direction, along, faces, shade, deeper, np.where(passes, passed, 0.0))
 
 
 def _daylight(scene: Scene) -> Any:
@@ -308,28 +294,3 @@ def _window_average(scattered: Floats, window: float) -> Floats:
     sines = np.sqrt(1.0 - cosines**2)[:, None, None] * np.sqrt(1.0 - mu**2)[None, :, None]
     angles = np.arccos(np.clip(cosines[:, None, None] * mu[None, :, None] + sines * np.cos(phi), -1.0, 1.0))
     return np.interp(np.maximum(angles, 0.1), _ANGLES, scattered).sum(axis=(1, 2)) * weight
-
-
-def _on_faces(field: _Field, normals: Floats, depth: float) -> Floats:
-    """Irradiance on faces of unit normals `[P, 3]` at the depth of the lens [W/m²/nm]: sun, sky, and the light that the
-    water sends up."""
-    rings, azimuths = 16, 24
-    down = field.down
-    first = np.cross(down, [1.0, 0.0, 0.0] if abs(down[0]) < 0.9 else [0.0, 1.0, 0.0])
-    first /= np.linalg.norm(first)
-    second = np.cross(down, first)
-    z = (2.0 * np.arange(rings) + 1.0) / rings - 1.0
-    phi = 2.0 * math.pi * (np.arange(azimuths) + 0.5) / azimuths
-    across = np.cos(phi)[:, None] * first + np.sin(phi)[:, None] * second
-    seen = (z[:, None, None] * down + np.sqrt(1.0 - z**2)[:, None, None] * across).reshape(-1, 3)
-    water = field.of_water(seen, np.full(len(seen), np.inf), depth)
-    # All light that goes down, scattered or not, is in what K_d leaves of sun and sky.
-    water[seen @ down < 0.0] = 0.0
-    # The window's edge is not on the rings: its own irradiance sets the scale.
-    inside = -seen @ down > field.window
-    sky = np.where(inside, math.pi * (1.0 - field.window**2) * field.sky / max((-seen @ down)[inside].sum(), 1e-9), 0.0)
-    solid_angle = 4.0 * math.pi / len(seen)
-    # Faces of a mesh share normals.
-    kinds, index = np.unique(np.round(normals, 4), axis=0, return_inverse=True)
-    total = np.maximum(kinds @ seen.T, 0.0) @ (water * solid_angle + sky)
-    return (total + field.sun * np.maximum(kinds @ -field.towards, 0.0))[index.reshape(-1)]

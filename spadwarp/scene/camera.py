@@ -9,26 +9,36 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 from xml.etree import ElementTree
 
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.text import parse_json, read_text, write_text
-from spadwarp.limits import check_integer, read_real, shown
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.sections import AnyFile, Brown, Coordinate, Infinite, Section, Vector, Whole, field_range
+from spadwarp.scene.sections import AnyFile, Coordinate, Infinite, Section, Vector, Whole, field, field_range, listed
+from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, read_real, shown
 
 __all__ = ["Camera", "load_calibration", "save_calibration"]
 
 Points = NDArray[np.float64]
+
+_INTRINSICS = ("fx", "fy", "cx", "cy", "calibration")
+
+
+def _padded(value: Any) -> Any:
+    """Four coefficients of distortion lack k3, as OpenCV allows."""
+    value = listed(value)
+    return (*value, 0.0) if isinstance(value, tuple) and len(value) == 4 else value
+
+
+Brown = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(_padded)]
 
 
 class Camera(Section):
@@ -40,52 +50,42 @@ class Camera(Section):
     """
 
     section: ClassVar[str] = "camera"
-    preset: str | None = None
-    """a named camera, see `spadwarp list presets camera`"""
-    width: Whole = Field(..., ge=1, le=16384)
-    """pixels in a row"""
-    height: Whole = Field(..., ge=1, le=16384)
-    """rows"""
-    horizontal_fov_deg: float | None = Field(None, ge=1e-6, lt=180)
-    """full horizontal field of view [°]"""
-    focal_length: float | None = Field(None, ge=1e-6, le=1e6)
-    """focal length [m]"""
-    pixel_pitch_um: float | None = Field(None, ge=1e-9, le=1e6)
-    """side of a pixel [µm]"""
-    fx: float | None = Field(None, ge=1e-3, le=1e9)
-    """focal length along rows [pixels], as OpenCV writes it"""
-    fy: float | None = Field(None, ge=1e-3, le=1e9)
-    """focal length along columns [pixels]; fx if not given"""
-    cx: Coordinate | None = None
-    """column of the optical axis, 0 at the first pixel's centre as in OpenCV; default: the middle"""
-    cy: Coordinate | None = None
-    """row of the optical axis, likewise"""
-    distortion: Brown = (0.0,) * 5
-    """Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order"""
-    calibration: AnyFile = None
-    """OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place"""
-    aperture_diameter: float | None = Field(None, ge=1e-9, le=1e6)
-    """diameter of the entrance aperture [m]"""
-    f_number: float | None = Field(None, ge=1e-3, le=1e6)
-    """focal length over aperture diameter"""
+    displaces: ClassVar = {
+        "horizontal_fov_deg": ("pixel_pitch_um", *_INTRINSICS),
+        "pixel_pitch_um": ("horizontal_fov_deg", *_INTRINSICS),
+        "fx": ("horizontal_fov_deg", "pixel_pitch_um"),
+        "calibration": ("horizontal_fov_deg", "pixel_pitch_um", *_INTRINSICS, "distortion"),
+        "aperture_diameter": ("f_number",),
+        "f_number": ("aperture_diameter",),
+    }
+    preset: str | None = field(None, "a named camera, see `spadwarp list presets camera`")
+    width: Whole = field(..., "pixels in a row", "[1, 16384]")
+    height: Whole = field(..., "rows", "[1, 16384]")
+    horizontal_fov_deg: float | None = field(None, "full horizontal field of view [°]", "[1e-6, 180)")
+    focal_length: float | None = field(None, "focal length [m]", "[1e-6, 1e6]")
+    pixel_pitch_um: float | None = field(None, "side of a pixel [µm]", "[1e-9, 1e6]")
+    fx: float | None = field(None, "focal length along rows [pixels], as OpenCV writes it", "[0.001, 1e9]")
+    fy: float | None = field(None, "focal length along columns [pixels]; fx if not given", "[0.001, 1e9]")
+    cx: Coordinate | None = field(None, "column of the optical axis, 0 at the first pixel's centre; default: middle")
+    cy: Coordinate | None = field(None, "row of the optical axis, likewise")
+    distortion: Brown = field((0.0,) * 5, "Brown's lens distortion k1, k2, p1, p2, k3, OpenCV's order")
+    calibration: AnyFile = field(None, "OpenCV's YAML or JSON file, whose fx, fy, cx, cy and distortion take its place")
+    aperture_diameter: float | None = field(None, "diameter of the entrance aperture [m]", "[1e-9, 1e6]")
+    f_number: float | None = field(None, "focal length over aperture diameter", "[0.001, 1e6]")
     focus_distance: Annotated[
         Annotated[float, Field(ge=1e-6, le=math.inf, allow_inf_nan=True)] | Literal["target"], Infinite
     ] = "target"
     """depth that is imaged sharply [m], inf or "infinity"; "target": that of the first target on the optical axis"""
-    pinhole: bool = False
-    """whether the lens is a point, which images all depths sharply and collects the light of the aperture's area"""
-    position: Vector = (0.0, 0.0, 0.0)
-    """lens centre in the world [m]"""
-    rotation_deg: Vector = (0.0, 0.0, 0.0)
-    """rotations from the world's axes about x, then the new y, then the new z [°]"""
+    pinhole: bool = field(False, "whether the lens is a point: all depths sharp, the light of the aperture's area")
+    position: Vector = field((0.0, 0.0, 0.0), "lens centre in the world [m]")
+    rotation_deg: Vector = field((0.0, 0.0, 0.0), "rotations from the world's axes about x, the new y, the new z [°]")
     polarisation: Literal["none", "analyser", "stokes"] = "none"
     """what it records of polarisation: nothing; light through an analyser and one across; the Stokes vector"""
     analyser_angle_deg: float = Field(0.0, ge=-180, le=180)
     """analyser: direction of the field that it lets through, in the image from +x towards +y [°]"""
     analyser_extinction_ratio: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True), Infinite] = math.inf
     """analyser: light that it lets through along its direction over light across; inf or "infinity" is ideal"""
-    port: Port | None = None
-    """what it looks through; view and focus are those in the air behind it. Without one it is in the water"""
+    port: Port | None = field(None, "what it looks through; view and focus are those in air; without it in water")
 
     @model_validator(mode="before")
     @classmethod
@@ -98,24 +98,22 @@ class Camera(Section):
                 raise ValueError(f"{name} = {fields[name]} is not {read[name]}, the image's of the calibration")
         return {**read, **{name: value for name, value in fields.items() if name != "calibration"}}
 
-    @model_validator(mode="after")
-    def _determined(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         given = [name for name in ("horizontal_fov_deg", "pixel_pitch_um", "fx") if getattr(self, name) is not None]
         if len(given) != 1:
             hint = f"; given: {', '.join(given)}" if given else ""
-            raise ValueError(f"needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length{hint}")
+            yield f"needs one of horizontal_fov_deg, fx, and pixel_pitch_um with focal_length{hint}"
         if (self.aperture_diameter is None) == (self.f_number is None):
-            raise ValueError("needs either aperture_diameter or f_number with focal_length")
+            yield "needs either aperture_diameter or f_number with focal_length"
         needs_it = [name for name in ("f_number", "pixel_pitch_um") if getattr(self, name) is not None]
         if self.focal_length is None and needs_it:
-            raise ValueError(f"focal_length is missing; {needs_it[0]} needs it")
-        self._only_with("fx", self.fx is not None, "fy", "cx", "cy")
+            yield f"focal_length is missing; {needs_it[0]} needs it"
+        yield from self._only_with("fx", self.fx is not None, "fy", "cx", "cy")
         if self.focus_distance != "target" and self.focus_distance <= (self.focal_length or 0.0):
-            self._refuse("focus_distance", f"is outside ({self.focal_length}, inf], beyond the focal length")
+            yield self._that("focus_distance", f"is outside ({self.focal_length}, inf], beyond the focal length")
         if not is_invertible(self):
             size = f"{self.width} x {self.height}"
-            self._refuse("distortion", f"is not one-to-one: some of its {size} pixels show no direction, or two")
-        return self
+            yield self._that("distortion", f"is not one-to-one: some of its {size} pixels show no direction, or two")
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -267,21 +265,21 @@ def view_box(camera: Camera) -> tuple[float, float, float, float]:
     columns, rows = np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)
     if not any(camera.distortion):
         columns, rows = columns[[0, -1]], rows[[0, -1]]
-    border = np.concatenate(
-        [_grid(columns, rows[[0, -1]]).reshape(-1, 2), _grid(columns[[0, -1]], rows).reshape(-1, 2)]
-    )
-    tangents = image_tangents(camera, border)
-    margin = _MARGIN / np.array(camera.focal_pixels)
-    (left, top), (right, bottom) = tangents.min(axis=0) - margin, tangents.max(axis=0) + margin
-    return float(left), float(top), float(right), float(bottom)
+    border = [_grid(columns, rows[[0, -1]]).reshape(-1, 2), _grid(columns[[0, -1]], rows).reshape(-1, 2)]
+    left, top, right, bottom = _boxes(camera, image_tangents(camera, np.concatenate(border))).tolist()
+    return left, top, right, bottom
 
 
 def pixel_views(camera: Camera) -> Points:
     """As `view_box` for each pixel alone: `[H, W, 4]`."""
     corners = image_tangents(camera, _grid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)))
-    four = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]])
+    return _boxes(camera, np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]]))
+
+
+def _boxes(camera: Camera, tangents: Points) -> Points:
+    """Boxes `[..., 4]` that hold tangents `[N, ..., 2]`."""
     margin = _MARGIN / np.array(camera.focal_pixels)
-    return np.concatenate([four.min(axis=0) - margin, four.max(axis=0) + margin], axis=-1)
+    return np.concatenate([tangents.min(axis=0) - margin, tangents.max(axis=0) + margin], axis=-1)
 
 
 def camera_attributes(camera: Camera, focus_distance: float | None) -> dict[str, NDArray[np.float64] | float]:
@@ -311,13 +309,8 @@ def _distort(tangents: Points, coefficients: tuple[float, ...]) -> Points:
     x, y = tangents[..., 0], tangents[..., 1]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
+    column = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    return np.stack([column, y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y], axis=-1)
 
 
 def _jacobian(tangents: Points, coefficients: tuple[float, ...]) -> tuple[Points, Points, Points]:
@@ -342,42 +335,27 @@ CALIBRATION_ENDINGS = (".xml", ".yml", ".yaml", ".json")
 _COORDINATE = field_range(Camera, "cx")
 _LARGEST = 1 << 19  # bytes; one with all corners of 100 views has 300 kB
 
-# What programs call the same thing.
-_NAMES = {
-    "camera_matrix": ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "mtx", "K", "M"),
-    "distortion": (
-        "distortion_coefficients",
-        "dist_coeffs",
-        "dist_coeff",
-        "distCoeffs",
-        "distortion",
-        "dist",
-        "D",
-    ),
-    "width": ("image_width", "width"),
-    "height": ("image_height", "height"),
-}
+# What programs call the same thing, OpenCV's name first.
+_NAMES = (
+    ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "mtx", "K", "M"),
+    ("distortion_coefficients", "dist_coeffs", "dist_coeff", "distCoeffs", "distortion", "dist", "D"),
+    ("image_width", "width"),
+    ("image_height", "height"),
+)
 
 
 def load_calibration(path: str | Path) -> dict[str, Any]:
     """Fields of the scene's `camera` section from a calibration file.
 
     Reads `camera_matrix` (3 × 3), `distortion_coefficients` (k1, k2, p1, p2[, k3]) and, if there, `image_width` and
-    `image_height`, under these or the other usual names.
-
-    Returns:
-        `fx`, `fy`, `cx`, `cy`, `distortion` [pixels, 1], and `width` and `height` if the file has them.
-
-    Raises:
-        FileError: The file cannot be read.
-        ConfigError: It holds no calibration, one of a lens model other than Brown's, or numbers that are not finite.
+    `image_height`, under these or the other usual names, as `fx`, `fy`, `cx`, `cy`, `distortion` [pixels, 1], and
+    `width` and `height`. Raises `FileError` if the file cannot be read, `ConfigError` if it holds no calibration, one
+    of a lens model other than Brown's, or numbers that are not finite.
     """
     try:
-        text = read_text(path, largest=_LARGEST)
+        return _fields(_entries(read_text(path, largest=_LARGEST)))
     except FileError as error:
         raise FileError(f"camera.calibration = {error}") from None
-    try:
-        return _fields(_entries(text))
     except ValueError as error:
         raise ConfigError(f"camera.calibration = {str(path)!r}: {error}") from None
 
@@ -386,44 +364,59 @@ def save_calibration(camera: Camera, path: str | Path) -> Path:
     """Writes a camera's calibration as OpenCV's `cv::FileStorage` reads it: XML, YAML or JSON by the ending.
 
     Holds `image_width`, `image_height`, `camera_matrix` and `distortion_coefficients` (k1, k2, p1, p2, k3), as
-    `cv2.calibrateCamera` gives them: 0 is the centre of the first pixel.
-
-    Raises:
-        ArgumentError: Another ending.
-        FileError: The file cannot be written.
+    `cv2.calibrateCamera` gives them: 0 is the centre of the first pixel. Raises `ArgumentError` for another ending,
+    `FileError` if the file cannot be written.
     """
     path = Path(path)
     if (ending := path.suffix.lower()) not in CALIBRATION_ENDINGS:
         raise ArgumentError(f"{path}: ending {path.suffix!r} is not one of {', '.join(CALIBRATION_ENDINGS)}")
     numbers: Any = camera_attributes(camera, None)
-    size = {"image_width": camera.width, "image_height": camera.height}
-    matrices: dict[str, dict[str, Any]] = {
-        "camera_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": numbers["camera_matrix"].tolist()},
-        "distortion_coefficients": {"rows": 1, "cols": 5, "dt": "d", "data": numbers["camera_distortion"].tolist()},
-    }
+    entries: dict[str, Any] = {"image_width": camera.width, "image_height": camera.height}
+    for name, rows, values in (
+        ("camera_matrix", 3, "camera_matrix"),
+        ("distortion_coefficients", 1, "camera_distortion"),
+    ):
+        data = numbers[values].tolist()
+        entries[name] = {"type_id": "opencv-matrix", "rows": rows, "cols": len(data) // rows, "dt": "d", "data": data}
     if ending == ".json":
-        tables = {name: {"type_id": "opencv-matrix", **matrix} for name, matrix in matrices.items()}
-        return write_text(json.dumps({**size, **tables}, indent=1) + "\n", path)
-    is_xml = ending == ".xml"
-    lines = ['<?xml version="1.0"?>', "<opencv_storage>"] if is_xml else ["%YAML:1.0", "---"]
-    lines += [f"<{name}>{value}</{name}>" if is_xml else f"{name}: {value}" for name, value in size.items()]
-    for name, matrix in matrices.items():
-        data = map(repr, matrix["data"])
-        matrix["data"] = " ".join(data) if is_xml else f"[ {', '.join(data)} ]"
-        lines += [f'<{name} type_id="opencv-matrix">' if is_xml else f"{name}: !!opencv-matrix"]
-        lines += [f"  <{key}>{value}</{key}>" if is_xml else f"   {key}: {value}" for key, value in matrix.items()]
-        lines += [f"</{name}>"] if is_xml else []
-    return write_text("\n".join([*lines, "</opencv_storage>", ""] if is_xml else [*lines, ""]), path)
+        return write_text(json.dumps(entries, indent=1) + "\n", path)
+    write = _xml_lines if ending == ".xml" else _yaml_lines
+    return write_text("\n".join([*write(entries), ""]), path)
+
+
+def _xml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
+    yield from ('<?xml version="1.0"?>', "<opencv_storage>")
+    for name, value in entries.items():
+        if not isinstance(value, Mapping):
+            yield f"<{name}>{value}</{name}>"
+            continue
+        yield f'<{name} type_id="opencv-matrix">'
+        for key in ("rows", "cols", "dt", "data"):
+            text = " ".join(map(repr, value[key])) if key == "data" else value[key]
+            yield f"  <{key}>{text}</{key}>"
+        yield f"</{name}>"
+    yield "</opencv_storage>"
+
+
+def _yaml_lines(entries: Mapping[str, Any]) -> Iterator[str]:
+    yield from ("%YAML:1.0", "---")
+    for name, value in entries.items():
+        yield f"{name}: {'!!opencv-matrix' if isinstance(value, Mapping) else value}"
+        if isinstance(value, Mapping):
+            yield from (f"   {key}: {value[key]}" for key in ("rows", "cols", "dt"))
+            yield f"   data: [ {', '.join(map(repr, value['data']))} ]"
 
 
 def _entries(text: str) -> dict[str, Any]:
-    if text.lstrip().startswith("<"):
-        return _xml_entries(text)
-    is_json = text.lstrip().startswith("{")
+    """Names and values of a file in XML, JSON or YAML. Raises `ValueError`."""
+    start = text.lstrip()[:1]
+    kind = {"<": "XML", "{": "JSON"}.get(start, "YAML")
     try:  # OpenCV's first line is no YAML
-        entries = parse_json(text) if is_json else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
-    except (ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"not valid {'JSON' if is_json else 'YAML'}: {' '.join(str(error).split())}") from None
+        if kind == "XML":
+            return _xml_entries(text)
+        entries = parse_json(text) if kind == "JSON" else yaml.load(text.removeprefix("%YAML:1.0"), Loader=_Loader)
+    except (ValueError, yaml.YAMLError, ElementTree.ParseError) as error:
+        raise ValueError(f"not valid {kind}: {' '.join(str(error).split())}") from None
     except RecursionError:
         raise ValueError("not valid YAML: lists or tables are nested too deeply") from None
     return entries if isinstance(entries, dict) else {}
@@ -432,24 +425,14 @@ def _entries(text: str) -> dict[str, Any]:
 def _xml_entries(text: str) -> dict[str, Any]:
     """The entries of OpenCV's XML, its matrices as `_numbers` takes them."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # with entities a small file can be huge
-        raise ValueError("not OpenCV's XML: it declares a document type")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(f"not valid XML: {error}") from None
-    entries: dict[str, Any] = {}
-    for element in root:
-        if element.find("data") is not None:  # a matrix
-            parts = {part.tag: (part.text or "").split() for part in element}
-            entries[element.tag] = {**parts, "rows": _one(parts.get("rows")), "cols": _one(parts.get("cols"))}
-        else:
-            entries[element.tag] = _one((element.text or "").split())
-    return entries
+        raise ValueError("it declares a document type, which OpenCV's does not")
 
+    def words(text: str | None) -> Any:
+        found = (text or "").split()
+        return found[0] if len(found) == 1 else found
 
-def _one(words: list[str] | None) -> list[str] | str | None:
-    """The word of a list of one, else the list."""
-    return words[0] if words is not None and len(words) == 1 else words
+    root = ElementTree.fromstring(text)
+    return {one.tag: {part.tag: words(part.text) for part in one} if len(one) else words(one.text) for one in root}
 
 
 class _Loader(yaml.BaseLoader):
@@ -462,32 +445,25 @@ class _Loader(yaml.BaseLoader):
 
 
 def _fields(entries: Mapping[str, Any]) -> dict[str, Any]:
-    def find(key: str) -> list[float] | None:
-        name = next((name for name in _NAMES[key] if name in entries), None)
-        return None if name is None else _numbers(name, entries[name])
-
     model = entries.get("distortion_model", entries.get("camera_model", "plumb_bob"))
     if str(model).lower() not in ("plumb_bob", "brown", "pinhole", "opencv", "radtan"):
         raise ValueError(f"the lens model {shown(model)} is not Brown's (k1, k2, p1, p2, k3)")
-    matrix = find("camera_matrix")
-    if matrix is None or len(matrix) != 9:
+    matrix, distortion, *size = (
+        next((_numbers(name, entries[name]) for name in names if name in entries), []) for names in _NAMES
+    )
+    if len(matrix) != 9:
         raise ValueError("holds no camera_matrix of 3 x 3 numbers")
     fx, skew, cx, zero, fy, cy, *last = matrix
     if skew or zero or last != [0, 0, 1] or fx <= 0 or fy <= 0:
         raise ValueError(f"camera_matrix = {shown(matrix)} is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]")
-    distortion = find("distortion") or []
     if any(distortion[5:]) or len(distortion) not in (0, 4, 5, 8, 12, 14):
-        raise ValueError(
-            f"distortion_coefficients = {shown(distortion)}: k1, k2, p1, p2, k3 are known, no rational, prism or tilt"
-            " terms"
-        )
-    coefficients = tuple([*distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5])
-    fields: dict[str, Any] = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": coefficients}
-    for name in ("width", "height"):
-        if (pixels := find(name)) is not None:
-            fields[name] = check_integer(
-                f"image_{name}", pixels[0] if len(pixels) == 1 else pixels, field_range(Camera, name)
-            )
+        known = "k1, k2, p1, p2, k3 are known, no rational, prism or tilt terms"
+        raise ValueError(f"distortion_coefficients = {shown(distortion)}: {known}")
+    fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "distortion": tuple([*distortion, *[0.0] * 5][:5])}
+    for name, pixels in zip(("width", "height"), size, strict=True):
+        if pixels:
+            number = pixels[0] if len(pixels) == 1 else pixels
+            fields[name] = check_integer(f"image_{name}", number, field_range(Camera, name))
     return fields
 
 

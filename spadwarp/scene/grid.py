@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from spadwarp.errors import ConfigError, FileError, SpadwarpError
 from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
-from spadwarp.limits import Interval
 from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field_range
-from spadwarp.scene.tables import COEFFICIENTS
+from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range
+from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 
 __all__: list[str] = []
+
+COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
+"""Of water; two of them determine all."""
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.floating]
@@ -43,58 +44,46 @@ class Grid(Section):
     density 1. A file with coefficients gives the water itself.
     """
 
-    section: ClassVar[str] = "grid"
-    file: AnyFile = None
-    """path of a .npz, .h5 or .nvdb file with cells, relative to the scene file"""
+    displaces: ClassVar = {"file": ("shape", "cells", "turbulence", "eddy_size", "seed"), "shape": ("file",)}
+    file: AnyFile = field(None, "path of a .npz, .h5 or .nvdb file with cells, relative to the scene file")
     shape: Literal["cloud", "plume", "sediment", "gradient"] | None = None
     """in place of a file: a round cloud, a plume that rises, matter stirred up from the bottom, a rise from top to
     bottom; the box's y points down"""
-    size: Size | None = None
-    """edges of the box, one or three; default: those of the file [m]"""
-    cells: Counts = (64,)
-    """shape: number of cells along the edges; one number: along the longest"""
-    extinction: float = Field(1.0, ge=0, le=1e6)
-    """what density 1 adds to the medium's extinction [1/m]"""
-    albedo: float = Field(0.8, ge=0, le=1)
-    """single-scattering albedo of what is added"""
-    anisotropy: float | None = Field(None, gt=-1, lt=1)
-    """henyey_greenstein: mean cosine of the scattering by what is added; default: the medium's"""
+    size: Size | None = field(None, "edges of the box, one or three; default: those of the file [m]")
+    cells: Counts = field((64,), "shape: number of cells along the edges; one number: along the longest")
+    extinction: float = field(1.0, "what density 1 adds to the medium's extinction [1/m]", "[0, 1e6]")
+    albedo: float = field(0.8, "single-scattering albedo of what is added", "[0, 1]")
+    anisotropy: float | None = field(None, "henyey_greenstein: g of what is added; default: the medium's", "(-1, 1)")
     turbulence: float = Field(0.0, ge=0, le=3)
     """shape: standard deviation of the logarithm of the density about the shape, by eddies of von Kármán's spectrum"""
     eddy_size: float | None = Field(None, ge=1e-6, le=1e9)
-    """shape: size of the largest eddies; default: a third of the box's shortest edge [m]"""
-    seed: Whole = Field(0, ge=0, le=2**63 - 1)
-    """shape: of the turbulence"""
+    """shape: the largest; default: a third of the shortest edge [m]"""
+    seed: Whole = field(0, "shape: of the turbulence", "[0, 9223372036854775807]")
     frame: float = Field(0.0, ge=0, le=1e9)
     """time, for what moves: in a file's frames, between which cells are interpolated; in turnovers of a shape's largest
     eddies"""
-    scale: Scale = (1.0, 1.0, 1.0)
-    """factor on the size, one or three"""
-    rotation_deg: Vector = (0.0, 0.0, 0.0)
-    """rotations about the box's own x, then its new y, then its new z [°]"""
-    translation: Vector = (0.0, 0.0, 0.0)
-    """shift in the world [m], the camera's frame if it has no pose"""
+    scale: Scale = field((1.0, 1.0, 1.0), "factor on the size, one or three")
+    rotation_deg: Vector = field((0.0, 0.0, 0.0), "rotations about the box's own x, then its new y, then its new z [°]")
+    translation: Vector = field((0.0, 0.0, 0.0), "shift in the world [m], the camera's frame if it has no pose")
     tracking: Literal["auto", "regular", "delta"] = "auto"
     """how photons fly through cells: "regular" from cell to cell, exact; "delta" by chance and without bias, faster
     where cells are many; "auto": the latter for more than 32 768 cells"""
 
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         if (self.file is None) == (self.shape is None):
-            raise ValueError("needs either file or shape")
+            yield "needs either file or shape"
         if self.file is not None and Path(self.file).suffix.lower() not in GRID_ENDINGS:
             is_vdb = self.file.lower().endswith(".vdb")
             hint = "; `nanovdb_convert` of OpenVDB makes a .nvdb file of it" if is_vdb else ""
-            self._refuse("file", f"does not end in {', '.join(GRID_ENDINGS)}{hint}")
+            yield self._that("file", f"does not end in {', '.join(GRID_ENDINGS)}{hint}")
         if self.shape is not None and self.size is None:
-            raise ValueError(f"needs size with shape = {self.shape!r}")
+            yield f"needs size with shape = {self.shape!r}"
         for name in ("size", "cells"):
             if len(getattr(self, name) or ()) == 2:
-                self._refuse(name, "has two numbers; one or three are needed")
+                yield self._that(name, "has two numbers; one or three are needed")
         if min(self.scale) <= 0.0:
-            self._refuse("scale", "is not positive")
-        self._only_with("shape", self.shape is not None, *_OF_SHAPES)
-        return self
+            yield self._that("scale", "is not positive")
+        yield from self._only_with("shape", self.shape is not None, *_OF_SHAPES)
 
     @property
     def edges(self) -> tuple[float, float, float] | None:
@@ -121,32 +110,21 @@ class Grid(Section):
         return {name: value for name, value in fields.items() if name not in hidden}
 
 
-# Shapes: in the box's own coordinates x, y and z run from -1 to 1; y points down, as in the world.
+# Shapes
+
+SHAPES = ("cloud", "plume", "sediment", "gradient")
 
 
-def cloud(x: Floats, y: Floats, z: Floats) -> Floats:
-    """A Gaussian in all directions, of a standard deviation of a third of half the edge; 1 in the middle."""
-    return np.exp(-4.5 * (x**2 + y**2 + z**2))
-
-
-def plume(x: Floats, y: Floats, z: Floats) -> Floats:
-    """A Gaussian across, from the middle of the bottom upwards, four times as wide at the top; 1 where it begins."""
-    width = 0.1 + 0.15 * (1.0 - y)
-    return (0.1 / width) ** 2 * np.exp(-0.5 * (x**2 + z**2) / width**2)
-
-
-def sediment(x: Floats, y: Floats, z: Floats) -> Floats:
-    """Matter stirred up from the bottom: it falls to 1/e in a fifth of the height, and towards the sides."""
-    return np.exp(-5.0 * 0.5 * (1.0 - y)) * np.cos(0.5 * np.pi * x) ** 2 * np.cos(0.5 * np.pi * z) ** 2
-
-
-def gradient(x: Floats, y: Floats, z: Floats) -> Floats:
-    """From 0 at the top to 1 at the bottom."""
-    return 0.5 * (1.0 + y) + 0.0 * (x + z)
-
-
-SHAPES = {"cloud": cloud, "plume": plume, "sediment": sediment, "gradient": gradient}
-"""Densities by the name of `medium.grid.shape`."""
+def shape_values(shape: str, x: Floats, y: Floats, z: Floats) -> Floats:
+    """Density of a shape in the box's own coordinates, which run from -1 to 1; y points down, as in the world."""
+    if shape == "cloud":  # a Gaussian in all directions, of a standard deviation of a third of half the edge
+        return np.exp(-4.5 * (x**2 + y**2 + z**2))
+    if shape == "plume":  # a Gaussian across, from the middle of the bottom upwards, four times as wide at the top
+        width = 0.1 + 0.15 * (1.0 - y)
+        return (0.1 / width) ** 2 * np.exp(-0.5 * (x**2 + z**2) / width**2)
+    if shape == "sediment":  # from the bottom it falls to 1/e in a fifth of the height, and towards the sides
+        return np.exp(-5.0 * 0.5 * (1.0 - y)) * np.cos(0.5 * np.pi * x) ** 2 * np.cos(0.5 * np.pi * z) ** 2
+    return 0.5 * (1.0 + y) + 0.0 * (x + z)  # from 0 at the top to 1 at the bottom
 
 
 def shape_density(grid: Grid) -> Floats:
@@ -154,11 +132,10 @@ def shape_density(grid: Grid) -> Floats:
     counts, edges = grid.cell_counts, grid.edges
     assert grid.shape is not None and edges is not None  # see Grid
     axes = [(2.0 * np.arange(count) + 1.0) / count - 1.0 for count in counts]
-    density = SHAPES[grid.shape](axes[0][:, None, None], axes[1][:, None], axes[2])
+    density = shape_values(grid.shape, axes[0][:, None, None], axes[1][:, None], axes[2])
     if grid.turbulence > 0.0:
-        eddy = grid.eddy_size or min(edges) / 3.0
-        field = turbulent_field(counts, edges, eddy, grid.seed, grid.frame)
-        density = density * np.exp(grid.turbulence * field - 0.5 * grid.turbulence**2)
+        eddies = turbulent_field(counts, edges, grid.eddy_size or min(edges) / 3.0, grid.seed, grid.frame)
+        density = density * np.exp(grid.turbulence * eddies - 0.5 * grid.turbulence**2)
     return density
 
 
@@ -166,14 +143,8 @@ def turbulent_field(
     counts: tuple[int, int, int], edges: tuple[float, float, float], eddy_size: float, seed: int, time: float = 0.0
 ) -> Floats:
     """A Gaussian random field of mean 0 and variance 1 with von Kármán's spectrum, (k² + k0²)^(-11/6), k0 = 2π over
-    eddy_size.
-
-    Args:
-        counts: Cells along the edges.
-        edges: Of the box [m].
-        eddy_size: Of the largest eddies [m].
-        seed: Same seed, same field.
-        time: In turnovers of the largest eddies; a mode changes at the rate of its own, as k^(2/3).
+    `eddy_size` [m], in cells along the edges of a box [m]. `time` is in turnovers of the largest eddies; a mode changes
+    at the rate of its own, as k^(2/3).
     """
     rng = np.random.default_rng(seed)
     waves = [2.0 * np.pi * np.fft.fftfreq(n, edge / n) for n, edge in zip(counts, edges, strict=True)]
@@ -208,13 +179,8 @@ Place = tuple[float, float, float]
 
 
 class GridFile(NamedTuple):
-    """Cells of a file.
-
-    Attributes:
-        arrays: By the names of `GRID_ARRAYS`, `[frame, x, y, z]` float32.
-        size: Edges of the box [m]; None: the scene has to say.
-        origin: Its lower corner in the file's own frame [m]; None: the box stands about its middle.
-    """
+    """Cells of a file: arrays by the names of `GRID_ARRAYS`, `[frame, x, y, z]` float32; edges of the box [m], None if
+    the scene has to say; its lower corner in the file's own frame [m], None if it stands about its middle."""
 
     arrays: Mapping[str, NDArray[np.float32]]
     size: Place | None = None
@@ -226,117 +192,103 @@ def read_grid(path: str | Path) -> GridFile:
 
     `.npz` and `.h5`: arrays by these names, `[x, y, z]` or `[frame, x, y, z]`, and `size` (3 edges) or `cell_size` (one
     or 3) and `origin` [m]. `.nvdb`: grids of these names, or one grid of any name, which is the density; the box holds
-    the voxels that are set.
-
-    Raises `FileError`.
+    the voxels that are set. Raises `FileError`.
     """
     place, names = existing_file(path), (*GRID_ARRAYS, *_PLACES)
     try:
         if place.suffix.lower() == ".nvdb":
-            arrays = _read_nvdb(place)
-        elif place.suffix.lower() == ".npz":
-            arrays = read_npz(place, names=names, largest=LARGEST_CELL_COUNT)
-        else:
-            with read_hdf5(place) as file:
-                found = {name: entry for name, entry in file.arrays().items() if name in names}
-                arrays = {name: file.array(name, kind, (None,) * len(shape)) for name, (shape, kind) in found.items()}
-        return _checked(place, arrays)
-    except FileError:
-        raise
+            return _checked(_read_nvdb(place))
+        if place.suffix.lower() == ".npz":
+            return _checked(read_npz(place, names=names, largest=LARGEST_CELL_COUNT))
+        with read_hdf5(place) as file:
+            found = {name: entry for name, entry in file.arrays().items() if name in names}
+            return _checked({n: file.array(n, kind, (None,) * len(shape)) for n, (shape, kind) in found.items()})
+    except _Unfit as error:
+        raise FileError(f"{path}: {error}") from None
     except (SpadwarpError, ValueError, TypeError, RuntimeError, OSError, MemoryError) as error:
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
+        raise (
+            error if isinstance(error, FileError) else FileError(f"{path}: damaged or not readable: {error}")
+        ) from error
+
+
+class _Unfit(Exception):
+    """Why the content of a file is no grid."""
 
 
 def _read_nvdb(path: Path) -> dict[str, NDArray[Any]]:
-    """By way of `wp.Volume`, on the CPU."""
-    import warp as wp
-
-    volume: Any = wp.Volume.load_from_nvdb(path.read_bytes(), device="cpu")
-    volumes: list[Any] = []
-    while volume is not None:
-        volumes.append(volume)
-        info = volume.get_grid_info()
-        volume = volume.load_next_grid() if info.grid_index + 1 < info.grid_count else None
-    names = [one.get_grid_info().name for one in volumes]
-    named = {name: one for name, one in zip(names, volumes, strict=True) if name in GRID_ARRAYS}
-    if not named:
-        if len(volumes) > 1:
-            raise FileError(f"{path}: grids {names}, none of which is one of {', '.join(GRID_ARRAYS)}")
-        named = {"density": volumes[0]}
-    voxels = {name: one.get_voxels().numpy() for name, one in named.items()}
-    if not all(map(len, voxels.values())):
-        raise FileError(f"{path}: a grid without voxels")
-    low = np.min([one.min(axis=0) for one in voxels.values()], axis=0)
-    shape = tuple(int(n) for n in np.max([one.max(axis=0) for one in voxels.values()], axis=0) + 1 - low)
-    if np.prod(shape, dtype=np.float64) > LARGEST_CELL_COUNT:
-        raise FileError(f"{path}: voxels within {shape} cells; at most {LARGEST_CELL_COUNT} are allowed")
-    info = next(iter(named.values())).get_grid_info()
-    transform = np.array(info.transform_matrix, np.float64).reshape(3, 3)
-    cell = np.diag(transform)
-    if not np.allclose(transform, np.diag(cell)) or (cell <= 0.0).any():
-        raise FileError(f"{path}: a rotated or mirrored grid; rotate it by medium.grid.rotation_deg")
-    # A voxel's value is that at its middle, which is the place of its index.
-    origin = np.array(info.translation, np.float64) + (low - 0.5) * cell
-    arrays = {name: _dense(path, one, voxels[name], low, shape) for name, one in named.items()}
-    return {**arrays, "size": cell * shape, "origin": origin}
-
-
-def _dense(path: Path, volume: Any, voxels: Any, low: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The values of a sparse grid, and its background where there are none."""
+    """By way of `wp.Volume`, on the CPU: the voxels of sparse grids, and their background where there are none."""
     import warp as wp
 
     import spadwarp_kernels as sk
 
-    if volume.dtype is not wp.float32:
-        raise FileError(f"{path}: grid {volume.get_grid_info().name!r} holds {volume.dtype}; float is needed")
-    values = wp.empty(len(voxels), dtype=float, device="cpu")
-    indices: wp.array = wp.array(voxels, dtype=wp.vec3i, device="cpu")
-    wp.launch(sk.voxel_values_kernel, len(voxels), [volume.id, indices, values], device="cpu")
-    dense = np.zeros(shape, np.float32)
-    dense[tuple((voxels - low).T)] = values.numpy()
-    return dense
+    volume: Any = wp.Volume.load_from_nvdb(path.read_bytes(), device="cpu")
+    volumes: list[tuple[Any, Any]] = []
+    while volume is not None:
+        volumes.append((info := volume.get_grid_info(), volume))
+        volume = volume.load_next_grid() if info.grid_index + 1 < info.grid_count else None
+    named = {info.name: (info, one) for info, one in volumes if info.name in GRID_ARRAYS}
+    if not named and len(volumes) > 1:
+        names = [info.name for info, _ in volumes]
+        raise _Unfit(f"grids {names}, none of which is one of {', '.join(GRID_ARRAYS)}")
+    named = named or {"density": volumes[0]}
+    voxels = {name: one.get_voxels().numpy() for name, (_, one) in named.items()}
+    if not all(map(len, voxels.values())):
+        raise _Unfit("a grid without voxels")
+    low = np.min([one.min(axis=0) for one in voxels.values()], axis=0)
+    shape = tuple(int(n) for n in np.max([one.max(axis=0) for one in voxels.values()], axis=0) + 1 - low)
+    if np.prod(shape, dtype=np.float64) > LARGEST_CELL_COUNT:
+        raise _Unfit(f"voxels within {shape} cells; at most {LARGEST_CELL_COUNT} are allowed")
+    info = next(iter(named.values()))[0]
+    transform = np.array(info.transform_matrix, np.float64).reshape(3, 3)
+    cell = np.diag(transform)
+    if not np.allclose(transform, np.diag(cell)) or (cell <= 0.0).any():
+        raise _Unfit("a rotated or mirrored grid; rotate it by medium.grid.rotation_deg")
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, (info, one) in named.items():
+        if one.dtype is not wp.float32:
+            raise _Unfit(f"grid {info.name!r} holds {one.dtype}; float is needed")
+        values = wp.empty(len(voxels[name]), dtype=float, device="cpu")
+        indices: wp.array = wp.array(voxels[name], dtype=wp.vec3i, device="cpu")
+        wp.launch(sk.voxel_values_kernel, len(voxels[name]), [one.id, indices, values], device="cpu")
+        arrays[name] = np.zeros(shape, np.float32)
+        arrays[name][tuple((voxels[name] - low).T)] = values.numpy()
+    # A voxel's value is that at its middle, which is the place of its index.
+    origin = np.array(named[next(iter(named))][0].translation, np.float64) + (low - 0.5) * cell
+    return {**arrays, "size": cell * shape, "origin": origin}
 
 
-def _checked(path: Path, found: Mapping[str, NDArray[Any]]) -> GridFile:
+def _checked(found: Mapping[str, NDArray[Any]]) -> GridFile:
     arrays: dict[str, NDArray[np.float32]] = {}
     for name, interval in GRID_ARRAYS.items():
-        if name not in found:
+        if (values := found.get(name)) is None:
             continue
-        values = found[name]
         if values.ndim not in (3, 4) or values.dtype.kind not in "fiu" or not 0 < values.size <= LARGEST_CELL_COUNT:
-            raise FileError(
-                f"{path}: {name} is {values.dtype} {values.shape}; numbers [x, y, z] or [frame, x, y, z] of at most "
+            raise _Unfit(
+                f"{name} is {values.dtype} {values.shape}; numbers [x, y, z] or [frame, x, y, z] of at most "
                 f"{LARGEST_CELL_COUNT} cells are needed"
             )
         values = values.astype(np.float32).reshape(-1, *values.shape[-3:])
         if not (inside := interval.holds(values)).all():
             place = tuple(int(i) for i in np.argwhere(~inside)[0])
-            raise FileError(f"{path}: {name}{list(place[1:])} = {values[place]:g} is outside {interval}")
+            raise _Unfit(f"{name}{list(place[1:])} = {values[place]:g} is outside {interval}")
         arrays[name] = values
     coefficients = set(COEFFICIENTS) & set(arrays)
     if ("density" in arrays) == bool(coefficients) or len(coefficients) not in (0, 2):
-        held = ", ".join(arrays) or "none of them"
-        raise FileError(
-            f"{path}: holds {held}; density, or two of extinction, absorption, scattering and albedo are needed"
-        )
+        needed = "density, or two of extinction, absorption, scattering and albedo are needed"
+        raise _Unfit(f"holds {', '.join(arrays) or 'none of them'}; {needed}")
     shapes = {values.shape for values in arrays.values()}
     if len(shapes) > 1:
-        raise FileError(f"{path}: arrays of different shapes, {sorted(shapes)}")
-    places = {name: _place(path, name, found[name]) for name in _PLACES if name in found}
-    size = places.get("size")
-    if size is None and (cell := places.get("cell_size")) is not None:
-        (_, x, y, z) = shapes.pop()
-        size = (cell[0] * x, cell[1] * y, cell[2] * z)
-    return GridFile(arrays, size, places.get("origin"))
-
-
-def _place(path: Path, name: str, found: NDArray[Any]) -> Place:
-    values = np.asarray(found, np.float64).ravel()
-    values = np.repeat(values, 3) if values.size == 1 else values
-    if values.size != 3 or not Interval.read(_PLACES[name]).holds(values).all():
-        raise FileError(f"{path}: {name} = {values.tolist()[:4]} is not three numbers in {_PLACES[name]}")
-    x, y, z = values.tolist()
-    return x, y, z
+        raise _Unfit(f"arrays of different shapes, {sorted(shapes)}")
+    places: dict[str, NDArray[np.float64]] = {}
+    for name, within in _PLACES.items():
+        if name in found:
+            values = np.asarray(found[name], np.float64).ravel()
+            places[name] = np.repeat(values, 3) if values.size == 1 else values
+            if places[name].size != 3 or not Interval.read(within).holds(values).all():
+                raise _Unfit(f"{name} = {places[name].tolist()[:4]} is not three numbers in {within}")
+    if "cell_size" in places:
+        places.setdefault("size", places["cell_size"] * shapes.pop()[1:])
+    return GridFile(arrays, *(vector_of(places[name]) if name in places else None for name in ("size", "origin")))
 
 
 # Cells
@@ -344,38 +296,28 @@ def _place(path: Path, name: str, found: NDArray[Any]) -> Place:
 
 @dataclass(frozen=True, eq=False)
 class GridCells:
-    """Cells of water in a box, and what light loses on straight lines through it.
+    """Cells of water in a box, and what light loses on straight lines through it."""
 
-    Attributes:
-        extinction: c [1/m], `[x, y, z]` along the box's own axes.
-        albedo: b/c.
-        anisotropy: g; None: the medium's everywhere.
-        size: Edges of the box [m].
-        centre: Its middle in the world [m].
-        rotation: Its own axes in the world, as columns.
-    """
-
-    extinction: NDArray[np.float32]
-    albedo: NDArray[np.float32]
-    anisotropy: NDArray[np.float32] | None
-    size: Place
-    centre: Place
-    rotation: Floats
+    extinction: NDArray[np.float32]  # c [1/m], `[x, y, z]` along the box's own axes
+    albedo: NDArray[np.float32]  # b/c
+    anisotropy: NDArray[np.float32] | None  # g; None: the medium's everywhere
+    size: Place  # edges of the box [m]
+    centre: Place  # its middle in the world [m]
+    rotation: Floats  # its own axes in the world, as columns
 
     @property
     def scattering(self) -> NDArray[np.float32]:
         """b [1/m] of each cell."""
         return self.extinction * self.albedo
 
-    def in_cells(self, points: ArrayLike) -> Floats:
-        """Points of the world `[..., 3]` [m] in cells: the box has 0 ... shape there."""
-        shape = np.array(self.extinction.shape)
-        own = (np.asarray(points, np.float64) - self.centre) @ self.rotation
-        return (own / self.size + 0.5) * shape
-
     def at(self, points: ArrayLike, outside: float) -> Floats:
         """Extinction [1/m] at points of the world `[..., 3]`, with that outside the box."""
         return self._at(self.in_cells(points), outside)
+
+    def in_cells(self, points: ArrayLike) -> Floats:
+        """Points of the world `[..., 3]` [m] in cells: the box has 0 ... shape there."""
+        own = (np.asarray(points, np.float64) - self.centre) @ self.rotation
+        return (own / self.size + 0.5) * np.array(self.extinction.shape)
 
     def _at(self, places: Floats, outside: float) -> Floats:
         shape = self.extinction.shape
@@ -414,32 +356,32 @@ def cells_of(grid: Grid, water: tuple[float, float, float], has_table: bool, sta
 
     `has_table`: whether scattering is drawn from a table, which all cells share. `stamp` changes when the file does.
     """
-    edges, origin, own_g = grid.edges, None, None
+    edges, origin = grid.edges, None
+    found: dict[str, Any]
     if grid.file is None:
-        c, omega, g = _added(grid, shape_density(grid), water)
+        found = {"density": shape_density(grid)}
     else:
         file = _read(grid.file, stamp)
         edges, origin = edges or file.size, file.origin
         if edges is None:
             raise ConfigError(f"medium.grid: needs size; {grid.file} has no size and no cell_size")
         found = {name: _frame(grid, values) for name, values in file.arrays.items()}
-        own_g = found.get("anisotropy")
-        if own_g is not None and has_table:
-            raise ConfigError(
-                f"medium.grid.file = {grid.file!r} has an anisotropy, which goes with phase_function = "
-                "'henyey_greenstein' only; cells share any other"
-            )
-        if "density" in found:
-            c, omega, g = _added(grid, found["density"], water, own_g)
-        else:
-            c, omega, g = *_coefficients(found), own_g
+    own_g = found.get("anisotropy")
+    if own_g is not None and has_table:
+        raise ConfigError(
+            f"medium.grid.file = {grid.file!r} has an anisotropy, which goes with phase_function = "
+            "'henyey_greenstein' only; cells share any other"
+        )
+    if "density" in found:
+        c, omega, g = _added(grid, found["density"], water, own_g)
+    else:
+        c, omega, g = *_coefficients(found), own_g
     size = np.array(edges) * grid.scale
     rotation = rotation_matrix(grid.rotation_deg)
     own = np.zeros(3) if origin is None else (np.array(origin) + 0.5 * np.array(edges)) * grid.scale
-    centre = rotation @ own + grid.translation
     c, omega = np.ascontiguousarray(c, np.float32), np.ascontiguousarray(omega, np.float32)
     g = None if g is None else np.ascontiguousarray(g, np.float32)
-    return GridCells(c, omega, g, vector_of(size), vector_of(centre), rotation)
+    return GridCells(c, omega, g, vector_of(size), vector_of(rotation @ own + grid.translation), rotation)
 
 
 @functools.lru_cache(maxsize=2)
@@ -461,15 +403,14 @@ def _frame(grid: Grid, values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _added(
-    grid: Grid, density: Cells, water: tuple[float, float, float], own_anisotropy: Cells | None = None
+    grid: Grid, density: Cells, water: tuple[float, float, float], own_anisotropy: Cells | None
 ) -> tuple[Cells, Cells, Cells | None]:
     """The medium with suspended matter: coefficients add up, the mean cosine is that of both scatterings together."""
     extinction, albedo, anisotropy = water
     added = grid.extinction * density
     c = extinction + added
     b = extinction * albedo + grid.albedo * added
-    g = grid.anisotropy if own_anisotropy is None else own_anisotropy
-    mean: Cells | None = None
+    g, mean = grid.anisotropy if own_anisotropy is None else own_anisotropy, None
     if g is not None:
         both = (extinction * albedo * anisotropy + grid.albedo * added * g) / np.maximum(b, 1e-30)
         mean = np.where(b > 0.0, both, anisotropy)
@@ -478,17 +419,12 @@ def _added(
 
 def _coefficients(found: Mapping[str, NDArray[np.float32]]) -> tuple[Cells, Cells]:
     """Extinction and albedo from two of the four coefficients."""
-    a, b, c, omega = (found.get(name) for name in COEFFICIENTS)
+    a, b, c, omega = (found.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
     tiny = np.float32(1e-30)
     if omega is not None:
         if b is not None:
             return b / np.maximum(omega, tiny) * (omega > 0.0), omega
-        if a is not None:
-            return a / np.maximum(1.0 - omega, tiny) * (omega < 1.0), omega
-        assert c is not None  # two of the four are there
-        return c, omega
-    if c is None:
-        assert a is not None and b is not None
-        c = a + b
-    scattered = b if b is not None else np.maximum(c - (0.0 if a is None else a), 0.0)
+        return (c if a is None else a / np.maximum(1.0 - omega, tiny) * (omega < 1.0)), omega
+    c = a + b if c is None else c
+    scattered = np.maximum(c - a, 0.0) if b is None else b
     return c, np.clip(scattered / np.maximum(c, tiny), 0.0, 1.0)

@@ -1,61 +1,152 @@
-"""Water: the section `medium`, its layers, and what it is along a line."""
+"""Water: the section `medium`, its layers, what it is along a line, and how it scatters."""
 
 from __future__ import annotations
 
 import bisect
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
 
-from spadwarp.limits import bounds
-from spadwarp.scene.grid import Grid, GridCells, cells_of
+from spadwarp.scene.grid import COEFFICIENTS, Grid, GridCells, cells_of
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.sections import (
+    PRESETS,
     Coordinate,
     CsvFile,
     Direction,
     FilePath,
     Section,
+    field,
     field_range,
     listed,
-    with_units,
+    read_table,
 )
-from spadwarp.scene.tables import (
-    COEFFICIENTS,
-    PHASE_FIELDS,
-    PHASE_TABLES,
-    PRESETS,
-    WATER_INDICES,
-    complete_coefficients,
-    merge_section,
+from spadwarp.values import ConfigError, bounds, pulse_speed
+from spadwarp.water import (
+    molecular_density,
+    rayleigh_matrix,
+    read_matrix_table,
+    scaled_rayleigh_matrix,
+    voss_fry_matrix,
 )
-from spadwarp.units import pulse_speed
 from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, water_optics
 
-__all__ = ["Layer", "Medium"]
+__all__ = ["Layer", "Matrix", "Medium", "PhaseFunction", "phase_function", "scattering_matrix"]
+
+Floats = NDArray[np.float64]
+
+# (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`).
+# Time of flight uses the group index.
+WATER_INDICES: dict[str, tuple[float, float]] = {"seawater": (1.3415, 1.3638), "fresh": (1.3350, 1.3566)}
+
+# Overriding one coefficient of a complete medium keeps this other one.
+_KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
+
+
+def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
+    """All four coefficients from exactly two of them, the given ones as they are.
+
+    With `albedo = "lu2024"` absorption and scattering are the means (ω is uniform in (0, 0.97): mean 0.485).
+    Raises `ValueError` whose text names the fields, without the section.
+    """
+    if len(pair) != 2:
+        given = ", ".join(pair) or "none"
+        raise ValueError(f"needs exactly two of {', '.join(COEFFICIENTS)}, or chlorophyll; given: {given}")
+    a, b, c, albedo = (pair.get(name) for name in COEFFICIENTS)  # type: Any, Any, Any, Any
+    if albedo == "lu2024":
+        if c is None:
+            raise ValueError("albedo = 'lu2024' goes with extinction only")
+        return {"absorption": c * (1.0 - 0.485), "scattering": c * 0.485, "extinction": c, "albedo": albedo}
+    if albedo is not None:
+        if c is None:
+            rest = albedo if a is None else 1.0 - albedo
+            if rest <= 0.0:
+                raise ValueError(f"albedo = {albedo} leaves the extinction undetermined; give extinction and albedo")
+            c = (b if a is None else a) / rest
+        a = c * (1.0 - albedo) if a is None else a
+        b = c * albedo if b is None else b
+    elif c is None:
+        c = a + b
+    else:
+        part, value = ("scattering", b) if a is None else ("absorption", a)
+        if value > c:
+            raise ValueError(f"{part} = {value} is outside [0, {c}], {c} being the extinction")
+        a = c - b if a is None else a
+        b = c - a if b is None else b
+    share = (b / c if c else 0.0) if albedo is None else albedo
+    return {"absorption": a, "scattering": b, "extinction": c, "albedo": share}
+
+
+class PhaseFields(NamedTuple):
+    """Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and
+    those with a default, which phase functions may share."""
+
+    needed: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+
+
+PHASE_FIELDS = {
+    "henyey_greenstein": PhaseFields(optional=("anisotropy",)),
+    "two_term_henyey_greenstein": PhaseFields(needed=("g1", "g2", "alpha")),
+    "fournier_forand": PhaseFields(optional=("particle_index", "junge_slope")),
+    "rayleigh": PhaseFields(optional=("depolarisation_ratio",)),
+    "tabulated": PhaseFields(needed=("phase_table",)),
+}
+
+# Tabulated phase functions: name -> (file in spadwarp/water/tables, source).
+PHASE_TABLES: dict[str, tuple[str, str]] = {
+    "petzold-average-particle": (
+        "petzold_average_particle.csv",
+        "Petzold 1972 (SIO Ref. 72-78), mean of three stations in San Diego harbour without the water's own "
+        "scattering, as tabulated by Mobley et al., Appl. Opt. 32, 7484 (1993)",
+    )
+}
 
 
 class Water(Section):
     """Coefficients of water: two of four coefficients, or chlorophyll, from which they follow."""
 
     section: ClassVar[str] = "medium"
-    alternatives: ClassVar[tuple[str, ...]] = COEFFICIENTS
-    preset: str | None = None
-    """a named water, see `spadwarp list presets medium`"""
-    absorption: float = Field(0.0, ge=0, le=1e6)
-    """absorption coefficient a [1/m]"""
-    scattering: float = Field(0.0, ge=0, le=1e6)
-    """scattering coefficient b [1/m]"""
-    extinction: float = Field(0.0, ge=1e-12, le=1e6)
-    """extinction (beam attenuation) coefficient c = a + b [1/m]"""
+    alternatives: ClassVar = COEFFICIENTS
+    displaces: ClassVar = {
+        **dict.fromkeys(COEFFICIENTS, ("chlorophyll",)),
+        "chlorophyll": (*COEFFICIENTS, "preset"),
+        "temperature": ("phase_index", "group_index"),
+        "salinity": ("phase_index", "group_index"),
+        "phase_function": tuple(name for fields in PHASE_FIELDS.values() for name in fields.needed),
+    }
+    preset: str | None = field(None, "a named water, see `spadwarp list presets medium`")
+    absorption: float = field(0.0, "absorption coefficient a [1/m]", "[0, 1e6]")
+    scattering: float = field(0.0, "scattering coefficient b [1/m]", "[0, 1e6]")
+    extinction: float = field(0.0, "extinction (beam attenuation) coefficient c = a + b [1/m]", "[1e-12, 1e6]")
     albedo: Annotated[float, Field(ge=0, le=1)] | Literal["lu2024"] = 0.0
     """single-scattering albedo b/c, or "lu2024": uniform in (0, 0.97) at each collision"""
-    chlorophyll: float | None = Field(None, **bounds(RANGES["chlorophyll"]))
-    """chlorophyll of the open ocean, in place of coefficients [mg/m³]"""
+    chlorophyll: float | None = field(None, "of open ocean, in place of coefficients [mg/m³]", RANGES["chlorophyll"])
+
+    @classmethod
+    def _kept(cls, base: Mapping[str, Any], layer: Mapping[str, Any]) -> dict[str, Any]:
+        """Of coefficients what completes those of the layer; a clash is left for validation to report."""
+        kept, new = super()._kept(base, layer), [name for name in COEFFICIENTS if layer.get(name) is not None]
+        old = {name: kept[name] for name in COEFFICIENTS if name in kept}
+        keep = {}
+        if len(new) == 1:
+            other = _KEEPS[new[0]]
+            if len(old) < 2 or (old.get("albedo") == "lu2024" and other not in old and new[0] not in old):
+                return kept
+            try:
+                keep = {other: old[other] if other in old else complete_coefficients(old)[other]}
+            except (TypeError, ValueError):
+                return kept
+        return {name: value for name, value in kept.items() if name not in old} | keep if new else kept
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -65,7 +156,8 @@ class Water(Section):
             if self.extinction not in (allowed := field_range(type(self), "extinction")):
                 raise ValueError(f"extinction = {self.extinction} is outside {allowed}")
         elif self.given or self.preset is not None:
-            self._refuse("chlorophyll", f"cannot be combined with {', '.join(self.given or ['preset'])}")
+            others = ", ".join(self.given or ["preset"])
+            raise ValueError(self._that("chlorophyll", f"cannot be combined with {others}"))
         return self
 
     @property
@@ -77,37 +169,18 @@ class Water(Section):
 class Layer(Water):
     """Water from a plane on, up to the next layer; given as a medium is."""
 
-    start: Coordinate
-    """where it begins along `layer_axis`, the world's z if not given [m]"""
-    anisotropy: float | None = Field(None, gt=-1, lt=1)
-    """henyey_greenstein: mean cosine of the scattering angle; default: the medium's"""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _expand_preset(cls, fields: Any) -> Any:
-        if not isinstance(fields, Mapping):
-            return fields
-        whole = merge_section(cls.section, {}, with_units(cls, fields))
-        # A preset has indices, but one pair of them holds for all layers: the medium's.
-        return {name: value for name, value in whole.items() if name in fields or name in cls.model_fields}
+    start: Coordinate = field(..., "where it begins along `layer_axis`, the world's z if not given [m]")
+    anisotropy: float | None = field(None, "henyey_greenstein: mean cosine; default: the medium's", "(-1, 1)")
 
 
 class WaterRange(NamedTuple):
-    """Extremes over all water of a scene.
+    """Extremes over all water of a scene."""
 
-    Attributes:
-        extinction: The largest [1/m].
-        scattering: The largest [1/m].
-        absorption: The least [1/m].
-        albedo: The largest, of "lu2024" none.
-        anisotropies: Mean cosines beside the medium's own, the least and the largest of a grid.
-    """
-
-    extinction: float
-    scattering: float
-    absorption: float
-    albedo: float
-    anisotropies: tuple[float, ...]
+    extinction: float  # the largest [1/m]
+    scattering: float  # the largest [1/m]
+    absorption: float  # the least [1/m]
+    albedo: float  # the largest, of "lu2024" none
+    anisotropies: tuple[float, ...]  # mean cosines beside the medium's own, the least and the largest of a grid
 
 
 class Medium(Water):
@@ -121,18 +194,12 @@ class Medium(Water):
         "henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "rayleigh", "tabulated"
     ] = "henyey_greenstein"
     """law of the scattering angle"""
-    anisotropy: float = Field(0.924, gt=-1, lt=1)
-    """henyey_greenstein: mean cosine g of the scattering angle"""
-    g1: float | None = Field(None, gt=-1, lt=1)
-    """two_term_henyey_greenstein: g of the first term"""
-    g2: float | None = Field(None, gt=-1, lt=1)
-    """two_term_henyey_greenstein: g of the second term"""
-    alpha: float | None = Field(None, ge=0, le=1)
-    """two_term_henyey_greenstein: weight of the first term"""
-    particle_index: float = Field(1.10, gt=1, le=1.35)
-    """fournier_forand: index n of the particles over that of the water"""
-    junge_slope: float = Field(3.5835, ge=3.05, lt=5)
-    """fournier_forand: slope µ of the size distribution"""
+    anisotropy: float = field(0.924, "henyey_greenstein: mean cosine g of the scattering angle", "(-1, 1)")
+    g1: float | None = field(None, "two_term_henyey_greenstein: g of the first term", "(-1, 1)")
+    g2: float | None = field(None, "two_term_henyey_greenstein: g of the second term", "(-1, 1)")
+    alpha: float | None = field(None, "two_term_henyey_greenstein: weight of the first term", "[0, 1]")
+    particle_index: float = field(1.10, "fournier_forand: index n of the particles over that of the water", "(1, 1.35]")
+    junge_slope: float = field(3.5835, "fournier_forand: slope µ of the size distribution", "[3.05, 5)")
     phase_table: Annotated[str | None, FilePath(".csv", tuple(PHASE_TABLES))] = None
     """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
     scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
@@ -142,22 +209,16 @@ class Medium(Water):
     """
     depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
     """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
-    largest_polarisation: float = Field(0.66, **bounds(RANGES["largest"]))
-    """scaled_rayleigh: polarisation of unpolarised light that is scattered by 90°"""
+    largest_polarisation: float = field(0.66, "scaled_rayleigh: polarisation of light at 90°", RANGES["largest"])
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
     """refractive index; "seawater" and "fresh" stand for 1.3415 and 1.3350"""
-    temperature: float | None = Field(None, **bounds(RANGES["temperature"]))
-    """gives the indices that are not given, with salinity 35 [°C]"""
-    salinity: float | None = Field(None, **bounds(RANGES["salinity"]))
-    """the same, with temperature 20 [g/kg]"""
-    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = ()
-    """other waters further along `layer_axis`, in its order"""
-    layer_axis: Direction = (0.0, 0.0, 1.0)
-    """direction across the layers, in the world; not 0"""
-    grid: Grid | None = None
-    """water that varies within a box, cell by cell; not with layers"""
+    temperature: float | None = field(None, "gives missing indices, with salinity 35 [°C]", RANGES["temperature"])
+    salinity: float | None = field(None, "the same, with temperature 20 [g/kg]", RANGES["salinity"])
+    layers: Annotated[tuple[Layer, ...], BeforeValidator(listed)] = field((), "waters further along `layer_axis`")
+    layer_axis: Direction = field((0.0, 0.0, 1.0), "direction across the layers, in the world; not 0")
+    grid: Grid | None = field(None, "water that varies within a box, cell by cell; not with layers")
     _molecular_share: float = PrivateAttr(0.0)
 
     @field_validator("phase_index", "group_index", mode="before")
@@ -167,41 +228,35 @@ class Medium(Water):
             raise ValueError(f"is neither a number nor one of {', '.join(map(repr, WATER_INDICES))}")
         return WATER_INDICES[value][info.field_name == "group_index"] if isinstance(value, str) else value
 
-    @model_validator(mode="after")
-    def _tables_of_scattering(self) -> Self:
-        for law, (needed, _) in PHASE_FIELDS.items():
+    def _problems(self) -> Iterator[str]:
+        law, own_law = self.phase_function, "goes with phase_function = 'henyey_greenstein' only"
+        for other, (needed, _) in PHASE_FIELDS.items():
             missing = [name for name in needed if getattr(self, name) is None]
-            if law == self.phase_function and missing:
-                raise ValueError(f"needs {', '.join(missing)} with phase_function = {law!r}")
-            self._only_with(f"phase_function = {law!r}", law == self.phase_function, *needed)
+            if other == law and missing:
+                yield f"needs {', '.join(missing)} with phase_function = {law!r}"
+            yield from self._only_with(f"phase_function = {other!r}", other == law, *needed)
         has_table = self.scattering_matrix == "tabulated"
         if has_table and self.matrix_table is None:
-            raise ValueError("needs matrix_table with scattering_matrix = 'tabulated'")
-        self._only_with("scattering_matrix = 'tabulated'", has_table, "matrix_table")
-        return self
-
-    @model_validator(mode="after")
-    def _resolved(self) -> Self:
-        own_law = "goes with phase_function = 'henyey_greenstein' only"
+            yield "needs matrix_table with scattering_matrix = 'tabulated'"
+        yield from self._only_with("scattering_matrix = 'tabulated'", has_table, "matrix_table")
         for i, layer in enumerate(self.layers):
             if i and layer.start <= (before := self.layers[i - 1].start):
-                raise ValueError(f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it")
+                yield f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it"
             if (layer.albedo == "lu2024") != (self.albedo == "lu2024"):
-                raise ValueError(
-                    f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
-                )
+                yield f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
             # A preset may bring one with it, which is no more than what the medium's own preset may.
             own = PRESETS["medium"][layer.preset].values.get("anisotropy") if layer.preset else None
-            if self.phase_function != "henyey_greenstein" and layer.anisotropy not in (None, own):
-                raise ValueError(f"layers[{i}].anisotropy = {layer.anisotropy} {own_law}; layers share any other")
-        if self.grid is not None:
-            if self.layers:
-                count = len(self.layers)
-                raise ValueError(f"grid does not go with layers, {count} given; cells can repeat them, from a file")
-            if self.albedo == "lu2024":
-                raise ValueError("grid does not go with albedo = 'lu2024', which has no cells; give it a number")
-            if self.grid.anisotropy is not None and self.phase_function != "henyey_greenstein":
-                raise ValueError(f"grid.anisotropy = {self.grid.anisotropy} {own_law}; cells share any other")
+            if law != "henyey_greenstein" and layer.anisotropy not in (None, own):
+                yield f"layers[{i}].anisotropy = {layer.anisotropy} {own_law}; layers share any other"
+        if self.grid is not None and self.layers:
+            yield f"grid does not go with layers, {len(self.layers)} given; cells can repeat them, from a file"
+        if self.grid is not None and self.albedo == "lu2024":
+            yield "grid does not go with albedo = 'lu2024', which has no cells; give it a number"
+        if self.grid is not None and self.grid.anisotropy is not None and law != "henyey_greenstein":
+            yield f"grid.anisotropy = {self.grid.anisotropy} {own_law}; cells share any other"
+
+    @model_validator(mode="after")
+    def _at_default_wavelength(self) -> Self:
         self._follow(Laser.model_fields["wavelength_nm"].default)
         return self
 
@@ -278,18 +333,15 @@ class Medium(Water):
     @property
     def range(self) -> WaterRange:
         """Extremes over the medium, its layers and its grid. Raises what `grid_cells` raises."""
-        extinction = [water.extinction for water in self.waters]
-        scattering = [water.scattering for water in self.waters]
-        absorption = [water.extinction - water.scattering for water in self.waters]
-        albedo = [water.scattering / max(water.extinction, 1e-30) for water in self.waters]
+        rows = [(water.extinction, water.scattering) for water in self.waters]
+        extremes = [(c, b, c - b, b / max(c, 1e-30)) for c, b in rows]
         g = [layer.anisotropy for layer in self.layers if layer.anisotropy is not None]
         if self.grid is not None:
             cells = grid_cells(self)
-            extinction.append(float(cells.extinction.max()))
-            scattering.append(float(cells.scattering.max()))
-            absorption.append(float((cells.extinction - cells.scattering).min()))
-            albedo.append(float(cells.albedo.max()))
-            g += [] if cells.anisotropy is None else [float(cells.anisotropy.min()), float(cells.anisotropy.max())]
+            c, b, own = cells.extinction, cells.scattering, cells.anisotropy
+            extremes.append((float(c.max()), float(b.max()), float((c - b).min()), float(cells.albedo.max())))
+            g += [] if own is None else [float(own.min()), float(own.max())]
+        extinction, scattering, absorption, albedo = zip(*extremes, strict=True)
         return WaterRange(max(extinction), max(scattering), max(0.0, min(absorption)), max(albedo), tuple(g))
 
     def optical_depth(self, begin: Sequence[float], end: Sequence[float]) -> float:
@@ -321,19 +373,120 @@ class Medium(Water):
 
 
 def grid_cells(medium: Medium) -> GridCells:
-    """The cells of a medium with a grid.
-
-    Raises:
-        FileError: The file cannot be read, or has no cells.
-        ConfigError: `medium.grid` does not say how large the box is, or its frame is not in the file.
-    """
+    """The cells of a medium with a grid. Raises `FileError` if its file cannot be read or has no cells, `ConfigError`
+    if `medium.grid` does not say how large the box is, or its frame is not in the file."""
     grid, albedo = medium.grid, medium.albedo
     assert grid is not None and not isinstance(albedo, str)  # see Medium
-    stamp: tuple[int, int] | None = None
-    if grid.file is not None:
-        try:
-            status = Path(grid.file).stat()
-            stamp = status.st_mtime_ns, status.st_size
-        except OSError:
-            stamp = None  # the reader says why
+    stamp = None
+    with suppress(OSError):  # the reader says why
+        status = Path(grid.file or "").stat()
+        stamp = status.st_mtime_ns, status.st_size
     return cells_of(grid, (medium.extinction, albedo, medium.anisotropy), medium.has_phase_table, stamp)
+
+
+# Scattering
+
+PHASE_COLUMNS = {"angle_deg": "[0, 180]", "value": "[0, 1e30]"}
+"""Columns of a phase table: scattering angle [°] and value of any scale."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseFunction:
+    """Probability density of the direction of scattered light, of unit integral over the sphere.
+
+    Attributes:
+        name: `medium.phase_function`.
+        parameters: The medium's fields that it takes.
+        molecular_share: Part of the scattering that is the water's own and not of that name.
+        over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
+        first_angle: Of a table [rad]; below it the table is continued.
+    """
+
+    name: str
+    parameters: dict[str, float | str]
+    molecular_share: float
+    over_t: Callable[[Floats], Floats]
+    first_angle: float = 0.0
+
+    def density(self, angle: ArrayLike) -> Floats:
+        """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""
+        return self.over_t(2.0 * np.sin(0.5 * np.asarray(angle, np.float64)) ** 2)
+
+    @cached_property
+    def mean_cosine(self) -> float:
+        """⟨cosθ⟩, the asymmetry parameter g."""
+        if self.name == "henyey_greenstein":
+            return (1.0 - self.molecular_share) * float(self.parameters["anisotropy"])
+        return _sphere_integral(lambda t: self.over_t(t) * (1.0 - t))
+
+    @cached_property
+    def backscatter_fraction(self) -> float:
+        """Part of the light that is scattered by more than 90°."""
+        return _sphere_integral(lambda t: self.over_t(t) * (t > 1.0))
+
+    def fraction_below(self, angle: float) -> float:
+        """Part of the light that is scattered by less than an angle [rad] in (0, π]."""
+        share = math.sin(0.5 * angle) ** 2
+        return share * _sphere_integral(lambda t: self.over_t(share * t))
+
+
+def _sphere_integral(density: Callable[[Floats], Floats]) -> float:
+    from spadwarp_kernels import sphere_integral
+
+    return sphere_integral(density)
+
+
+def phase_function(medium: Medium) -> PhaseFunction:
+    """The phase function of a scene's medium, `phase_function(scene.medium)`.
+
+    Raises `FileError` if its table cannot be read, `ConfigError` if the table is not a phase function.
+    """
+    import spadwarp_kernels as sk
+
+    density: Callable[[Floats], Floats]
+    first_angle = 0.0
+    name, parameters = medium.phase_function, medium.phase_parameters
+    if name == "tabulated":
+        path = Path(str(medium.phase_table))
+        if str(path) in PHASE_TABLES:
+            path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)][0]
+        angles, values = read_table("medium.phase_table", path, PHASE_COLUMNS)
+        try:
+            density = sk.interpolated_density(np.radians(angles), values)
+            first_angle = math.radians(float(angles[0]))
+        except ValueError as error:
+            raise ConfigError(f"medium.phase_table: {path}: {error}") from None
+    else:
+        numbers: dict[str, Any] = {"g": medium.anisotropy} if name == "henyey_greenstein" else dict(parameters)
+        density = partial(getattr(sk, f"{name}_density"), **numbers)
+    share = medium.molecular_share
+
+    def mixed(t: Floats) -> Floats:
+        return (1.0 - share) * density(t) + share * molecular_density(t)
+
+    return PhaseFunction(name, parameters, share, mixed if share > 0.0 else density, first_angle)
+
+
+Matrix = Callable[[Floats], Floats]
+"""Cosines of the scattering angle `[n]` → m12, m22, m33, m34 and m44, each over m11, `[n, 5]`: I′ = I + m12 Q,
+Q′ = m12 I + m22 Q, U′ = m33 U + m34 V, V′ = −m34 U + m44 V with respect to the plane of scattering (Bohren & Huffman
+1983, eq 4.77)."""
+
+
+def scattering_matrix(medium: Medium) -> Matrix | None:
+    """The scattering matrix of a scene's medium, over its phase function, `scattering_matrix(scene.medium)`; None for
+    "none".
+
+    Raises `FileError` or `ConfigError` if its table cannot be read.
+    """
+    if medium.scattering_matrix == "tabulated":
+        try:
+            return read_matrix_table(str(medium.matrix_table))
+        except ConfigError as error:
+            raise ConfigError(f"medium.matrix_table: {error}") from None
+    return {
+        "none": None,
+        "rayleigh": partial(rayleigh_matrix, depolarisation_ratio=medium.depolarisation_ratio),
+        "scaled_rayleigh": partial(scaled_rayleigh_matrix, largest=medium.largest_polarisation),
+        "voss_fry": voss_fry_matrix,
+    }[medium.scattering_matrix]

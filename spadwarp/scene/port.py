@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from spadwarp.scene.pose import vector_of
-from spadwarp.scene.sections import Direction, Section, Vector, unit_vector
+from spadwarp.scene.sections import Direction, Section, Vector, field, unit_vector
 
 __all__: list[str] = []
 
@@ -27,40 +27,30 @@ _STEPS = 30
 
 
 class Material(NamedTuple):
-    """Sellmeier's n² = 1 + Σ B λ²/(λ² − C), λ in µm, within a range [µm]."""
+    """Sellmeier's n² = 1 + Σ B λ²/(λ² − C), λ in µm, within a range [µm], and its source."""
 
-    terms: tuple[tuple[float, float], ...]
+    b: tuple[float, ...]
+    c: tuple[float, ...]
     low: float
     high: float
     source: str
 
 
-_PMMA = Material(((1.1819, 0.011313),), 0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C")
+_SULTANOVA = (0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C")
+_SAPPHIRE = "ordinary ray; Malitson (1962), as in Weber, Handbook of optical materials (2003)"
+_BK7_C, _SAPPHIRE_B = (0.00600069867, 0.0200179144, 103.560653), (1.4313493, 0.65054713, 5.3414021)
+_SILICA_C, _SAPPHIRE_C = ((0.0684043**2, 0.1162414**2, 9.896161**2), (0.0726631**2, 0.1193242**2, 18.028251**2))
+_PMMA = Material((1.1819,), (0.011313,), *_SULTANOVA)
 
-MATERIALS: dict[str, Material] = {
-    "BK7": Material(
-        ((1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)),
-        0.3,
-        2.5,
-        "SCHOTT, data sheet of N-BK7",
-    ),
+MATERIALS = {
+    "BK7": Material((1.03961212, 0.231792344, 1.01046945), _BK7_C, 0.3, 2.5, "SCHOTT, data sheet of N-BK7"),
     "fused silica": Material(
-        ((0.6961663, 0.0684043**2), (0.4079426, 0.1162414**2), (0.8974794, 9.896161**2)),
-        0.21,
-        6.7,
-        "Malitson, J. Opt. Soc. Am. 55, 1205 (1965)",
+        (0.6961663, 0.4079426, 0.8974794), _SILICA_C, 0.21, 6.7, "Malitson, J. Opt. Soc. Am. 55, 1205 (1965)"
     ),
-    "sapphire": Material(
-        ((1.4313493, 0.0726631**2), (0.65054713, 0.1193242**2), (5.3414021, 18.028251**2)),
-        0.2,
-        5.0,
-        "ordinary ray; Malitson (1962), as in Weber, Handbook of optical materials (2003)",
-    ),
+    "sapphire": Material(_SAPPHIRE_B, _SAPPHIRE_C, 0.2, 5.0, _SAPPHIRE),
     "acrylic": _PMMA,
     "PMMA": _PMMA,
-    "polycarbonate": Material(
-        ((1.4182, 0.021304),), 0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C"
-    ),
+    "polycarbonate": Material((1.4182,), (0.021304,), *_SULTANOVA),
 }
 """Materials of windows; the coefficients as refractiveindex.info lists them."""
 
@@ -74,9 +64,9 @@ def window_indices(material: str, wavelength_nm: float) -> tuple[float, float]:
     if not glass.low <= micrometres <= glass.high:
         low, high = 1e3 * glass.low, 1e3 * glass.high
         raise ValueError(f"material = {material!r} is known for [{low:g}, {high:g}] nm, not for {wavelength_nm:g} nm")
-    square = micrometres**2
-    index = math.sqrt(1.0 + sum(b * square / (square - c) for b, c in glass.terms))
-    slope = -sum(b * c * micrometres / (square - c) ** 2 for b, c in glass.terms) / index
+    square, terms = micrometres**2, list(zip(glass.b, glass.c, strict=True))
+    index = math.sqrt(1.0 + sum(b * square / (square - c) for b, c in terms))
+    slope = -sum(b * c * micrometres / (square - c) ** 2 for b, c in terms) / index
     return index, index - micrometres * slope
 
 
@@ -94,45 +84,39 @@ class Port(Section):
     """A flat or dome port between the air of a housing and the water; without thickness and material a calm surface."""
 
     section: ClassVar[str] = "port"
-    preset: str | None = None
-    """a named port, see `spadwarp list presets port`"""
-    shape: Literal["flat", "dome"] = "flat"
-    """a plane window, or a spherical one"""
+    displaces: ClassVar = {
+        "shape": ("distance", "normal", "radius", "offset"),
+        "material": ("index", "group_index"),
+        "index": ("material",),
+    }
+    preset: str | None = field(None, "a named port, see `spadwarp list presets port`")
+    shape: Literal["flat", "dome"] = field("flat", "a plane window, or a spherical one")
     distance: float | None = Field(None, ge=1e-6, le=1e6)
     """flat: from the lens centre along `normal` to the window; above a calm surface the altitude [m]"""
     normal: Direction = (0.0, 0.0, 1.0)
     """flat: direction into the water, any length but 0; in the frame of the camera, or of the laser's direction"""
-    radius: float | None = Field(None, ge=1e-6, le=1e6)
-    """dome: of its inner face [m]"""
-    offset: Vector = (0.0, 0.0, 0.0)
-    """dome: from the lens centre to the dome's centre [m]"""
-    thickness: float = Field(0.0, ge=0, le=1e3)
-    """of the window [m]; 0: there is none"""
+    radius: float | None = field(None, "dome: of its inner face [m]", "[1e-6, 1e6]")
+    offset: Vector = field((0.0, 0.0, 0.0), "dome: from the lens centre to the dome's centre [m]")
+    thickness: float = field(0.0, "of the window [m]; 0: there is none", "[0, 1000]")
     material: Literal["BK7", "fused silica", "sapphire", "acrylic", "PMMA", "polycarbonate"] | None = None
     """of the window: its indices at the laser's wavelength"""
-    index: float | None = Field(None, ge=1, le=4)
-    """phase index of the window, in place of material"""
-    group_index: float | None = Field(None, ge=1, le=4)
-    """group index of the window; default: its phase index"""
-    inside_index: float | None = Field(None, ge=1, le=4)
-    """phase index inside the housing; default: that of air"""
-    inside_group_index: float | None = Field(None, ge=1, le=4)
-    """group index inside the housing; default: that of air, or inside_index"""
+    index: float | None = field(None, "phase index of the window, in place of material", "[1, 4]")
+    group_index: float | None = field(None, "group index of the window; default: its phase index", "[1, 4]")
+    inside_index: float | None = field(None, "phase index inside the housing; default: that of air", "[1, 4]")
+    inside_group_index: float | None = field(None, "group index inside; default: air's, or inside_index", "[1, 4]")
 
-    @model_validator(mode="after")
-    def _determined(self) -> Self:
+    def _problems(self) -> Iterator[str]:
         needed = "distance" if self.shape == "flat" else "radius"
         if getattr(self, needed) is None:
-            raise ValueError(f"needs {needed} with shape = {self.shape!r}")
-        self._only_with("shape = 'flat'", self.shape == "flat", "distance", "normal")
-        self._only_with("shape = 'dome'", self.shape == "dome", "radius", "offset")
+            yield f"needs {needed} with shape = {self.shape!r}"
+        yield from self._only_with("shape = 'flat'", self.shape == "flat", "distance", "normal")
+        yield from self._only_with("shape = 'dome'", self.shape == "dome", "radius", "offset")
         if self.material is not None and self.index is not None:
-            raise ValueError(f"needs either material or index; given: {self.material!r} and {self.index}")
+            yield f"needs either material or index; given: {self.material!r} and {self.index}"
         if (self.thickness > 0.0) != (self.material is not None or self.index is not None):
-            raise ValueError(f"needs material or index and a thickness > 0, or neither; thickness = {self.thickness}")
-        self._only_with("index", self.index is not None, "group_index")
-        self._only_with("inside_index", self.inside_index is not None, "inside_group_index")
-        return self
+            yield f"needs material or index and a thickness > 0, or neither; thickness = {self.thickness}"
+        yield from self._only_with("index", self.index is not None, "group_index")
+        yield from self._only_with("inside_index", self.inside_index is not None, "inside_group_index")
 
     def indices(self, wavelength_nm: float) -> tuple[tuple[float, float], tuple[float, float]]:
         """(phase, group) index of what is inside, and of the window.
@@ -156,48 +140,25 @@ class Port(Section):
     ) -> PortGeometry:
         """The port with its lengths from `origin` and its normal in the frame of the camera; `water`: (phase, group)
         index of the water. Raises as `indices` does."""
-        (n_inside, g_inside), (n_window, g_window) = self.indices(wavelength_nm)
+        index, group_index = zip(*self.indices(wavelength_nm), water, strict=True)
         normal = np.asarray(normal, np.float64)
-        centre = origin + np.array(self.offset)
-        return PortGeometry(
-            shape=self.shape,
-            distance=(self.distance or 0.0) + float(origin @ normal),
-            normal=vector_of(normal),
-            radius=self.radius or 0.0,
-            centre=vector_of(centre),
-            thickness=self.thickness,
-            index=(n_inside, n_window, water[0]),
-            group_index=(g_inside, g_window, water[1]),
-        )
+        distance, centre = (self.distance or 0.0) + float(origin @ normal), origin + np.array(self.offset)
+        radius, ends = self.radius or 0.0, (vector_of(normal), vector_of(centre))
+        return PortGeometry(self.shape, distance, ends[0], radius, ends[1], self.thickness, index, group_index)
 
 
 @dataclass(frozen=True)
 class PortGeometry:
-    """A port: a window between two planes across `normal`, or between two spheres about `centre`.
+    """A port: a window between two planes across `normal`, or between two spheres about `centre`."""
 
-    Attributes:
-        shape: "flat" or "dome".
-        distance: flat: from the camera's lens centre along the normal to the inner face [m].
-        normal: flat: unit vector into the water.
-        radius, centre: dome: of the inner face [m].
-        thickness: Of the window [m].
-        index, group_index: Of what is inside, of the window, of the water.
-    """
-
-    shape: str
-    distance: float
-    normal: tuple[float, float, float]
-    radius: float
-    centre: tuple[float, float, float]
-    thickness: float
-    index: tuple[float, float, float]
+    shape: str  # "flat" or "dome"
+    distance: float  # flat: from the camera's lens centre along the normal to the inner face [m]
+    normal: tuple[float, float, float]  # flat: unit vector into the water
+    radius: float  # dome: of the inner face [m]
+    centre: tuple[float, float, float]  # dome [m]
+    thickness: float  # of the window [m]
+    index: tuple[float, float, float]  # phase index of what is inside, of the window, of the water
     group_index: tuple[float, float, float]
-
-    @property
-    def delays(self) -> tuple[float, float]:
-        """Group indices inside and in the window over that of the water."""
-        inside, window, water = self.group_index
-        return inside / water, window / water
 
     @property
     def nearest(self) -> float:
@@ -211,10 +172,8 @@ class PortGeometry:
         if self.shape == "flat":
             ahead = self.distance - float(np.asarray(x) @ np.array(self.normal))
             return "" if ahead > 0.0 else f"it is {-ahead:.4g} m beyond the window's inner face"
-        away = math.dist(np.ravel(x), self.centre)
-        return (
-            "" if away < self.radius else f"it is {away:.4g} m from the dome's centre, the radius is {self.radius:g} m"
-        )
+        away, radius = math.dist(np.ravel(x), self.centre), self.radius
+        return "" if away < radius else f"it is {away:.4g} m from the dome's centre, the radius is {radius:g} m"
 
     def enter(self, x: ArrayLike, u: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
         """Rays from x inside along unit vectors u, `[..., 3]`, up to where they enter the water.
@@ -225,7 +184,8 @@ class PortGeometry:
         with np.errstate(invalid="ignore"):
             (inside, _, _, _, _), (window, _, _, y, v) = self._faces(x, u)
             inside = np.where(inside > 0.0, inside, np.nan)
-        return y, v, inside + window, self.delays[0] * inside + self.delays[1] * window
+        g_inside, g_window, g_water = self.group_index
+        return y, v, inside + window, g_inside / g_water * inside + g_window / g_water * window
 
     def transmission(self, x: ArrayLike, u: ArrayLike) -> Floats:
         """Fraction of unpolarised light that gets through, of rays from x inside along unit vectors u; 0: none."""

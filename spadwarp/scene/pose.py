@@ -11,7 +11,7 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 
 __all__ = ["look_at", "opencv_pose"]
 
@@ -38,17 +38,9 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     """`position` and `rotation_deg` of the camera that OpenCV calls (rvec, tvec), as `solvePnP` returns them.
 
     OpenCV maps a point X of the world to R·X + t of the camera, with R the rotation about rvec by |rvec| radians
-    (Rodrigues): its position is −Rᵀt, and its axes are the rows of R.
-
-    Args:
-        rvec: Rotation vector [rad], 3 numbers, or the rotation matrix R `[3, 3]`.
-        tvec: t [m], 3 numbers.
-
-    Returns:
-        Fields of the scene's `camera` section.
-
-    Raises:
-        ArgumentError: Another number of values, or a matrix that is no rotation.
+    (Rodrigues): its position is −Rᵀt, and its axes are the rows of R. `rvec` is the rotation vector [rad], 3 numbers,
+    or R `[3, 3]`; `tvec` t [m], 3 numbers. Returns fields of the scene's `camera` section. Raises `ArgumentError` for
+    another number of values, or a matrix that is no rotation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -67,21 +59,12 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
 
 
 def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.0, 0.0)) -> dict[str, Vector]:
-    """`position` and `rotation_deg` of a camera at a position in the world that looks at a point.
+    """`position` and `rotation_deg` of a camera at a position in the world that looks at a point, both [m].
 
-    Args:
-        position: Its position [m].
-        point: What is on its optical axis [m].
-        down: Direction of the world that is downwards in the image, as far as the view allows.
-
-    Returns:
-        Fields of the scene's `camera` section.
-
-    Raises:
-        ArgumentError: Two of the points coincide, or the camera looks along `down`.
+    `down` is the direction of the world that is downwards in the image, as far as the view allows. Returns fields of
+    the scene's `camera` section. Raises `ArgumentError` for a point at the position, or along `down`.
     """
-    place = np.asarray(position, np.float64)
-    end = np.asarray(point, np.float64)
+    place, end = np.asarray(position, np.float64), np.asarray(point, np.float64)
     forward = end - place
     right = np.cross(np.asarray(down, np.float64), forward)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):

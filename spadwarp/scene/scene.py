@@ -1,47 +1,50 @@
-"""A scene of all its sections, the file that it comes from, and what follows from several sections."""
+"""A scene of all its sections, its file, what follows from several sections; and scenes that move."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, PrivateAttr, ValidationError, model_validator
+from numpy.typing import NDArray
+from pydantic import BeforeValidator
 
-from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
-from spadwarp.io.text import parse_toml, read_toml
-from spadwarp.limits import shown
+from spadwarp.io.text import read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
-from spadwarp.scene.detector import Detector
-from spadwarp.scene.laser import Laser
+from spadwarp.scene.document import Document, Overrides
+from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium
-from spadwarp.scene.messages import describe
 from spadwarp.scene.port import Port, PortGeometry
-from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.scattering import check_polarisation
-from spadwarp.scene.sections import listed, plain, with_paths, with_units
-from spadwarp.scene.settings import Analytic, Gate, Output, Scan, Transport
-from spadwarp.scene.spectrum import detection_efficiency, spectral_lines
-from spadwarp.scene.surroundings import Daylight, Domain, Target
-from spadwarp.scene.tables import Key, merge_scene, override_layer, set_item, toml_text
-from spadwarp.units import path_from_time
+from spadwarp.scene.pose import rotation_angles, rotation_matrix, vector_of
+from spadwarp.scene.sections import listed
+from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
+from spadwarp.values import (
+    ArgumentError,
+    ConfigError,
+    FileError,
+    check_integer,
+    check_real,
+    path_from_time,
+    read_real,
+    shown,
+)
 
-__all__ = ["Scene", "SceneLike", "WaterLine", "as_scene", "load_scene", "template", "water_lines"]
-
-Overrides = Mapping[str, Any] | Sequence[str]
+__all__ = ["Scene", "SceneLike", "Trajectory", "WaterLine", "as_scene", "load_scene", "load_trajectory", "template"]
+__all__ += ["water_lines"]
 
 _DOWNWARDS = 0.999  # Cosine with the vertical, of the normal of a surface.
 
 
-class Scene(BaseModel):
+class Scene(Document):
     """Everything a run depends on, checked and frozen."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     medium: Medium
     laser: Laser = Laser()
@@ -55,101 +58,79 @@ class Scene(BaseModel):
     transport: Transport = Transport()
     output: Output = Output()
     analytic: Analytic = Analytic()
-    _source: Path | None = PrivateAttr(None)
 
-    @model_validator(mode="after")
-    def _water_at_the_lasers_wavelength(self) -> Self:
-        try:
+    def _problems(self) -> Iterator[str]:
+        try:  # the water that the laser's light meets
             self.__dict__["medium"] = self.medium.at_wavelength(self.laser.wavelength_nm)
         except ValueError as error:
-            raise ValueError(f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold") from None
-        return self
+            yield f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold"
+        yield from self._exclusions()
+        yield from self._blocked_ports()
 
-    @model_validator(mode="after")
-    def _sections_that_agree(self) -> Self:
-        camera, daylight, layers = self.camera, self.daylight, self.medium.layers
-        if camera.pinhole and self.transport.estimator == "analog":
-            raise ValueError(
-                "camera.pinhole = true does not go with transport.estimator = 'analog', whose photons cannot hit a "
-                "point: take a small aperture_diameter, or next_event or guided"
+    def _exclusions(self) -> Iterator[str]:
+        """Why sections exclude each other."""
+        medium, transport, goes = self.medium, self.transport, "does not go with"
+        if self.camera.pinhole and transport.estimator == "analog":
+            yield (
+                f"camera.pinhole = true {goes} transport.estimator = 'analog', whose photons cannot hit a point: take "
+                "a small aperture_diameter, or next_event or guided"
             )
-        if self.domain.reflecting and math.isfinite(limit := self.transport.lateral_limit):
-            raise ValueError(
-                f"transport.lateral_limit = {limit} does not go with domain.outside_index: the faces reflect light "
-                "from beyond it"
+        if self.domain.reflecting and math.isfinite(limit := transport.lateral_limit):
+            yield f"transport.lateral_limit = {limit} {goes} domain.outside_index: faces reflect light from beyond it"
+        if self.daylight is not None and medium.layers:
+            yield f"medium.layers: {len(medium.layers)} given; daylight takes one water"
+        if self.daylight is not None and medium.grid is not None:
+            yield f"medium.grid {goes} daylight, which takes one water: leave one of them out"
+        if self.polarised and transport.axis_threshold < 1.0:
+            yield (
+                f"transport.axis_threshold = {transport.axis_threshold} {goes} polarised light: set it to 1, for "
+                "directions without the near-axis rule"
             )
-        if daylight is not None and layers:
-            raise ValueError(f"medium.layers: {len(layers)} given; daylight takes one water")
-        if daylight is not None and self.medium.grid is not None:
-            raise ValueError("medium.grid does not go with daylight, which takes one water: leave one of them out")
-        if self.polarised:
-            check_polarisation(self.medium, self.transport, self.targets)
-        return self
+        if self.polarised and medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
+            yield (
+                f"medium.scattering_matrix = 'none' {goes} polarised light in water that scatters: choose 'rayleigh', "
+                "'scaled_rayleigh', 'voss_fry' or 'tabulated'"
+            )
+        for k, target in enumerate(self.targets if self.polarised else ()):
+            if target.specular > 0.0 and abs(target.specular_index / medium.phase_index - 1.0) < 1e-3:
+                yield (
+                    f"targets[{k}].specular_index = {target.specular_index} is that of the water, "
+                    f"{medium.phase_index:.4g}: such facets reflect nothing"
+                )
 
-    @model_validator(mode="after")
-    def _ports_that_light_can_pass(self) -> Self:
+    def _blocked_ports(self) -> Iterator[str]:
+        """Why light cannot pass the ports, or cannot be computed through them."""
         camera, laser = self.camera.port, self.laser.port
         if laser == "camera" and camera is None:
-            raise ValueError("laser.port = 'camera' needs a camera.port")
+            yield "laser.port = 'camera' needs a camera.port"
         for section, port in (("camera", camera), ("laser", laser)):
-            if isinstance(port, Port):
-                try:
-                    port.indices(self.laser.wavelength_nm)
-                except ValueError as error:
-                    raise ValueError(f"{section}.port.{error}") from None
-        if self.daylight is not None and camera is not None and camera.shape == "flat" and not camera.thickness:
+            try:
+                _ = isinstance(port, Port) and port.indices(self.laser.wavelength_nm)
+            except ValueError as error:
+                yield f"{section}.port.{error}"
+        is_surface = camera is not None and camera.shape == "flat" and not camera.thickness
+        if self.daylight is not None and camera is not None and is_surface:
             normal = rotation_matrix(self.camera.rotation_deg) @ camera.axis
             if self.daylight.down @ normal > _DOWNWARDS:
-                raise ValueError(
+                yield (
                     "daylight does not go with a camera.port that is the surface, seen from above: the sky that it "
                     "reflects is not modelled"
                 )
         if self.scan.mode != "none" and (camera is not None or laser is not None):
             if laser != "camera":
-                raise ValueError("scan.mode = 'confocal' behind a port needs laser.port = 'camera': one port for both")
+                yield "scan.mode = 'confocal' behind a port needs laser.port = 'camera': one port for both"
             if math.isfinite(self.scan.distance):
-                raise ValueError(
+                yield (
                     f"scan.distance = {self.scan.distance} does not go with a port, behind which beam and line of "
                     "sight can be parallel alone: inf"
                 )
         through, position = camera_port(self), list(self.beam.position)
         if through is not None and (why := through.outside((0.0, 0.0, 0.0))):
-            raise ValueError(f"camera.port: the lens is outside: {why}; change offset or radius")
+            yield f"camera.port: the lens is outside: {why}; change offset or radius"
         if (through := laser_port(self)) is not None and (why := through.outside(position)):
-            is_shared = self.laser.port == "camera"
+            is_shared = laser == "camera"
             hint = "move the laser, or give it a port of its own: [laser.port]" if is_shared else "change it"
-            raise ValueError(f"laser.position = {position} is outside laser.port: {why}; {hint}")
-        return self
-
-    @classmethod
-    def from_dict(cls, tables: Mapping[str, Any], *, source: str | os.PathLike[str] | None = None) -> Scene:
-        """A scene from tables as TOML gives them; relative paths in them start at `source`'s folder.
-
-        Raises `ConfigError` with a line for each problem.
-        """
-        return _build(dict(tables), source=source)
-
-    @classmethod
-    def from_toml(cls, text: str, *, source: str | os.PathLike[str] | None = None) -> Scene:
-        """A scene from the text that `to_toml` made, in a file of results or frames. Raises `ConfigError`."""
-        return _build(parse_toml(text), source=source)
-
-    @property
-    def source(self) -> Path | None:
-        """The file that the scene came from."""
-        return self._source
-
-    @property
-    def files(self) -> list[Path]:
-        """Files that the scene refers to: meshes, tables and images, all that `to_dict` names."""
-        found: list[Path] = []
-
-        def noted(path: str) -> str:
-            found.append(Path(path))
-            return path
-
-        with_paths(Scene, self.to_dict(), noted)
-        return [path for path in found if path.suffix]
+            yield f"laser.position = {position} is outside laser.port: {why}; {hint}"
 
     @property
     def scan_positions(self) -> int:
@@ -198,30 +179,6 @@ class Scene(BaseModel):
         gate_end = path_from_time(self.gate.stop, self.medium.group_index)
         return min(self.transport.max_path or gate_end, gate_end)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Tables from which `from_dict` makes an equal scene."""
-        return {name: plain(value) for name, value in self if value not in (None, ())}
-
-    def to_toml(self, *, folder: str | os.PathLike[str] | None = None) -> str:
-        """The full text that `load_scene` reads back to an equal scene.
-
-        `folder`: of the file that the text is for. Paths of files in it or in the folder above it, with the folders in
-        these, are then relative to it: they still hold where all were moved together. Others stay absolute.
-        """
-        tables = self.to_dict()
-        return toml_text(tables if folder is None else _paths_from(tables, folder))
-
-    def with_overrides(self, overrides: Overrides | None = None, /, **sections: Mapping[str, Any]) -> Scene:
-        """A changed scene: `with_overrides({"medium.extinction": 0.9})`, `with_overrides(medium={"extinction": 0.9})`.
-
-        Overrides act as in `load_scene`. Raises `ConfigError`.
-        """
-        changed = self
-        for layer in (overrides, sections):
-            if layer:
-                changed = _build(changed.to_dict(), overrides=layer, source=self.source, resolve=False)
-        return changed
-
     def plot(self, **options: Any) -> Any:
         """A figure of what the camera sees through clear water; see `spadwarp.viz.plot`."""
         import spadwarp
@@ -245,13 +202,6 @@ class Scene(BaseModel):
 
     def __str__(self) -> str:
         return repr(self)
-
-    def __eq__(self, other: object) -> bool:
-        """Equal in every field; where it came from does not matter."""
-        return isinstance(other, Scene) and self.__dict__ == other.__dict__
-
-    def __hash__(self) -> int:
-        return hash(tuple(self.__dict__.values()))
 
 
 SceneLike = Scene | str | os.PathLike[str]
@@ -285,7 +235,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     tables = read_toml(path)
     if "scene" in tables and "laser" not in tables:
         raise ConfigError("a recipe of a dataset, for `spadwarp dataset`, not a scene", source=str(path))
-    return _build(tables, overrides=overrides, source=path)
+    return Scene.from_dict(tables, overrides=overrides, source=path)
 
 
 def template() -> str:
@@ -349,75 +299,113 @@ def _placed(scene: Scene, port: Port, origin: Any, normal: Any) -> PortGeometry:
     return port.placed(origin, normal, wavelength_nm=scene.laser.wavelength_nm, water=water)
 
 
-def _build(
-    tables: dict[str, Any],
-    *,
-    overrides: Overrides | None = None,
-    source: str | os.PathLike[str] | None = None,
-    resolve: bool = True,
-) -> Scene:
-    name = None if source is None else str(source)
-    layer: dict[str, Any] = {}
-    items: dict[Key, Any] = {}
-    try:
-        if source is not None and resolve:
-            tables = _absolute_paths(tables, Path(source).absolute().parent)
-        if overrides:
-            layer, items = override_layer(overrides)
-            tables = merge_scene(_with_units(tables), _absolute_paths(_with_units(layer), Path.cwd()))
-        scene = Scene.model_validate(tables)
-        for key, value in items.items():  # of lists that may be defaults
-            scene = Scene.model_validate(set_item(scene.to_dict(), key, value))
-    except ConfigError as error:
-        raise ConfigError(error.problems, source=name) from None
-    except ValidationError as error:
-        raise ConfigError(describe(error, Scene, layer), source=name) from None
-    scene._source = None if source is None else Path(source)
-    return scene
+# Scenes that move
+
+_MOST_ROWS = 1_000_000
 
 
-def _with_units(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers with a unit in the water and the laser as numbers: merging completes what they define."""
-    changed = dict(tables)
-    for name, model in (("medium", Medium), ("laser", Laser)):
-        if isinstance(fields := tables.get(name), Mapping):
-            changed[name] = with_units(model, fields)
-    return changed
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trajectory:
+    """Values of fields of a scene at ascending times.
 
-
-def _absolute_paths(tables: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The tables with paths that are relative to a folder made absolute."""
-    return with_paths(Scene, tables, lambda path: _without_dots(folder / os.path.expanduser(path)))
-
-
-def _paths_from(tables: Mapping[str, Any], folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """The tables of a scene in memory with the paths that a scene file in a folder has.
-
-    Relative for files in the folder or in the one above it, with the folders in these: what is moved together stays
-    together. Absolute for others.
+    Attributes:
+        times: [s], `[N]`.
+        fields: Fields as overrides name them, such as `camera.position[0]` or `targets[1].translation[2]`.
+        values: `[N, fields]`, in the units of the fields.
+        source: The file that they came from.
     """
-    here = os.path.abspath(folder)
-    above = os.path.dirname(here)
-    root = above if os.path.dirname(above) != above else here  # that of a disk holds all files
 
-    def shortened(value: str) -> str:
-        place = os.path.abspath(value)
-        if not Path(place).is_relative_to(root):
-            return place
-        relative = os.path.relpath(place, here)
-        return Path(relative).as_posix() if _is_same(os.path.join(here, relative), place) else place
+    times: NDArray[np.float64]
+    fields: tuple[str, ...]
+    values: NDArray[np.float64]
+    source: str | None = None
 
-    return with_paths(Scene, tables, shortened)
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def scene(self, base: Scene, row: int) -> Scene:
+        """The scene at a row. Raises `ConfigError` for a field that it does not have, or a value out of range."""
+        try:
+            return base.with_overrides(dict(zip(self.fields, map(float, self.values[row]), strict=True)))
+        except ConfigError as error:
+            place = f"row {row + 1}, time {self.times[row]:g} s"
+            raise ConfigError([f"{place}: {text}" for text in error.problems], source=self.source) from None
+
+    def scenes(self, base: Scene) -> Iterator[Scene]:
+        """The scene at each row."""
+        return (self.scene(base, row) for row in range(len(self)))
+
+    def sampled(self, frame_rate: float) -> Trajectory:
+        """The trajectory at even times from its first to its last, `frame_rate` a second.
+
+        Values in between are linear; the three angles of a `rotation_deg` together are those of the shortest turn.
+        """
+        check_real("frame_rate", frame_rate, "[1e-6, 1e12]")
+        span = float(self.times[-1] - self.times[0])
+        count = check_integer(
+            "frames of the trajectory", int(span * frame_rate * (1 + 1e-12)) + 1, f"[1, {_MOST_ROWS}]"
+        )
+        times = np.minimum(self.times[0] + np.arange(count) / frame_rate, self.times[-1])
+        values = np.stack([np.interp(times, self.times, column) for column in self.values.T], axis=1)
+        for columns in _rotations(self.fields):
+            values[:, columns] = _turned(times, self.times, self.values[:, columns])
+        return Trajectory(times=times, fields=self.fields, values=values, source=self.source)
 
 
-def _without_dots(path: Path) -> str:
-    short = os.path.normpath(path)
-    return short if ".." in path.parts and _is_same(short, path) else str(path)
+def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Reads a .csv file: a line of names, `time` [s] first and then fields of the scene, and a row for each pose.
 
-
-def _is_same(one: str | Path, other: str | Path) -> bool:
-    """Whether two paths lead to one place; links may make a difference of `..`."""
+    Fields are named as `--set` names them, with one number each: `camera.position[0]`, `camera.rotation_deg[1]`,
+    `laser.position[2]`, `targets[0].translation[2]`. Lines that begin with # are passed over. Raises `FileError` if the
+    file cannot be read, `ConfigError` for no such table, a number that is not finite, or times that do not ascend.
+    """
+    lines = csv.reader(io.StringIO(read_text(path), newline=""))
+    names: tuple[str, ...] = ()
+    rows: list[list[float]] = []
     try:
-        return os.path.realpath(one) == os.path.realpath(other)
-    except (OSError, ValueError):  # no path at all
-        return False
+        for cells in lines:
+            if not cells or cells[0].lstrip().startswith("#"):
+                continue
+            if not names:
+                names = _names(cells)
+                continue
+            if len(cells) != len(names):
+                raise ValueError(f"{len(cells)} values for {len(names)} names")
+            row = [read_real(name, cell, "[-1e19, 1e19]") for name, cell in zip(names, cells, strict=True)]
+            if rows and not row[0] > rows[-1][0]:
+                raise ValueError(f"time = {row[0]:g} is not after {rows[-1][0]:g}")
+            rows.append(row)
+            if len(rows) > _MOST_ROWS:
+                raise ValueError(f"more than {_MOST_ROWS} rows")
+        if not rows:
+            raise ValueError("no row of numbers")
+    except (ValueError, csv.Error) as error:
+        raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
+    table = np.array(rows, np.float64)
+    return Trajectory(times=table[:, 0], fields=names[1:], values=table[:, 1:], source=str(Path(path)))
+
+
+def _names(cells: list[str]) -> tuple[str, ...]:
+    names = tuple(cell.strip() for cell in cells)
+    if names[0] != "time" or len(names) < 2:
+        raise ValueError(f"{shown(','.join(names))} is not time and names of fields, such as time,camera.position[0]")
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise ValueError(f"{shown(twice)} is there twice")
+    return names
+
+
+def _rotations(fields: tuple[str, ...]) -> Iterator[list[int]]:
+    """Columns of the angles of each rotation of which all three are given."""
+    for name in fields:
+        angles = [f"{name[:-3]}[{axis}]" for axis in range(3)]
+        if name.endswith("rotation_deg[0]") and set(angles) <= set(fields):
+            yield [fields.index(angle) for angle in angles]
+
+
+def _turned(times: NDArray[np.float64], known: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    from scipy.spatial.transform import Rotation, Slerp
+
+    if len(known) < 2:
+        return np.repeat(angles, len(times), axis=0)
+    turns = Slerp(known, Rotation.from_euler("XYZ", angles, degrees=True))(times)
+    return np.array([rotation_angles(matrix) for matrix in turns.as_matrix()])

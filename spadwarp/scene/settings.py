@@ -1,30 +1,228 @@
-"""Sections of settings: `gate`, `scan`, `transport`, `analytic` and `output`."""
+"""Sections of a scene that stand alone: what is around camera and laser, the detector, and settings of a run."""
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
+from collections.abc import Iterator
+from typing import Annotated, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from spadwarp.limits import SEED, bounds
-from spadwarp.scene.sections import Section, Whole
+from spadwarp.scene.sections import (
+    AnyFile,
+    Corner,
+    CsvFile,
+    Direction,
+    FilePath,
+    Scale,
+    Section,
+    Size,
+    Vector,
+    Whole,
+    field,
+    unit_vector,
+)
+from spadwarp.values import SEED, bounds
+from spadwarp.water.daylight import refracted_cosine
+from spadwarp.water.seawater import RANGES
 
-__all__ = ["Analytic", "Gate", "Output", "Scan", "Transport"]
+__all__ = ["Analytic", "Daylight", "Detector", "Domain", "Gate", "Output", "Scan", "Target", "Transport"]
+
+
+class Target(Section):
+    """One mesh: sized and scaled, then rotated, then moved."""
+
+    displaces: ClassVar = {"builtin": ("mesh",), "mesh": ("builtin", "size")}
+    builtin: str | None = Field(None, min_length=1)
+    """a built-in mesh, such as "staircase"; see `spadwarp list targets`"""
+    mesh: AnyFile = field(None, "path of a mesh file, relative to the scene file")
+    size: Size | None = field(None, "extent of plane, box, sphere; one number, two for x and y, or three [m]")
+    subdivisions: Whole = field(0, "times that every face is split into four", "[0, 12]")
+    scale: Scale = field((1.0, 1.0, 1.0), "factor, one or three; mesh units to metres")
+    rotation_deg: Vector = field((0.0, 0.0, 0.0), "rotations about the target's own x, the new y, the new z [°]")
+    translation: Vector = field((0.0, 0.0, 0.0), "shift in the world [m], the camera's frame if it has no pose")
+    reflectance: Annotated[float, Field(ge=0, le=1)] | Literal["from_file"] = 0.5
+    """Lambertian reflectance of both sides; "from_file": colours and textures of the mesh file"""
+    reflectance_scale: float = field(1.0, 'factor on a reflectance that is "from_file", the file\'s', "[1e-9, 1e9]")
+    colour_encoding: Literal["srgb", "linear"] = "srgb"
+    """how the file's colours and images stand for reflectance; "linear" is proportional"""
+    specular: float = field(0.0, "reflectance of the facets of a rough specular lobe; 0 is none", "[0, 1]")
+    roughness: float = field(0.2, "width of that lobe: GGX parameter α", "[0.01, 1]")
+    specular_index: float = field(1.5, "phase index of its facets; for polarised light alone", "[1, 10]")
+
+    def _problems(self) -> Iterator[str]:
+        if (self.builtin is None) == (self.mesh is None):
+            yield "needs either builtin or mesh"
+        if not all(self.scale):
+            yield self._that("scale", "holds a zero")
+        if self.size is not None and self.builtin is None:
+            yield self._that("size", "goes with builtin only; a mesh file takes scale")
+        if self.reflectance == "from_file":
+            if self.mesh is None:
+                yield self._that("reflectance", "goes with mesh only; a builtin takes a number")
+        elif self.reflectance + self.specular > 1:
+            yield (
+                f"specular = {self.specular:g} and reflectance = {self.reflectance:g} reflect more than arrives:"
+                " their sum is outside [0, 1]"
+            )
+        yield from self._only_with("reflectance = 'from_file'", self.reflectance == "from_file", "reflectance_scale")
+
+
+Index = Annotated[float, Field(ge=1, le=1e9)]
+
+
+class OutsideIndex(Section):
+    """Faces of the domain that reflect as the boundary of two media: walls of a tank, the surface seen from below.
+
+    A face that has no index lets all light out.
+    """
+
+    x_low: Index | None = field(None, "phase index behind the face at the lower bound in x")
+    x_high: Index | None = field(None, "the same at the upper bound in x")
+    y_low: Index | None = field(None, "the same at the lower bound in y")
+    y_high: Index | None = field(None, "the same at the upper bound in y")
+    z_low: Index | None = field(None, "the same at the lower bound in z")
+    z_high: Index | None = field(None, "the same at the upper bound in z")
+
+
+class Domain(Section):
+    """Where the water is, in the world; camera and laser must be inside. A photon that comes to a face leaves, and is
+    gone, unless the face has an `outside_index`: there it is reflected, by Fresnel's formulas for unpolarised light."""
+
+    shape: Literal["unbounded", "slab", "box"] = field("unbounded", "slab: bounded in z; box: in x, y and z")
+    lower: Corner = field((-math.inf,) * 3, "lower corner [m]; one number for all three; a slab uses z")
+    upper: Corner = field((math.inf,) * 3, "upper corner [m]; one number for all three; a slab uses z")
+    outside_index: OutsideIndex | None = None
+    """phase index behind the faces that reflect, such as `{y_low = 1.0}`: 1 is air, a very large number a mirror"""
+    max_reflections: Whole = Field(2, ge=0, le=8)
+    """longest chain of reflections on the way from a scattering to the lens; light by longer ones is left out"""
+
+    def _problems(self) -> Iterator[str]:
+        for axis, low, high in zip("xyz", *self.bounds, strict=True):
+            if not low < high:
+                yield f"lower = {low} is outside (-inf, {high}), {high} being upper in {axis}"
+        for name in self.reflecting:
+            bound = self.bounds[name.endswith("high")]["xyz".index(name[0])]
+            if math.isinf(bound):
+                yield (
+                    f"outside_index.{name}: the domain has no such face with shape = {self.shape!r}; a slab has z_low "
+                    "and z_high, a box all six, each where lower or upper is finite"
+                )
+
+    @property
+    def reflecting(self) -> dict[str, float]:
+        """Phase index behind each face that reflects, by the face's name."""
+        return {} if self.outside_index is None else self.outside_index.to_dict()
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Lower and upper corner as they act [m]; infinite where the shape has no bound."""
+        free = {"unbounded": 3, "slab": 2, "box": 0}[self.shape]
+        low, high = (-math.inf,) * free + self.lower[free:], (math.inf,) * free + self.upper[free:]
+        return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+class Daylight(Section):
+    """Sun and clear sky over calm water, from which the ambient light of each pixel follows, on top of
+    `detector.ambient_rate`."""
+
+    sun_elevation_deg: float = field(..., "height of the sun above the horizon [°]", RANGES["sun_elevation_deg"])
+    depth: float = field(..., "of the lens below the surface [m]", "[0, 10000]")
+    sun_azimuth_deg: float = Field(90.0, ge=-360, le=360)
+    """horizontal angle from the world's z axis, or without one from its x axis, to below the sun, towards +x [°]"""
+    up: Direction = field((0.0, -1.0, 0.0), "direction of the surface in the world; any length but 0")
+    aerosol_optical_depth: float = Field(0.084, **bounds(RANGES["aerosol_optical_depth"]))
+    """vertical optical depth of the aerosol at 500 nm: 0.05 very clear air, 0.3 haze"""
+    cloud_factor: float = field(1.0, "irradiance over that of a clear sky", "[0, 2]")
+
+    @property
+    def down(self) -> NDArray[np.float64]:
+        """Unit vector away from the surface, in the world."""
+        return -np.asarray(unit_vector(self.up))
+
+    def sun_direction(self, index: float) -> NDArray[np.float64]:
+        """Unit vector in which the sun's light goes in water of a refractive index, in the world."""
+        down = self.down
+        ahead = np.array([0.0, 0.0, 1.0]) - down[2] * down
+        if np.linalg.norm(ahead) < 1e-6:
+            ahead = np.array([1.0, 0.0, 0.0]) - down[0] * down
+        ahead /= np.linalg.norm(ahead)
+        azimuth = math.radians(self.sun_azimuth_deg)
+        towards_sun = math.cos(azimuth) * ahead + math.sin(azimuth) * np.cross(down, ahead)
+        cosine = refracted_cosine(self.sun_elevation_deg, index)
+        return cosine * down - math.sqrt(1.0 - cosine**2) * towards_sun
+
+
+class Detector(Section):
+    """The SPAD array and its timing electronics."""
+
+    section: ClassVar[str] = "detector"
+    displaces: ClassVar = {
+        "filter_fwhm_nm": ("filter_table",),
+        "filter_table": ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"),
+    }
+    preset: str | None = field(None, "a named detector, see `spadwarp list presets detector`")
+    pdp: float = field(0.247, "photon detection probability of the active area", "[0, 1]")
+    fill_factor: float = field(0.2, "active part of a pixel's area, microlenses included", "(0, 1]")
+    jitter_fwhm_ps: float = field(200.0, "timing jitter, full width at half maximum [ps]", "[0, 1e12]")
+    irf: Annotated[str, FilePath(".csv", ("gaussian", "exponentially_modified_gaussian"))] = "gaussian"
+    """instrument response: "gaussian", "exponentially_modified_gaussian", or the path of a .csv file"""
+    irf_tail_ps: float = field(100.0, "time constant of the exponential tail [ps]", "[1e-12, 1e12]")
+    dark_count_rate: float = field(100.0, "median dark counts per second and pixel [1/s]", "[0, 1e15]")
+    dark_count_spread: float = field(0.0, "relative (log-normal) spread of the dark count rate over pixels", "[0, 10]")
+    hot_pixel_fraction: float = field(0.0, "part of the pixels that are hot", "[0, 1]")
+    hot_pixel_rate: float = field(1e4, "dark count rate of a hot pixel [1/s]", "[0, 1e15]")
+    ambient_rate: float = field(0.0, "detected background counts per second and pixel [1/s]", "[0, 1e15]")
+    filter_centre_nm: float | None = Field(None, ge=1e-9, le=1e6)
+    """wavelength of largest transmission of the filter before the detector [nm]; default: the laser's"""
+    filter_fwhm_nm: float | None = Field(None, ge=1e-6, le=1e6)
+    """full width at half maximum of its Gaussian transmission [nm]; without it there is no filter"""
+    filter_peak: float = field(1.0, "its largest transmission", "(0, 1]")
+    filter_table: CsvFile = field(None, "a measured filter in place of these: .csv of wavelength [nm] and transmission")
+    mode: Literal["first_photon", "free_running"] = field("first_photon", "one count a pulse, or as many as come")
+    dead_time_ns: float = field(0.0, "dead time after a count, free-running [ns]", "[0, 1e12]")
+    afterpulsing_probability: float = field(0.0, "probability that a count causes another", "[0, 1)")
+    afterpulsing_time_constant_ns: float = field(50.0, "decay time of afterpulsing [ns]", "[1e-12, 1e12]")
+    crosstalk_probability: float = field(0.0, "probability that a count fires a neighbour", "[0, 1)")
+    wrap: bool = field(True, "time of flight modulo the pulse period (range aliasing), as a detector sees it")
+    pulses_per_frame: Whole = field(20_000, "laser pulses in one frame of counts", "[1, 9223372036854775807]")
+    max_count: Whole = field(0, "largest count a histogram bin holds; 0 is unlimited", "[0, 2147483647]")
+
+    def _problems(self) -> Iterator[str]:
+        for name in ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"):
+            if getattr(self, name) == Detector.model_fields[name].default:
+                continue
+            if self.filter_table is not None:
+                yield self._that(name, "cannot be combined with filter_table")
+            if self.filter_fwhm_nm is None:
+                yield self._that(name, "needs filter_fwhm_nm")
+
+    @property
+    def has_filter(self) -> bool:
+        """Whether there is a filter before the detector."""
+        return self.filter_fwhm_nm is not None or self.filter_table is not None
+
+    @property
+    def pde(self) -> float:
+        """Photon detection efficiency: PDP × fill factor; the filter's transmission is left out."""
+        return self.pdp * self.fill_factor
+
+    @property
+    def noise_rate(self) -> float:
+        """Mean counts per second and pixel without light of the laser: dark counts and ambient light [1/s]."""
+        return self.dark_count_rate + self.ambient_rate
 
 
 class Gate(Section):
     """The time bins after the pulse leaves the laser."""
 
     section: ClassVar[str] = "gate"
-    preset: str | None = None
-    """named electronics, see `spadwarp list presets gate`"""
-    start_ns: float = Field(0.0, ge=0, le=1e12)
-    """begin of the first bin [ns]"""
-    bin_width_ps: float = Field(..., ge=1e-12, le=1e15)
-    """width of a bin [ps]"""
-    bins: Whole = Field(..., ge=1, le=1_000_000)
-    """number of bins"""
+    preset: str | None = field(None, "named electronics, see `spadwarp list presets gate`")
+    start_ns: float = field(0.0, "begin of the first bin [ns]", "[0, 1e12]")
+    bin_width_ps: float = field(..., "width of a bin [ps]", "[1e-12, 1e15]")
+    bins: Whole = field(..., "number of bins", "[1, 1000000]")
 
     @property
     def start(self) -> float:
@@ -45,73 +243,47 @@ class Gate(Section):
 class Scan(Section):
     """How the beam moves over the scene."""
 
-    section: ClassVar[str] = "scan"
-    mode: Literal["none", "confocal"] = "none"
-    """confocal: the beam visits the pixels in turn and each sees its own light alone"""
-    distance: float = Field(math.inf, ge=1e-6, le=math.inf, allow_inf_nan=True)
-    """range at which a confocal beam crosses its pixel's line of sight [m]; inf is parallel"""
+    mode: Literal["none", "confocal"] = field("none", "confocal: the beam visits the pixels, each sees its own light")
+    distance: float = field(math.inf, "where beam and line of sight cross [m]; inf is parallel", "[1e-6, inf]")
 
 
 class Transport(Section):
     """How photons are traced."""
 
-    section: ClassVar[str] = "transport"
-    photons: Whole = Field(1_000_000, ge=1, le=10**12)
-    """photons to emit"""
-    seed: Whole = Field(0, **bounds(SEED))
-    """key of the random numbers; one seed gives the same bits"""
+    photons: Whole = field(1_000_000, "photons to emit", "[1, 1000000000000]")
+    seed: Whole = field(0, "key of the random numbers; one seed gives the same bits", SEED)
     estimator: Literal["analog", "next_event", "guided"] = "guided"
     """what scores: the photon itself, every event, or guided flights; `none` of the kernel library is not offered here;
     `spadwarp.transport.trace` uses it"""
     points_per_flight: Whole = Field(1, ge=1, le=3)
     """points at which `guided` scores a flight; more leave less noise in the bins of a pixel and take longer"""
-    termination: Literal["cutoff", "roulette"] = "cutoff"
-    """drop light photons (biased), or Russian roulette"""
-    weight_cutoff: float = Field(2e-4, ge=0, lt=1)
-    """analog weight below which a photon ends; 0 is never"""
-    max_collisions: Whole = Field(64, ge=1, le=2**31 - 1)
-    """events of one photon at most, surfaces included; the light of the last one still counts"""
-    max_path: float | None = Field(None, gt=0, le=1e12)
-    """longest geometric path [m]; the gate's end if not given"""
-    lateral_limit: float = Field(math.inf, gt=0, le=math.inf, allow_inf_nan=True)
-    """photons end where |x| or |y| in the camera frame reaches this [m]; inf is no limit"""
-    axis_threshold: float = Field(0.9998, gt=0, le=1)
-    """|u_z| from which the near-axis rule acts; 1 turns it off (exact)"""
+    termination: Literal["cutoff", "roulette"] = field("cutoff", "drop light photons (biased), or Russian roulette")
+    weight_cutoff: float = field(2e-4, "analog weight below which a photon ends; 0 is never", "[0, 1)")
+    max_collisions: Whole = field(64, "events of one photon, surfaces included; the last counts", "[1, 2147483647]")
+    max_path: float | None = field(None, "longest geometric path [m]; the gate's end if not given", "(0, 1e12]")
+    lateral_limit: float = field(math.inf, "photons end where |x| or |y| of the camera frame is this [m]", "(0, inf]")
+    axis_threshold: float = field(0.9998, "|u_z| from which the near-axis rule acts; 1 turns it off (exact)", "(0, 1]")
 
 
 class Analytic(Section):
     """Settings of the analytic simulator; transport does not read them."""
 
-    section: ClassVar[str] = "analytic"
-    form: Literal["radiometric", "lu2024"] = "radiometric"
-    """constants of the lidar equation: radiometry, or eq 7 as printed"""
-    backscatter: Literal["constant", "single_scatter", "monte_carlo"] = "single_scatter"
-    """time course of the backscatter"""
-    backscatter_rate: float = Field(0.0, ge=0, le=1e15)
-    """constant backscatter, detections per second in the gate [1/s]"""
-    backscatter_fraction: float | None = Field(None, ge=0, le=1)
-    """part of the pixels that report backscatter (BS); from the rates if not given"""
-    count_law: Literal["per_pulse", "per_frame_lu2024", "per_frame"] = "per_pulse"
-    """at most one count a pulse, or a frame"""
+    form: Literal["radiometric", "lu2024"] = field("radiometric", "constants of the lidar equation, or eq 7 as printed")
+    backscatter: Literal["constant", "single_scatter", "monte_carlo"] = field("single_scatter", "its time course")
+    backscatter_rate: float = field(0.0, "constant backscatter, detections per second in the gate [1/s]", "[0, 1e15]")
+    backscatter_fraction: float | None = field(None, "of pixels that report it (BS); default: by the rates", "[0, 1]")
+    count_law: Literal["per_pulse", "per_frame_lu2024", "per_frame"] = field("per_pulse", "one at most: pulse or frame")
     pulses_per_depth_frame: Whole | None = Field(None, ge=1, le=2**63 - 1)
     """pulses of one depth frame, for per_pulse; if not given those of one frame of the detector, pulses_per_frame"""
-    frames: Whole = Field(1000, ge=1, le=2**63 - 1)
-    """detector frames of one depth frame, for per_frame"""
-    exposure: float = Field(1e-5, ge=1e-15, le=1e6)
-    """exposure of one detector frame [s]"""
+    frames: Whole = field(1000, "detector frames of one depth frame, for per_frame", "[1, 9223372036854775807]")
+    exposure: float = field(1e-5, "exposure of one detector frame [s]", "[1e-15, 1e6]")
 
 
 class Output(Section):
     """Files that a run writes into its directory."""
 
-    section: ClassVar[str] = "output"
-    result: bool = True
-    """everything, as HDF5"""
-    exr: bool = True
-    """truth and depth, as EXR"""
-    png: bool = True
-    """pictures for a first look"""
-    pdf: bool = False
-    """the same pictures as vectors, for print"""
-    depth_method: Literal["peak", "centroid", "matched", "likelihood"] = "centroid"
-    """how the depth frame is made"""
+    result: bool = field(True, "everything, as HDF5")
+    exr: bool = field(True, "truth and depth, as EXR")
+    png: bool = field(True, "pictures for a first look")
+    pdf: bool = field(False, "the same pictures as vectors, for print")
+    depth_method: Literal["peak", "centroid", "matched", "likelihood"] = field("centroid", "how depth is found")

@@ -8,7 +8,7 @@ axis (z).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from spadwarp.scene.camera import Camera, image_tangents
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.scene import Scene, camera_port, laser_port
-from spadwarp.units import path_from_time
+from spadwarp.values import path_from_time
 
 __all__: list[str] = []
 
@@ -51,21 +51,13 @@ def scan_axes(scene: Scene) -> Floats:
 
 
 def range_from_path(path: ArrayLike, directions: ArrayLike, laser_position: ArrayLike) -> Floats:
-    """Range along a line of sight at which light has gone `path` from the laser by the target to the lens.
+    """Range [m] along unit vectors u from the lens, `[..., 3]`, at which light has gone `path` L [m] from the laser at
+    p [m] by the target to the lens; NaN where L is NaN or too short.
 
     The points of one path lie on an ellipsoid with laser p and lens 0 as foci. |r·u − p| + r = L has one solution along
     u: r = (L² − |p|²) / (2 (L − u·p)). For a laser in the lens it is L/2.
-
-    Args:
-        path: Geometric path L [m], any shape.
-        directions: Unit vectors u from the lens, `[..., 3]`, broadcast against `path`.
-        laser_position: p [m], `[3]`.
-
-    Returns:
-        Range r [m]; NaN where L is NaN or too short to go from laser to lens.
     """
-    length = np.asarray(path, dtype=np.float64)
-    laser = np.asarray(laser_position, dtype=np.float64)
+    length, laser = np.asarray(path, np.float64), np.asarray(laser_position, np.float64)
     baseline = np.linalg.norm(laser)
     possible = length > baseline
     safe = np.where(possible, length, baseline + 1.0)  # keeps the unused branch free of 0/0
@@ -79,22 +71,14 @@ class LinesOfSight:
 
     A range is the length along the bent ray from the lens centre, a path the length in water that light needs as long
     for as from the laser by the point to the lens.
-
-    Attributes:
-        start: Where the lines begin: the lens centre, or where they leave the port [m], `[..., 3]`.
-        direction: Unit vectors, `[..., 3]`.
-        lead: Length of the way from the lens centre to the start [m].
-        delay: Length in water that takes as long [m].
-        laser: Position of the laser [m].
-        laser_port: What it shines through.
     """
 
-    start: Floats
-    direction: Floats
-    lead: Floats
-    delay: Floats
-    laser: Floats
-    laser_port: PortGeometry | None = None
+    start: Floats  # where the lines begin: the lens centre, or where they leave the port [m], `[..., 3]`
+    direction: Floats  # unit vectors, `[..., 3]`
+    lead: Floats  # length of the way from the lens centre to the start [m]
+    delay: Floats  # length in water that takes as long [m]
+    laser: Floats  # position of the laser [m]
+    laser_port: PortGeometry | None = None  # what it shines through
 
     @classmethod
     def in_water(cls, view: Floats, laser: Floats, port: PortGeometry | None = None) -> LinesOfSight:
@@ -104,13 +88,13 @@ class LinesOfSight:
 
     def __getitem__(self, index: Any) -> LinesOfSight:
         """The lines of some pixels."""
-        parts = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
-        return LinesOfSight(*parts, self.laser, self.laser_port)
+        lines = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
+        return LinesOfSight(*lines, self.laser, self.laser_port)
 
     def flat(self) -> LinesOfSight:
         """The lines of all pixels in one row, `[P, 3]`."""
-        start, direction = self.start.reshape(-1, 3), self.direction.reshape(-1, 3)
-        return replace(self, start=start, direction=direction, lead=self.lead.ravel(), delay=self.delay.ravel())
+        vectors = self.start.reshape(-1, 3), self.direction.reshape(-1, 3)
+        return LinesOfSight(*vectors, self.lead.ravel(), self.delay.ravel(), self.laser, self.laser_port)
 
     def points(self, distance: ArrayLike) -> Floats:
         """Points in the camera frame at ranges [m]."""
@@ -201,13 +185,11 @@ def depth_from_time(time: Floats, *, scene: Scene) -> Floats:
 
 def depth_per_time(scene: Scene, distance: Floats, view: Floats | None = None) -> Floats:
     """dz/dt at ranges along the lines of sight, `[H, W]` [m/s], or along those of unit vectors `view`."""
-    beam = scene.beam
-    axis: Floats | None = None
-    if beam.profile == "collimated":
-        port = laser_port(scene)
-        axis = np.array(beam.axis) if port is None else port.enter(beam.position, beam.axis)[1]
-    lines = lines_of_sight(scene, view)
-    light = lines.light_at(lines.points(distance))[0] if axis is None else axis
+    beam, lines, port = scene.beam, lines_of_sight(scene, view), laser_port(scene)
+    if beam.profile != "collimated":
+        light = lines.light_at(lines.points(distance))[0]
+    else:
+        light = np.array(beam.axis) if port is None else port.enter(beam.position, beam.axis)[1]
     # The path rises with the range by 1 + the cosine between both directions of light.
     return scene.medium.pulse_speed / (1.0 + (light * lines.direction).sum(axis=-1)) * lines.direction[..., 2]
 
@@ -234,21 +216,19 @@ def beam_planes(laser: Laser) -> Floats:
         right, down = profile_axes(laser.axis)
         normals = np.array([wide * axis - right, wide * axis + right, tall * axis - down, tall * axis + down, axis])
         return np.column_stack([normals, -normals @ origin])
-    other = np.eye(3)[np.argmin(np.abs(axis))]
-    b1 = np.cross(axis, other) / np.linalg.norm(np.cross(axis, other))
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    b1 = across / np.linalg.norm(across)
     phi = np.arange(24) * (2.0 * math.pi / 24)
     outward = np.cos(phi)[:, None] * b1 + np.sin(phi)[:, None] * np.cross(axis, b1)
     slope, radius = 0.0, max(laser.beam_radius, 1e-6)
     if laser.profile != "collimated":
-        slope = math.tan(laser.half_angle) * (_GAUSSIAN_EDGE if laser.profile == "gaussian" else 1.0)
-        radius = 0.0
+        slope, radius = math.tan(laser.half_angle) * (_GAUSSIAN_EDGE if laser.profile == "gaussian" else 1.0), 0.0
     normals = np.concatenate([slope * axis - outward, axis[None]])
-    offsets = -normals @ origin + np.append(np.full(24, radius), 0.0)
-    return np.column_stack([normals, offsets])
+    return np.column_stack([normals, -normals @ origin + np.append(np.full(24, radius), 0.0)])
 
 
 def points_inside(triangles: Floats, planes: Floats) -> Floats:
-    """Floats of the triangles that are inside all planes, `[N, 3]`: none if and only if no triangle reaches in."""
+    """Points of the triangles that are inside all planes, `[N, 3]`: none if and only if no triangle reaches in."""
     whole, outside = np.ones(len(triangles), dtype=bool), np.zeros(len(triangles), dtype=bool)
     for plane in planes:
         distance = triangles @ plane[:3] + plane[3]
@@ -266,7 +246,7 @@ def points_inside(triangles: Floats, planes: Floats) -> Floats:
 
 
 def _spread(triangles: Floats) -> Floats:
-    """Floats evenly over each triangle; of many triangles the corners alone."""
+    """Points evenly over each triangle; of many triangles the corners alone."""
     steps = 6 if len(triangles) < 2000 else 1
     weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
     return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)

@@ -2,16 +2,14 @@
 
 from typing import TYPE_CHECKING
 
-from spadwarp.transport import derivatives, light, model, plan, records, simulation, tally_unit, workers
+from spadwarp.transport import derivatives, model, plan, records, simulation, workers
 from spadwarp.transport.derivatives import *
-from spadwarp.transport.light import *
 from spadwarp.transport.model import *
 from spadwarp.transport.plan import *
 from spadwarp.transport.records import *
 from spadwarp.transport.simulation import *
-from spadwarp.transport.tally_unit import *
 from spadwarp.transport.workers import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _modules = (derivatives, light, model, plan, records, simulation, tally_unit, workers)
+    _modules = (derivatives, model, plan, records, simulation, workers)
     __all__ = [name for module in _modules for name in module.__all__]

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
-from spadwarp.errors import ConfigError, DeviceError
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Truth
 from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix
@@ -25,7 +24,8 @@ from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
-from spadwarp.transport.tally_unit import tally_scale
+from spadwarp.transport.plan import tally_scale
+from spadwarp.values import ConfigError, DeviceError
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
@@ -55,17 +55,11 @@ def build_model(
     mesh_cache: MeshCache | None = None,
     derivatives: Sequence[str] = (),
 ) -> sk.Model:
-    """The scene on a device.
+    """The scene on a device; the mesh is that of `spadwarp.mesh.build_mesh`.
 
-    Args:
-        scene: What to simulate.
-        device: From `spadwarp.device.pick_device`.
-        mesh: From `spadwarp.mesh.build_mesh`.
-        copies: Histograms that the run will hold on the device, for the check of its memory.
-        scale: Tally units per emitted photon; None: `tally_scale(scene, mesh)`.
-        mesh_cache: Meshes of earlier scenes on their devices; one of the same faces is refitted and not built anew.
-        camera: Without one a history's path is limited by `transport.max_path` alone, not by the end of the gate.
-        derivatives: Full names of parameters, from `resolve_derivatives`.
+    Without a `camera` a history's path is limited by `transport.max_path` alone, not by the end of the gate. The run
+    will hold so many `copies` of the histogram on the device, for the check of its memory. `mesh_cache` has meshes of
+    earlier scenes; one of the same faces is refitted and not built anew. `derivatives` are full names.
 
     Raises:
         ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
@@ -74,26 +68,21 @@ def build_model(
         DeviceError: The device has too little memory.
     """
     _check_domain(scene, camera)
-    _check_discs(scene, camera)
     if camera:
         _check_gate(scene)
-    lens, limits = _camera(scene, mesh), _limits(scene, camera)
-    if scene.domain.reflecting:
-        limits.boundary = _boundary(scene, device)
     if scale is None:
         scale = tally_scale(scene, mesh) if camera else 1.0
+    lens, limits = _camera(scene, mesh), _limits(scene, device, camera)
     # Behind a port, light bends: the map of what the lens sees for certain is of straight lines.
     mapped = lens if camera and scene.camera.port is None else None
     device_mesh, surfaces = _surfaces(mesh, mapped, device, mesh_cache)
     parts: dict[str, Any] = {}
-    if scene.medium.layers:
+    if scene.medium.varies:
         parts["layers"] = _layers(scene, device)
-    if scene.medium.grid is not None:
-        parts["layers"] = _grid(scene, device)
     if scene.scan.mode != "none":
         parts["scan"] = _scan(scene, device)
     if derivatives:
-        grid = parts["layers"].grid if "layers" in parts else sk.Layers().grid
+        grid = parts.get("layers", sk.Layers()).grid
         parts["derivatives"] = make_derivatives(scene, derivatives, mesh, scale, device, grid)
     if scene.polarised:
         parts |= _polarised(scene, mesh, scale, device)
@@ -116,53 +105,53 @@ def build_model(
     return model
 
 
+def _filled(struct: Any, **fields: Any) -> Any:
+    """A struct of the kernels with values in its fields."""
+    for name, value in fields.items():
+        setattr(struct, name, value)
+    return struct
+
+
 def _largest_albedo(albedo: float | str) -> float:
     return _LU2024_ALBEDO if isinstance(albedo, str) else albedo
 
 
 def _medium(scene: Scene, device: wp.Device) -> Any:
-    medium = sk.Medium()
-    medium.extinction = scene.medium.extinction
-    medium.albedo = _largest_albedo(scene.medium.albedo)
-    medium.anisotropy = scene.medium.anisotropy
-    medium.axis_threshold = scene.transport.axis_threshold
-    if scene.medium.has_phase_table:
-        medium.phase = sk.make_phase_tables(phase_function(scene.medium).over_t, device=device)
-    return medium
+    water, medium = scene.medium, sk.Medium()
+    if water.has_phase_table:
+        medium.phase = sk.make_phase_tables(phase_function(water).over_t, device=device)
+    numbers = {"extinction": water.extinction, "albedo": _largest_albedo(water.albedo), "anisotropy": water.anisotropy}
+    return _filled(medium, **numbers, axis_threshold=scene.transport.axis_threshold)
 
 
 def _gate(scene: Scene, max_path: float) -> Any:
     """The gate in path [m]; light by a longer path than histories may have is outside it for every estimator."""
-    speed = scene.medium.pulse_speed
-    gate = sk.Gate()
-    gate.start, gate.stop = scene.gate.start * speed, min(scene.gate.stop * speed, max_path)
-    gate.bins_per_metre = 1.0 / (scene.gate.bin_width * speed)
-    gate.bins = scene.gate.bins
-    return gate
+    gate, speed = scene.gate, scene.medium.pulse_speed
+    span = {"start": gate.start * speed, "stop": min(gate.stop * speed, max_path)}
+    return _filled(sk.Gate(), **span, bins_per_metre=1.0 / (gate.bin_width * speed), bins=gate.bins)
 
 
-def _limits(scene: Scene, camera: bool) -> Any:
-    limits = sk.Limits()
-    lower, upper = np.array(scene.domain.bounds)
+def _limits(scene: Scene, device: wp.Device, camera: bool) -> Any:
+    limits, transport, domain = sk.Limits(), scene.transport, scene.domain
+    lower, upper = np.array(domain.bounds)
     if _has_rotated_domain(scene):
         limits.rotation = wp.mat33(*rotation_matrix(scene.camera.rotation_deg).ravel())
         limits.origin = wp.vec3(*scene.camera.position)
     else:
         lower, upper = lower - scene.camera.position, upper - scene.camera.position
-    limits.lower = wp.vec3(*np.maximum(lower, -_UNLIMITED))
-    limits.upper = wp.vec3(*np.minimum(upper, _UNLIMITED))
-    limits.lateral = min(scene.transport.lateral_limit, _UNLIMITED)
-    limits.max_path = scene.path_limit if camera else scene.transport.max_path or _UNLIMITED
-    limits.weight_cutoff = scene.transport.weight_cutoff
-    limits.max_collisions = scene.transport.max_collisions
-    return limits
-
-
-def _boundary(scene: Scene, device: wp.Device) -> Any:
-    """What the faces of the domain reflect."""
-    behind, water = scene.domain.reflecting, scene.medium.phase_index
-    low, high = ([behind.get(f"{axis}_{side}", 0.0) / water for axis in "xyz"] for side in ("low", "high"))
-    return sk.make_boundary(low, high, max_reflections=scene.domain.max_reflections, device=device)
+    if behind := domain.reflecting:
+        water = scene.medium.phase_index
+        low, high = ([behind.get(f"{axis}_{side}", 0.0) / water for axis in "xyz"] for side in ("low", "high"))
+        limits.boundary = sk.make_boundary(low, high, max_reflections=domain.max_reflections, device=device)
+    return _filled(
+        limits,
+        lower=wp.vec3(*np.maximum(lower, -_UNLIMITED)),
+        upper=wp.vec3(*np.minimum(upper, _UNLIMITED)),
+        lateral=min(transport.lateral_limit, _UNLIMITED),
+        max_path=scene.path_limit if camera else transport.max_path or _UNLIMITED,
+        weight_cutoff=transport.weight_cutoff,
+        max_collisions=transport.max_collisions,
+    )
 
 
 def _guiding(scene: Scene, max_path: float) -> Any:
@@ -178,14 +167,15 @@ def _guiding(scene: Scene, max_path: float) -> Any:
         thickness = max(2.0 * scene.optical_depth(beam.position, far_point), 1e-6)
     else:
         thickness = max(scene.medium.extinction * max_path, 1e-6)
-    guiding = sk.Guiding()
     in_grid = scene.medium.grid is not None
-    guiding.probability = 0.3 * min(1.0, math.sqrt((6.0 if in_grid else 10.0) / thickness))
-    guiding.surface_probability = 0.3
-    guiding.anisotropy = 1.0 - 0.03 * min(max(thickness / 6.0, 1.0), 4.0 / 3.0) if in_grid else 0.97
-    guiding.return_probability = 0.1 * min(1.0, 5.0 / thickness)
-    guiding.return_anisotropy = 0.5
-    return guiding
+    return _filled(
+        sk.Guiding(),
+        probability=0.3 * min(1.0, math.sqrt((6.0 if in_grid else 10.0) / thickness)),
+        surface_probability=0.3,
+        anisotropy=1.0 - 0.03 * min(max(thickness / 6.0, 1.0), 4.0 / 3.0) if in_grid else 0.97,
+        return_probability=0.1 * min(1.0, 5.0 / thickness),
+        return_anisotropy=0.5,
+    )
 
 
 def _device_mesh(mesh: TriangleMesh, device: wp.Device, cache: MeshCache | None) -> wp.Mesh:
@@ -213,24 +203,33 @@ def _surfaces(
     """The mesh with its BVH, and its surfaces as the kernels take them."""
     if mesh is None:
         return None, sk.make_surfaces(None, device=device)
-    device_mesh = _device_mesh(mesh, device, cache)
-    arrays: dict[str, Any] = {}
-    if mesh.specular is not None and mesh.roughness is not None:
-        arrays["specular"] = wp.array(mesh.specular, dtype=float, device=device)
-        arrays["roughness"] = wp.array(mesh.roughness, dtype=float, device=device)
-    if mesh.pattern is not None:
-        arrays["corner_reflectance"] = wp.array(mesh.pattern.corners, dtype=wp.vec3, device=device)
-        if mesh.pattern.images:
-            arrays["textures"] = sk.make_textures(
-                mesh.pattern.texture, mesh.pattern.coordinates, mesh.pattern.images, device=device
-            )
+    device_mesh, arrays = _device_mesh(mesh, device, cache), dict[str, Any]()
+    for name in ("specular", "roughness") if mesh.specular is not None and mesh.roughness is not None else ():
+        arrays[name] = wp.array(getattr(mesh, name), dtype=float, device=device)
+    if (pattern := mesh.pattern) is not None:
+        arrays["corner_reflectance"] = wp.array(pattern.corners, dtype=wp.vec3, device=device)
+        if pattern.images:
+            arrays["textures"] = sk.make_textures(pattern.texture, pattern.coordinates, pattern.images, device=device)
     reflectance: wp.array = wp.array(mesh.reflectance, dtype=float, device=device)
     return device_mesh, sk.make_surfaces(device_mesh, reflectance, camera=lens, **arrays)
 
 
 def _layers(scene: Scene, device: wp.Device) -> Any:
-    """The medium and its layers as the kernels take them."""
+    """The medium and its layers, or its grid of cells, in the camera's frame."""
     medium, camera = scene.medium, scene.camera
+    rotation = rotation_matrix(camera.rotation_deg)
+    if medium.grid is not None:
+        cells, layers = grid_cells(medium), sk.Layers()
+        layers.grid = sk.make_grid(
+            cells.extinction,
+            np.clip(cells.albedo, 0.0, 1.0),
+            cells.anisotropy,
+            size=cells.size,
+            centre=tuple(to_camera(camera, cells.centre).tolist()),
+            rotation=rotation.T @ cells.rotation,
+            device=device,
+        )
+        return layers
     axis = np.array(medium.layer_axis) / math.hypot(*medium.layer_axis)
     shift = float(axis @ camera.position)
     return sk.make_layers(
@@ -238,25 +237,9 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
         [water.extinction for water in medium.waters],
         [_largest_albedo(water.albedo) for water in medium.waters],
         [medium.anisotropy if water.anisotropy is None else water.anisotropy for water in medium.waters],
-        axis=(axis @ rotation_matrix(camera.rotation_deg)).tolist(),
+        axis=(axis @ rotation).tolist(),
         device=device,
     )
-
-
-def _grid(scene: Scene, device: wp.Device) -> Any:
-    """The grid on a device, in the camera's frame."""
-    cells, camera = grid_cells(scene.medium), scene.camera
-    layers = sk.Layers()
-    layers.grid = sk.make_grid(
-        cells.extinction,
-        np.clip(cells.albedo, 0.0, 1.0),
-        cells.anisotropy,
-        size=cells.size,
-        centre=tuple(to_camera(camera, cells.centre).tolist()),
-        rotation=rotation_matrix(camera.rotation_deg).T @ cells.rotation,
-        device=device,
-    )
-    return layers
 
 
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequence[str] = (), **choices: Any) -> Any:
@@ -296,10 +279,8 @@ def _grid_tracking(scene: Scene) -> Any:
     grid = scene.medium.grid
     if grid is None:
         return None
-    regular = grid.tracking == "regular"
-    if grid.tracking == "auto":
-        regular = grid_cells(scene.medium).extinction.size <= _MOST_REGULAR_CELLS
-    return sk.REGULAR_TRACKING if regular else sk.DELTA_TRACKING
+    small = grid.tracking == "auto" and grid_cells(scene.medium).extinction.size <= _MOST_REGULAR_CELLS
+    return sk.REGULAR_TRACKING if small or grid.tracking == "regular" else sk.DELTA_TRACKING
 
 
 def points_per_flight(scene: Scene, kinds: Sequence[str] = (), by_block: Sequence[str] = ()) -> int:
@@ -307,54 +288,48 @@ def points_per_flight(scene: Scene, kinds: Sequence[str] = (), by_block: Sequenc
 
     Raises `ConfigError` for what cannot be combined with several.
     """
-    points = scene.transport.points_per_flight
-    if points == 1:
-        return points
-    estimator = scene.transport.estimator
+    points, estimator = scene.transport.points_per_flight, scene.transport.estimator
     against = {
         f'estimator = "{estimator}"': estimator != "guided",
         "faces of the domain that reflect": bool(scene.domain.reflecting),
         "derivatives by block": bool(by_block),
         'medium.grid.tracking = "delta"': _grid_tracking(scene) is sk.DELTA_TRACKING,
     }
-    if any(against.values()):
-        names = " and ".join(name for name, found in against.items() if found)
-        text = f"transport.points_per_flight = {points} cannot be combined with {names}; take 1"
-        raise ConfigError(text, source=scene.source)
-    if points > 2 and len(kinds) > 4:
-        text = f"transport.points_per_flight = {points} goes with up to 4 derivatives; take 2"
-        raise ConfigError(text, source=scene.source)
+    problem = ""
+    if found := " and ".join(name for name, holds in against.items() if holds):
+        problem = f"cannot be combined with {found}; take 1"
+    elif points > 2 and len(kinds) > 4:
+        problem = "goes with up to 4 derivatives; take 2"
+    if points > 1 and problem:
+        raise ConfigError(f"transport.points_per_flight = {points} {problem}", source=scene.source)
     return points
 
 
 def _laser(scene: Scene, device: wp.Device) -> Any:
     beam = scene.beam
-    laser: Any = sk.Laser()
-    laser.position = wp.vec3(*beam.position)
-    laser.axis = wp.vec3(*beam.axis)
+    laser: Any = _filled(sk.Laser(), position=wp.vec3(*beam.position), axis=wp.vec3(*beam.axis))
     if (port := laser_port(scene)) is not None:
         laser.port = port_parameters(scene, port, beam.position, 0.0, 0.0)
     if beam.profile == "measured":
-        rows, columns = sk.profile_tables(load_profile(beam))
-        laser.rows = wp.array(rows, dtype=float, device=device)
-        laser.columns = wp.array(columns, dtype=float, device=device)
-        laser.extent = wp.vec2(*profile_extent(beam))
-        return laser
-    laser.profile = sk.LASER_PROFILES.index(beam.profile)
+        for name, table in zip(("rows", "columns"), sk.profile_tables(load_profile(beam)), strict=True):
+            setattr(laser, name, wp.array(table, dtype=float, device=device))
+        return _filled(laser, extent=wp.vec2(*profile_extent(beam)))
     if beam.profile == "gaussian":
         laser.tan2 = math.tan(beam.half_angle) ** 2
     else:
         laser.spread = 2.0 * math.sin(0.5 * beam.half_angle) ** 2
-    laser.radius = beam.beam_radius
-    return laser
+    return _filled(laser, profile=sk.LASER_PROFILES.index(beam.profile), radius=beam.beam_radius)
 
 
 def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
     camera = scene.camera
-    lens = sk.Camera()
-    lens.width, lens.height = camera.width, camera.height
-    lens.pixel_tangent = camera.pixel_tangent
-    lens.aperture_area = camera.aperture_area
+    lens = _filled(
+        sk.Camera(),
+        width=camera.width,
+        height=camera.height,
+        pixel_tangent=camera.pixel_tangent,
+        aperture_area=camera.aperture_area,
+    )
     if (focus := focus_distance(scene, mesh)) is not None:
         lens.aperture_radius, lens.inverse_focus = camera.aperture_radius, 1.0 / focus
     if not _has_plain_lens(scene):
@@ -382,14 +357,8 @@ def port_parameters(
     # Between the corners, cosines are larger; the lens sees the view by up to its radius over the focus aside.
     cosine = float(((corners @ normal) / np.linalg.norm(corners, axis=1)).min())
     angle = math.acos(min(max(cosine, -1.0), 1.0)) + math.atan(aperture_radius * inverse_focus) + 0.01
-    choices: dict[str, Any] = {
-        "thickness": port.thickness,
-        "index": port.index,
-        "group_index": port.group_index,
-        "origin": origin,
-        "aperture_radius": aperture_radius,
-        "largest_angle": min(angle, 1.55),
-    }
+    choices: dict[str, Any] = {name: getattr(port, name) for name in ("thickness", "index", "group_index")}
+    choices |= {"origin": origin, "aperture_radius": aperture_radius, "largest_angle": min(angle, 1.55)}
     try:
         if port.shape == "flat":
             return sk.make_flat_port(distance=port.distance, normal=port.normal, **choices)
@@ -406,11 +375,9 @@ def _has_plain_lens(scene: Scene) -> bool:
 def _scan(scene: Scene, device: wp.Device) -> Any:
     """A raster over the pixels: the beam goes through the middle of each."""
     axes, views = scan_axes(scene).reshape(-1, 3), pixel_views(scene.camera).reshape(-1, 4)
-    scan = sk.Scan()
-    scan.count = len(axes)
-    scan.axis = wp.array(axes.astype(np.float32), dtype=wp.vec3, device=device)
-    scan.view = wp.array(views.astype(np.float32), dtype=wp.vec4, device=device)
-    return scan
+    axis: wp.array = wp.array(axes.astype(np.float32), dtype=wp.vec3, device=device)
+    view: wp.array = wp.array(views.astype(np.float32), dtype=wp.vec4, device=device)
+    return _filled(sk.Scan(), count=len(axes), axis=axis, view=view)
 
 
 def _has_rotated_domain(scene: Scene) -> bool:
@@ -420,23 +387,16 @@ def _has_rotated_domain(scene: Scene) -> bool:
 
 def _polarised(scene: Scene, mesh: TriangleMesh | None, scale: float, device: wp.Device) -> dict[str, Any]:
     """Polarised light of the model, and tallies of the camera's channels in the unit of its histogram."""
-    rows = _channel_rows(scene.camera)
-    facets: Any = ()
+    rows, facets = _channel_rows(scene.camera), ()  # type: tuple[Any, Any]
     if mesh is not None and mesh.specular is not None:
         index = np.array([target.specular_index for target in scene.targets]) / scene.medium.phase_index
         facets = index[mesh.target]
-    parts: dict[str, Any] = {
-        "polarisation": sk.make_polarisation(
-            laser=_emitted_stokes(scene.laser),
-            matrix=scattering_matrix(scene.medium),
-            channels=rows,
-            facet_index=facets,
-            device=device,
-        )
-    }
-    if rows:
-        parts["derivatives"] = sk.make_derivatives([], [], [scale] * len(rows), channels=len(rows), device=device)
-    return parts
+    emitted, matrix = _emitted_stokes(scene.laser), scattering_matrix(scene.medium)
+    light = sk.make_polarisation(laser=emitted, matrix=matrix, channels=rows, facet_index=facets, device=device)
+    if not rows:
+        return {"polarisation": light}
+    tallies = sk.make_derivatives([], [], [scale] * len(rows), channels=len(rows), device=device)
+    return {"polarisation": light, "derivatives": tallies}
 
 
 def _emitted_stokes(laser: Laser) -> tuple[float, float, float, float]:
@@ -467,44 +427,35 @@ def _channel_rows(camera: Camera) -> list[list[float]]:
 
 
 def _check_domain(scene: Scene, camera: bool) -> None:
-    """Refuses a camera or a laser, or the way out of its port, outside the domain."""
-    beam = scene.beam
-    ways = {"laser.position": (laser_port(scene), beam.position, beam.axis)}
+    """Refuses a camera or a laser, or the way out of its port, outside the domain; and a lens or a beam that reaches
+    through a face that reflects: beyond it nothing is mirrored."""
+    beam, lens, domain = scene.beam, scene.camera, scene.domain
+    radius = beam.beam_radius if beam.profile == "collimated" else 0.0
+    ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)]
     if camera:
-        ways["camera.position"] = (camera_port(scene), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-    for name, (port, position, axis_of) in ways.items():
-        point, slack = np.asarray(position, np.float64), 0.0
+        radius, origin = 0.0 if lens.pinhole else lens.aperture_radius, (0.0, 0.0, 0.0)
+        ends.append(("camera", camera_port(scene), origin, (0.0, 0.0, 1.0), "aperture_diameter", radius))
+    for section, port, position, axis, field, radius in ends:
+        name, point, slack = f"{section}.position", np.asarray(position, np.float64), 0.0
         if port is not None:
             # The water begins behind the port, which may be a face of the domain.
-            name, slack = f"{name}, its axis behind the port", 1e-6
-            point = port.enter(position, axis_of)[0]
+            name, slack, radius = f"{name}, its axis behind the port", 1e-6, 0.0
+            point = port.enter(position, axis)[0]
             if not np.isfinite(point).all():
                 text = f"{name}: light along the axis does not get through the port: turn the axis or the port"
                 raise ConfigError(text, source=scene.source)
-        for axis, value, low, high in zip(
-            "xyz", to_world(scene.camera, point).tolist(), *scene.domain.bounds, strict=True
-        ):
+        centre = to_world(lens, point).tolist()
+        for letter, value, low, high in zip("xyz", centre, *domain.bounds, strict=True):
             if not low - slack <= value <= high + slack:
-                text = f"{name}: {axis} = {value} is outside [{low}, {high}], the domain"
+                text = f"{name}: {letter} = {value} is outside [{low}, {high}], the domain"
                 raise ConfigError(text, source=scene.source)
-
-
-def _check_discs(scene: Scene, camera: bool) -> None:
-    """Refuses a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
-    beam, discs = scene.beam, {}
-    if beam.profile == "collimated" and laser_port(scene) is None:
-        discs["laser.beam_radius"] = (beam.position, beam.axis, beam.beam_radius)
-    if camera and camera_port(scene) is None and not scene.camera.pinhole:
-        discs["camera.aperture_diameter"] = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), scene.camera.aperture_radius)
-    for name, (position, axis, radius) in discs.items():
-        centre = to_world(scene.camera, np.asarray(position, np.float64))
-        across = rotation_matrix(scene.camera.rotation_deg) @ np.asarray(axis, np.float64)
-        for face in scene.domain.reflecting:
-            k, high = "xyz".index(face[0]), face.endswith("high")
-            beyond = radius * math.sqrt(max(1.0 - across[k] ** 2, 0.0)) - abs(scene.domain.bounds[high][k] - centre[k])
+        across = rotation_matrix(lens.rotation_deg) @ np.asarray(axis, np.float64)
+        for face in domain.reflecting:
+            k, upper = "xyz".index(face[0]), face.endswith("high")
+            beyond = radius * math.sqrt(max(1.0 - across[k] ** 2, 0.0)) - abs(domain.bounds[upper][k] - centre[k])
             if beyond > 0.0:
-                text = f"{name}: reaches {beyond:.4g} m through {face} of the domain, which has an outside_index"
-                raise ConfigError(text, source=scene.source)
+                text = f"reaches {beyond:.4g} m through {face} of the domain, which has an outside_index"
+                raise ConfigError(f"{section}.{field}: {text}", source=scene.source)
 
 
 def _check_gate(scene: Scene) -> None:
@@ -518,16 +469,15 @@ def _check_gate(scene: Scene) -> None:
 def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bool:
     """Refuses what cannot fit before anything is computed; returns whether half as much again would, which is more than
     the low words of the histograms take."""
-    camera, size = scene.camera, model.tally_size
+    camera, size, cuda = scene.camera, model.tally_size, model.device.is_cuda
     shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
-    if signed and size * signed >= 2**31:
-        text = f"{shape} x {signed} derivatives or channels = {size * signed} is outside [1, {2**31 - 1}]"
+    outside, count = f"is outside [1, {2**31 - 1}]", size * max(signed, 1)
+    if count >= 2**31 and signed:
+        text = f"{shape} x {signed} derivatives or channels = {count} {outside}"
         way_out = "fewer pixels, bins or blocks, or fewer derivatives a run, with the same seed"
         raise ConfigError(f"{text}; {way_out}", source=scene.source)
-    if size >= 2**31:
-        text = f"camera and gate: {shape} = {size} is outside [1, {2**31 - 1}]"
-        raise ConfigError(text, source=scene.source)
-    cuda = model.device.is_cuda
+    if count >= 2**31:
+        raise ConfigError(f"camera and gate: {shape} = {size} {outside}", source=scene.source)
     # On the CPU counts on the device, their copy in the result, and the total of the components.
     needed = (8 if cuda else 16) * size * (1 + signed) * copies / 2**30
     available = model.device.free_memory if cuda else physical_memory()
@@ -552,29 +502,23 @@ def truth_maps(scene: SceneLike, *, device: str | None = None) -> Truth:
 
 def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     """`truth_maps` for a model that is already on its device."""
-    shape = (scene.camera.height, scene.camera.width)
+    camera, device = scene.camera, model.device
+    shape = (camera.height, camera.width)
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
-    origins = directions = wp.zeros((0, 0), dtype=wp.vec3, device=model.device)
-    if not scene.camera.is_plain:
-        directions = wp.array(pixel_directions(scene.camera).astype(np.float32), dtype=wp.vec3, device=model.device)
-    lines = lines_of_sight(scene)
-    depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
-    normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
-    if scene.camera.port is not None:
+    nowhere = np.zeros((0, 0, 3))
+    origins, directions, lead = nowhere, nowhere if camera.is_plain else pixel_directions(camera), None
+    if camera.port is not None:
         # A ray that does not get through goes where nothing is.
-        passes = np.isfinite(lines.direction).all(axis=-1, keepdims=True)
-        rays = [np.where(passes, lines.start, 1e9), np.where(passes, lines.direction, [0.0, 0.0, 1.0])]
-        origins, directions = (wp.array(part.astype(np.float32), dtype=wp.vec3, device=model.device) for part in rays)
-    wp.launch(
-        sk.truth_kernel,
-        dim=shape,
-        inputs=[model.camera, model.surfaces, origins, directions],
-        outputs=[depth, distance, normal, reflectance],
-        device=model.device,
-    )
-    ranges = distance.numpy()
-    if scene.camera.port is not None:
-        ranges = (ranges + lines.lead).astype(np.float32)
+        lines = lines_of_sight(scene)
+        passes, lead = np.isfinite(lines.direction).all(axis=-1, keepdims=True), lines.lead
+        origins = np.where(passes, lines.start, 1e9)
+        directions = np.where(passes, lines.direction, [0.0, 0.0, 1.0])
+    rays: Any = [wp.array(part.astype(np.float32), dtype=wp.vec3, device=device) for part in (origins, directions)]
+    depth, distance, reflectance = (wp.empty(shape, dtype=float, device=device) for _ in range(3))
+    normal = wp.empty(shape, dtype=wp.vec3, device=device)
+    inputs, outputs = [model.camera, model.surfaces, *rays], [depth, distance, normal, reflectance]
+    wp.launch(sk.truth_kernel, dim=shape, inputs=inputs, outputs=outputs, device=device)
+    ranges = distance.numpy() if lead is None else (distance.numpy() + lead).astype(np.float32)
     return Truth(depth=depth.numpy(), range=ranges, normal=normal.numpy(), reflectance=reflectance.numpy())

@@ -1,27 +1,33 @@
-"""The plan of a run: scene, seed, photon ids, batches, and how its work is divided."""
+"""The plan of a run: scene, seed, photon ids, batches, the unit of its tallies, and how its work is divided."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spadwarp.errors import ConfigError
-from spadwarp.limits import SEED, check_integer, check_part, check_real
-from spadwarp.mesh import build_mesh
+import numpy as np
+from numpy.typing import NDArray
+
+import spadwarp_kernels as sk
+from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Result, ResultLike
-from spadwarp.result.photon_ids import Range, count, shard_of
-from spadwarp.result.result import physics_of
-from spadwarp.scene import Scene, Transport
+from spadwarp.result.result import ResultHead, difference
+from spadwarp.result.tallies import count, shard_of
+from spadwarp.scene import Laser, Scene, Transport, phase_function
+from spadwarp.scene.laser import load_profile, profile_extent
+from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sections import field_range
+from spadwarp.scene.sight import view_planes
 from spadwarp.transport.derivatives import resolve_derivatives
-from spadwarp.transport.tally_unit import scale_and_capacity
+from spadwarp.values import SEED, ConfigError, check_integer, check_part, check_real
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["RunOptions"]
+__all__ = ["PHOTON_CAPACITY", "RunOptions", "photon_capacity", "tally_scale"]
 
 # Photons in one launch: large enough to fill the device, small enough for progress and Ctrl-C.
 LAUNCH_SIZE = {"cpu": 1 << 16, "cuda": 1 << 26}
@@ -67,38 +73,29 @@ class RunOptions:
     checkpoint_every: float = 60.0
 
     def __post_init__(self) -> None:
-        checked: dict[str, Any] = {}
-        checked["checkpoint_every"] = check_real("checkpoint_every", self.checkpoint_every, "[0, inf]")
+        checked: dict[str, Any] = {
+            "checkpoint_every": check_real("checkpoint_every", self.checkpoint_every, "[0, inf]")
+        }
         for name, within in _RANGES.items():
             value = getattr(self, name)
             checked[name] = None if value is None and name != "first_photon" else check_integer(name, value, within)
         checked["shard"] = None if self.shard is None else check_part("shard", self.shard)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(checked)
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A run, in a form that can be sent to other processes.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan(ResultHead):
+    """The head of a run's result, in a form that can be sent to other processes, and how it is traced: with which mesh
+    and derivatives by their full names; None as `launch_size` is what suits the device."""
 
-    Attributes:
-        scene, mesh: What to simulate; the mesh from `spadwarp.mesh.build_mesh`.
-        seed: 64-bit.
-        ids: Of the photons, [start, stop).
-        scale: Tally units per emitted photon.
-        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
-        launch_size: Photons in one launch; None: what suits the device.
-        derivatives: Full names of the parameters by which the histogram is differentiated.
-    """
-
-    scene: Scene
     mesh: TriangleMesh | None
-    seed: int
-    ids: Range
-    scale: float
-    batch_size: int = 0
-    launch_size: int | None = None
     derivatives: tuple[str, ...] = ()
+    launch_size: int | None = None
+
+    @property
+    def scale(self) -> float:
+        """Tally units per emitted photon."""
+        return 1.0 / self.unit
 
 
 def make_plan(
@@ -119,35 +116,32 @@ def make_plan(
     """
     photons = None if photons is None else check_integer("photons", photons, _PHOTONS)
     seed = None if seed is None else check_integer("seed", seed, SEED)
-    first_photon, shard = run.first_photon, run.shard
+    first_photon, shard, batch_size = run.first_photon, run.shard, 0
     if relative_error is not None:
         check_real("relative_error", relative_error, "(0, 1)")
         if shard is not None:
             raise ConfigError("relative_error cannot be combined with shard: no part knows the error of the whole")
     batches = batches or relative_error is not None
+    names = () if derivatives is None else resolve_derivatives(scene, derivatives, blocks)
     if resume is not None:
-        _check_resumed(resume, run, scene, seed, batches)
-        seed, first_photon = resume.seed, resume.requested[0]
+        _check_resumed(resume, run, seed, batches)
+        seed, first_photon, batch_size = resume.seed, resume.requested[0], resume.batch_size
         photons = count([resume.requested]) if photons is None else photons
         if photons <= resume.photons:
             raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
-    resumed = () if resume is None else tuple(resume.derivatives)
-    names = resumed if derivatives is None else resolve_derivatives(scene, derivatives, blocks)
-    if resume is not None and names != resumed:
-        raise ConfigError(f"derivatives: the run to resume has {', '.join(resumed) or 'none'}, not {', '.join(names)}")
+        had = tuple(resume.derivatives)
+        if derivatives is not None and names != had:
+            text = f"the run to resume has {', '.join(had) or 'none'}, not {', '.join(names)}"
+            raise ConfigError(f"derivatives: {text}")
+        names = had
     photons = scene.transport.photons if photons is None else photons
-    seed = scene.transport.seed if seed is None else seed
-    batch_size = 0
-    if resume is not None:
-        batch_size = resume.batch_size
-    elif batches:
+    if batches and resume is None:
         batch_size = _batch_size(scene, photons, relative_error, shard)
     if batch_size:
         photons = -(-photons // batch_size) * batch_size
         if first_photon % batch_size:
-            raise ConfigError(
-                f"first_photon = {first_photon} is not a multiple of {batch_size}, the photons of a batch"
-            )
+            text = f"is not a multiple of {batch_size}, the photons of a batch"
+            raise ConfigError(f"first_photon = {first_photon} {text}")
     mesh = build_mesh(scene)
     scale, capacity = scale_and_capacity(scene, mesh)
     if photons > capacity:
@@ -157,9 +151,24 @@ def make_plan(
             "instead, or start the gate later"
         )
     ids = first_photon, first_photon + photons
-    if shard is not None:
-        ids = shard_of(ids, shard, batch_size or 1)
-    return Plan(scene, mesh, seed, ids, scale, batch_size, run.launch_size, names)
+    ids = ids if shard is None else shard_of(ids, shard, batch_size or 1)
+    plan = Plan(
+        scene=scene,
+        unit=1.0 / scale,
+        photons=count([ids]),
+        seed=scene.transport.seed if seed is None else seed,
+        energy_balance_unit=sk.LEDGER_UNIT,
+        photon_ranges=(ids,),
+        batch_size=batch_size,
+        requested=ids,
+        focus_distance=focus_distance(scene, mesh),
+        mesh=mesh,
+        derivatives=names,
+        launch_size=run.launch_size,
+    )
+    if resume is not None and (problem := difference(resume, plan)):
+        raise ConfigError(f"resume: {problem}")
+    return plan
 
 
 def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
@@ -175,15 +184,190 @@ def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard:
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
 
 
-def _check_resumed(resume: Result, run: RunOptions, scene: Scene, seed: int | None, batches: bool) -> None:
+def _check_resumed(resume: Result, run: RunOptions, seed: int | None, batches: bool) -> None:
     for name in ("first_photon", "shard"):
         if value := getattr(run, name):
             raise ConfigError(f"{name} = {value} cannot be combined with resume, which has the photon ids of its run")
-    if physics_of(scene) != physics_of(resume.scene):
-        raise ConfigError("resume: the result is of another scene; only photons and output may differ")
     if seed not in (None, resume.seed):
         raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
     if batches and not resume.batch_size:
         raise ConfigError("uncertainty: the run to resume has no batches")
     if channel := resume.provenance.get("channel"):
         raise ConfigError(f"resume: the result holds {channel}-polarised light alone; resume the run that it is of")
+
+
+# The unit of the tallies, between the brightest bin that they hold and the faintest light that they resolve
+
+PHOTON_CAPACITY = 2**40
+"""Photons that a tally holds, where the faintest light does not ask for a finer unit; else `photon_capacity`, which is
+at least 1/16 of it."""
+
+_LEAST_CAPACITY = 2**36
+
+# A single contribution of the faintest light has this many units at least, if the least capacity allows it: rounding
+# adds 2 % to the variance then.
+_FAINT_UNITS = 4.0
+
+_LARGEST_BIN = 2.0**62
+
+
+def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
+    """Tally units per emitted photon, a power of two; a function of the scene alone, so that parts of a run add up.
+
+    From both ends: `PHOTON_CAPACITY` photons keep the brightest bin below 2^62; or fewer, down to 1/16, where a finer
+    unit is needed to resolve the faintest light, the next event of one photon on the furthest target.
+    """
+    return scale_and_capacity(scene, mesh)[0]
+
+
+def photon_capacity(scene: Scene, mesh: TriangleMesh | None) -> int:
+    """Photons, in all parts of a run together, that keep the brightest bin of a scene's tally below 2^62."""
+    return scale_and_capacity(scene, mesh)[1]
+
+
+def scale_and_capacity(scene: Scene, mesh: TriangleMesh | None) -> tuple[float, int]:
+    """`tally_scale` and `photon_capacity`, which share their work."""
+    density = _phase_density(scene)
+    brightest, faintest = (min(max(bound(scene, mesh, density), 1e-30), 1.0) for bound in (_brightest, _faintest))
+    coarsest, finest = (
+        math.floor(math.log2(_LARGEST_BIN / (photons * brightest))) for photons in (PHOTON_CAPACITY, _LEAST_CAPACITY)
+    )
+    wanted = math.ceil(math.log2(_FAINT_UNITS / faintest))
+    # Finer than 2^-52, light that by chance scatters right before the lens would not fit into one contribution.
+    scale = 2.0 ** min(max(coarsest, min(wanted, finest)), 52)
+    return scale, min(PHOTON_CAPACITY, int(_LARGEST_BIN / (brightest * scale)))
+
+
+Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def _own_anisotropies(scene: Scene) -> list[float]:
+    """Of layers and cells that share the phase function's form alone."""
+    return [] if scene.medium.has_phase_table else list(scene.medium.range.anisotropies)
+
+
+def _phase_density(scene: Scene) -> Density:
+    """Largest density [1/sr] of the phase functions of a scene's waters over t = 1 - cos(angle) in (0, 2]."""
+    common, own = phase_function(scene.medium).over_t, _own_anisotropies(scene)
+    return lambda t: np.max([common(t), *(sk.henyey_greenstein_density(t, g) for g in own)], axis=0)
+
+
+def _backward(scene: Scene, density: Density) -> float:
+    """Density [1/sr] with which light is thrown back: the largest of the phase function beyond 90°, or what many
+    small deflections come to, isotropic scattering of (1 - <cos>) times the light."""
+    turned = 1.0 - min([phase_function(scene.medium).mean_cosine, *_own_anisotropies(scene)])
+    return max(float(density(np.linspace(1.0, 2.0, 181)).max()), turned / (4.0 * math.pi))
+
+
+def _faintest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> float:
+    """Next event of a photon of full weight at the far end of the scene: on the furthest target, or in the water."""
+    furthest = 0.5 * scene.path_limit
+    scattered = max(scene.medium.range.albedo, 1e-3) * float(density(np.array([2.0]))[0])
+    if mesh is not None:
+        furthest = min(furthest, float(np.linalg.norm(np.abs(mesh.bounds).max(axis=0))))
+        scattered = max(float(mesh.reflectance.max()), 1e-3) / math.pi
+    through = math.exp(-scene.optical_depth([0.0, 0.0, 0.0], [0.0, 0.0, furthest]))
+    return scattered * through * scene.camera.aperture_area / furthest**2
+
+
+def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> float:
+    """The brightest bin's share of the light.
+
+    It is bounded from above by the lidar equation at the near end of the gate, for light scattered back in the water,
+    or off the nearest point of a target, all of it within one bin, shared by the pixels that the beam spans; for a
+    laser away from the lens also where its beam, narrow near its exit, crosses the view, and for light that scatters
+    into the view before the beam reaches it. Times 16 for multiple scattering, and lost by absorption alone, since what
+    scatters may still arrive.
+    """
+    camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium
+    speed = medium.pulse_speed
+    pixels = camera.width * camera.height
+    half_field = 0.5 * camera.width * camera.pixel_tangent
+    spread = _spread(laser)
+    # Each position of a scan has its own part of the photons.
+    share = scene.scan_positions
+
+    def illuminated_pixels(spot_scale: float) -> float:
+        """Pixels that share the beam, for a spot of `spot_scale` times its size as seen from the lens's distance."""
+        spot = max(math.pi * (spread * spot_scale / camera.pixel_tangent) ** 2, 1.0)
+        return share * spot if share > 1 else min(spot, pixels)
+
+    baseline = math.hypot(laser.position[0], laser.position[1])
+    nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
+    if (port := camera_port(scene)) is not None:
+        nearest = max(nearest, port.nearest)
+    scattering, absorption = medium.range.scattering, medium.range.absorption
+    reach = 0.5 * gate.bin_width * speed
+    # The integral of 1/r^2 over the bin.
+    backward = scattering * _backward(scene, density) * reach
+    water = backward / (nearest * (nearest + reach))
+    surface, bistatic = 0.0, _crossing(scene, illuminated_pixels, density)
+    if mesh is not None:
+        gap = _distance(np.zeros(3), mesh)
+        white = 1.0
+        if mesh.specular is not None and mesh.roughness is not None:
+            # A lobe is brighter than white by the density of its facets, 1/(4 alpha^2) times their reflectance.
+            white = max(1.0, float((mesh.reflectance + 0.25 * mesh.specular / mesh.roughness**2).max()))
+        surface = white / (math.pi * max(gap, nearest) ** 2)
+        if math.hypot(*laser.position) > 0.25 * gap:
+            thrown = _distance(np.array(laser.position), mesh)
+            spot = illuminated_pixels(min(1.0, thrown / max(gap, 1e-3)))
+            through = math.exp(-absorption * (gap + thrown))
+            bistatic = max(bistatic, white * through / (math.pi * max(gap, camera.aperture_radius, 0.01) ** 2 * spot))
+    coaxial = max(water, surface) * math.exp(-absorption * 2.0 * nearest) / illuminated_pixels(1.0)
+    aside = 0.0
+    if baseline > camera.aperture_radius:
+        view = min(4.0 * half_field**2 * camera.height / camera.width, 2.0 * math.pi) / (4.0 * math.pi)
+        longest = max(gate.start * speed, baseline)
+        aside = min(scattering * baseline, 1.0) * backward * view * math.exp(-absorption * longest) / baseline**2
+        aside /= share if share > 1 else pixels
+    return 16.0 * camera.aperture_area * max(coaxial, bistatic, aside)
+
+
+def _distance(point: NDArray[np.float64], mesh: TriangleMesh) -> float:
+    """From a point to the nearest face [m]."""
+    from trimesh.triangles import closest_point
+
+    vertices, faces = mesh.vertices - point.astype(np.float32), mesh.faces
+    nearest = (vertices**2).sum(axis=1).min()
+    corners = [vertices[faces[:, k]] for k in range(3)]
+    # The boxes about the faces leave few of them.
+    box = np.maximum(np.minimum.reduce(corners), -np.maximum.reduce(corners)).clip(min=0.0)
+    near = vertices[faces[(box**2).sum(axis=1) <= 1.001 * nearest]].astype(np.float64)
+    return float(np.linalg.norm(closest_point(near, np.zeros((len(near), 3))), axis=1).min())
+
+
+def _spread(laser: Laser) -> float:
+    """Tangent of the half angle of an even cone that is as bright as the beam; 0 for a parallel one."""
+    if laser.profile == "collimated":
+        return 0.0
+    if laser.profile == "measured":
+        image = load_profile(laser)
+        wide, tall = profile_extent(laser)
+        return math.sqrt(4.0 * wide * tall * float(image.mean() / image.max()) / math.pi)
+    return math.tan(min(laser.half_angle, 1.5))
+
+
+def _crossing(scene: Scene, illuminated_pixels: Callable[[float], float], density: Density) -> float:
+    """Largest share of the light per area of the lens [1/m^2] that one bin of one pixel gets where the beam's axis is
+    in view, by single scattering; 0 if it never is, or starts at the lens."""
+    camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium.range
+    speed = scene.medium.pulse_speed
+    exit_point = np.array(laser.position)
+    if np.linalg.norm(exit_point) < camera.aperture_radius or scene.scan_positions > 1:
+        return 0.0
+    along = np.geomspace(1e-3, max(scene.path_limit, 2e-3), 400)
+    points = exit_point + along[:, None] * np.array(laser.axis)
+    away = np.linalg.norm(points, axis=1)
+    planes = view_planes(camera)
+    seen = (points @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)
+    seen &= (along + away >= gate.start * speed) & (along + away <= gate.stop * speed)
+    points, away, along = points[seen], away[seen], along[seen]
+    one_minus_cosine = 1.0 + points @ np.array(laser.axis) / away
+    # A peak that is narrower than half the lens lights a part of it.
+    phase = density(np.clip(one_minus_cosine, 0.5 * (0.25 * camera.aperture_radius / away) ** 2, 2.0))
+    # The part of the beam that arrives within a bin; light that comes straight at the lens arrives all at once.
+    part = np.minimum(gate.bin_width * speed / np.maximum(one_minus_cosine, 1e-6), along + away)
+    away = np.maximum(away, max(camera.aperture_radius, 0.01))
+    light = medium.scattering * part * phase * np.exp(-medium.absorption * (along + away)) / away**2
+    return float((light / [illuminated_pixels(scale) for scale in along / away]).max(initial=0.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,9 +14,7 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
-from spadwarp.errors import ArgumentError
 from spadwarp.io.hdf5 import Coordinate, name_dimensions, read_hdf5, write_hdf5
-from spadwarp.limits import SEED, check_integer
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import to_world
@@ -25,31 +24,28 @@ from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.transport.plan import LAUNCH_SIZE
 from spadwarp.transport.simulation import Progress
 from spadwarp.transport.workers import DeviceWorker
+from spadwarp.values import SEED, ArgumentError, check_integer
 
 __all__ = ["PhotonRecords", "load_records", "save_records", "trace"]
 
 FORMAT = "spadwarp records"
 FORMAT_VERSION = 1
 
-_ARRAYS: dict[str, tuple[Any, tuple[int, ...]]] = {
-    "id": (np.uint64, ()),
-    "position": (np.float32, (3,)),
-    "direction": (np.float32, (3,)),
-    "weight": (np.float32, ()),
-    "path": (np.float32, ()),
-    "collisions": (np.int32, ()),
-    "reason": (np.int32, ()),
-}
-_AXES: Coordinate = (["x", "y", "z"], "1", "of the world")
-_DIMENSIONS = {
-    "id": (("photon",), "1", "of the photon"),
-    "position": (("photon", "axis"), "m", "where the history ended"),
-    "direction": (("photon", "axis"), "1", "of the last flight"),
-    "weight": (("photon",), "1", "remaining weight"),
-    "path": (("photon",), "m", "geometric path"),
-    "collisions": (("photon",), "1", "events, surfaces included"),
-    "reason": (("photon",), "1", "index into reasons"),
-    "log_derivatives": (("photon", "parameter"), "1", "derivative of the logarithm of what the history has met"),
+# Type, dimensions, unit, meaning.
+_ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
+    "id": (np.uint64, ("photon",), "1", "of the photon"),
+    "position": (np.float32, ("photon", "axis"), "m", "where the history ended"),
+    "direction": (np.float32, ("photon", "axis"), "1", "of the last flight"),
+    "weight": (np.float32, ("photon",), "1", "remaining weight"),
+    "path": (np.float32, ("photon",), "m", "geometric path"),
+    "collisions": (np.int32, ("photon",), "1", "events, surfaces included"),
+    "reason": (np.int32, ("photon",), "1", "index into reasons"),
+    "log_derivatives": (
+        np.float32,
+        ("photon", "parameter"),
+        "1",
+        "derivative of the logarithm of what the history has met",
+    ),
 }
 _READ_ME = (
     "One row per photon, as its history ended: position [m] and direction in the world (for a camera without pose its "
@@ -125,28 +121,26 @@ def trace(
     if progress is not None:
         progress("compile", 0, 0)
     spec = transport_spec(scene, mesh, derivatives=names, estimator="none", records=True)
-    arrays = [name for name in _ARRAYS if name != "id"] + (["log_derivatives"] if names else [])
+    arrays = [name for name in _ARRAYS if name != "id" and (names or name != "log_derivatives")]
     size = LAUNCH_SIZE["cuda" if model.device.is_cuda else "cpu"]
-    worker = DeviceWorker(model, spec, seed=seed, launch_size=size, histogram=False)
-    parts: list[dict[str, NDArray[Any]]] = []
+    worker = DeviceWorker(model, spec, seed=seed, launch_size=size)
+    parts: list[list[NDArray[Any]]] = []
     for first in range(0, photons, size):
         stop = min(first + size, photons)
         worker.data.records = sk.make_records(stop - first, device=model.device, derivatives=len(names))
-        worker.launch(first, stop)
-        parts.append({name: getattr(worker.data.records, name).numpy() for name in arrays})
+        worker.trace((first, stop), stopped=threading.Event())
+        parts.append([getattr(worker.data.records, name).numpy() for name in arrays])
         if progress is not None:
             progress("trace", stop, photons)
-    energy_balance, _ = sk.read_ledger(worker.data)
-    camera = scene.camera
-    if camera.is_posed:
-        for part in parts:
-            part["position"] = to_world(camera, part["position"]).astype(np.float32)
-            part["direction"] = (part["direction"] @ rotation_matrix(camera.rotation_deg).T).astype(np.float32)
+    whole: Any = dict(zip(arrays, map(np.concatenate, zip(*parts, strict=True)), strict=True))
+    if (camera := scene.camera).is_posed:
+        whole["position"] = to_world(camera, whole["position"]).astype(np.float32)
+        whole["direction"] = (whole["direction"] @ rotation_matrix(camera.rotation_deg).T).astype(np.float32)
     return PhotonRecords(
         id=np.arange(photons, dtype=np.uint64),
-        **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
+        **whole,
         reasons=sk.LEDGER_ENTRIES,
-        energy_balance=energy_balance,
+        energy_balance=sk.read_ledger(worker.data)[0],
         energy_balance_unit=sk.LEDGER_UNIT,
         derivatives=names,
     )
@@ -163,28 +157,22 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
     Raises:
         FileError: The file cannot be written.
     """
+    head = {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, "reasons": list(records.reasons)}
+    if records.derivatives:
+        head["derivatives"] = list(records.derivatives)
     with write_hdf5(path) as file:
-        file.attrs.update(
-            {
-                "format": FORMAT,
-                "format_version": FORMAT_VERSION,
-                "read_me": _READ_ME,
-                "reasons": list(records.reasons),
-                "energy_balance_unit": records.energy_balance_unit,
-            }
-        )
-        for name in _ARRAYS:
+        file.attrs.update({**head, "energy_balance_unit": records.energy_balance_unit})
+        for name in _ARRAYS if records.derivatives else list(_ARRAYS)[:-1]:
             file.create_dataset(name, data=getattr(records, name), compression="gzip", compression_opts=1, shuffle=True)
-        if records.derivatives:
-            file.attrs["derivatives"] = list(records.derivatives)
-            file.create_dataset(
-                "log_derivatives", data=records.log_derivatives, compression="gzip", compression_opts=1, shuffle=True
-            )
         file.create_dataset("energy_balance", data=json.dumps(records.energy_balance))  # integers without limit
         if scene is not None:
             file.create_dataset("config", data=scene.to_toml())
-        parameters: Coordinate = (list(records.derivatives), "1", "of the scene")
-        name_dimensions(file, {"photon": len(records.id), "axis": _AXES, "parameter": parameters}, _DIMENSIONS)
+        coordinates: dict[str, Coordinate | int | None] = {
+            "photon": len(records.id),
+            "axis": (["x", "y", "z"], "1", "of the world"),
+            "parameter": (list(records.derivatives), "1", "of the scene"),
+        }
+        name_dimensions(file, coordinates, {name: entry[1:] for name, entry in _ARRAYS.items()})
     return Path(path)
 
 
@@ -195,18 +183,20 @@ def load_records(path: str | Path) -> PhotonRecords:
         FileError: No such file, not photon records, or damaged; says which.
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
-        count = len(file.stored("id", np.uint64, (None,)))
-        arrays = {name: file.array(name, kind, (count, *shape)) for name, (kind, shape) in _ARRAYS.items()}
-        reasons = np.ravel(file.attribute("reasons")).tolist()
-        if not all(isinstance(name, str) for name in reasons):
-            file.refuse("reasons", "are not names")
-        if count and not 0 <= arrays["reason"].min() <= arrays["reason"].max() < len(reasons):
-            file.refuse("reason", f"is outside [0, {len(reasons)}) for some photons")
         names: list[Any] = np.ravel(file.attribute("derivatives", [])).tolist()
         if bool(names) != ("log_derivatives" in file) or not all(isinstance(name, str) for name in names):
             file.refuse("derivatives", "are not the names of derivatives")
-        if names:
-            arrays["log_derivatives"] = file.array("log_derivatives", np.float32, (count, len(names)))
+        sizes = {"photon": len(file.stored("id", np.uint64, (None,))), "axis": 3, "parameter": len(names)}
+        arrays: Any = {
+            name: file.array(name, kind, [sizes[dimension] for dimension in dimensions])
+            for name, (kind, dimensions, *_) in _ARRAYS.items()
+            if names or name != "log_derivatives"
+        }
+        reasons = np.ravel(file.attribute("reasons")).tolist()
+        if not all(isinstance(name, str) for name in reasons):
+            file.refuse("reasons", "are not names")
+        if len(arrays["id"]) and not 0 <= arrays["reason"].min() <= arrays["reason"].max() < len(reasons):
+            file.refuse("reason", f"is outside [0, {len(reasons)}) for some photons")
         return PhotonRecords(
             **arrays,
             derivatives=tuple(names),

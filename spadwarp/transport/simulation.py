@@ -10,31 +10,24 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from itertools import accumulate
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import spadwarp_kernels as sk
 from spadwarp.device import pick_devices, processor_name
-from spadwarp.errors import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning
-from spadwarp.limits import shown
-from spadwarp.mesh import focus_distance
 from spadwarp.parallel import Ray, interruptible
-from spadwarp.result import COMPONENTS, Result, as_result, save_result
-from spadwarp.result.merging import add_timing, check_focus, check_targets, join_provenance
-from spadwarp.result.photon_ids import Range, Ranges, count, joined, without
-from spadwarp.result.result import largest_share
-from spadwarp.result.tallies import check_capacity, total_of
+from spadwarp.parallel.worker import Event
+from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
+from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets
+from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
 from spadwarp.scene import SceneLike, as_scene
-from spadwarp.transport.executor import Executor, Workers
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
-from spadwarp.transport.workers import ClusterWorkers, LocalWorkers
-from spadwarp.units import percent
+from spadwarp.transport.workers import ClusterWorkers, LocalWorkers, trace_block
+from spadwarp.values import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning, percent, shown
 
 __all__ = ["Progress", "provenance", "simulate"]
 
@@ -44,6 +37,9 @@ Progress = Callable[[str, int, int], None]
 # so small, in numbers of them to one unit, that their own scatter is less.
 _LARGEST_ROUNDING_ERROR = 0.05
 _MANY = 10
+
+# Seconds that a block of photons takes: long beside the milliseconds of handing it out, short beside a checkpoint's.
+_BLOCK_SECONDS = 5.0
 
 # Checkpoints take at most this share of the time.
 _LARGEST_SHARE = 0.02
@@ -127,7 +123,6 @@ def simulate(
         raise ArgumentError(f"run = {shown(run)} is not a RunOptions")
     if tallies is not None and (run.resume is not None or engine is not None):
         raise ConfigError("tallies cannot be combined with resume and engine: they hold one run of one device")
-    writer = Checkpoint(run.checkpoint, run.checkpoint_every)
     resume = None if run.resume is None else as_result(run.resume, "resume")
     plan = make_plan(
         as_scene(scene),
@@ -144,20 +139,14 @@ def simulate(
         stopped = stack.enter_context(interruptible())
         if progress is not None:
             progress("compile", 0, 0)
-        workers: Workers
+        workers: LocalWorkers | ClusterWorkers
         if engine is None:
             devices = pick_devices(device)
             workers = LocalWorkers(plan, devices, threads=run.threads, tallies=tallies, mesh_cache=mesh_cache)
         else:
             note = None if progress is None else lambda text: progress(text, 0, 0)
             workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))
-        try:
-            result = _Run(plan, workers, resume, progress, writer).result(stopped, relative_error)
-        except DeviceError as error:
-            if writer.photons:
-                saved = f"{writer.path}: the {writer.photons} photons that were done are here; resume it"
-                raise DeviceError(f"{error}\n{saved}") from error
-            raise
+        result = _Run(plan, workers, resume, progress, run, stopped).result(relative_error)
     _warn_of_rounding(result)
     for text in result.warnings:
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
@@ -187,46 +176,59 @@ def _units(tally: NDArray[np.int64]) -> int:
 
 
 class _Run:
-    """The photons of a plan, those of an earlier result included."""
+    """The photons of a plan, each counted once, those of an earlier result included: blocks of workers that were lost
+    run again, and what is done is written to a checkpoint now and then."""
 
     def __init__(
-        self, plan: Plan, workers: Workers, resumed: Result | None, progress: Progress | None, checkpoint: Checkpoint
+        self,
+        plan: Plan,
+        workers: LocalWorkers | ClusterWorkers,
+        resumed: Result | None,
+        progress: Progress | None,
+        options: RunOptions,
+        stopped: threading.Event,
     ) -> None:
-        self._plan, self._workers, self._resumed, self._checkpoint = plan, workers, resumed, checkpoint
+        if resumed is not None and not same_targets(resumed.truth, workers.truth):
+            raise ConfigError(f"resume: {TARGETS_DIFFER}")
+        self._plan, self._workers, self._resumed, self._stopped = plan, workers, resumed, stopped
         self._report = (lambda stage, done, total: None) if progress is None else progress
-        self._unit = 1.0 / plan.scale
-        if resumed is not None and resumed.unit != self._unit:
-            raise ConfigError(f"resume: the tally unit is {self._unit}, that of the result {resumed.unit}")
-        self._focus_distance = focus_distance(plan.scene, plan.mesh)
-        began = time.perf_counter()
-        self._truth = workers.truth()
         self._began = time.perf_counter()
-        self._truth_seconds = self._began - began
-        if resumed is not None:
-            check_targets(resumed.truth, self._truth, "resume")
-            check_focus(resumed.focus_distance, self._focus_distance, "resume")
         self._earlier: Ranges = () if resumed is None else joined(resumed.photon_ranges)
+        self._waiting = IdQueue(())
+        self._done: list[Range] = []  # in `workers.tallies()`
+        self._held: dict[Any, list[Range]] = {}  # done, in the tallies of the worker
+        self._running: dict[Any, Range | None] = {}  # None: it hands its tallies over
+        self._progress: dict[Any, int] = {}  # photons of a running block that are done
+        self._speed: dict[Any, float] = {}
+        self._collecting: set[Any] | None = None  # workers that have yet to hand over, while a checkpoint is due
+        self._place, self._every = options.checkpoint, options.checkpoint_every
+        self._written, self._cost, self._saved = time.monotonic(), 0.0, 0  # time, seconds and photons of the checkpoint
 
-    def result(self, stopped: threading.Event, relative_error: float | None) -> Result:
+    def result(self, relative_error: float | None) -> Result:
         """Of all photons, of those that reach a relative error, or of those done when the run was stopped."""
-        if relative_error is not None:
-            return self._known_result(stopped, relative_error)
-        done = self._trace(self._plan.ids, self._earlier, stopped)
-        if count(done) == count(self._earlier):
-            raise KeyboardInterrupt
-        return self._collect(done)
-
-    def _known_result(self, stopped: threading.Event, relative_error: float) -> Result:
-        """Traces until the error is known to be small enough, looking at it where it may be."""
-        done, size, rule = self._earlier, self._plan.batch_size, StoppingRule(relative_error)
-        (start, stop), photons = self._plan.ids, count([self._plan.ids])
-        goal = min(start + max(FIRST_LOOK * size, count(done)), stop)
-        while True:
-            done = self._trace((start, goal), done, stopped)
-            if count(done) == count(self._earlier) and stopped.is_set():
+        try:
+            if relative_error is not None:
+                return self._known_result(relative_error)
+            self._trace(self._plan.requested)
+            if not self._done:
                 raise KeyboardInterrupt
-            result = self._collect(done)
-            if stopped.is_set() and without((start, goal), done):
+            return self._collect()
+        except DeviceError as error:
+            if not self._saved:
+                raise
+            saved = f"{self._place}: the {self._saved} photons that were done are here; resume it"
+            raise DeviceError(f"{error}\n{saved}") from error
+
+    def _known_result(self, relative_error: float) -> Result:
+        """Traces until the error is known to be small enough, looking at it where it may be."""
+        size, rule, (start, stop) = self._plan.batch_size, StoppingRule(relative_error), self._plan.requested
+        goal = min(start + max(FIRST_LOOK * size, count(self._earlier)), stop)
+        while True:
+            self._trace((start, goal))
+            if not self._done and self._stopped.is_set():
+                raise KeyboardInterrupt
+            result = self._collect()
+            if self._stopped.is_set() and without((start, goal), joined(result.photon_ranges)):
                 return result
             batches = result.photons // size
             error = result.relative_error if batches > 1 else math.inf
@@ -234,86 +236,121 @@ class _Run:
             remark = f"error {100 * error:.3g} % after {batches} batches"
             if relative_error < error < math.inf:
                 remark += f"; about {result.photons * (error / relative_error) ** 2:.2g} photons are needed"
-            self._report(remark, result.photons, photons)
+            self._report(remark, result.photons, self._plan.photons)
             if wanted is None or goal == stop:
                 return replace(result, requested=(start, goal), partial=False)
             goal = min(goal + (wanted - batches) * size, stop)
 
-    def _trace(self, span: Range, done: Ranges, stopped: threading.Event) -> Ranges:
-        """The ids done once a span is, or once the run was stopped."""
-        todo = without(span, done)
-        if not todo:
-            return done
-        before, total = count(done), count([self._plan.ids])
-        now = Executor(self._workers, todo, unit=self._plan.batch_size or 1).run(
-            stopped=stopped,
-            report=lambda photons: self._report("trace", before + photons, total),
-            checkpoint_due=self._checkpoint.is_due,
-            checkpoint=lambda ids: self._checkpoint.write(lambda: self._collect(joined([*done, *ids]))),
-        )
-        return joined([*done, *now])
+    def _trace(self, span: Range) -> None:
+        """Traces the ids of a span that are not done; fewer where the run is stopped."""
+        self._waiting = IdQueue(without(span, joined([*self._earlier, *self._done])))
+        stop_sent = False
+        try:
+            while True:
+                if self._stopped.is_set() and not stop_sent:
+                    self._workers.stop()
+                    stop_sent = True
+                ending = stop_sent or not self._unfinished()
+                if self._collecting is None and not ending and self._checkpoint_is_due():
+                    # None again if no worker has done or begun anything yet.
+                    self._collecting = {*self._held, *self._running} or None
+                self._assign(ending, stop_sent)
+                if ending and not self._running:
+                    return
+                for event in self._workers.wait():
+                    self._take(event)
+                photons = sum(map(count, (self._earlier, self._done, *self._held.values())))
+                self._report("trace", photons + sum(self._progress.values()), self._plan.photons)
+                if self._collecting is not None and not self._collecting:
+                    self._collecting = None
+                    if self._done and not self._stopped.is_set() and self._unfinished():
+                        self._write_checkpoint()
+        except BaseException:
+            self._workers.stop()
+            raise
 
-    def _collect(self, done: Ranges) -> Result:
-        """The result of the ids done, whose tallies the workers and the earlier result hold."""
-        total, timing, made = self._workers.tallies(), dict(self._workers.timing), provenance()
-        timing = {"truth": self._truth_seconds, **timing, "trace": time.perf_counter() - self._began}
-        made |= self._workers.metadata()
-        if self._resumed is None:
-            check_capacity(total.tallies)
+    def _unfinished(self) -> bool:
+        return bool(self._waiting.left or any(self._running.values()))
+
+    def _assign(self, ending: bool, stopped: bool) -> None:
+        """Gives every idle worker something to do."""
+        idle: Sequence[Any] = self._workers.idle
+        for worker in idle:
+            if self._held.get(worker) and (ending or worker in (self._collecting or ())):
+                self._running[worker] = None
+                self._workers.collect(worker)
+            elif stopped or (self._collecting is not None and self._workers.must_rest):
+                continue
+            elif block := self._waiting.take(self._size(worker)):
+                self._running[worker] = block
+                self._workers.send(worker, trace_block, block)
+
+    def _size(self, worker: Any) -> int:
+        """Photons of the next block: some seconds, fewer towards the end so that all workers end together."""
+        first, workers, unit = self._workers.first_block, len(self._workers.workers), self._plan.batch_size or 1
+        size = int(self._speed[worker] * _BLOCK_SECONDS) if worker in self._speed else first
+        if workers > 1:
+            size = min(size, max(self._waiting.left // (2 * workers), first // 16))
+        return max(1, size // unit) * unit
+
+    def _take(self, event: Event) -> None:
+        """What a worker did; an event of one that has nothing to do is that it has joined, or was lost before."""
+        worker = event.worker
+        if event.kind == "progress":
+            self._progress[worker] = self._progress.get(worker, 0) + event.value
+            return
+        if worker not in self._running:
+            return
+        block = self._running.pop(worker)
+        self._progress.pop(worker, None)
+        if event.kind == "returned" and block is not None:
+            ids, seconds = event.value
+            self._held.setdefault(worker, []).extend(ids)
+            if seconds > 0:
+                self._speed[worker] = count(ids) / seconds
+            return
+        if event.kind == "returned":
+            self._done += self._held.pop(worker)
         else:
-            total = total_of(total, self._resumed)
-        result = Result(
-            scene=self._plan.scene,
-            **vars(total),
-            unit=self._unit,
-            focus_distance=self._focus_distance,
-            photons=count(done),
-            seed=self._plan.seed,
-            energy_balance_unit=sk.LEDGER_UNIT,
-            truth=self._truth,
-            timing=timing,
-            provenance=made,
-            photon_ranges=done,
-            batch_size=self._plan.batch_size,
-            requested=self._plan.ids,
-            partial=bool(without(self._plan.ids, done)),
-        )
+            self._waiting.put_back([*self._held.pop(worker, []), *([block] if block else [])])
+        if self._collecting is not None:
+            self._collecting.discard(worker)
+
+    def _collect(self) -> Result:
+        """The result of the ids done, whose tallies the workers and the earlier result hold."""
+        parts, plan = [] if self._resumed is None else [self._resumed], self._plan
+        if done := joined(self._done):
+            total = self._workers.tallies()
+            if not parts:
+                check_capacity(total.tallies)
+            head = {field.name: getattr(plan, field.name) for field in fields(ResultHead)}
+            own = Result(
+                **{**head, "photons": count(done), "photon_ranges": done},
+                **vars(total),
+                truth=self._workers.truth,
+                timing={**self._workers.timing, "trace": time.perf_counter() - self._began},
+                provenance=provenance() | self._workers.metadata(),
+            )
+            parts.append(own)
+        whole = parts[0] if len(parts) == 1 else merge(parts)
+        left = bool(without(plan.requested, joined(whole.photon_ranges)))
+        result = replace(whole, scene=plan.scene, requested=plan.requested, partial=left)
         if difference := result.energy_report()["difference"]:
             raise DeviceError(f"the energy balance is off by {difference} units: a device has lost counts")
-        if self._resumed is None:
-            return result
-        own = tuple(span for ids in done for span in without(ids, self._earlier))
-        parts = [(self._resumed.provenance, self._resumed.photon_ranges), *([(made, own)] if own else [])]
-        return replace(result, timing=add_timing([timing, self._resumed.timing]), provenance=join_provenance(parts))
+        return result
 
-
-class Checkpoint:
-    """A file that is written again and again.
-
-    Args:
-        path: The file; None: no checkpoints.
-        every: Seconds between two of them, at least.
-
-    Attributes:
-        photons: In the file; 0 before the first.
-    """
-
-    def __init__(self, path: str | Path | None, every: float) -> None:
-        self.path, self.photons, self._every = path, 0, every
-        self._written, self._cost = time.monotonic(), 0.0
-
-    def is_due(self) -> bool:
+    def _checkpoint_is_due(self) -> bool:
         pause = max(self._every, self._cost / _LARGEST_SHARE)
-        return self.path is not None and time.monotonic() >= self._written + pause
+        return self._place is not None and time.monotonic() >= self._written + pause
 
-    def write(self, collect: Callable[[], Result]) -> None:
-        """Writes a result; where that fails the run continues, as the disk may have space again later."""
-        assert self.path is not None
+    def _write_checkpoint(self) -> None:
+        """Writes what is done; where that fails the run continues, as the disk may have space again later."""
+        assert self._place is not None
         began = time.monotonic()
         try:
-            result = collect()
-            save_result(result, self.path)
-            self.photons = result.photons
+            result = self._collect()
+            save_result(result, self._place)
+            self._saved = result.photons
         except FileError as error:
             warnings.warn(f"no checkpoint, the run continues: {error}", RuntimeWarning, stacklevel=2)
         self._written = time.monotonic()
@@ -327,22 +364,14 @@ class StoppingRule:
     bright photons have not come yet: too dark, with an error that is too small. So it goes on by a part of these
     photons that is fixed there and then, and ends whatever the last of them bring. The part is small where many photons
     matter equally, 40 to 80 batches; where few decide it is as many photons again, so that half had no say in it.
-
-    Args:
-        goal: Relative error.
     """
 
     def __init__(self, goal: float) -> None:
         self._goal, self._found = goal, False
 
     def next_look(self, batches: int, error: float, share: Callable[[], float]) -> int | None:
-        """Batches at the next look; None if the run ends.
-
-        Args:
-            batches: So far.
-            error: Relative error after these, infinite if it is not known.
-            share: Gives the part of the variance between batches that one of them has, in [0, 1].
-        """
+        """Batches at the next look, None if the run ends; from those so far, the relative error after these (infinite:
+        not known) and the part of the variance between batches that one of them has, in [0, 1]."""
         if self._found:
             return None
         if error <= self._goal:

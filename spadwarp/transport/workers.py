@@ -1,4 +1,4 @@
-"""Workers that trace photons into tallies of their own: devices of this host, and workers of Ray."""
+"""Workers that trace photons into tallies of their own: devices of this host, workers of Ray, a tracer of light."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -20,18 +19,28 @@ from numpy.typing import NDArray
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, pick_device, pick_devices, processor_name
-from spadwarp.errors import ConfigError, DeviceError, SpadwarpError, address_space, kernel_errors
-from spadwarp.limits import check_integer
 from spadwarp.parallel import Ray, Worker
-from spadwarp.parallel.ray import RayWorker, RayWorkers
+from spadwarp.parallel.ray import RayWorkers
 from spadwarp.parallel.worker import Event
 from spadwarp.result import COMPONENTS, SignedTallies, Tallies, Truth
-from spadwarp.result.photon_ids import IdQueue, Range, Ranges, count, joined
-from spadwarp.result.tallies import OVERFLOW, added, joined_moments, moments_of, total_of
+from spadwarp.result.tallies import (
+    OVERFLOW,
+    IdQueue,
+    Range,
+    Ranges,
+    added,
+    joined,
+    joined_moments,
+    moments_of,
+    photons_per_position,
+    total_of,
+)
+from spadwarp.scene import Scene
 from spadwarp.transport.model import MeshCache, build_model, trace_truth, transport_spec
-from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan
+from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan, RunOptions, make_plan
+from spadwarp.values import ConfigError, DeviceError, SpadwarpError, address_space, check_integer, kernel_errors
 
-__all__ = ["prepare_kernels"]
+__all__ = ["ExpectedLight", "LightTracer", "prepare_kernels"]
 
 # Photons of the first block of a worker of Ray, which shows how fast it is.
 _FIRST_BLOCK = {"cpu": 1 << 14, "cuda": 1 << 24}
@@ -40,35 +49,28 @@ _FIRST_BLOCK = {"cpu": 1 << 14, "cuda": 1 << 24}
 # Photons on one device
 
 
-@dataclass
-class _DeviceTally:
-    """A tally on the device, `[voxel * parts]`, and where there are any its batches."""
+class _Histogram:
+    """A tally on the device, `[voxel * parts]`, and its batches, if any; `total` may be the caller's."""
 
-    array: wp.array
-    parts: int
-    signed: bool
-    batches: sk.Batches | None
-
-    @property
-    def total(self) -> wp.array:
-        return self.array if self.batches is None else self.batches.total
+    def __init__(self, array: wp.array, *, signed: bool, batched: bool, total: wp.array | None = None) -> None:
+        self.array, self._signed = array, signed
+        self.batches = sk.Batches(array, len(COMPONENTS), total=total, signed=signed) if batched else None
+        self.total: wp.array = array if self.batches is None else self.batches.total
 
     def has_overflowed(self) -> bool:
         if self.batches is not None:
             return self.batches.has_overflowed()
-        return sk.has_overflowed(self.array, signed=self.signed)
+        return sk.has_overflowed(self.array, signed=self._signed)
 
-    def take_over(self, other: _DeviceTally) -> None:
+    def take_over(self, other: _Histogram) -> None:
         if self.batches is not None and other.batches is not None:
             self.batches.add(other.batches)
         else:
             sk.add_tallies(self.array, other.array)
 
     def clear(self) -> None:
-        self.array.zero_()
-        if self.batches is not None:
-            for array in (self.batches.total, *self.batches.second_moment):
-                array.zero_()
+        for array in (self.array, *(() if self.batches is None else (self.total, *self.batches.second_moment))):
+            array.zero_()
 
     def second_moment(self, shape: Sequence[int]) -> NDArray[np.uint64] | None:
         """`[2, *shape]`, low and high halves; None without batches."""
@@ -78,18 +80,10 @@ class _DeviceTally:
 
 
 class DeviceWorker:
-    """A device with a model and tallies of its own.
+    """A device with a model and tallies of its own, or the caller's.
 
-    Args:
-        model: From `build_model`.
-        spec: From `transport_spec`.
-        seed: 64-bit.
-        launch_size: Photons in one launch at most.
-        threads: Launches at a time. On a CPU all of them add to one tally, with atomics of their own.
-        batch_size: Photons of a batch, for the error of every bin; 0: no batches.
-        tallies: The caller's own, to be filled.
-        histogram: False: none is made, for records of photons without a camera.
-        derivatives, channels: Names of those of the spec, which has one kind of them.
+    Its threads launch at a time; on a CPU all of them add to one tally, with atomics of their own. A batch has
+    `batch_size` photons; 0: no batches. `signed` names the spec's derivatives, or else its channels.
     """
 
     def __init__(
@@ -101,96 +95,73 @@ class DeviceWorker:
         launch_size: int,
         threads: int = 1,
         batch_size: int = 0,
+        signed: tuple[str, ...] = (),
         tallies: Any = None,
-        histogram: bool = True,
-        derivatives: tuple[str, ...] = (),
-        channels: tuple[str, ...] = (),
     ) -> None:
-        camera, gate = model.camera, model.gate
-        self._shape = (len(COMPONENTS), camera.height, camera.width, gate.bins)
+        self._shape = (len(COMPONENTS), model.camera.height, model.camera.width, model.gate.bins)
         total = None if tallies is None else caller_tallies(tallies, shape=self._shape, device=model.device)
-        self.model, self.threads, self.launch_size = model, threads, launch_size
-        self._spec, self._seed, self._batch_size = spec, seed, batch_size
-        self._derivatives, self._channels = derivatives, channels
+        self.model, self._spec, self._seed, self._signed = model, spec, seed, signed
+        self._threads, self._launch_size, self._batch_size = threads, launch_size, batch_size
+        batched = batch_size > 0
         with device_errors(model.device):
-            signed = len(derivatives) + len(channels)
-            self.data = sk.make_data(
-                model, tally=None if batch_size else total, histogram=histogram, derivatives=signed
-            )
-            batches = sk.Batches(self.data.tally, len(COMPONENTS), total=total) if batch_size else None
-            self._tallies = [_DeviceTally(self.data.tally, 1, False, batches)]
+            own = None if batched else total
+            self.data = sk.make_data(model, tally=own, histogram=not spec.records, derivatives=len(signed))
+            self._histograms = [_Histogram(self.data.tally, signed=False, batched=batched, total=total)]
             if self.data.gradients is not None:
-                batches = sk.Batches(self.data.gradients, len(COMPONENTS), signed=True) if batch_size else None
-                self._tallies.append(_DeviceTally(self.data.gradients, signed, True, batches))
+                self._histograms.append(_Histogram(self.data.gradients, signed=True, batched=batched))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device, model=model, photon_count=most)
-        self._counts: tuple[dict[str, int], ...] | None = None  # energy balance and counters of the batches
-        self._moments: dict[str, int] = {}
-
-    def launch(self, first: int, stop: int) -> None:
-        """Traces the photons of one launch to their end."""
-        self._wait(self._begin(first, stop))
-
-    def _begin(self, first: int, stop: int) -> wp.Event | None:
-        """Gives a launch to the device, for whose end `_wait` waits; on a CPU it has ended then."""
-        device = self.model.device
-        with device_errors(device):
-            sk.launch_transport(
-                self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
-            )
-            return device.stream.record_event() if device.is_cuda else None
-
-    def _wait(self, end: wp.Event | None) -> None:
-        if end is not None:
-            with device_errors(self.model.device):
-                wp.synchronize_event(end)
+        self._closed: tuple[dict[str, int], dict[str, int], dict[str, int]] | None = None  # of batches
 
     def _launched(self, spans: Iterable[Range]) -> Iterator[Range]:
         """Traces a launch for each span and yields it when that has ended; a GPU has the next before."""
-        ahead = 1 if self.model.device.is_cuda else 0
-        running: list[tuple[Range, wp.Event | None]] = []
-        for span in spans:
-            running.append((span, self._begin(*span)))
+        device, running = self.model.device, list[tuple[Range, Any]]()
+        ahead = 1 if device.is_cuda else 0
+
+        def ended() -> Range:
+            span, end = running.pop(0)
+            if end is not None:
+                wp.synchronize_event(end)
+            return span
+
+        for first, stop in spans:
+            sk.launch_transport(
+                self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
+            )
+            running.append(((first, stop), device.stream.record_event() if device.is_cuda else None))
             if len(running) > ahead:
-                ended, end = running.pop(0)
-                self._wait(end)
-                yield ended
-        for ended, end in running:
-            self._wait(end)
-            yield ended
+                yield ended()
+        while running:
+            yield ended()
 
     def trace(
         self, block: Range, *, stopped: threading.Event, report: Callable[[int], None] = lambda photons: None
     ) -> Ranges:
         """Traces photons; returns the ids that were done before `stopped` was set, with batches those of whole ones.
 
-        Args:
-            block: The ids; with batches whole batches.
-            stopped: Once set, no further launch begins.
-            report: Called with the photons of each launch, from the thread that ran it.
+        `report` gets the photons of each launch, from the thread that ran it.
         """
-        if not self._batch_size:
-            traced = self._trace(block, stopped, report)
+        done, size = list[Range](), self._batch_size or block[1] - block[0]
+        with device_errors(self.model.device):
+            for first in range(*block, size):
+                part = first, first + size
+                traced = self._trace(part, stopped, report)
+                if not self._batch_size:
+                    done += traced
+                elif traced == (part,):
+                    self._close_batch()
+                    done.append(part)
+                else:
+                    for array in (self.data.ledger, *(histogram.array for histogram in self._histograms)):
+                        array.zero_()
+                    break
             self._check_overflow()
-            return traced
-        done: list[Range] = []
-        for first in range(*block, self._batch_size):
-            batch = first, first + self._batch_size
-            if self._trace(batch, stopped, report) != (batch,):
-                for array in (self.data.ledger, *(tally.array for tally in self._tallies)):
-                    array.zero_()
-                break
-            self._close_batch()
-            done.append(batch)
-        self._check_overflow()
         return joined(done)
 
     def _check_overflow(self) -> None:
         """After every block of photons, long before an integer could wrap around and look right again."""
-        with device_errors(self.model.device):
-            overflowed = any(tally.has_overflowed() for tally in self._tallies)
-        if overflowed:
+        if any(histogram.has_overflowed() for histogram in self._histograms):
             raise SpadwarpError(OVERFLOW)
 
     def _trace(self, ids: Range, stopped: threading.Event, report: Callable[[int], None]) -> Ranges:
@@ -200,7 +171,9 @@ class DeviceWorker:
         def spans() -> Iterator[Range]:
             while not (stopped.is_set() or failures):
                 with lock:
-                    span = waiting.take(self._size(waiting.left))
+                    # Fewer towards the end so that all threads end at about the same time.
+                    share = waiting.left // (2 * self._threads) if self._threads > 1 else waiting.left
+                    span = waiting.take(min(self._launch_size, max(share, self._launch_size // 16, 1)))
                 if span is None:
                     return
                 yield span
@@ -214,7 +187,7 @@ class DeviceWorker:
             except BaseException as error:
                 failures.append(error)
 
-        helpers = [threading.Thread(target=work, daemon=True) for _ in range(self.threads - 1)]
+        helpers = [threading.Thread(target=work, daemon=True) for _ in range(self._threads - 1)]
         for thread in helpers:
             thread.start()
         work()
@@ -224,79 +197,73 @@ class DeviceWorker:
             raise failures[0]
         return joined(done)
 
-    def _size(self, left: int) -> int:
-        """Photons of the next launch, fewer towards the end so that all threads end at about the same time."""
-        share = left // (2 * self.threads) if self.threads > 1 else left
-        return min(self.launch_size, max(share, self.launch_size // 16, 1))
-
     def _close_batch(self) -> None:
         """Adds a batch whose photons are all done to the totals."""
-        with device_errors(self.model.device):
-            for tally in self._tallies:
-                assert tally.batches is not None
-                tally.batches.close(tally.array, threads=self.threads)
-            assert self._tallies[0].batches is not None
-            moments = moments_of(COMPONENTS, self._tallies[0].batches.take_sums())
-            counts = sk.read_ledger(self.data)
-            self.data.ledger.zero_()
-        self._add_counts(counts, moments)
+        for histogram in self._histograms:
+            assert histogram.batches is not None
+            histogram.batches.close(histogram.array, threads=self._threads)
+        assert self._histograms[0].batches is not None
+        moments = moments_of(COMPONENTS, self._histograms[0].batches.take_sums())
+        self._add_closed((*sk.read_ledger(self.data), moments))
+        self.data.ledger.zero_()
 
-    def _add_counts(self, counts: tuple[dict[str, int], ...], moments: dict[str, int]) -> None:
-        """Of closed batches."""
-        self._counts = counts if self._counts is None else tuple(map(added, self._counts, counts))
-        self._moments = joined_moments(self._moments, moments) if self._moments else moments
+    def _add_closed(self, more: tuple[dict[str, int], dict[str, int], dict[str, int]]) -> None:
+        """Energy balance, counters and moments of closed batches."""
+        if (mine := self._closed) is not None:
+            more = added(mine[0], more[0]), added(mine[1], more[1]), joined_moments(mine[2], more[2])
+        self._closed = more
 
     def take_over(self, other: DeviceWorker) -> None:
         """Moves the tallies of another worker of the same run here; both must rest."""
         with device_errors(self.model.device):
-            for mine, more in zip(self._tallies, other._tallies, strict=True):
+            for mine, more in zip(self._histograms, other._histograms, strict=True):
                 mine.take_over(more)
             sk.add_tallies(self.data.ledger, other.data.ledger)
-        if other._counts is not None:
-            self._add_counts(other._counts, other._moments)
-        self._check_overflow()
-        other.clear()
+            if other._closed is not None:
+                self._add_closed(other._closed)
+            self._check_overflow()
+            other.clear()
 
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
         with device_errors(self.model.device):
-            tally = self._tallies[0]
-            energy_balance, counters = self._counts or sk.read_ledger(self.data)
-            scales = [float(self.model.derivatives.scale[p]) for p in range(len(self._channels))]
+            energy_balance, counters, moments = self._closed or (*sk.read_ledger(self.data), {})
+            signed, histogram = self._signed_tallies(), self._histograms[0]
             return Tallies(
-                tallies=_on_host(tally.total, self.model.device).reshape(self._shape),
+                tallies=_on_host(histogram.total, self.model.device).reshape(self._shape),
                 energy_balance=energy_balance,
                 counters=counters,
-                second_moment=tally.second_moment(self._shape[1:]),
-                batch_moments=dict(self._moments),
-                derivative_tallies=self._signed_tallies(self._derivatives, self.derivative_units),
-                channel_tallies=self._signed_tallies(self._channels, tuple(1.0 / scale for scale in scales)),
+                second_moment=histogram.second_moment(self._shape[1:]),
+                batch_moments=dict(moments),
+                derivative_tallies=None if self._spec.channels else signed,
+                channel_tallies=signed if self._spec.channels else None,
             )
 
-    def _signed_tallies(self, names: tuple[str, ...], units: tuple[float, ...]) -> SignedTallies | None:
+    def _signed_tallies(self) -> SignedTallies | None:
         """The device has the derivatives or channels of a voxel side by side, the result an array for each."""
-        if not names:
+        if not self._signed:
             return None
-        tally, shape = self._tallies[1], (*self._shape, len(names))
-        values, moments = tally.total.numpy().reshape(shape), tally.second_moment(shape[1:])
+        histogram, shape = self._histograms[1], (*self._shape, len(self._signed))
+        values, moments = histogram.total.numpy().reshape(shape), histogram.second_moment(shape[1:])
         moments = None if moments is None else np.ascontiguousarray(np.moveaxis(moments, -1, 1))
-        return SignedTallies(names, np.moveaxis(values, -1, 0), units, moments)
+        return SignedTallies(self._signed, np.moveaxis(values, -1, 0), self.signed_units, moments)
 
     @property
-    def derivative_units(self) -> tuple[float, ...]:
-        """Of each derivative's tallies [fraction of an emitted photon per unit of the parameter], powers of two."""
+    def signed_units(self) -> tuple[float, ...]:
+        """Of the tallies of each derivative or channel [fraction of an emitted photon, per unit of the parameter],
+        powers of two."""
         found, spec = self.model.derivatives, self._spec
-        scales = [found.scale[p] for p in range(len(spec.derivatives))]
+        scales = [found.scale[p] for p in range(len(spec.derivatives) + spec.channels)]
         for kind in range(len(spec.blocks)):
             scales += [found.blocks.scale[kind]] * found.blocks.count
         return tuple(1.0 / float(scale) for scale in scales)
 
     def clear(self) -> None:
         """Empties the tallies."""
-        self._counts, self._moments = None, {}
+        self._closed = None
         self.data.ledger.zero_()
-        for tally in self._tallies:
-            tally.clear()
+        for histogram in self._histograms:
+            histogram.clear()
 
 
 def _on_host(array: wp.array, device: wp.Device) -> NDArray[np.int64]:
@@ -364,12 +331,8 @@ def prepare_kernels(device: str | None = None) -> None:
 class LocalWorkers:
     """Workers of this process, one a device, each with a thread of Python for the length of a block.
 
-    Args:
-        plan: Of the run.
-        devices: From `spadwarp.device.pick_devices`.
-        threads: CPU threads in all; by default one a core. A GPU takes one.
-        tallies: The caller's own, for one device.
-        mesh_cache: Meshes of earlier runs, as `build_model` takes them.
+    A worker's first block, of `first_block` photons, shows how fast it is; `must_rest`: `tallies` changes while any
+    traces. `threads` are those of the CPU in all, by default one a core; a GPU takes one.
 
     Raises:
         ConfigError: CPU and GPU together, caller's tallies with several devices, or a number out of range.
@@ -395,10 +358,10 @@ class LocalWorkers:
         size = LAUNCH_SIZE[kind] if plan.launch_size is None else plan.launch_size
         size = check_integer("launch_size", size, f"[1, {LARGEST_LAUNCH[kind]}]")
         if kind == "cuda":  # a run of few photons needs no kernel of larger launches
-            size = min(size, max(1, count([plan.ids])))
+            size = min(size, max(1, plan.photons))
         threads = 1 if kind == "cuda" else max(1, (threads or core_count()) // len(devices))
-        self._devices = devices
         copies = (2 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))
+        choices: Any = {"copies": copies, "scale": plan.scale, "mesh_cache": mesh_cache}
         began = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
         # On GPUs `DeviceWorker` loads the kernel, which may be another one for a large histogram.
@@ -406,98 +369,79 @@ class LocalWorkers:
         models = []
         for device in devices:
             with device_errors(device):
-                model = build_model(
-                    plan.scene,
-                    device,
-                    plan.mesh,
-                    copies=copies,
-                    scale=plan.scale,
-                    mesh_cache=mesh_cache,
-                    derivatives=plan.derivatives,
-                )
-                models.append(model)
+                models.append(build_model(plan.scene, device, plan.mesh, derivatives=plan.derivatives, **choices))
         built = time.perf_counter()
         with device_errors(devices[0]):
-            self._truth = trace_truth(plan.scene, models[0])
+            self.truth = trace_truth(plan.scene, models[0])
             traced = time.perf_counter()
             for kernel in loading:
                 kernel.result()
-        settings: dict[str, Any] = {
-            "seed": plan.seed,
-            "launch_size": size,
-            "threads": threads,
-            "batch_size": plan.batch_size,
-            "derivatives": plan.derivatives,
-            "channels": plan.scene.camera.tallied_channels,
-        }
-        self.workers = [DeviceWorker(model, spec, tallies=tallies, **settings) for model in models]
+        settings: Any = {"seed": plan.seed, "launch_size": size, "threads": threads, "batch_size": plan.batch_size}
+        signed = plan.derivatives or plan.scene.camera.tallied_channels
+        self.tracers = [DeviceWorker(model, spec, signed=signed, tallies=tallies, **settings) for model in models]
         self.timing = {"setup": built - began, "compile": time.perf_counter() - traced, "truth": traced - built}
         self.first_block = threads * size
-        self._busy: set[DeviceWorker] = set()
-        self._stopped = threading.Event()
-        self._events: queue.SimpleQueue[Event | tuple[DeviceWorker, BaseException]] = queue.SimpleQueue()
-        self._failure: BaseException | None = None
+        self._devices, self._stopped = devices, threading.Event()
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._busy, self._failures = set[Worker](), list[BaseException]()
+        self.workers = [
+            Worker(device.alias, threads, self._stopped, {"tracer": tracer})
+            for device, tracer in zip(devices, self.tracers, strict=True)
+        ]
+        for worker in self.workers:
+            worker.state["report"] = functools.partial(self._report, worker)
+
+    def _report(self, worker: Worker, photons: int) -> None:
+        self._events.put(Event("progress", worker, photons))
 
     @property
-    def idle(self) -> list[DeviceWorker]:
-        return [] if self._failure else [worker for worker in self.workers if worker not in self._busy]
+    def idle(self) -> list[Worker]:
+        return [] if self._failures else [worker for worker in self.workers if worker not in self._busy]
 
-    def trace(self, worker: DeviceWorker, block: Range) -> None:
-        def work() -> None:
-            began = time.perf_counter()
+    def send(self, worker: Worker, work: Callable[..., Any], *arguments: Any) -> None:
+        """Lets an idle worker run `work(*arguments, worker)`."""
+
+        def run() -> None:
             try:
-                done = worker.trace(
-                    block,
-                    stopped=self._stopped,
-                    report=lambda photons: self._events.put(Event("progress", worker, photons)),
-                )
-                self._events.put(Event("traced", worker, (done, time.perf_counter() - began)))
+                self._events.put(Event("returned", worker, work(*arguments, worker)))
             except BaseException as error:
                 self._stopped.set()
-                self._events.put((worker, error))
+                self._events.put(Event("failed", worker, error))
 
         self._busy.add(worker)
-        threading.Thread(target=work, daemon=True).start()
+        threading.Thread(target=run, daemon=True).start()
 
-    def collect(self, worker: DeviceWorker) -> None:
+    def collect(self, worker: Worker) -> None:
         """Tallies stay where they are: `tallies` adds them up when all workers rest."""
         self._busy.add(worker)
-        self._events.put(Event("collected", worker))
+        self._events.put(Event("returned", worker))
 
     def stop(self) -> None:
         self._stopped.set()
 
     def wait(self) -> list[Event]:
+        """As `RayWorkers.wait`, and "progress": more photons of a worker's block are done."""
         events: list[Event] = []
-        try:
+        with suppress(queue.Empty):
             # With a timeout: Python handles a signal only when the wait for a lock ends.
-            event = self._events.get(timeout=0.1)
+            events.append(self._events.get(timeout=0.1))
             while True:
-                if not isinstance(event, Event):
-                    self._failure = self._failure or event[1]
-                    self._busy.discard(event[0])
-                else:
-                    events.append(event)
-                    if event.kind != "progress":
-                        self._busy.discard(event.worker)
-                event = self._events.get_nowait()
-        except queue.Empty:
-            pass
-        if self._failure is not None and not self._busy:
-            raise self._failure
-        return events
-
-    def truth(self) -> Truth:
-        return self._truth
+                events.append(self._events.get_nowait())
+        self._busy -= {event.worker for event in events if event.kind != "progress"}
+        self._failures += [event.value for event in events if event.kind == "failed"]
+        if self._failures and not self._busy:
+            raise self._failures[0]
+        return [event for event in events if event.kind != "failed"]
 
     def tallies(self) -> Tallies:
         """Those of all devices, added up on the first; on CPUs in its own memory."""
-        first, *others = self.workers
+        first, *others = self.tracers
         for other in others:
             first.take_over(other)
         return first.tallies()
 
     def metadata(self) -> dict[str, Any]:
+        """The devices, for a result's provenance."""
         names = list(dict.fromkeys(map(processor_name, self._devices)))
         return {"device": ",".join(device.alias for device in self._devices), "device_name": ", ".join(names)}
 
@@ -505,17 +449,11 @@ class LocalWorkers:
 # Ray
 
 
-class ClusterWorkers:
-    """Workers of Ray for the length of a `with` block, on this machine or many.
+class ClusterWorkers(RayWorkers):
+    """Workers of Ray for the length of a `with` block, on this machine or many; as `LocalWorkers`.
 
     A worker adds its blocks up where it is, since a histogram can take longer to send than a block to trace, and hands
     its tallies over for a checkpoint or at the end, while the others continue.
-
-    Args:
-        plan: Of the run.
-        engine: Which cluster, how many workers.
-        device: "cpu" or "cuda"; None: GPUs if the cluster has any.
-        note: Called with remarks: which workers have joined, which were lost.
     """
 
     must_rest = False
@@ -523,104 +461,156 @@ class ClusterWorkers:
     def __init__(
         self, plan: Plan, engine: Ray, device: str | None = None, *, note: Callable[[str], None] | None = None
     ) -> None:
-        camera, gate = plan.scene.camera, plan.scene.gate
-        histograms = len(COMPONENTS) + (2 if plan.batch_size else 0)
-        signed = len(plan.derivatives) + len(camera.tallied_channels)
-        size = 8 * histograms * (1 + signed) * camera.width * camera.height * gate.bins
-        prepare = functools.partial(_prepare, plan)
-        self._ray = RayWorkers(engine, device, prepare=prepare, value_bytes=size, note=note)
+        camera = plan.scene.camera
+        voxels = camera.width * camera.height * plan.scene.gate.bins
+        histograms = 1 + len(plan.derivatives) + len(camera.tallied_channels)
+        size = 8 * (len(COMPONENTS) + (2 if plan.batch_size else 0)) * histograms * voxels
+        super().__init__(engine, device, prepare=functools.partial(_prepare, plan), value_bytes=size, note=note)
         self._total: Tallies | None = None
-        self._metadata: dict[str, dict[str, Any]] = {}
-        self.timing = {"setup": 0.0, "compile": 0.0}
+        self.timing: dict[str, float] = {}
 
     def __enter__(self) -> ClusterWorkers:
         began = time.perf_counter()
-        self._ray.__enter__()
-        self.first_block = _FIRST_BLOCK["cuda" if self._ray.cuda else "cpu"]
-        self.timing["setup"] = time.perf_counter() - began
+        super().__enter__()
+        self.first_block = _FIRST_BLOCK["cuda" if self.cuda else "cpu"]
+        started = time.perf_counter()
+        try:
+            self.truth = self._truth()
+        except BaseException:
+            self.__exit__()
+            raise
+        self.timing = {"setup": started - began, "compile": self._joined - started}
+        self.timing["truth"] = time.perf_counter() - self._joined
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self._ray.__exit__(*error)
-
-    @property
-    def workers(self) -> list[RayWorker]:
-        return self._ray.workers
-
-    @property
-    def idle(self) -> list[RayWorker]:
-        return self._ray.idle
-
-    def trace(self, worker: RayWorker, block: Range) -> None:
-        self._ray.send(worker, _trace, block)
-
-    def collect(self, worker: RayWorker) -> None:
-        self._ray.send(worker, _collect)
-
-    def stop(self) -> None:
-        self._ray.stop()
-
-    def wait(self) -> list[Event]:
-        events = []
-        for event in self._ray.wait(0.2):
-            if event.kind == "joined":
-                assert event.worker.metadata is not None
-                self._metadata["{host} {pid}".format_map(event.worker.metadata)] = event.worker.metadata
-            elif event.kind == "lost":
-                events.append(Event("lost", event.worker))
-            elif isinstance(event.value, Tallies):
-                self._total = total_of(*([] if self._total is None else [self._total]), event.value)
-                events.append(Event("collected", event.worker))
-            else:
-                events.append(Event("traced", event.worker, event.value))
-        return events
-
-    def truth(self) -> Truth:
+    def _truth(self) -> Truth:
         """By the first worker that has joined, which also waits for it."""
-        began = time.perf_counter()
         while not self.idle:
             self.wait()
-        self.timing["compile"] = time.perf_counter() - began
-        self._ray.send(self.idle[0], _truth)
+        self._joined = time.perf_counter()
+        self.send(self.idle[0], _truth)
         while True:
             for event in self.wait():
-                if event.kind == "traced":
+                if event.kind == "returned":
                     return event.value
                 if event.kind == "lost":
-                    return self.truth()
+                    return self._truth()
+
+    def collect(self, worker: Any) -> None:
+        """Lets an idle worker begin to hand its tallies over."""
+        self.send(worker, _collect)
+
+    def wait(self, timeout: float = 0.2) -> list[Event]:
+        events = super().wait(timeout)
+        for event in events:
+            if isinstance(event.value, Tallies):
+                self._total = total_of(*([] if self._total is None else [self._total]), event.value)
+        return events
 
     def tallies(self) -> Tallies:
+        """Those of all photons that were collected."""
         assert self._total is not None
         return self._total
 
     def metadata(self) -> dict[str, Any]:
-        names = sorted({worker["device_name"] for worker in self._metadata.values()})
-        count = len(self.workers)
-        return {
-            "device": f"{count} Ray worker{'s' * (count != 1)}",
-            "device_name": ", ".join(names),
-            "workers": list(self._metadata.values()),
-        }
+        """The workers, for a result's provenance."""
+        names, workers = sorted({worker["device_name"] for worker in self.joined}), len(self.workers)
+        device = f"{workers} Ray worker{'s' * (workers != 1)}"
+        return {"device": device, "device_name": ", ".join(names), "workers": list(self.joined)}
+
+
+# What a worker runs
 
 
 def _prepare(plan: Plan, worker: Worker) -> None:
     """Run first by a worker of Ray, which then has the device of `LocalWorkers`."""
-    worker.state["local"] = LocalWorkers(plan, [pick_device(worker.device)], threads=worker.threads)
+    local = LocalWorkers(plan, [pick_device(worker.device)], threads=worker.threads)
+    worker.state |= {"tracer": local.tracers[0], "truth": local.truth, "report": lambda photons: None}
 
 
 def _truth(worker: Worker) -> Truth:
-    return worker.state["local"].truth()
+    return worker.state["truth"]
 
 
-def _trace(block: Range, worker: Worker) -> tuple[Ranges, float]:
+def trace_block(block: Range, worker: Worker) -> tuple[Ranges, float]:
     """Traces a block; returns the ids done, fewer if it was stopped, and the seconds it took."""
     began = time.perf_counter()
-    done = worker.state["local"].workers[0].trace(block, stopped=worker.stopped)
+    done = worker.state["tracer"].trace(block, stopped=worker.stopped, report=worker.state["report"])
     return done, time.perf_counter() - began
 
 
 def _collect(worker: Worker) -> Tallies:
-    device_worker = worker.state["local"].workers[0]
-    tallies = total_of(device_worker.tallies()) if worker.device == "cpu" else device_worker.tallies()
-    device_worker.clear()
+    tracer = worker.state["tracer"]
+    tallies = total_of(tracer.tallies()) if worker.device == "cpu" else tracer.tallies()
+    tracer.clear()
     return tallies
+
+
+# Light that stays on its device, for programs that render a scene again and again
+
+
+class ExpectedLight(NamedTuple):
+    """Expected detections per pulse, Warp float32 `[pixel, bin]`; of all light, and of the targets' alone, or None."""
+
+    total: Any
+    target: Any
+
+
+class LightTracer:
+    """Traces photons of one scene on one device, part after part, without copies to the host.
+
+    Args:
+        scene: What to trace.
+        photons: Of a part at most.
+        seed: 64 bits.
+        device: As in `simulate`; the first of several.
+        derivatives: Names, as in `simulate`.
+        separate_targets: Whether the light of the targets alone is wanted, too.
+        mesh_cache: As in `simulate`.
+        tally: That of another tracer of as many pixels and bins, to save memory: a call empties it.
+
+    Raises what `simulate` raises.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        photons: int,
+        seed: int,
+        device: str | None = None,
+        derivatives: Sequence[str] = (),
+        separate_targets: bool = False,
+        mesh_cache: dict[str, Any] | None = None,
+        tally: Any = None,
+    ) -> None:
+        plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=derivatives or None)
+        workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)
+        self._scene, self._separate_targets, self._unit = scene, separate_targets, 1.0 / plan.scale
+        self._names, self._worker = plan.derivatives, workers.tracers[0]
+        self.truth: Truth = workers.truth
+
+    @property
+    def tally(self) -> Any:
+        """Warp int64, of the photons traced last."""
+        return self._worker.data.tally
+
+    def __call__(self, first: int, photons: int) -> tuple[ExpectedLight, dict[str, ExpectedLight]]:
+        """Light of the photons `first` … `first + photons`, and its derivatives by name with the same photons."""
+        worker = self._worker
+        worker.clear()
+        worker.trace((first, first + photons), stopped=threading.Event())
+        scene, data, names = self._scene, worker.data, self._names
+        per_photon = scene.laser.photons_per_pulse * scene.detections_per_photon
+        value = per_photon / photons_per_position(scene, ((first, first + photons),)).reshape(-1)
+        slopes = {
+            name: self._light(data.gradients, value * unit, len(names), p)
+            for p, (name, unit) in enumerate(zip(names, worker.signed_units, strict=True))
+        }
+        return self._light(data.tally, value * self._unit, 1, 0), slopes
+
+    def _light(self, tally: Any, value: Any, parameters: int, parameter: int) -> ExpectedLight:
+        scale: Any = wp.array(np.asarray(value, np.float64), dtype=wp.float64, device=tally.device)
+        which: Any = {"bins": self._scene.gate.bins, "parameters": parameters, "parameter": parameter}
+        target = sk.tally_rates(tally, scale, components=(0, 2), **which) if self._separate_targets else None
+        return ExpectedLight(sk.tally_rates(tally, scale, **which), target)

@@ -6,7 +6,6 @@
 True
 """
 
-from spadwarp.validate.cases import CASES, FAMILY_LEVEL, CaseResult, draw_results, report, run
-from spadwarp.validate.measure import Case
+from spadwarp.validate.cases import CASES, FAMILY_LEVEL, Case, CaseResult, draw_results, report, run
 
 __all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run"]

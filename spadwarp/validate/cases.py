@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,20 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.limits import check_choice, check_integer
 from spadwarp.mesh import load_target
 from spadwarp.scene import Target
 from spadwarp.scene.pose import rotation_angles
-from spadwarp.units import path_from_time
 from spadwarp.validate import references
 from spadwarp.validate.measure import (
     PENCIL,
-    Case,
     Estimate,
     Quantity,
     Run,
-    ScoreMeans,
-    batch_means,
+    block_means,
     holm,
     point_source,
     quantities,
@@ -34,23 +30,39 @@ from spadwarp.validate.measure import (
     slab_domain,
     two_sided_p,
 )
+from spadwarp.values import check_choice, check_integer, path_from_time
 from spadwarp.viz import draw_validation
 
-__all__ = ["CASES", "FAMILY_LEVEL", "CaseResult", "draw_results", "report", "run", "scattered_once", "vessel_reading"]
-__all__ += ["white_vessel"]
+__all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run", "vessel_reading"]
+__all__ += ["vessel_scene"]
+
+Measure = Callable[[Run], Iterator[Quantity]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One reference case.
+
+    Attributes:
+        name: Its key.
+        summary: What is checked, and where the reference comes from.
+        measure: Runs it.
+    """
+
+    name: str
+    summary: str
+    measure: Measure
+
 
 CASES: dict[str, Case] = {}
 """The reference cases by name."""
 
 
-def _case(name: str, summary: str) -> Callable[[Callable[[Run], list[Quantity]]], Callable[[Run], list[Quantity]]]:
-    """Adds a function to `CASES`."""
-
-    def register(measure: Callable[[Run], list[Quantity]]) -> Callable[[Run], list[Quantity]]:
-        CASES[name] = Case(name, summary, measure)
-        return measure
-
-    return register
+def _case(measure: Measure) -> Measure:
+    """Adds a function to `CASES`, by its name and with its docstring."""
+    name = measure.__name__.replace("_", "-")
+    CASES[name] = Case(name, (measure.__doc__ or "").strip(), measure)
+    return measure
 
 
 # Cases in water alone, from the records of how each photon ended
@@ -65,6 +77,10 @@ def _leaving(records: Any, reason: str) -> NDArray[np.float64]:
     return records.weight * (records.reason == records.reasons.index(reason))
 
 
+def _both_faces(records: Any) -> list[NDArray]:
+    return [_leaving(records, "exit_z_low"), _leaving(records, "exit_z_high")]
+
+
 def _in_bins(weight: NDArray, value: NDArray, edges: tuple[float, ...]) -> list[NDArray]:
     """The weights whose value lies in [low, high) of each bin; the last bin has its upper edge as well."""
     bins = np.where(value == edges[-1], len(edges) - 2, np.digitize(value, edges) - 1)
@@ -75,54 +91,47 @@ def _bin_names(label: str, edges: tuple[float, ...]) -> list[str]:
     return [label.format(f"{low:g}–{high:g}") for low, high in itertools.pairwise(edges)]
 
 
-def _both_faces(records: Any) -> list[NDArray]:
-    return [_leaving(records, "exit_z_low"), _leaving(records, "exit_z_high")]
+def _cosine(records: Any) -> NDArray:
+    return records.direction[:, 2]
 
 
-def _cosine(records: Any) -> list[NDArray]:
-    return [records.direction[:, 2]]
+def _place(records: Any) -> list[NDArray]:
+    x = records.position.astype(np.float64)
+    return [x[:, 2], (x**2).sum(axis=1)]
 
 
-def _medium(slab: references.Slab) -> dict[str, Any]:
-    return {"extinction": 1.0, "albedo": slab.albedo, "anisotropy": slab.anisotropy}
+def _slab_scene(slab: references.Slab, **transport: Any) -> dict[str, Any]:
+    medium = {"extinction": 1.0, "albedo": slab.albedo, "anisotropy": slab.anisotropy}
+    return scene(medium, PENCIL, domain=slab_domain(slab.optical_depth), **transport)
 
 
-@_case("slab", "Slabs and half-spaces, index-matched, normal incidence: adding–doubling, published rows")
-def _slabs(run: Run) -> list[Quantity]:
-    measured = []
-    for slab in references.SLABS:
-        end = _ROULETTE if slab.albedo < 1 else {}
-        tables = scene(_medium(slab), PENCIL, domain=slab_domain(slab.optical_depth), **end)
-        names, expected = (f"R, {slab.text}", f"T, {slab.text}"), (slab.reflected, slab.transmitted)
-        both = quantities(names, run.means(tables, _both_faces), expected)
-        measured += both[:1] if math.isinf(slab.optical_depth) else both
-    return measured
+@_case
+def slab(run: Run) -> Iterator[Quantity]:
+    """Slabs and half-spaces, index-matched, normal incidence: adding–doubling, published rows"""
+    for row in references.SLABS:
+        faces = run.by_photon(_slab_scene(row, **(_ROULETTE if row.albedo < 1 else {})), _both_faces)
+        both = quantities((f"R, {row.text}", f"T, {row.text}"), faces, (row.reflected, row.transmitted))
+        yield from both[:1] if math.isinf(row.optical_depth) else both
 
 
-@_case(
-    "slab-derivatives",
-    "Derivatives of slabs by absorption, scattering, anisotropy: adding–doubling, differentiated numerically",
-)
-def _slab_derivatives(run: Run) -> list[Quantity]:
+@_case
+def slab_derivatives(run: Run) -> Iterator[Quantity]:
+    """Derivatives of slabs by absorption, scattering, anisotropy: adding–doubling, differentiated numerically"""
     # A table of the phase function has no anisotropy.
     kinds = ("absorption", "scattering", "anisotropy")[: 2 if run.tables else 3]
 
     def slopes(records: Any) -> list[NDArray]:
         return [face * score for face in _both_faces(records) for score in records.log_derivatives.T.astype(np.float64)]
 
-    measured = []
-    for slab in references.SLAB_DERIVATIVES:
-        medium = {"extinction": 1.0, "albedo": slab.albedo, "anisotropy": slab.anisotropy}
-        tables = scene(medium, PENCIL, domain=slab_domain(slab.optical_depth), **_ROULETTE)
-        names = [f"∂{face}/∂{kind}, {slab.text}" for face in "RT" for kind in kinds]
-        expected = [*slab.reflected[: len(kinds)], *slab.transmitted[: len(kinds)]]
-        measured += quantities(names, run.means(tables, slopes, derivatives=kinds), expected)
-    return measured
+    for row in references.SLAB_DERIVATIVES:
+        names = [f"∂{face}/∂{kind}, {row.text}" for face in "RT" for kind in kinds]
+        expected = [*row.reflected[: len(kinds)], *row.transmitted[: len(kinds)]]
+        yield from quantities(names, run.by_photon(_slab_scene(row, **_ROULETTE), slopes, kinds), expected)
 
 
-@_case("layers", "Three layers of different waters, illuminated from either side: adding–doubling")
-def _stacks(run: Run) -> list[Quantity]:
-    measured = []
+@_case
+def layers(run: Run) -> Iterator[Quantity]:
+    """Three layers of different waters, illuminated from either side: adding–doubling"""
     for stack in references.STACKS:
         waters: list[dict[str, float]] = []
         depth = 0.0
@@ -132,98 +141,89 @@ def _stacks(run: Run) -> list[Quantity]:
         first = {name: value for name, value in waters[0].items() if name != "start"}
         tables = scene({**first, "layers": waters[1:]}, PENCIL, domain=slab_domain(depth), **_ROULETTE)
         names = (f"R, layers of {stack.text}", f"T, layers of {stack.text}")
-        measured += quantities(names, run.means(tables, _both_faces), (stack.reflected, stack.transmitted))
-    return measured
+        yield from quantities(names, run.by_photon(tables, _both_faces), (stack.reflected, stack.transmitted))
 
 
-@_case("exit-cosines", "What leaves a slab, by exit cosine: adding–doubling")
-def _exit_cosines(run: Run) -> list[Quantity]:
-    measured = []
+@_case
+def exit_cosines(run: Run) -> Iterator[Quantity]:
+    """What leaves a slab, by exit cosine: adding–doubling"""
     edges = references.EXIT_COSINE_EDGES
-    for slab, face, fractions in references.EXIT_COSINES:
-        tables = scene(_medium(slab), PENCIL, domain=slab_domain(slab.optical_depth), **_ROULETTE)
+    for row, face, fractions in references.EXIT_COSINES:
 
         def scores(records: Any, face: str = face) -> list[NDArray]:
             diffuse = _leaving(records, face) * (records.collisions > 0)
             return _in_bins(diffuse, np.abs(records.direction[:, 2]), edges)
 
         side = {"exit_z_low": "R", "exit_z_high": "T"}[face]
-        names = _bin_names(f"{side}, exit cosine {{}}, {slab.text}", edges)
-        measured += quantities(names, run.means(tables, scores), fractions)
-    return measured
+        names = _bin_names(f"{side}, exit cosine {{}}, {row.text}", edges)
+        yield from quantities(names, run.by_photon(_slab_scene(row, **_ROULETTE), scores), fractions)
 
 
-@_case("time-resolved", "Time-resolved reflectance of a half-space: doubling, inverse Laplace transform")
-def _time_resolved(run: Run) -> list[Quantity]:
-    pulse = references.TIME_RESOLVED
-    medium = {"scattering": pulse.scattering, "absorption": pulse.absorption, "anisotropy": pulse.anisotropy}
-    tables = scene(medium, PENCIL, domain=slab_domain(math.inf), max_path=pulse.edges[-1] + 1.0)
-    estimates = run.means(tables, lambda r: _in_bins(_leaving(r, "exit_z_low"), r.path, pulse.edges))
-    return quantities(_bin_names("R, path {} m", pulse.edges), estimates, pulse.fractions)
+@_case
+def time_resolved(run: Run) -> Iterator[Quantity]:
+    """Time-resolved reflectance of a half-space: doubling, inverse Laplace transform"""
+    medium, edges = references.TIME_RESOLVED_MEDIUM, references.TIME_RESOLVED_EDGES
+    tables = scene(medium, PENCIL, domain=slab_domain(math.inf), max_path=edges[-1] + 1.0)
+    estimates = run.by_photon(tables, lambda r: _in_bins(_leaving(r, "exit_z_low"), r.path, edges))
+    yield from quantities(_bin_names("R, path {} m", edges), estimates, references.TIME_RESOLVED)
 
 
-@_case("moments", "Infinite medium: exact moments after a fixed path and after five collisions")
-def _moments(run: Run) -> list[Quantity]:
-    def place(records: Any) -> list[NDArray]:
-        x = records.position.astype(np.float64)
-        return [x[:, 2], (x**2).sum(axis=1)]
-
+@_case
+def moments(run: Run) -> Iterator[Quantity]:
+    """Infinite medium: exact moments after a fixed path and after five collisions"""
     isotropic = scene({"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.0}, PENCIL, max_path=5.0)
     collided = scene(_FORWARD, PENCIL, max_collisions=5)
     # A record keeps the direction of its last flight: the sixth has scattered five times.
     flown = scene(_FORWARD, PENCIL, max_collisions=6)
-    after_path = ("⟨z⟩ [m], g 0, path 5", "⟨r²⟩ [m²], g 0, path 5")
-    after_collisions = [f"{name}, g 0.924, 5 collisions" for name in ("⟨z⟩ [m]", "⟨r²⟩ [m²]", "⟨cosθ⟩")]
-    return [
-        *quantities(after_path, run.means(isotropic, place), references.AFTER_PATH),
-        *quantities(
-            after_collisions,
-            [*run.means(collided, place), *run.means(flown, _cosine)],
-            references.AFTER_COLLISIONS,
-        ),
-    ]
+    places = ("⟨z⟩ [m]", "⟨r²⟩ [m²]")
+    names = [f"{name}, g 0, path 5" for name in places]
+    yield from quantities(names, run.by_photon(isotropic, _place), references.AFTER_PATH)
+    names = [f"{name}, g 0.924, 5 collisions" for name in (*places, "⟨cosθ⟩")]
+    measured = [*run.by_photon(collided, _place), *run.by_photon(flown, lambda r: [_cosine(r)])]
+    yield from quantities(names, measured, references.AFTER_COLLISIONS)
 
 
-@_case("near-axis", "The near-axis rule's bias: density of the cosine from collision to collision")
-def _near_axis(run: Run) -> list[Quantity]:
-    measured = []
+@_case
+def near_axis(run: Run) -> Iterator[Quantity]:
+    """The near-axis rule's bias: density of the cosine from collision to collision"""
     for threshold, reference in references.NEAR_AXIS.items():
-        tables = scene(_FORWARD, PENCIL, max_collisions=6, axis_threshold=threshold)
+        (mean,) = run.by_photon(
+            scene(_FORWARD, PENCIL, max_collisions=6, axis_threshold=threshold), lambda r: [_cosine(r)]
+        )
         rule = "rule off" if threshold == 1.0 else f"threshold {threshold:g}"
-        measured += quantities([f"⟨cosθ⟩, g 0.924, 5 collisions, {rule}"], run.means(tables, _cosine), [reference])
-    return measured
+        yield Quantity(f"⟨cosθ⟩, g 0.924, 5 collisions, {rule}", mean, reference)
 
 
-@_case("cutoff", "The weight cut-off's bias: orders of scattering from doubling")
-def _cutoff(run: Run) -> list[Quantity]:
+@_case
+def cutoff(run: Run) -> Iterator[Quantity]:
+    """The weight cut-off's bias: orders of scattering from doubling"""
     water = {"extinction": 1.0, "albedo": 0.8, "anisotropy": 0.0}
-    measured = []
     for cutoff, reference in references.CUTOFF.items():
         end: dict[str, Any] = {"weight_cutoff": cutoff} if cutoff else _ROULETTE
         tables = scene(water, PENCIL, domain=slab_domain(math.inf), **end)
+        (reflected,) = run.by_photon(tables, lambda r: [_leaving(r, "exit_z_low")])
         rule = f"cut-off {cutoff:g}" if cutoff else "no cut-off"
-        reflected = run.means(tables, lambda r: [_leaving(r, "exit_z_low")])
-        measured += quantities([f"R, half-space, g 0, ω 0.8, {rule}"], reflected, [reference])
-    return measured
+        yield Quantity(f"R, half-space, g 0, ω 0.8, {rule}", reflected, reference)
 
 
-@_case("fluence", "Isotropic time-resolved fluence in an infinite medium: Fourier–Laplace solution")
-def _fluence(run: Run) -> list[Quantity]:
-    shells = references.FLUENCE
-    medium = {"scattering": 1.0, "absorption": shells.absorption, "anisotropy": 0.0}
-    tables = scene(medium, point_source(0.0, 0.0, 0.0), max_path=shells.path)
+@_case
+def fluence(run: Run) -> Iterator[Quantity]:
+    """Isotropic time-resolved fluence in an infinite medium: Fourier–Laplace solution"""
+    edges, path = references.FLUENCE_EDGES, references.FLUENCE_PATH
+    medium = {"scattering": 1.0, "absorption": references.FLUENCE_ABSORPTION, "anisotropy": 0.0}
 
     def scores(records: Any) -> list[NDArray]:
         radius = np.linalg.norm(records.position.astype(np.float64), axis=1)
         # Unscattered light lies at the outermost edge, but for rounding.
-        return _in_bins(_leaving(records, "max_path"), np.minimum(radius, 0.999 * shells.path), shells.edges)
+        return _in_bins(_leaving(records, "max_path"), np.minimum(radius, 0.999 * path), edges)
 
-    names = _bin_names(f"light at {{}} m after a path of {shells.path:g} m", shells.edges)
-    return quantities(names, run.means(tables, scores), shells.fractions)
+    shells = run.by_photon(scene(medium, point_source(0.0, 0.0, 0.0), max_path=path), scores)
+    yield from quantities(_bin_names(f"light at {{}} m after a path of {path:g} m", edges), shells, references.FLUENCE)
 
 
-@_case("cube60", "Absorption in MCX's cube60 benchmark: published")
-def _cube60(run: Run) -> list[Quantity]:
+@_case
+def cube60(run: Run) -> Iterator[Quantity]:
+    """Absorption in MCX's cube60 benchmark: published"""
     medium = {"absorption": 5.0, "scattering": 1000.0, "anisotropy": 0.01, "group_index": 1.37}
     cube = {"shape": "box", "lower": [0.0] * 3, "upper": [0.06] * 3}
     sources = {
@@ -231,80 +231,54 @@ def _cube60(run: Run) -> list[Quantity]:
         "absorbed, isotropic at (29, 29, 29) mm": point_source(0.029, 0.029, 0.029),
     }
     gate = path_from_time(5e-9, medium["group_index"])
-    absorbed = []
-    for source in sources.values():
+    for (name, source), reference in zip(sources.items(), references.CUBE60, strict=True):
         tables = scene(medium, source, domain=cube, max_path=gate)
-        absorbed += run.means(tables, lambda r: [1.0 - r.weight.astype(np.float64)])
-    return quantities(sources, absorbed, references.CUBE60, rounding=references.CUBE60_ROUNDING)
+        (absorbed,) = run.by_photon(tables, lambda r: [1.0 - r.weight.astype(np.float64)])
+        yield Quantity(name, absorbed, reference, rounding=references.CUBE60_ROUNDING)
 
 
-# Other phase functions than Henyey–Greenstein, which all other cases use
+# Another phase function than Henyey–Greenstein, which all other cases use
 
 
-@_case("fournier-forand", "Fournier–Forand: its closed integral, exact moments, light scattered once by quadrature")
-def _fournier_forand(run: Run) -> list[Quantity]:
+@_case
+def fournier_forand(run: Run) -> Iterator[Quantity]:
+    """Fournier–Forand: its closed integral, exact moments, light scattered once by quadrature"""
     law = {"phase_function": "fournier_forand", "particle_index": 1.10, "junge_slope": 3.5835}
     white = {"extinction": 1.0, "albedo": 1.0, **law}
+    angle = references.FOURNIER_FORAND_ANGLE
 
-    def measured(events: int, *scores: Any) -> list[Estimate]:
-        tables = scene(white, PENCIL, max_collisions=events)
-        return run.means(tables, lambda records: [score(records) for score in scores])
+    def measured(events: int, scores: Callable[[Any], list[NDArray]]) -> list[Estimate]:
+        return run.by_photon(scene(white, PENCIL, max_collisions=events), scores)
 
-    def cosine(records: Any) -> NDArray[np.float64]:
-        return records.direction[:, 2].astype(np.float64)
-
-    def deflected_less(records: Any) -> NDArray[np.float64]:
+    def deflections(records: Any) -> list[NDArray]:
         u = records.direction.astype(np.float64)
-        limit = np.sin(np.radians(references.FOURNIER_FORAND_ANGLE))
-        return (np.hypot(u[:, 0], u[:, 1]) < limit) * (u[:, 2] > 0.0)
+        less = (np.hypot(u[:, 0], u[:, 1]) < np.sin(np.radians(angle))) * (u[:, 2] > 0.0)
+        return [u[:, 2] < 0.0, less, u[:, 2]]
 
     # A record keeps the direction of its last flight: the second has scattered once, the sixth five times.
-    once = measured(2, lambda r: cosine(r) < 0.0, deflected_less, cosine)
-    five = measured(6, cosine)
-    places = measured(
-        5, lambda r: r.position[:, 2].astype(np.float64), lambda r: (r.position.astype(np.float64) ** 2).sum(axis=1)
-    )
-    names = (
+    estimates = [*measured(2, deflections), *measured(6, lambda r: [_cosine(r)]), *measured(5, _place)]
+    names = [
         "scattered by more than 90°",
-        f"scattered by less than {references.FOURNIER_FORAND_ANGLE:g}°",
+        f"scattered by less than {angle:g}°",
         "⟨cosθ⟩, 1 collision",
         "⟨cosθ⟩, 5 collisions",
         "⟨z⟩ [m], 5 collisions",
         "⟨r²⟩ [m²], 5 collisions",
-    )
-    tables = scattered_once({"extinction": 0.3, "albedo": 0.8, **law})
-    bins = batch_means([result.histogram.sum(axis=(0, 1)) for result in run.results(tables)])
-    paths = [f"scattered once, path {k + 2}–{k + 3} m" for k in range(len(bins))]
-    return [
-        *quantities(names, [*once, *five, *places], references.FOURNIER_FORAND),
-        *quantities(paths, bins, references.FOURNIER_FORAND_SINGLE_SCATTER),
     ]
+    yield from quantities(names, estimates, references.FOURNIER_FORAND)
+    once = _scattered_once({"extinction": 0.3, "albedo": 0.8, **law})
+    bins = run.by_run(once, lambda result: result.histogram.sum(axis=(0, 1)))
+    paths = [f"scattered once, path {k + 2}–{k + 3} m" for k in range(len(bins))]
+    yield from quantities(paths, bins, references.FOURNIER_FORAND_SINGLE_SCATTER)
 
 
 # Cases with a camera or a mesh, from histograms and from the energy balance
 
 _WATER = {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.924}
-_CAMERA = {
-    "width": 32,
-    "height": 32,
-    "horizontal_fov_deg": 10.0,
-    "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi),
-}
-
-# A cube of white walls around a wide lens, whose gate opens when the light has become even.
-_VESSEL_SIDE, _VESSEL_GATE = 2.0, (6.0, 10.0)
-_VESSEL_CAMERA = {
-    "width": 2,
-    "height": 2,
-    "horizontal_fov_deg": 40.0,
-    "aperture_diameter": 1.0,
-    "focus_distance": math.inf,
-}
-
-_SIGNED = ("roulette", "importance_sampling_residual")  # entries of the energy balance whose mean is 0
+_CAMERA = {"width": 32, "height": 32, "horizontal_fov_deg": 10.0, "aperture_diameter": 2.0 * math.sqrt(1e-4 / math.pi)}
 
 
-def scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
+def _scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
     """The scene of `references.SINGLE_SCATTER` in any water."""
     laser = {"position": [-0.1, 0.0, 0.0], "profile": "uniform_cone", "half_angle_deg": 2.5}
     # The quadrature images through a point; a lens would blur the beam where it crosses the view at 1 m.
@@ -312,35 +286,36 @@ def scattered_once(medium: dict[str, Any]) -> dict[str, Any]:
     return scene(medium, laser, camera=camera, path_edges=(2.0, 7.0, 5), max_collisions=1, estimator="guided")
 
 
-@_case("single-scatter", "Light scattered once, by path and pixel: quadrature over the same geometry")
-def _single_scatter(run: Run) -> list[Quantity]:
-    tables, places = scattered_once(_WATER), references.SINGLE_SCATTER
-    sums = [
-        [result.histogram[rows, columns].sum(axis=(0, 1)) for rows, columns, _ in places.values()]
-        for result in run.results(tables)
-    ]
+@_case
+def single_scatter(run: Run) -> Iterator[Quantity]:
+    """Light scattered once, by path and pixel: quadrature over the same geometry"""
+    places = references.SINGLE_SCATTER
+    estimates = run.by_run(
+        _scattered_once(_WATER),
+        lambda result: [result.histogram[rows, columns].sum(axis=(0, 1)) for rows, columns, _ in places.values()],
+    )
     names = [f"path {k + 2}–{k + 3} m, {place}" for place, (_, _, bins) in places.items() for k in range(len(bins))]
-    expected = [fraction for _, _, bins in places.values() for fraction in bins]
-    return quantities(names, batch_means(np.reshape(sums, (len(sums), -1))), expected)
+    yield from quantities(names, estimates, [fraction for _, _, bins in places.values() for fraction in bins])
 
 
-@_case("lambertian", "Light reflected once by a plane, by pixel: quadrature")
-def _lambertian(run: Run) -> list[Quantity]:
+@_case
+def lambertian(run: Run) -> Iterator[Quantity]:
+    """Light reflected once by a plane, by pixel: quadrature"""
     laser = {"position": [0.1, -0.05, 0.0], "profile": "uniform_cone", "half_angle_deg": 10.0}
     plane = {"builtin": "plane", "size": [20.0, 20.0], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
     tables = scene(_WATER, laser, camera=_CAMERA, path_edges=(0.0, 12.0, 12), targets=[plane], max_collisions=1)
     places = references.LAMBERTIAN
-    sums = [
-        [result.component("ballistic")[rows, columns].sum() for rows, columns, _ in places.values()]
-        for result in run.results(tables)
-    ]
+    estimates = run.by_run(
+        tables, lambda result: [result.component("ballistic")[rows, cols].sum() for rows, cols, _ in places.values()]
+    )
     names = [f"reflected once, {place}" for place in places]
-    return quantities(names, batch_means(sums), [fraction for _, _, fraction in places.values()])
+    yield from quantities(names, estimates, [fraction for _, _, fraction in places.values()])
 
 
-@_case("ledger", "Emitted weight is accounted for to the last unit; signed entries have mean zero")
-def _ledger(run: Run) -> list[Quantity]:
-    """A scene in which every way to end occurs."""
+@_case
+def ledger(run: Run) -> Iterator[Quantity]:
+    """Emitted weight is accounted for to the last unit; signed entries have mean zero"""
+    # A scene in which every way to end occurs.
     laser = {"profile": "uniform_cone", "half_angle_deg": 15.0}
     target = {"builtin": "staircase", "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
     common: dict[str, Any] = {
@@ -352,48 +327,42 @@ def _ledger(run: Run) -> list[Quantity]:
         "max_collisions": 20,
         "axis_threshold": 0.9998,
     }
-    # The older word for "lu2024": the text of these tables seeds the photons.
     water = {"extinction": 0.6, "albedo": "lu2024", "anisotropy": 0.924}
-    measured = []
+    signed = ("roulette", "importance_sampling_residual")
     for estimator in ("analog", "next_event", "guided"):
-        for termination, cutoff in (("cutoff", 0.05), ("roulette", 0.3)):
-            rules: dict[str, Any] = {"estimator": estimator, "termination": termination, "weight_cutoff": cutoff}
-            missing, gains = 0, []
-            for result in run.results(scene(water, laser, **common, **rules)):
+        for termination, least in (("cutoff", 0.05), ("roulette", 0.3)):
+            rules: dict[str, Any] = {"estimator": estimator, "termination": termination, "weight_cutoff": least}
+
+            def entries(result: Any) -> list[float]:
                 emitted = result.photons / result.energy_balance_unit
-                entries = {name: value for name, value in result.energy_balance.items() if name != "emitted"}
-                missing += abs(round(emitted) - sum(entries.values()))
-                gains.append(
-                    [entries.get(entry, 0) / emitted for entry in ("roulette", "importance_sampling_residual")]
-                )
+                booked = {name: value for name, value in result.energy_balance.items() if name != "emitted"}
+                missing = abs(round(emitted) - sum(booked.values()))
+                return [missing, *(booked.get(entry, 0) / emitted for entry in signed)]
+
+            missing, *means = run.by_run(scene(water, laser, **common, **rules), entries)
+            asked = (termination == "roulette", estimator == "guided")
             name = f"{estimator}, {termination}"
-            measured.append(Quantity(f"ledger units missing, {name}", Estimate(float(missing), 0.0), 0.0))
-            roulette, residual = batch_means(gains)
-            if termination == "roulette":
-                measured.append(Quantity(f"mean {_SIGNED[0]} entry per photon, {name}", roulette, 0.0))
-            if estimator == "guided":
-                measured.append(Quantity(f"mean {_SIGNED[1]} entry per photon, {name}", residual, 0.0))
-    return measured
+            yield Quantity(f"ledger units missing, {name}", Estimate(missing.value, 0.0), 0.0)
+            for entry, mean, is_asked in zip(signed, means, asked, strict=True):
+                if is_asked:
+                    yield Quantity(f"mean {entry} entry per photon, {name}", mean, 0.0)
 
 
-@_case("reciprocity", "Laser and camera change places before a target in turbid water")
-def _reciprocity(run: Run) -> list[Quantity]:
-    """Laser and camera change places: cones of equal half-angle, a box in the beams, many scatterings."""
+@_case
+def reciprocity(run: Run) -> Iterator[Quantity]:
+    """Laser and camera change places before a target in turbid water"""
+    # Cones of equal half-angle, a box in the beams, many scatterings.
     half_angle, pixels = 6.0, 64
-    camera = {
-        "width": pixels,
-        "height": pixels,
-        "horizontal_fov_deg": 2 * half_angle,
-        "aperture_diameter": 1e-3,
-    }
+    camera = {"width": pixels, "height": pixels, "horizontal_fov_deg": 2 * half_angle, "aperture_diameter": 1e-3}
     position, direction = np.array([-0.8, 0.3, -0.4]), np.array([0.22, -0.05, 1.0])
     direction /= np.linalg.norm(direction)
-    centre = np.array([0.25, 0.1, 3.2])
-    turn = _rotation_onto_z(direction)
+    centre, ahead = np.array([0.25, 0.1, 3.2]), np.array([0.0, 0.0, 1.0])
+    right = np.cross([0.0, 1.0, 0.0], direction)
+    right /= np.linalg.norm(right)
+    turn = np.stack([right, np.cross(direction, right), direction])  # takes the direction to +z
     weights = _disc_weights(math.radians(half_angle), pixels)
 
     def measured(at: NDArray, along: NDArray, placement: NDArray, rotation: NDArray) -> list[Estimate]:
-        laser = {"position": at.tolist(), "direction": along.tolist(), "half_angle_deg": half_angle}
         block = {
             "builtin": "box",
             "size": [0.7, 0.5, 0.6],
@@ -402,32 +371,39 @@ def _reciprocity(run: Run) -> list[Quantity]:
         }
         tables = scene(
             {**_WATER, "extinction": 0.6},
-            laser,
+            {"position": at.tolist(), "direction": along.tolist(), "half_angle_deg": half_angle},
             camera=camera,
             path_edges=(5.0, 13.0, 4),
             targets=[block],
             max_collisions=20,
             estimator="guided",
         )
-        return batch_means([np.einsum("ijt,ij->t", r.histogram, weights) for r in run.results(tables)])
+        return run.by_run(tables, lambda result: np.einsum("ijt,ij->t", result.histogram, weights))
 
     # Swapped: in the frame x' = turn·(x − position) the laser's place and axis are those of a camera.
     forward = measured(position, direction, centre, np.eye(3))
-    backward = measured(turn @ -position, turn @ np.array([0.0, 0.0, 1.0]), turn @ (centre - position), turn)
-    names = [f"path {k}–{k + 2} m, laser and camera swapped" for k in range(5, 13, 2)]
-    return [
-        Quantity(name, estimate, swapped.value, swapped.standard_error)
-        for name, estimate, swapped in zip(names, forward, backward, strict=True)
-    ]
+    backward = measured(turn @ -position, turn @ ahead, turn @ (centre - position), turn)
+    for k, (one, swapped) in enumerate(zip(forward, backward, strict=True)):
+        name = f"path {2 * k + 5}–{2 * k + 7} m, laser and camera swapped"
+        yield Quantity(name, one, swapped.value, swapped.standard_error)
 
 
-@_case("mean-path", "Mean path 4V/S in a closed convex mesh, whatever the scattering (Blanco & Fournier 2003)")
-def _mean_path(run: Run) -> list[Quantity]:
-    """Light between white walls becomes isotropic: its mean path from wall to wall is 4V/S (Blanco & Fournier 2003)."""
-    measured = []
-    bodies = {
-        "box 1 × 2 × 3 m": {"builtin": "box", "size": [1.0, 2.0, 3.0]},
-        "sphere of 2 m": {"builtin": "sphere", "size": [2.0]},
+def _disc_weights(half_angle: float, pixels: int, inner: int = 16) -> NDArray[np.float64]:
+    """Weights `[pixels, pixels]` with which a square camera has the field of a laser's uniform cone: 1/cosψ in it."""
+    fine = pixels * inner
+    tangent = ((np.arange(fine) + 0.5) / fine * 2.0 - 1.0) * math.tan(half_angle)
+    squared = tangent[:, None] ** 2 + tangent**2
+    weight = np.sqrt(1.0 + squared) * (squared < math.tan(half_angle) ** 2)
+    return weight.reshape(pixels, inner, pixels, inner).mean(axis=(1, 3))
+
+
+@_case
+def mean_path(run: Run) -> Iterator[Quantity]:
+    """Mean path 4V/S in a closed convex mesh, whatever the scattering (Blanco & Fournier 2003)"""
+    # Light between white walls becomes isotropic: its mean path from wall to wall is 4V/S.
+    bodies: dict[str, dict[str, Any]] = {
+        "box 1 × 2 × 3 m": {"builtin": "box", "size": [1.0, 2.0, 3.0], "reflectance": 1.0},
+        "sphere of 2 m": {"builtin": "sphere", "size": [2.0], "reflectance": 1.0},
     }
     waters = {
         "clear": {"extinction": 1e-6, "albedo": 1.0},
@@ -438,26 +414,32 @@ def _mean_path(run: Run) -> list[Quantity]:
     # exp(−0.49 path), which left an error of 1.5e-4 of the mean path after 15 m.
     early, late = 30.0, 50.0
     for body, target in bodies.items():
-        targets: list[dict[str, Any]] = [{**target, "reflectance": 1.0}]
-        mesh = load_target(Target(**targets[0]))
-        expected = 4.0 * abs(mesh.volume) / mesh.area
+        mesh = load_target(Target(**target))
         for water, medium in waters.items():
-            means = ScoreMeans()
             until = [
-                scene(medium, point_source(0.1, 0.2, 0.3), targets=targets, max_path=path) for path in (early, late)
+                scene(medium, point_source(0.1, 0.2, 0.3), targets=[target], max_path=path) for path in (early, late)
             ]
-            for first, last in zip(*(run.records(tables, key=body + water) for tables in until), strict=True):
-                # Events of one photon between two moments of its life: walls at the rate 1/⟨path⟩, water at the rate c.
-                means.add((last.collisions - first.collisions).astype(np.float64))
-            (events,) = means.estimates()
+            # Events of one photon between two moments of its life: walls at the rate 1/⟨path⟩, water at the rate c.
+            moments = zip(*(run.records(tables, key=body + water) for tables in until), strict=True)
+            (events,) = block_means((last.collisions - first.collisions).astype(np.float64) for first, last in moments)
             walls = events.value - medium["extinction"] * (late - early)
             path = (late - early) / walls
             estimate = Estimate(path, path / walls * events.standard_error)
-            measured.append(Quantity(f"mean path [m], {body}, {water}", estimate, expected))
-    return measured
+            yield Quantity(f"mean path [m], {body}, {water}", estimate, 4.0 * abs(mesh.volume) / mesh.area)
 
 
-def white_vessel(estimator: str) -> dict[str, Any]:
+# A cube of white walls around a wide lens, whose gate opens when the light has become even.
+_VESSEL_SIDE, _VESSEL_GATE = 2.0, (6.0, 10.0)
+_VESSEL_CAMERA = {
+    "width": 2,
+    "height": 2,
+    "horizontal_fov_deg": 40.0,
+    "aperture_diameter": 1.0,
+    "focus_distance": math.inf,
+}
+
+
+def vessel_scene(estimator: str) -> dict[str, Any]:
     """A closed vessel that loses no light, with water that scatters before and behind the lens.
 
     The water within 10 cm of the lens is clear: otherwise next_event would have no finite variance.
@@ -477,37 +459,19 @@ def white_vessel(estimator: str) -> dict[str, Any]:
 
 
 def vessel_reading() -> float:
-    """What the camera in `white_vessel` reads: A·Δs/(4πV)·∫cosψ dΩ over its field, of even light in all directions."""
+    """What the camera in `vessel_scene` reads: A·Δs/(4πV)·∫cosψ dΩ over its field, of even light in all directions."""
     half = math.tan(math.radians(0.5 * _VESSEL_CAMERA["horizontal_fov_deg"]))
     area = math.pi * (0.5 * _VESSEL_CAMERA["aperture_diameter"]) ** 2
     side = half / math.hypot(1.0, half)
     return area * (_VESSEL_GATE[1] - _VESSEL_GATE[0]) / _VESSEL_SIDE**3 / math.pi * side * math.atan(side)
 
 
-@_case("white-vessel", "Even light in a closed vessel that loses none, into a wide lens: energy over volume")
-def _white_vessel(run: Run) -> list[Quantity]:
-    measured = []
+@_case
+def white_vessel(run: Run) -> Iterator[Quantity]:
+    """Even light in a closed vessel that loses none, into a wide lens: energy over volume"""
     for estimator in ("analog", "next_event", "guided"):
-        sums = [result.histogram.sum() for result in run.results(white_vessel(estimator))]
-        measured += quantities([f"light in the lens, {estimator}"], batch_means(sums), [vessel_reading()])
-    return measured
-
-
-def _rotation_onto_z(direction: NDArray) -> NDArray:
-    """A rotation matrix that takes a unit vector to +z."""
-    right = np.cross([0.0, 1.0, 0.0], direction)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(direction, right), direction])
-
-
-def _disc_weights(half_angle: float, pixels: int, inner: int = 16) -> NDArray[np.float64]:
-    """Weights with which a square camera has the field of a laser's uniform cone: 1/cosψ inside it, 0 outside;
-    `[pixels, pixels]`."""
-    fine = pixels * inner
-    tangent = ((np.arange(fine) + 0.5) / fine * 2.0 - 1.0) * math.tan(half_angle)
-    squared = tangent[:, None] ** 2 + tangent**2
-    weight = np.sqrt(1.0 + squared) * (squared < math.tan(half_angle) ** 2)
-    return weight.reshape(pixels, inner, pixels, inner).mean(axis=(1, 3))
+        (light,) = run.by_run(vessel_scene(estimator), lambda result: result.histogram.sum())
+        yield Quantity(f"light in the lens, {estimator}", light, vessel_reading())
 
 
 # Their runs
@@ -572,25 +536,17 @@ def run(
         check_choice("cases: an item", name, [*CASES])
     photons = check_integer("photons", photons, "[1000, 1000000000000]")
     seed = check_integer("seed", seed, "[0, 1099511627776]")
-    measured = []
+    measured: list[tuple[str, Quantity]] = []
     with tempfile.TemporaryDirectory() as folder:
         setup = Run(photons=photons, seed=seed, device=device, tables=Path(folder) if tabulated else None)
         for name in names:
             if progress is not None:
                 progress(CASES[name])
             measured += [(name, quantity) for quantity in CASES[name].measure(setup)]
+    family = holm(two_sided_p(one.z) for _, one in measured)
     return [
-        CaseResult(
-            name=name,
-            quantity=quantity.name,
-            value=quantity.estimate.value,
-            reference=quantity.reference,
-            standard_error=quantity.standard_error,
-            z=quantity.z,
-            p=p,
-            passed=p > FAMILY_LEVEL,
-        )
-        for (name, quantity), p in zip(measured, holm(two_sided_p(quantity.z) for _, quantity in measured), strict=True)
+        CaseResult(name, one.name, one.estimate.value, one.reference, one.standard_error, one.z, p, p > FAMILY_LEVEL)
+        for (name, one), p in zip(measured, family, strict=True)
     ]
 
 

@@ -5,23 +5,25 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.scene import Scene, phase_function
 from spadwarp.transport import simulate, trace
-from spadwarp.units import time_from_path
+from spadwarp.values import time_from_path
 
-__all__ = ["PENCIL", "Case", "Estimate", "Quantity", "Run", "ScoreMeans", "batch_means", "holm", "point_source"]
+__all__ = ["PENCIL", "Estimate", "Quantity", "Run", "batch_means", "block_means", "holm", "point_source"]
 __all__ += ["quantities", "scene", "slab_domain", "two_sided_p"]
 
+BLOCK = 1 << 20  # photons whose records are held at a time
+BATCHES = 32  # independent runs behind a standard error of a histogram
 
-@dataclass(frozen=True)
-class Estimate:
+
+class Estimate(NamedTuple):
     """A measured number with its standard error, and the degrees of freedom of that error (inf: exactly known)."""
 
     value: float
@@ -31,21 +33,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One measured number of a case beside its reference.
+    """One measured number of a case beside its reference."""
 
-    Attributes:
-        name: What was measured, with its unit.
-        estimate: The simulator's value.
-        reference: The known value.
-        reference_error: Standard error of the reference, 0 where it is known.
-        rounding: Half a unit of the last published digit: the reference lies within it, and z counts from its edge.
-    """
-
-    name: str
+    name: str  # what was measured, with its unit
     estimate: Estimate
     reference: float
-    reference_error: float = 0.0
-    rounding: float = 0.0
+    reference_error: float = 0.0  # standard error of the reference, 0 where it is known
+    rounding: float = 0.0  # half a unit of the last published digit: z counts from the edge of this interval
 
     @property
     def standard_error(self) -> float:
@@ -54,44 +48,39 @@ class Quantity:
 
     @property
     def z(self) -> float:
-        """Standard normal deviate of the difference; without any error 0 for equality and ±inf else."""
-        distance = self.estimate.value - self.reference
+        """Standard normal deviate of the difference; without any error 0 for equality and ±inf else.
+
+        As likely as Student's t, by Wallace (1959): within 0.04 from seven degrees of freedom on.
+        """
+        distance, degrees = self.estimate.value - self.reference, self.estimate.degrees
         difference = math.copysign(max(abs(distance) - self.rounding, 0.0), distance)
         if self.standard_error == 0.0:
             return math.copysign(math.inf, difference) if difference else 0.0
-        return _normal_from_t(difference / self.standard_error, self.estimate.degrees)
+        t = difference / self.standard_error
+        if math.isinf(degrees):
+            return t
+        z = math.sqrt(degrees * math.log1p(t * t / degrees)) * (8 * degrees + 1) / (8 * degrees + 3)
+        return math.copysign(z, t)
 
 
 def quantities(
     names: Iterable[str], estimates: Iterable[Estimate], references: Iterable[float], *, rounding: float = 0.0
 ) -> list[Quantity]:
     """One quantity for each name, estimate and reference, which are equally many."""
-    return [
-        Quantity(name, estimate, reference, rounding=rounding)
-        for name, estimate, reference in zip(names, estimates, references, strict=True)
-    ]
+    rows = zip(names, estimates, references, strict=True)
+    return [Quantity(name, estimate, reference, rounding=rounding) for name, estimate, reference in rows]
 
 
-@dataclass
-class ScoreMeans:
-    """Means over photons of several scores that arrive block by block: `add` arrays `[N, scores]` or `[N]`."""
-
-    count: int = 0
-    total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
-    square: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
-
-    def add(self, scores: ArrayLike) -> None:
-        array = np.asarray(scores, np.float64)
-        array = array.reshape(len(array), -1)
-        self.count += len(array)
-        self.total = self.total + array.sum(axis=0)
-        self.square = self.square + (array**2).sum(axis=0)
-
-    def estimates(self) -> list[Estimate]:
-        """One estimate a score."""
-        mean = self.total / self.count
-        variance = np.maximum(self.square / self.count - mean**2, 0.0) / max(self.count - 1, 1)
-        return [Estimate(float(m), float(v)) for m, v in zip(mean, np.sqrt(variance), strict=True)]
+def block_means(blocks: Iterable[ArrayLike]) -> list[Estimate]:
+    """Means over photons of scores that arrive block by block, `[N, scores]` or `[N]`."""
+    count, total, square = 0, np.zeros(1), np.zeros(1)
+    for block in blocks:
+        scores = np.asarray(block, np.float64)
+        scores = scores.reshape(len(scores), -1)
+        count, total, square = count + len(scores), total + scores.sum(axis=0), square + (scores**2).sum(axis=0)
+    mean = total / count
+    variance = np.maximum(square / count - mean**2, 0.0) / max(count - 1, 1)
+    return [Estimate(float(m), float(v)) for m, v in zip(mean, np.sqrt(variance), strict=True)]
 
 
 def batch_means(batches: ArrayLike) -> list[Estimate]:
@@ -99,8 +88,7 @@ def batch_means(batches: ArrayLike) -> list[Estimate]:
     array = np.asarray(batches, np.float64)
     array = array.reshape(len(array), -1)
     error = array.std(axis=0, ddof=1) / math.sqrt(len(array))
-    degrees = float(len(array) - 1)
-    return [Estimate(float(m), float(e), degrees) for m, e in zip(array.mean(axis=0), error, strict=True)]
+    return [Estimate(float(m), float(e), len(array) - 1.0) for m, e in zip(array.mean(axis=0), error, strict=True)]
 
 
 def two_sided_p(z: float) -> float:
@@ -110,32 +98,11 @@ def two_sided_p(z: float) -> float:
 
 def holm(p_values: Iterable[float]) -> list[float]:
     """Holm's family-wise p-values (1979), in the order given: reject where below the level of the whole family."""
-    p: Sequence[float] = list(p_values)
-    adjusted = [0.0] * len(p)
-    largest = 0.0
-    for rank, i in enumerate(sorted(range(len(p)), key=p.__getitem__)):
-        largest = max(largest, min(1.0, (len(p) - rank) * p[i]))
-        adjusted[i] = largest
-    return adjusted
-
-
-def _normal_from_t(t: float, degrees: float) -> float:
-    """The normal deviate as likely as Student's t, by Wallace (1959): within 0.04 from seven degrees of freedom on."""
-    if math.isinf(degrees):
-        return t
-    z = math.sqrt(degrees * math.log1p(t * t / degrees)) * (8 * degrees + 1) / (8 * degrees + 3)
-    return math.copysign(z, t)
-
-
-BLOCK = 1 << 20  # photons whose records are held at a time
-BATCHES = 32  # independent runs behind a standard error of a histogram
-
-# A pencil beam along +z; a camera for scenes that do not need one.
-PENCIL = {"profile": "collimated", "beam_radius": 0.0}
-_UNUSED_CAMERA = {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01}
-
-# Exact transport: no approximation, no limit.
-_EXACT = {"axis_threshold": 1.0, "weight_cutoff": 0.0, "max_collisions": 2**31 - 1}
+    p = np.array([*p_values])
+    order = np.argsort(p, kind="stable")
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, np.arange(p.size, 0, -1) * p[order]))
+    return adjusted.tolist()
 
 
 @dataclass(frozen=True)
@@ -143,7 +110,7 @@ class Run:
     """How the cases are run: photons for each scene, seed, device (None: the default one).
 
     With a folder for `tables` every Henyey–Greenstein function is read from a file of angles and values, except those
-    of layers, which cannot have a table each.
+    of layers, which cannot have a table each. Random numbers differ from scene to scene, or from `key` to `key`.
     """
 
     photons: int
@@ -151,35 +118,31 @@ class Run:
     device: str | None = None
     tables: Path | None = None
 
-    def records(
-        self, tables: Mapping[str, Any], *, key: str | None = None, derivatives: Sequence[str] = ()
-    ) -> Iterator[Any]:
-        """`PhotonRecords` of blocks of photons; random numbers differ from scene to scene, or from `key` to `key`."""
+    def records(self, tables: Mapping[str, Any], *, key: str = "", derivatives: Sequence[str] = ()) -> Iterator[Any]:
+        """`PhotonRecords` of blocks of photons."""
         traced = self._scene(tables)
         for block, start in enumerate(range(0, self.photons, BLOCK)):
-            count = min(BLOCK, self.photons - start)
-            seed = self._seed(key or repr(tables), block)
+            count, seed = min(BLOCK, self.photons - start), self._seed(key or repr(tables), block)
             yield trace(traced, photons=count, seed=seed, device=self.device, derivatives=derivatives)
 
-    def means(
+    def by_photon(
         self,
         tables: Mapping[str, Any],
-        scores: Callable[[Any], list[NDArray[Any]]],
-        *,
+        scores: Callable[[Any], Sequence[NDArray[Any]]],
         derivatives: Sequence[str] = (),
     ) -> list[Estimate]:
         """Means over photons of the scores `[N]` each that a function makes of `PhotonRecords`."""
-        means = ScoreMeans()
-        for records in self.records(tables, derivatives=derivatives):
-            means.add(np.stack(scores(records), axis=1))
-        return means.estimates()
+        return block_means(np.stack(scores(r), axis=1) for r in self.records(tables, derivatives=derivatives))
 
     def results(self, tables: Mapping[str, Any]) -> Iterator[Any]:
-        """`Result`s of `BATCHES` independent runs; the random numbers differ from scene to scene."""
-        simulated = self._scene(tables)
-        photons = max(1, self.photons // BATCHES)
+        """`Result`s of `BATCHES` independent runs."""
+        simulated, photons = self._scene(tables), max(1, self.photons // BATCHES)
         for batch in range(BATCHES):
             yield simulate(simulated, photons=photons, seed=self._seed(repr(tables), batch), device=self.device)
+
+    def by_run(self, tables: Mapping[str, Any], numbers: Callable[[Any], Any]) -> list[Estimate]:
+        """Means over the runs of the numbers that a function makes of a `Result`."""
+        return batch_means([numbers(result) for result in self.results(tables)])
 
     def _scene(self, tables: Mapping[str, Any]) -> Scene:
         medium = tables["medium"]
@@ -200,19 +163,11 @@ class Run:
         return int.from_bytes(digest, "little")
 
 
-@dataclass(frozen=True)
-class Case:
-    """One reference case.
+# Scenes; their text seeds the photons.
 
-    Attributes:
-        name: Its key.
-        summary: What is checked, and where the reference comes from.
-        measure: Runs it.
-    """
-
-    name: str
-    summary: str
-    measure: Callable[[Run], list[Quantity]]
+PENCIL = {"profile": "collimated", "beam_radius": 0.0}
+_UNUSED_CAMERA = {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01}
+_EXACT = {"axis_threshold": 1.0, "weight_cutoff": 0.0, "max_collisions": 2**31 - 1}  # no approximation, no limit
 
 
 def scene(
@@ -229,18 +184,15 @@ def scene(
     start, stop, bins = path_edges
     medium = {"group_index": 1.0, "phase_index": 1.0, **medium}
     first, width = (time_from_path(path, medium["group_index"]) for path in (start, (stop - start) / bins))
-    gate = {"start_ns": first * 1e9, "bin_width_ps": width * 1e12, "bins": bins}
     tables: dict[str, Any] = {
         "medium": medium,
         "laser": dict(laser),
         "camera": dict(camera),
-        "gate": gate,
+        "gate": {"start_ns": first * 1e9, "bin_width_ps": width * 1e12, "bins": bins},
         "domain": dict(domain or {}),
         "transport": {**_EXACT, **transport},
     }
-    if targets:
-        tables["targets"] = targets
-    return tables
+    return tables | ({"targets": targets} if targets else {})
 
 
 def point_source(*position: float) -> dict[str, Any]:

@@ -8,17 +8,18 @@ references.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Slab(NamedTuple):
-    """An index-matched slab, normal incidence; fractions that leave it, `transmitted` with the direct beam."""
+    """An index-matched slab, normal incidence: fractions that leave it, `transmitted` with the direct beam, or their
+    derivatives."""
 
     anisotropy: float
     albedo: float
     optical_depth: float
-    reflected: float
-    transmitted: float
+    reflected: Any
+    transmitted: Any
 
     @property
     def text(self) -> str:
@@ -40,32 +41,18 @@ SLABS = (
 )
 
 
-class SlabDerivatives(NamedTuple):
-    """Derivatives of what leaves a slab with an extinction of 1 1/m, normal incidence: by absorption [m], scattering
-    [m] and anisotropy."""
-
-    anisotropy: float
-    albedo: float
-    optical_depth: float
-    reflected: tuple[float, float, float]
-    transmitted: tuple[float, float, float]
-
-    @property
-    def text(self) -> str:
-        return f"g {self.anisotropy:g}, ω {self.albedo:g}, τ {self.optical_depth:g}"
-
-
-# Adding–doubling, differentiated numerically.
+# Derivatives at an extinction of 1 1/m by absorption [m], scattering [m] and anisotropy: adding–doubling,
+# differentiated numerically.
 SLAB_DERIVATIVES = (
-    SlabDerivatives(0.0, 0.9, 0.5, (-0.15272215, 0.15742895, -0.18840523), (-0.46695804, -0.17009768, 0.18806004)),
-    SlabDerivatives(0.0, 0.9, 2.0, (-0.95368366, 0.22686175, -0.24997523), (-1.17738796, -0.26992162, 0.23115400)),
-    SlabDerivatives(0.0, 0.9, 8.0, (-1.63715047, 0.18287816, -0.21256956), (-0.29527945, -0.04178317, 0.03199551)),
-    SlabDerivatives(0.5, 0.9, 0.5, (-0.07898399, 0.08149315, -0.18624387), (-0.50015071, -0.09201544, 0.20497228)),
-    SlabDerivatives(0.5, 0.9, 2.0, (-0.66549053, 0.19152481, -0.39040836), (-1.48073237, -0.24998057, 0.46368231)),
-    SlabDerivatives(0.5, 0.9, 8.0, (-1.57833685, 0.18069401, -0.36763430), (-0.79779839, -0.09731067, 0.16375440)),
-    SlabDerivatives(0.924, 0.9, 0.5, (-0.00902234, 0.00829725, -0.10478131), (-0.48347152, -0.01037582, 0.13060156)),
-    SlabDerivatives(0.924, 0.9, 2.0, (-0.08811821, 0.02901992, -0.36240427), (-1.66786320, -0.05107528, 0.62809605)),
-    SlabDerivatives(0.924, 0.9, 8.0, (-0.42092961, 0.05840857, -0.71951477), (-2.86269922, -0.14106234, 1.66293832)),
+    Slab(0.0, 0.9, 0.5, (-0.15272215, 0.15742895, -0.18840523), (-0.46695804, -0.17009768, 0.18806004)),
+    Slab(0.0, 0.9, 2.0, (-0.95368366, 0.22686175, -0.24997523), (-1.17738796, -0.26992162, 0.23115400)),
+    Slab(0.0, 0.9, 8.0, (-1.63715047, 0.18287816, -0.21256956), (-0.29527945, -0.04178317, 0.03199551)),
+    Slab(0.5, 0.9, 0.5, (-0.07898399, 0.08149315, -0.18624387), (-0.50015071, -0.09201544, 0.20497228)),
+    Slab(0.5, 0.9, 2.0, (-0.66549053, 0.19152481, -0.39040836), (-1.48073237, -0.24998057, 0.46368231)),
+    Slab(0.5, 0.9, 8.0, (-1.57833685, 0.18069401, -0.36763430), (-0.79779839, -0.09731067, 0.16375440)),
+    Slab(0.924, 0.9, 0.5, (-0.00902234, 0.00829725, -0.10478131), (-0.48347152, -0.01037582, 0.13060156)),
+    Slab(0.924, 0.9, 2.0, (-0.08811821, 0.02901992, -0.36240427), (-1.66786320, -0.05107528, 0.62809605)),
+    Slab(0.924, 0.9, 8.0, (-0.42092961, 0.05840857, -0.71951477), (-2.86269922, -0.14106234, 1.66293832)),
 )
 
 
@@ -97,20 +84,11 @@ EXIT_COSINES = (
 )
 
 
-class Pulse(NamedTuple):
-    """A short pulse on a half-space, normal incidence: fractions reflected by bin of path [m]; coefficients in 1/m."""
-
-    scattering: float
-    absorption: float
-    anisotropy: float
-    edges: tuple[float, ...]
-    fractions: tuple[float, ...]
-
-
-# Doubling at complex absorption, transformed back to path length (Abate & Whitt 1995).
-TIME_RESOLVED = Pulse(
-    0.9, 0.1, 0.5, (0.0, 1.0, 2.0, 4.0, 8.0, 16.0), (0.04104309, 0.03773958, 0.06089517, 0.07164072, 0.04903578)
-)
+# A short pulse on a half-space, normal incidence: fractions reflected by bin of path [m]. Doubling at complex
+# absorption, transformed back to path length (Abate & Whitt 1995).
+TIME_RESOLVED_MEDIUM = {"scattering": 0.9, "absorption": 0.1, "anisotropy": 0.5}
+TIME_RESOLVED_EDGES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)
+TIME_RESOLVED = (0.04104309, 0.03773958, 0.06089517, 0.07164072, 0.04903578)
 
 # Exact: ⟨z⟩ [m], ⟨r²⟩ [m²] for isotropic scattering of 1/m after a path of 5 m; ⟨z⟩, ⟨r²⟩, ⟨cosθ⟩ for g = 0.924 after
 # 5 collisions.
@@ -126,17 +104,11 @@ NEAR_AXIS = {0.9: 0.70988679, 0.97: 0.68573084, 0.9998: 0.67353803, 1.0: 0.67353
 CUTOFF = {0.05: 0.28315764, 2e-4: 0.28525224, 0.0: 0.28525450}
 
 
-class Fluence(NamedTuple):
-    """Light of an isotropic point source, isotropic scattering of 1/m, after `path` [m], by shell of radius."""
-
-    absorption: float
-    path: float
-    edges: tuple[float, ...]
-    fractions: tuple[float, ...]
-
-
+# Light of an isotropic point source, isotropic scattering of 1/m, after a path [m], by shell of radius [m]:
 # Fourier–Laplace solution of the transport equation; the outermost shell holds the unscattered front.
-FLUENCE = Fluence(0.2, 5.0, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0), (0.0169338, 0.0877305, 0.1297344, 0.0951447, 0.0383361))
+FLUENCE_ABSORPTION, FLUENCE_PATH = 0.2, 5.0
+FLUENCE_EDGES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+FLUENCE = (0.0169338, 0.0877305, 0.1297344, 0.0951447, 0.0383361)
 
 # Fractions absorbed, pencil and isotropic source: MCX's `cube60` benchmark, published to 0.01 %.
 CUBE60 = (0.1769, 0.8857)

@@ -12,8 +12,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from spadwarp.analytic.sweeps import OUTLIERS, TOLERANCE, BudgetRow, Sweep
@@ -23,8 +22,6 @@ from spadwarp.viz.style import (
     PAGE,
     RED,
     SERIES,
-    TEXT,
-    columns_that_fit,
     log_axis,
     new_figure,
     panel_grid,
@@ -37,22 +34,16 @@ from spadwarp.viz.style import (
 __all__ = ["draw_budget", "draw_learning_curves", "draw_sweep", "draw_validation"]
 
 # Label, factor, and the widest range of values to show.
-_PANELS: dict[str, tuple[str, float, tuple[float, float]]] = {
+_COLUMNS: dict[str, tuple[str, float, tuple[float, float]]] = {
     "signal": ("signal [detections per pulse]", 1.0, (1e-10, 1e3)),
     "sigma_depth": ("depth error, Cramér–Rao [mm]", 1e3, (1e-3, 1e4)),
     "signal_to_backscatter": ("signal to backscatter", 1.0, (1e-6, 1e6)),
     "pulses_for_1cm": ("pulses for 1 cm", 1.0, (1.0, 1e12)),
+    "outlier_probability": ("outlier probability", 1.0, (0.0, 1.0)),
+    "estimate_fraction": ("pixels with an estimate", 1.0, (0.0, 1.0)),
 }
-_ERROR_PANELS = ("sigma_depth", "outlier_probability", "estimate_fraction", "signal_to_backscatter")
-_LABELS: dict[str, tuple[str, float]] = {
-    **{name: (label, scale) for name, (label, scale, _) in _PANELS.items()},
-    "alpha": ("detections per pulse α", 1.0),
-    "background": ("background [detections per pulse]", 1.0),
-    "sigma_time": ("timing error, Cramér–Rao [ps]", 1e12),
-    "sigma_depth_p90": ("depth error, 90th percentile [mm]", 1e3),
-    "outlier_probability": ("outlier probability", 1.0),
-    "estimate_fraction": ("pixels with an estimate", 1.0),
-}
+_OF_BUDGETS = ("signal", "sigma_depth", "signal_to_backscatter", "pulses_for_1cm")
+_OF_ERRORS = ("sigma_depth", "outlier_probability", "estimate_fraction", "signal_to_backscatter")
 
 
 @paper()
@@ -62,78 +53,61 @@ def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, wi
     Where more than 1 % of the fits would be outliers, the bound is dashed: it is not reached. Returns the matplotlib
     figure of this width [inch], and writes it where `path` is given.
     """
-    waters = list(dict.fromkeys(row.medium for row in rows))
-    figure, axes = panel_grid(len(_PANELS), width, least=2.3, height=2.1, more=0.5)
-    for number, name in enumerate(waters):
-        own = [row for row in rows if row.medium == name]
-        x = np.array([row.range for row in own])
-        for axis, (field, (_, scale, shown)) in zip(axes, _PANELS.items(), strict=True):
-            y = np.array([getattr(row, field) for row in own]) * scale
-            y[~(np.isfinite(y) & (y > 0.01 * shown[0]) & (y < 100 * shown[1]))] = np.nan
-            colour = SERIES[number % len(SERIES)]
+    figure, axes = panel_grid(len(_OF_BUDGETS), width, least=2.3, height=2.1)
+    low, high = min(row.range for row in rows), max(row.range for row in rows)
+    reached = np.array([row.outlier_probability <= OUTLIERS for row in rows])
+    for axis, field in zip(axes, _OF_BUDGETS, strict=True):
+        label, scale, (least, most) = _COLUMNS[field]
+        values = np.array([getattr(row, field) for row in rows]) * scale
+        values[~((values >= least) & (values <= most))] = np.nan
+        for number, water in enumerate(dict.fromkeys(row.medium for row in rows)):
+            own = [index for index, row in enumerate(rows) if row.medium == water]
+            x, y, colour = [rows[index].range for index in own], values[own], SERIES[number % len(SERIES)]
             if field == "sigma_depth":
-                sure = np.array([row.outlier_probability <= OUTLIERS for row in own])
                 axis.plot(x, y, "--", color=colour, linewidth=0.8)
-                y = np.where(sure, y, np.nan)
-            label = f"{name}, c = {own[0].extinction:.3g} 1/m"
-            axis.plot(x, y, "o-", color=colour, markevery=-(-len(x) // 12), label=label)
-    for axis, (label, _, shown) in zip(axes, _PANELS.values(), strict=True):
-        axis.set(xlabel="range [m]", ylabel=_label(label), yscale="log")
-        low, high = axis.get_ylim()
-        low, high = max(low, shown[0]), min(high, shown[1])
-        axis.set(
-            yscale="log" if high > 20 * low else "linear", ylim=(low, high) if high > 20 * low else (0, 1.05 * high)
-        )
-        if high > 20 * low:
-            log_axis(axis, "y")
-        else:
-            axis.yaxis.minorticks_on()
-        _range_ticks(axis, [row.range for row in rows])
-    axes[1].axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
-    handles, labels = axes[0].get_legend_handles_labels()
-    if any(row.outlier_probability > OUTLIERS for row in rows):
-        handles.append(Line2D([], [], color="0.4", linestyle="--", linewidth=0.8))
-        labels.append(f"not reached: over {100 * OUTLIERS:g} % false peaks")
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns_that_fit(len(labels), width, 2.3))
+                y = np.where(reached[own], y, np.nan)
+            label_of = f"{water}, c = {rows[own[0]].extinction:.3g} 1/m"
+            axis.plot(x, y, "o-", color=colour, markevery=-(-len(x) // 12), label=label_of)
+        axis.set(xlabel="range [m]", ylabel=_broken(label))
+        if field == "sigma_depth":
+            axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
+        _value_axis(axis, values)
+        if high > low:
+            axis.set_xlim(low * (low / high) ** 0.05, high * (high / low) ** 0.05)  # also where nothing comes back
+            log_axis(axis, "x")
+    if not reached.all():
+        label = f"not reached: over {100 * OUTLIERS:g} % false peaks"
+        axes[0].plot([], [], color="0.4", linestyle="--", linewidth=0.8, label=label)
+    figure.key(axes, 2.3)
     if path is not None:
         save(figure, path)
     return figure
 
 
 @paper()
-def draw_sweep(
-    curves: Sweep, path: str | Path | None = None, *, columns: Sequence[str] | None = None, width: float = PAGE
-) -> Figure:
-    """One panel for each column over the values of the swept field; returns the matplotlib figure, writes it to `path`.
+def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = PAGE) -> Figure:
+    """Four panels over the values of the swept field, see `spadwarp.sweep`: those of `draw_budget`, or errors.
 
-    Linear axes begin at 0, and a curve that varies by less than a tenth has its span written into the panel.
-
-    Args:
-        curves: From `spadwarp.sweep`.
-        path: The picture.
-        columns: Attributes of the rows; default: what matters most.
-        width: Of the figure [inch].
+    Linear axes begin at 0, and a curve that varies by less than a tenth has its span written into the panel. Returns
+    the matplotlib figure of this width [inch], and writes it where `path` is given.
     """
     budgets = isinstance(curves.rows[0], BudgetRow)
-    names = list(columns or (_PANELS if budgets else _ERROR_PANELS))
-    figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.5)
+    names = _OF_BUDGETS if budgets else _OF_ERRORS
+    figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.3)
     numeric = all(isinstance(value, (int, float)) for value in curves.values)
     x: Any = np.array(curves.values, np.float64) if numeric else np.arange(len(curves.values))
-    for number, (axis, name) in enumerate(zip(axes, names, strict=False)):
-        label, scale = _LABELS.get(name, (name, 1.0))
+    for number, (axis, name) in enumerate(zip(axes, names, strict=True)):
+        label, scale, (_, most) = _COLUMNS[name]
         y, colour = curves.column(name) * scale, SERIES[number % 5]
         axis.plot(x, np.where(np.isfinite(y), y, np.nan), "o-", color=colour, label="median")
         if name == "sigma_depth" and not budgets:
-            p90 = curves.column("sigma_depth_p90") * scale
+            p90 = scale * curves.column("sigma_depth_p90")
             axis.plot(x, p90, "--", color=colour, linewidth=0.8, label="90 % of the pixels below")
             axis.legend()
-        axis.set(xlabel=f"{curves.field} {_unit(curves.field)}".rstrip(), ylabel=_label(label))
-        _value_axis(axis, y, probability=name in ("outlier_probability", "estimate_fraction"))
+        axis.set(xlabel=curves.field + _unit(curves.field), ylabel=_broken(label))
+        _value_axis(axis, y, probability=most == 1.0)
         if not numeric:
-            space = 0.95 * axis.get_position().width * width / len(x)
-            # Names of presets break at any hyphen.
-            texts = [wrapped(str(value).replace("-", "- "), space, size=7) for value in curves.values]
-            axis.set_xticks(x, [text.replace("- ", "-") for text in texts])
+            axis.set_xticks(x, map(str, curves.values), rotation=20, ha="right", rotation_mode="anchor")
             axis.set_xlim(-0.5, len(x) - 0.5)
         elif x.min() > 0 and x.max() > 30 * x.min():
             log_axis(axis, "x")
@@ -144,20 +118,29 @@ def draw_sweep(
     return figure
 
 
-def _label(text: str) -> str:
+def _broken(label: str) -> str:
     """The unit on a line of its own where both together are longer than an axis."""
-    return text if len(text) < 26 else text.replace(" [", "\n[")
+    return label if len(label) < 26 else label.replace(" [", "\n[")
 
 
-def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool) -> None:
+def _unit(field: str) -> str:
+    """` [1/m]` for `medium.extinction`: the unit in the field's description, or nothing."""
+    section, _, name = field.partition(".")
+    info = Scene.model_fields.get(section)
+    described = getattr(info.annotation, "model_fields", {}).get(name) if info else None
+    found = re.search(r" \[[^\]]+\]", getattr(described, "description", None) or "")
+    return found.group(0) if found else ""
+
+
+def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool = False) -> None:
     """From 0 to 1, or logarithmic over more than a factor of 20, else from 0."""
     known = y[np.isfinite(y)]
     positive = known[known > 0]
-    if not probability and positive.size and positive.max() > 20 * positive.min():
-        log_axis(axis, "y")
-        return
     if probability:
         axis.set_ylim(-0.03, 1.03)
+    elif positive.size and positive.max() > 20 * positive.min():
+        log_axis(axis, "y")
+        return
     elif known.size:
         axis.set_ylim(min(0.0, 1.1 * known.min()), 1.1 * known.max() or 1.0)
         span = np.ptp(known) / max(np.abs(known).max(), 1e-300)
@@ -165,28 +148,6 @@ def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool) -> Non
             text = f"{known.min():.4g} to {known.max():.4g}: a span of {100 * span:.2g} %"
             axis.text(0.03, 0.04, text, transform=axis.transAxes, fontsize="small", color="0.35")
     axis.yaxis.minorticks_on()
-
-
-def _unit(field: str) -> str:
-    """`[1/m]` for `medium.extinction`: the unit at the end of the field's description, or nothing."""
-    section, _, name = field.partition(".")
-    info = Scene.model_fields.get(section)
-    fields = getattr(info.annotation, "model_fields", {}) if info else {}
-    found = re.search(r"\[[^\]]+\]", getattr(fields.get(name), "description", None) or "")
-    return found.group(0) if found else ""
-
-
-def _range_ticks(axis: Axes, ranges: Sequence[float]) -> None:
-    """The ranges themselves where they are few, else 1, 2 and 5 times the powers of ten."""
-    low, high = min(ranges), max(ranges)
-    ticks = sorted(set(ranges))
-    if len(ticks) > 6:
-        ticks = [m * 10.0**e for e in range(-2, 4) for m in (1, 2, 5) if low <= m * 10.0**e <= high]
-    if len(ticks) > 1:
-        axis.set_xlim(low * (low / high) ** 0.05, high * (high / low) ** 0.05)  # also where nothing comes back
-        log_axis(axis, "x")
-        axis.xaxis.set_major_locator(FixedLocator(ticks))
-        axis.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
 @paper()
@@ -202,23 +163,19 @@ def draw_learning_curves(
     style: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
     levels = list(log[-1]["psnr"])
     counted = all(float(level) >= 1 for level in levels)
-    in_line = columns_that_fit(len(levels) + 1, width, 0.8)
-    more = 0.7 + 0.14 * (len(levels) // in_line)
-    figure, (loss, psnr) = panel_grid(2, width, least=3.0, height=2.1, more=more)
+    figure, (loss, psnr) = panel_grid(2, width, least=3.0, height=2.1)
     loss.plot(steps, losses, color=BLUE, **style)
     loss.set(xlabel="step", ylabel="loss")
     if min(losses) > 0:  # "psnr" is a logarithm
         log_axis(loss, "y")
     for level, shade in zip(levels, np.linspace(0.85, 0.0, len(levels)), strict=True):
-        colour = matplotlib.colormaps["viridis"](shade)
-        label = f"{float(level):g}" if counted else level
-        psnr.plot(steps, [line["psnr"][level] for line in log], color=colour, label=label, **style)
+        style |= {"color": matplotlib.colormaps["viridis"](shade), "label": f"{float(level):g}" if counted else level}
+        psnr.plot(steps, [line["psnr"][level] for line in log], **style)
     psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
-    title_of_levels = "signal photons per pixel" if counted else "backscatter fraction"
-    figure.legend(title=title_of_levels, loc="outside lower center", ncols=in_line)
     for axis in (loss, psnr):
         axis.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
-    figure.suptitle(wrapped(title, width - 0.3), color=TEXT)
+    figure.key([psnr], 0.8, title="signal photons per pixel" if counted else "backscatter fraction")
+    figure.caption(title)
     return save(figure, path)
 
 
@@ -230,27 +187,23 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     picture [inch]. Raises `FileError`.
     """
     names = [wrapped(row["quantity"], 0.36 * width, size=7) for row in rows]
-    lines = sum(name.count("\n") + 1 for name in names)
-    title = wrapped(title, width - 0.3)
-    figure = new_figure(width, 0.9 + 0.15 * (lines + len(rows)) + 0.14 * title.count("\n"))
+    figure = new_figure(width, 0.65 + 0.15 * sum(name.count("\n") + 2 for name in names))
+    figure.caption(title)
     ratio, deviation = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for y, row in enumerate(rows):
         style: dict[str, Any] = {"color": BLUE if row["passed"] else RED, "marker": "o" if row["passed"] else "X"}
-        reference = row["reference"]
-        if reference:
+        if reference := row["reference"]:
             error = abs(row["standard_error"] / reference)
             ratio.errorbar(row["value"] / reference - 1.0, y, xerr=error, linestyle="none", **style)
         if math.isfinite(row["z"]):
             deviation.plot(row["z"], y, **style)
     ratio.axvline(0.0, color="0.6", linewidth=0.8)
-    ratio.set_xlabel("value / reference − 1")
+    ratio.set(xlabel="value / reference − 1", ylim=(len(rows) - 0.5, -0.5))
     ratio.set_yticks(range(len(rows)), names)
-    ratio.set_ylim(len(rows) - 0.5, -0.5)
     deviation.axvspan(-2.0, 2.0, color="0.92", zorder=0)
     deviation.set_xlabel(wrapped("z [standard errors]", 0.22 * width))
     for axis in (ratio, deviation):
         axis.locator_params(axis="x", nbins=4)
         axis.xaxis.minorticks_on()
         plain_axis(axis)
-    figure.suptitle(title)
     return save(figure, path)

@@ -3,43 +3,26 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameReader
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import check_integer
 from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, TriangleMesh, build_mesh, builtin_names, make_builtin
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_camera, to_world
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import truth_maps
-from spadwarp.viz.style import (
-    BACKGROUND,
-    BLUE,
-    BOUND_MAP,
-    DEPTH_MAP,
-    GREEN,
-    INTENSITY_MAP,
-    PAGE,
-    coloured_depth,
-    new_figure,
-    paper,
-    save,
-    spaced,
-    strip_bar,
-    strips,
-    wrapped,
-)
+from spadwarp.values import ArgumentError, check_integer
+from spadwarp.viz import style
+from spadwarp.viz.style import BOUND_MAP, DEPTH_MAP, INTENSITY_MAP, PAGE, PaperFigure, coloured_depth, paper, save
 
 __all__ = ["describe_targets", "draw_dataset", "draw_mesh", "draw_targets", "draw_water"]
 
@@ -52,26 +35,18 @@ _PALE = LinearSegmentedColormap.from_list("pale water", matplotlib.colormaps[BOU
 
 @paper()
 def draw_water(scene: Scene, path: str | Path, mesh: TriangleMesh | None = None, *, width: float = PAGE) -> Path:
-    """Draws the extinction on two planes through the optical axis, from above and from the side, into one picture.
+    """Draws the extinction on two planes through the optical axis, from above and from the side; returns the path.
 
-    Args:
-        scene: With or without a grid of cells.
-        path: The picture.
-        mesh: Of the scene, if the caller has it.
-        width: Of the picture [inch].
-
-    Raises:
-        MeshError: A target that cannot be read.
-        FileError: The picture cannot be written, or the cells cannot be read.
+    `mesh`: of the scene, if the caller has it. `width`: of the picture [inch]. Raises `MeshError` for a target that
+    cannot be read, `FileError` where the picture cannot be written or the cells cannot be read.
     """
-    figure = new_figure(width, 0.34 * width)
+    figure = style.new_figure(width, 0.34 * width)
     mesh = build_mesh(scene) if mesh is None else mesh
     axes = figure.subplots(1, 2)
     images = [draw_slice(axis, scene, mesh, across) for across, axis in enumerate(axes)]
     for axis, title in zip(axes, ("from above", "from the side"), strict=True):
         axis.set_title(title)
-    drawn = [image.get_array().max() for image in images]
-    extend = "max" if max(drawn) > images[0].norm.vmax else "neither"
+    extend = "max" if max(image.get_array().max() for image in images) > images[0].norm.vmax else "neither"
     figure.colorbar(images[0], ax=axes, label="extinction [1/m]", shrink=0.7, extend=extend)
     return save(figure, path)
 
@@ -92,39 +67,31 @@ def draw_slice(axis: Axes, scene: Scene, mesh: TriangleMesh | None, across: int)
     )  # fmt: skip
     camera, laser = scene.camera, scene.beam
     tangent = 0.5 * camera.pixel_tangent * (camera.width, camera.height)[across]
-    axis.plot([0.0, depth], [0.0, depth * tangent], color=BLUE, lw=0.8)
-    axis.plot([0.0, depth], [0.0, -depth * tangent], color=BLUE, lw=0.8, label="view")
     start, along = np.array(laser.position), np.array(laser.axis)
-    for sign in (-1.0, 1.0):
-        slope = along[across] / max(along[2], 1e-6) + sign * np.tan(min(laser.half_angle, 1.4))
-        ends = start[across] + np.array([0.0, slope * (depth - start[2])])
-        axis.plot([start[2], depth], ends, color=GREEN, lw=0.8, ls="--", label="beam" if sign > 0 else None)
+    slope, spread = along[across] / max(along[2], 1e-6), np.tan(min(laser.half_angle, 1.4))
+    for sign, last in ((-1.0, False), (1.0, True)):
+        view, beam = ("view", "beam") if last else (None, None)
+        axis.plot([0.0, depth], [0.0, sign * depth * tangent], color=style.BLUE, lw=0.8, label=view)
+        ends = start[across] + np.array([0.0, (slope + sign * spread) * (depth - start[2])])
+        axis.plot([start[2], depth], ends, color=style.GREEN, lw=0.8, ls="--", label=beam)
     if mesh is not None:
         for ends in _section(mesh, 1 - across):
             axis.plot(ends[:, 2], ends[:, across], color="black", lw=1.2)
-    axis.set_xlim(0.0, depth)
-    axis.set_ylim(half, -half)
-    axis.set_xlabel("z [m]")
-    axis.set_ylabel("xy"[across] + " [m]")
+    axis.set(xlim=(0.0, depth), ylim=(half, -half), xlabel="z [m]", ylabel="xy"[across] + " [m]")
     axis.legend(loc="upper left", fontsize=6)
     return image
 
 
 def _extent(scene: Scene, mesh: TriangleMesh | None) -> tuple[float, float]:
     """Depth and half the height of the picture [m]: to the far end of the targets, or the box."""
-    camera = scene.camera
-    depth, half = 0.5 * scene.path_limit, 0.1
-    if mesh is not None:
-        depth = 1.05 * float(mesh.bounds[1][2])
-    elif scene.medium.grid is not None:
-        cells = grid_cells(scene.medium)
-        depth = float(to_camera(camera, cells.centre)[2] + 0.6 * np.linalg.norm(cells.size))
-    depth = max(depth, 0.01)
-    half = max(half, 0.5 * camera.pixel_tangent * max(camera.width, camera.height) * depth)
+    camera, depth, half = scene.camera, 0.5 * scene.path_limit, 0.1
     if scene.medium.grid is not None:
         cells = grid_cells(scene.medium)
         centre = to_camera(camera, cells.centre)
-        half = max(half, float(np.abs(centre[:2]).max()) + 0.5 * max(cells.size[:2]))
+        depth = float(centre[2] + 0.6 * np.linalg.norm(cells.size))
+        half = float(np.abs(centre[:2]).max()) + 0.5 * max(cells.size[:2])
+    depth = max(1.05 * float(mesh.bounds[1][2]) if mesh is not None else depth, 0.01)
+    half = max(half, 0.1, 0.5 * camera.pixel_tangent * max(camera.width, camera.height) * depth)
     return depth, min(1.15 * half, depth)
 
 
@@ -153,7 +120,6 @@ def _section(mesh: TriangleMesh, axis: int) -> Floats:
 
 # Sheets
 
-
 DISTANCE = 15.0  # [m]
 FIELD_OF_VIEW = 17.0  # [°]
 _SIDE = 3.5  # [m] of targets that have no size of their own
@@ -161,118 +127,93 @@ _VIEWS = ((0.0, 0.0, 0.0), (0.0, 90.0, 0.0), (90.0, 0.0, 0.0))  # rotations [°]
 _LIGHT = np.array([-0.35, -0.5, -0.79])  # direction to a lamp on the upper left of the camera
 
 
-def describe_targets(names: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Name, faces and extent x, y, z [m] of built-in targets; all if `names` is None. Raises `ArgumentError`."""
-    described = []
-    for name in builtin_names() if names is None else names:
-        mesh = make_builtin(name)
-        described.append({"name": name, "faces": len(mesh.faces), "extent": [float(side) for side in mesh.extents]})
-    return described
+def describe_targets() -> list[dict[str, Any]]:
+    """Name, faces and extent x, y, z [m] of the built-in targets."""
+    meshes = {name: make_builtin(name) for name in builtin_names()}
+    return [{"name": name, "faces": len(it.faces), "extent": it.extents.tolist()} for name, it in meshes.items()]
 
 
 @paper()
-def draw_targets(
-    path: str | Path,
-    *,
-    names: Sequence[str] | None = None,
-    pixels: int = 192,
-    width: float = PAGE,
-    device: str | None = None,
-) -> Path:
-    """Draws built-in targets as seen from 15 m, shaded and as depth maps, into one PNG; returns its path.
+def draw_targets(path: str | Path, *, width: float = PAGE, device: str | None = None) -> Path:
+    """Draws the built-in targets as seen from 15 m, shaded and as depth maps, into one picture; returns its path.
 
-    Args:
-        path: The picture.
-        names: Of the targets, in this order; all if None.
-        pixels: Width and height of each view, > 0.
-        width: Of the picture [inch].
-        device: Warp device for the rays.
-
-    Raises:
-        ConfigError: An unknown name.
-        FileError: The picture cannot be written.
+    `width`: of the picture [inch]; `device`: Warp device for the rays. Raises `FileError`.
     """
-    chosen = list(builtin_names() if names is None else names)
-    figure, axes, (bar,) = strips(len(chosen), width=width, least=1.7, ratio=0.5, title=0.2)
-    scale = Normalize(DISTANCE - 1.5, DISTANCE + 1.5)
-    for axis, name in zip(axes, chosen, strict=False):
+    targets: dict[str, dict[str, Any]] = {}
+    for name in builtin_names():
         size = {"size": [_SIDE] * (2 if name == "plane" else 3)} if name in SIZED_BUILTINS else {}
-        target = {"builtin": name, "translation": [0.0, 0.0, DISTANCE], **size}
-        _show_target(axis, target, scale, pixels, device)
-        axis.set_title(name, pad=2)
-    strip_bar(bar, scale, DEPTH_MAP, "depth z [m]")
+        targets[name] = {"builtin": name, "translation": [0.0, 0.0, DISTANCE], **size}
+    figure = _target_sheet(targets, 1.5, width, 192, device)
+    _sheet_bar(figure, Normalize(DISTANCE - 1.5, DISTANCE + 1.5), DEPTH_MAP, "depth z [m]")
     return save(figure, path)
 
 
 @paper()
-def draw_mesh(
-    mesh: MeshSummary, path: str | Path, *, pixels: int = 256, width: float = PAGE, device: str | None = None
-) -> Path:
+def draw_mesh(mesh: MeshSummary, path: str | Path, *, width: float = PAGE, device: str | None = None) -> Path:
     """Draws a mesh file as the camera sees it, from its side and from above, shaded, with its depth; returns the path.
 
-    Args:
-        mesh: From `spadwarp.mesh.describe_mesh`.
-        path: The picture.
-        pixels: Width and height of each view, > 0.
-        width: Of the picture [inch].
-        device: Warp device for the rays.
-
-    Raises:
-        MeshError: The file of the mesh is gone.
-        FileError: The picture cannot be written.
+    `mesh`: from `spadwarp.mesh.describe_mesh`; `width`: of the picture [inch]; `device`: Warp device for the rays.
+    Raises `MeshError` if the file of the mesh is gone, `FileError` where the picture cannot be written.
     """
     shown = _SIDE / max(mesh.extent)  # scale that fills the view
-    metres = " x ".join(f"{mesh.scale * side:.3g}" for side in mesh.extent)
-    figure, axes, (bar,) = strips(len(_VIEWS), width=width, least=1.7, ratio=0.5, title=0.2)
-    scale = Normalize(DISTANCE - 0.5 * _SIDE, DISTANCE + 0.5 * _SIDE)
-    for axis, rotation in zip(axes, _VIEWS, strict=False):
+    targets = {}
+    for rotation in _VIEWS:
         centre = rotation_matrix(rotation) @ (shown * np.array(mesh.centre))
-        target = {"mesh": str(mesh.path), "scale": shown, "rotation_deg": list(rotation)}
-        target["translation"] = [float(x) for x in np.array([0.0, 0.0, DISTANCE]) - centre]
-        _show_target(axis, target, scale, pixels, device)
-        axis.set_title(f"rotation_deg = {[round(angle) for angle in rotation]}", pad=3)
-    own = Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest)
-    strip_bar(bar, own, DEPTH_MAP, "depth from the centre [m]")
-    figure.suptitle(wrapped(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}", width - 0.3))
+        translation = (np.array([0.0, 0.0, DISTANCE]) - centre).tolist()
+        target = {"mesh": str(mesh.path), "scale": shown, "rotation_deg": list(rotation), "translation": translation}
+        targets[f"rotation_deg = {[round(angle) for angle in rotation]}"] = target
+    figure = _target_sheet(targets, 0.5 * _SIDE, width, 256, device)
+    _sheet_bar(figure, Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest), DEPTH_MAP, "depth from the centre [m]")
+    metres = " x ".join(f"{mesh.scale * side:.3g}" for side in mesh.extent)
+    figure.caption(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}")
     return save(figure, path)
 
 
-def _show_target(axis: Axes, target: dict[str, Any], scale: Normalize, pixels: int, device: str | None) -> None:
-    """A target at 15 m before a camera of 17°, shaded and as a depth map; means of 2 × 2 pixels."""
+def _target_sheet(
+    targets: dict[str, dict[str, Any]], reach: float, width: float, pixels: int, device: str | None
+) -> PaperFigure:
+    """Targets by title, at 15 m before a camera of 17°, shaded by one lamp and an even sky, and as depth maps."""
+    figure, axes = _sheet(len(targets), width, least=1.7, ratio=0.5, title=0.2)
+    scale, lamp = Normalize(DISTANCE - reach, DISTANCE + reach), _LIGHT / np.linalg.norm(_LIGHT)
     camera = {"width": 2 * pixels, "height": 2 * pixels, "horizontal_fov_deg": FIELD_OF_VIEW, "aperture_diameter": 0.01}
-    scene = Scene.from_dict(
-        {
-            "medium": {"extinction": 0.1, "albedo": 0.8},
-            "camera": camera,
-            "gate": {"bin_width_ps": 100.0, "bins": 1},
-            "targets": [target],
-        }
-    )
-    truth = truth_maps(scene, device=device)
-    views = np.concatenate([_shaded(truth.normal), coloured_depth(truth.depth, scale)], axis=1)
-    axis.imshow(views.reshape(pixels, 2, 2 * pixels, 2, 3).mean(axis=(1, 3)), interpolation="lanczos")
+    rest = {"medium": {"extinction": 0.1, "albedo": 0.8}, "gate": {"bin_width_ps": 100.0, "bins": 1}}
+    for axis, (title, target) in zip(axes, targets.items(), strict=True):
+        truth = truth_maps(Scene.from_dict({**rest, "camera": camera, "targets": [target]}), device=device)
+        normal = truth.normal.astype(np.float64)
+        grey = 0.16 + 0.62 * np.clip(normal @ lamp, 0.0, None) + 0.2 * np.clip(-normal[..., 2], 0.0, 1.0)
+        matt = (grey[..., None] * np.array([1.0, 0.97, 0.92])).clip(0.0, 1.0)
+        matt = np.where(np.isnan(matt), to_rgb(style.BACKGROUND), matt)
+        views = np.concatenate([matt, coloured_depth(truth.depth, scale)], axis=1)
+        # Means of 2 × 2 pixels.
+        axis.imshow(views.reshape(pixels, 2, 2 * pixels, 2, 3).mean(axis=(1, 3)), interpolation="lanczos")
+        axis.set_title(title, pad=2)
+    return figure
 
 
-def _shaded(normal: NDArray[np.float32]) -> NDArray[np.float64]:
-    """RGB of a matt surface under one lamp and an even sky, `[H, W, 3]`."""
-    n = normal.astype(np.float64)
-    lamp = np.clip(n @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, None)
-    facing = np.clip(-n[..., 2], 0.0, 1.0)
-    grey = 0.16 + 0.62 * lamp + 0.2 * facing
-    image = grey[..., None] * np.array([1.0, 0.97, 0.92])
-    return np.where(np.isfinite(grey)[..., None], image, to_rgb(BACKGROUND)).clip(0.0, 1.0)
+def _sheet(count: int, width: float, *, least: float, ratio: float, title: float) -> tuple[PaperFigure, list[Axes]]:
+    """A figure of `count` images without frames; `least`: width of one, `title`: height of its title [inch]."""
+    figure, axes = style.panel_grid(count, width, least=least, height=title, ratio=ratio)
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.0, wspace=0.0)  # type: ignore[call-arg,union-attr]
+    for axis in axes:
+        axis.axis("off")
+    return figure, axes
+
+
+def _sheet_bar(figure: PaperFigure, scale: Normalize, colours: str, label: str) -> None:
+    """A colour bar below all images."""
+    axes = [axis for axis in figure.axes if axis.images]
+    figure.grow(0.5)
+    aspect, shown = 0.8 * figure.get_figwidth() / 0.09, ScalarMappable(scale, colours)
+    bar = figure.colorbar(shown, ax=axes, location="bottom", label=label, shrink=0.8, aspect=aspect, pad=0.04)
+    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.ax.xaxis.minorticks_on()
 
 
 @paper()
 def draw_dataset(
-    folder: str | os.PathLike[str],
-    path: str | os.PathLike[str],
-    *,
-    split: str = "all",
-    frames: int = 20,
-    width: float = PAGE,
+    folder: str | Path, path: str | Path, *, split: str = "all", frames: int = 20, width: float = PAGE
 ) -> Path:
-    """Draws frames that lie evenly over a split into one PNG: true depth, measured depth, recorded photons.
+    """Draws frames that lie evenly over a split: true depth, measured depth, recorded photons; returns the path.
 
     Photons are shown relative to the brightest 0.5 % of each frame, which the frame's title gives.
 
@@ -283,9 +224,7 @@ def draw_dataset(
         frames: At most so many, 1 to 1000.
         width: Of the picture [inch].
 
-    Raises:
-        FileError: No dataset, or the picture cannot be written.
-        ArgumentError: An argument out of range.
+    Raises `FileError` where there is no dataset or the picture cannot be written, `ArgumentError`.
     """
     frames = check_integer("frames", frames, "[1, 1000]")
     reader = FrameReader(folder, split, fields=("clean", "noisy", "intensity"))
@@ -295,41 +234,27 @@ def draw_dataset(
     items = [reader[int((k + 0.5) * len(reader) / number)] for k in range(number)]
     splits = {name: split for split, value in reader.manifest["splits"].items() for name in value["targets"]}
     height, across = reader.shape
-    figure, axes, bars = strips(number, width=width, least=2.3, ratio=height / across / 3, title=0.34, bars=2)
-    scale = _depth_scale(items)
+    figure, axes = _sheet(number, width, least=2.3, ratio=height / across / 3, title=0.3)
+    beyond = np.concatenate([(item["clean"] - item["distance"]).ravel() for item in items])
+    scale = Normalize(*style.shown_limits(beyond, beyond=0.5, margin=0.1))
     gap = np.ones((height, max(1, across // 48), 3))
-    for axis, item in zip(axes, items, strict=False):
+    by_fraction = False
+    for axis, item in zip(axes, items, strict=True):
         clean, noisy = (coloured_depth(item[name][0] - item["distance"], scale) for name in ("clean", "noisy"))
-        intensity = item["intensity"][0]
-        top = max(float(np.percentile(intensity, 99.5)), 1.0)
-        photons = matplotlib.colormaps[INTENSITY_MAP](np.clip(intensity / top, 0.0, 1.0))[..., :3]
+        top = max(float(np.percentile(item["intensity"], 99.5)), 1.0)
+        photons = matplotlib.colormaps[INTENSITY_MAP](np.clip(item["intensity"][0] / top, 0.0, 1.0))[..., :3]
         axis.imshow(np.concatenate([clean, gap, noisy, gap, photons], axis=1), aspect="equal")
-        name = reader.manifest["targets"][item["target"]]
-        axis.set_title(_title(item, f"{name.replace('_', ' ')} ({splits[name]})", top), fontsize=6.5, pad=2)
-    strip_bar(bars[0], scale, DEPTH_MAP, "depth beyond the target's centre [m]", bars=2)
-    strip_bar(bars[1], Normalize(0.0, 1.0), INTENSITY_MAP, "recorded photons, relative to the brightest", bars=2)
-    note = (
+        name, fraction = reader.manifest["targets"][item["target"]], float(item["backscatter_fraction"])
+        by_fraction |= not math.isnan(fraction)
+        level = "" if math.isnan(fraction) else f", BS = {fraction:.3g}"
+        level += f", brightest {style.spaced(round(top))} photons"
+        title = f"{name.replace('_', ' ')} ({splits[name]})\nc r = {item['attenuation_lengths']:.2g}{level}"
+        axis.set_title(title, fontsize=6.5, pad=2)
+    _sheet_bar(figure, Normalize(0.0, 1.0), INTENSITY_MAP, "recorded photons, relative to the brightest")
+    _sheet_bar(figure, scale, DEPTH_MAP, "depth beyond the target's centre [m]")
+    figure.note(
         "Each frame: true depth, measured depth (light: none), recorded photons (brightest: their 99.5th percentile). "
         "c r: attenuation lengths one way, c being the water's extinction and r the range of the target."
+        + (" BS: backscatter fraction, the part of the pixels that report backscatter." if by_fraction else "")
     )
-    if not all(math.isnan(float(item["backscatter_fraction"])) for item in items):
-        note += " BS: backscatter fraction, the part of the pixels that report backscatter."
-    return save(figure, path, note=note)
-
-
-def _title(item: dict[str, Any], name: str, top: float) -> str:
-    """Target, attenuation lengths, backscatter fraction where it is known, largest number of photons in colours."""
-    fraction = float(item["backscatter_fraction"])
-    level = "" if math.isnan(fraction) else f", BS = {fraction:.3g}"
-    return f"{name}\nc r = {item['attenuation_lengths']:.2g}{level}, brightest {spaced(round(top))} photons"
-
-
-def _depth_scale(items: Sequence[dict[str, Any]]) -> Normalize:
-    """The span of the true depths, seen from the targets' centres."""
-    values = np.concatenate([(item["clean"] - item["distance"]).ravel() for item in items])
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return Normalize(-1.0, 1.0)
-    low, high = np.percentile(values, [0.5, 99.5])
-    margin = 0.1 * (high - low) + 0.05
-    return Normalize(float(low - margin), float(high + margin))
+    return save(figure, path)

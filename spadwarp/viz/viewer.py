@@ -6,33 +6,30 @@ import base64
 import shutil
 import subprocess
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
+from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.image import AxesImage
-from matplotlib.text import Text
 from numpy.typing import NDArray
 
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.files import Held, load, sequence
+from spadwarp.files.formats import FrameSequence
 from spadwarp.frames import FramesFile, InstrumentResponse, detector_response
-from spadwarp.frames.export import FrameSequence
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.spad import noise_caption
 from spadwarp.io.paths import atomic_path, check_apart
-from spadwarp.limits import check_choice, check_integer, check_real
 from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real
 from spadwarp.viz import style
 from spadwarp.viz.result import channel_text
-from spadwarp.viz.style import DEPTH_MAP, INTENSITY_MAP, LIGHT_MAP, colour_map, median_pixel, new_figure, paper
+from spadwarp.viz.style import PaperFigure, colour_map, median_pixel, paper
 
 __all__ = ["video", "view"]
 
@@ -46,17 +43,6 @@ _STEPS = ((1, 1), (1, 2), (1, 4), (2, 2), (2, 4), (2, 8), (4, 4), (4, 8), (4, 16
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Layer:
-    """Histograms of one kind; the page shows `cube` `[H, W, T]` times `factor`."""
-
-    label: str
-    colour: str
-    cube: NDArray[Any]
-    factor: float
-    filled: bool = False
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class _Page:
     """The content of a page, from a result or from frames of a camera."""
 
@@ -67,7 +53,7 @@ class _Page:
     truth: NDArray[Any]
     intensity: NDArray[Any]
     intensity_label: str
-    layers: list[_Layer]
+    layers: list[dict[str, Any]]  # see `_layer`
     edges: NDArray[np.float64]
     unit: str
     response: InstrumentResponse
@@ -128,17 +114,21 @@ def view(
 # Sources
 
 
+def _layer(label: str, colour: str, cube: NDArray[Any], factor: float = 1.0, *, filled: bool = False) -> dict[str, Any]:
+    """Histograms of one kind; the page shows `cube` `[H, W, T]` times `factor`."""
+    return {"label": label, "colour": colour, "filled": filled, "factor": factor, "cube": cube}
+
+
 def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     scene = result.scene
     per_pulse = scene.laser.photons_per_pulse * scene.detections_per_photon
     # In a scan the positions' numbers of photons differ by one at most.
     scale = float(result.tally_value.mean()) * per_pulse
     chosen: Any = method or "centroid"
+    partial = ", interrupted" if result.partial else ""
     return _Page(
-        caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}"
-        + (", interrupted" if result.partial else "")
-        + channel_text(result.provenance.get("channel"))
-        + "; expected histograms, before the instrument response",
+        caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}{partial}"
+        f"{channel_text(result.provenance.get('channel'))}; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),
         method=chosen,
@@ -147,8 +137,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
         layers=[
-            _Layer(label=label, colour=colour, cube=cube, factor=scale)
-            for (label, colour), cube in zip(style.COMPONENTS.values(), result.tallies, strict=True)
+            _layer(*names, cube, scale) for names, cube in zip(style.COMPONENTS.values(), result.tallies, strict=True)
         ],
         edges=result.bin_edges,
         unit="detections per pulse and bin",
@@ -175,9 +164,9 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
         intensity=file.intensity(frame),
         intensity_label="counts in the frame",
         layers=[
-            _Layer(label="counts", colour="#999999", cube=counts, factor=1.0, filled=True),
-            _Layer(label="expected", colour=style.BLUE, cube=file.expected, factor=file.pulses),
-            _Layer(label="background part", colour=style.GREEN, cube=background, factor=file.pulses),
+            _layer("counts", "#999999", counts, filled=True),
+            _layer("expected", style.BLUE, file.expected, file.pulses),
+            _layer("background part", style.GREEN, background, file.pulses),
         ],
         edges=file.gate_start + file.edges,
         unit="counts per bin",
@@ -193,6 +182,7 @@ def _of_depth(held: Held, method: str | None, frame: int) -> _Page:
     shown = frames.at(frame)
     assert shown.scene is not None and shown.depth is not None
     cube, edges = reported_depths(frames, frame)
+    counted = "intensity" in shown.images
     return _Page(
         caption=f"frame {frame} of {frames.count}: {shown.content}; histograms are of the depths that the frames of "
         "this scene report",
@@ -200,9 +190,9 @@ def _of_depth(held: Held, method: str | None, frame: int) -> _Page:
         depth=shown.images["Z"],
         method="stored",
         truth=shown.depth,
-        intensity=shown.images.get("intensity", shown.images["background"]),
-        intensity_label="recorded photons" if "intensity" in shown.images else "background photon (1) or return (0)",
-        layers=[_Layer(label="frames", colour="#999999", cube=cube, factor=1.0, filled=True)],
+        intensity=shown.images["intensity" if counted else "background"],
+        intensity_label="recorded photons" if counted else "background photon (1) or return (0)",
+        layers=[_layer("frames", "#999999", cube, filled=True)],
         edges=edges,
         unit="frames per bin",
         response=detector_response(shown.scene.detector, shown.scene.laser),
@@ -231,33 +221,27 @@ def reported_depths(frames: FrameSequence, frame: int) -> tuple[NDArray[np.int64
 
 def _data(page: _Page) -> dict[str, Any]:
     """Everything for the script, arrays packed."""
-    scene = page.scene
     depth, truth, intensity = (np.asarray(image, np.float64) for image in (page.depth, page.truth, page.intensity))
-    lines = lines_of_sight(scene)
+    lines, speed = lines_of_sight(page.scene), page.scene.medium.pulse_speed
     laser = np.zeros(3) if lines.bent else lines.laser
-    path = lines.path_from_range(lines.range_from_depth(truth))
-    arrival = path / scene.medium.pulse_speed
     port = [0.0, 0.0]  # what ports add to a path, and to a range [m]; for a laser close to the lens
     if lines.bent:
         both = 2.0 if lines.laser_port is not None else 1.0
         port = [both * float(np.nanmedian(lines.delay)), float(np.nanmedian(lines.lead))]
     cloud = lines.points(lines.range_from_depth(depth))
     histograms, block, merged = _histograms(page.layers)
-    edges = page.edges[::merged]
-    if edges[-1] != page.edges[-1]:
-        edges = np.append(edges, page.edges[-1])
+    edges = np.append(page.edges[:-1:merged], page.edges[-1])
     images = {"depth": depth, "truth": truth, "error": depth - truth, "intensity": intensity}
-    if page.reflectance is not None:
-        images["reflectance"] = page.reflectance
+    images |= {} if page.reflectance is None else {"reflectance": page.reflectance}
     return {
         "shape": list(depth.shape),
         "images": {name: _packed(image) for name, image in images.items()},
         "cloud": [_packed(cloud[..., axis]) for axis in range(3)],
-        "arrival": _packed(1e9 * arrival),
+        "arrival": _packed(1e9 * (lines.path_from_range(lines.range_from_depth(truth)) / speed)),
         "towards": _packed(lines.direction @ laser),
         "laser": float(laser @ laser),
         "port": port,
-        "speed": 1e-9 * scene.medium.pulse_speed,
+        "speed": 1e-9 * speed,
         "method": page.method,
         "intensityLabel": page.intensity_label,
         "histograms": histograms,
@@ -265,20 +249,20 @@ def _data(page: _Page) -> dict[str, Any]:
         "merged": merged,
         "edges": [round(1e9 * float(edge), 6) for edge in edges],
         "unit": page.unit,
-        "sparse": not any(layer.filled for layer in page.layers),
+        "sparse": not any(layer["filled"] for layer in page.layers),
         "response": _response(page.response),
         "first": median_pixel(intensity, np.isfinite(depth) & np.isfinite(truth)),
     }
 
 
-def _histograms(layers: list[_Layer]) -> tuple[list[dict[str, Any]], int, int]:
+def _histograms(layers: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], int, int]:
     """The layers, packed within `HISTOGRAM_BYTES`; the side of a block of pixels; bins that were merged."""
     for block, merged in _STEPS:
-        rows = max(layers[0].cube.shape[0] // 16, block) // block * block
-        trial = sum(len(_pack(_reduced(layer.cube[:rows], block, merged), layer)["codes"]) for layer in layers)
-        if trial * layers[0].cube.shape[0] / rows > 1.5 * HISTOGRAM_BYTES:
+        rows = max(layers[0]["cube"].shape[0] // 16, block) // block * block
+        trial = sum(len(_pack(_reduced(layer["cube"][:rows], block, merged), layer)["codes"]) for layer in layers)
+        if trial * layers[0]["cube"].shape[0] / rows > 1.5 * HISTOGRAM_BYTES:
             continue  # far too large, as a part of the rows shows
-        packed = [_pack(_reduced(layer.cube, block, merged), layer) for layer in layers]
+        packed = [_pack(_reduced(layer["cube"], block, merged), layer) for layer in layers]
         if sum(len(layer["codes"]) for layer in packed) <= HISTOGRAM_BYTES / 3 * 4:
             break
     return packed, block, merged
@@ -292,11 +276,11 @@ def _reduced(cube: NDArray[Any], block: int, merged: int) -> NDArray[Any]:
     return cube
 
 
-def _pack(values: NDArray[Any], layer: _Layer) -> dict[str, Any]:
+def _pack(values: NDArray[Any], layer: dict[str, Any]) -> dict[str, Any]:
     """Counts below 65536 as they are, other values as their logarithm in 254 steps; deflated."""
-    metadata = {"label": layer.label, "colour": layer.colour, "filled": layer.filled, "factor": layer.factor}
+    metadata = {name: value for name, value in layer.items() if name != "cube"}
     high = float(values.max())
-    if layer.filled and high < 65536:
+    if layer["filled"] and high < 65536:
         return {**metadata, "kind": "whole", "codes": _packed(values, "<u2")}
     lowest = high * 10.0**-_DECADES
     codes = np.zeros(values.shape, dtype=np.uint8)
@@ -337,7 +321,6 @@ def write_page(path: str | Path, template: str, **values: Any) -> None:
 
 # Moving pictures
 
-
 _VIDEO_DECADES = 4.0  # of the logarithmic colour scale
 _DPI = 140
 
@@ -377,40 +360,34 @@ def video(
     pictures, fps = check_integer("pictures", pictures, "[1, 1000000]"), check_real("fps", fps, "[0.01, 50]")
     check_choice("scale", scale, ("log", "linear"))
     check_apart(path, source)
-    source = source if isinstance(source, Held) else load(source)
-    if isinstance(source, SequenceFile):
-        _write(_of_sequence(source, pictures), path, fps)
-        return path
-    cube, edges, label, metres_per_ns = _light(source, frame)
-    kept = _window(cube, edges, window_ns)
-    cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
-    merged = -(-cube.shape[2] // pictures)
-    starts = np.arange(0, cube.shape[2], merged)
-    cube = np.add.reduceat(cube, starts, axis=2)
-    edges = np.append(edges[starts], edges[-1])
-    label += " and picture" if merged > 1 else " and bin"
-    _write(_of_light(cube, edges, label, metres_per_ns, scale), path, fps)
-    return path
-
-
-def _write(drawn: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> None:
-    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    held = source if isinstance(source, Held) else load(source)
+    if isinstance(held, SequenceFile):
+        drawn = _of_sequence(held, pictures)
+    else:
+        cube, edges, label, metres_per_ns = _light(held, frame)
+        kept = _window(cube, edges, window_ns)
+        cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
+        merged = -(-cube.shape[2] // pictures)
+        cube, edges = _reduced(cube, 1, merged), np.append(edges[:-1:merged], edges[-1])
+        label += " and picture" if merged > 1 else " and bin"
+        drawn = _of_light(cube, edges, label, metres_per_ns, scale)
     with atomic_path(path) as temporary:
-        write(drawn, temporary, fps)
+        (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(drawn, temporary, fps)
+    return path
 
 
 def _light(run: Held, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float]:
     """Histograms `[H, W, T]`, edges [ns], what they count, metres of path per ns."""
     if isinstance(run, Result):
         return run.detections, 1e9 * run.bin_edges, "detections per pulse, pixel", 1e-9 * run.pulse_speed
-    if not isinstance(run, FramesFile):
+    cube: NDArray[Any]
+    scene: Any
+    if isinstance(run, FramesFile):
+        cube, edges, scene, what = run.counts(frame), run.gate_start + run.edges, run.scene, "counts"
+    else:
         frames = sequence(run)
-        reported, times = reported_depths(frames, frame)
-        scene = frames.at(frame).scene
-        assert scene is not None
-        return reported.astype(np.float64), 1e9 * times, "frames per pixel", 1e-9 * scene.medium.pulse_speed
-    counts, edges = run.counts(frame).astype(np.float64), 1e9 * (run.gate_start + run.edges)
-    return counts, edges, "counts per pixel", 1e-9 * run.scene.medium.pulse_speed
+        (cube, edges), scene, what = reported_depths(frames, frame), frames.at(frame).scene, "frames"
+    return cube.astype(np.float64), 1e9 * edges, f"{what} per pixel", 1e-9 * scene.medium.pulse_speed
 
 
 def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tuple[float, float] | None) -> slice:
@@ -428,12 +405,30 @@ def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tu
     return slice(int(filled[0]), int(filled[-1]) + 1) if len(filled) else slice(0, cube.shape[2])
 
 
-def _pictures(figure: Figure, count: int, show: Callable[[int], None]) -> Iterator[NDArray[np.uint8]]:
-    """RGB pictures, one after the other; `show` puts into the figure what changes."""
+@paper()
+def _screen(
+    shape: tuple[int, ...], images: Sequence[tuple[str, Normalize, Colormap, str]], width: float
+) -> tuple[PaperFigure, list[AxesImage]]:
+    """The figure of all pictures, and its images; of each its title, scale, colours and label."""
+    image_height = float(np.clip((width - 0.3) / len(images) * shape[0] / shape[1], 0.9, 6.0))
+    figure = style.new_figure(width, image_height + 1.0)
+    axes, bars = figure.subplots(2, len(images), squeeze=False, height_ratios=[image_height, 0.1])
+    drawn = []
+    for axis, bar, (title, scale, colours, label) in zip(axes, bars, images, strict=True):
+        axis.set(xticks=[], yticks=[], title=title)
+        drawn.append(axis.imshow(np.zeros(shape[:2]), cmap=colours, norm=scale))
+        figure.colorbar(drawn[-1], cax=bar, orientation="horizontal", label=label, extend="both")
+    return figure, drawn
+
+
+def _pictures(figure: PaperFigure, count: int, show: Callable[[int], str]) -> Iterator[NDArray[np.uint8]]:
+    """RGB pictures, one after the other; `show` puts into the figure what changes and returns the title."""
     figure.set_dpi(_DPI)
     canvas = FigureCanvasAgg(figure)
+    with paper():
+        title = figure.suptitle(" ")
     for index in range(count):
-        show(index)
+        title.set_text(show(index))
         canvas.draw()
         if index == 0:
             figure.set_layout_engine("none")  # computed once, so that nothing moves between pictures
@@ -444,64 +439,38 @@ def _of_light(
     cube: NDArray[np.float64], edges: NDArray[np.float64], label: str, metres_per_ns: float, scale: str
 ) -> Iterator[NDArray[np.uint8]]:
     """A picture for each bin."""
-    figure, image, title = _light_figure(cube, label, scale)
+    values = cube[cube > 0]
+    top = float(np.percentile(values, 99.9)) if values.size else 1.0
+    norm = LogNorm(top * 10.0**-_VIDEO_DECADES, top) if scale == "log" else Normalize(0.0, top)
+    figure, (image,) = _screen(cube.shape, [("", norm, colour_map(style.LIGHT_MAP, missing="black"), label)], 3.9)
 
-    def show(index: int) -> None:
+    def show(index: int) -> str:
         image.set_data(cube[:, :, index])
         middle = 0.5 * (edges[index] + edges[index + 1])
-        title.set_text(f"time of flight {middle:.2f} ns, path {middle * metres_per_ns:.2f} m")
+        return f"time of flight {middle:.2f} ns, path {middle * metres_per_ns:.2f} m"
 
     return _pictures(figure, cube.shape[2], show)
 
 
-@paper()
-def _light_figure(cube: NDArray[np.float64], label: str, scale: str) -> tuple[Figure, AxesImage, Text]:
-    """The figure of all pictures, with what changes between them."""
-    height, width = cube.shape[:2]
-    values = cube[cube > 0]
-    top = float(np.percentile(values, 99.9)) if values.size else 1.0
-    norm = LogNorm(top * 10.0**-_VIDEO_DECADES, top) if scale == "log" else Normalize(0.0, top)
-    colours = colour_map(LIGHT_MAP).with_extremes(bad="black", under="black")
-    image_height = float(np.clip(3.6 * height / width, 1.1, 6.5))
-    figure = new_figure(3.9, image_height + 0.95)
-    axes, bar = figure.subplots(2, 1, height_ratios=[image_height, 0.1])
-    axes.set(xticks=[], yticks=[])
-    image = axes.imshow(np.zeros((height, width)), cmap=colours, norm=norm)
-    figure.colorbar(image, cax=bar, orientation="horizontal", label=label, extend="both" if scale == "log" else "max")
-    return figure, image, axes.set_title(" ")
-
-
-@paper()
 def _of_sequence(file: SequenceFile, most: int) -> Iterator[NDArray[np.uint8]]:
     """True depth, measured depth and counts of evenly chosen frames, at most `most`; all have the same scales."""
     method = file.best_method
     chosen = range(0, file.frames, -(-file.frames // most))
-    truth = [file.truth(number).depth for number in chosen]
-    counts = [file.counts(number).sum(axis=-1, dtype=np.int64) for number in chosen]
-    known = np.concatenate([image[np.isfinite(image)] for image in truth])
-    near, far = np.percentile(known, (1, 99)) if known.size else (0.0, 1.0)
-    margin = 0.1 * (far - near) + 0.05
-    depth = Normalize(near - margin, far + margin)
+    truth = np.array([file.truth(number).depth for number in chosen])
+    counts = np.array([file.counts(number).sum(axis=-1, dtype=np.int64) for number in chosen])
+    near, far = style.shown_limits(truth, beyond=1.0, margin=0.1)
+    depth = Normalize(near - 0.05, far + 0.05)
     light = Normalize(0.0, max(1.0, float(np.percentile(counts, 99.5))))
-    height, width = truth[0].shape[:2]
-    image_height = float(np.clip(2.3 * height / width, 0.9, 4.5))
-    figure = new_figure(7.2, image_height + 1.0)
-    axes, bars = figure.subplots(2, 3, height_ratios=[image_height, 0.1])
-    images = []
-    kinds = (("true depth", depth, DEPTH_MAP), ("measured depth", depth, DEPTH_MAP), ("counts", light, INTENSITY_MAP))
-    for axis, bar, (name, scale, colours) in zip(axes, bars, kinds, strict=True):
-        axis.set(xticks=[], yticks=[], title=name)
-        images.append(axis.imshow(np.zeros((height, width)), cmap=colour_map(colours), norm=scale))
-        label = "counts per pixel" if name == "counts" else "depth z [m]"
-        figure.colorbar(images[-1], cax=bar, orientation="horizontal", label=label)
-    title = figure.suptitle(" ")
+    shown = [(f"{name} depth", depth, colour_map(style.DEPTH_MAP), "depth z [m]") for name in ("true", "measured")]
+    shown.append(("counts", light, colour_map(style.INTENSITY_MAP), "counts per pixel"))
+    figure, images = _screen(truth.shape[1:], shown, 7.2)
 
-    def show(index: int) -> None:
+    def show(index: int) -> str:
         number = chosen[index]
         measured = np.full(truth[index].shape, np.nan) if method is None else file.depth(method, number)
         for image, values in zip(images, (truth[index], measured, counts[index]), strict=True):
             image.set_data(values)
-        title.set_text(f"frame {number}, {file.trajectory.times[number]:.4g} s")
+        return f"frame {number}, {file.trajectory.times[number]:.4g} s"
 
     return _pictures(figure, len(chosen), show)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.limits import check_real
+from spadwarp.values import check_real
 from spadwarp.water.seawater import RANGES, check_ranges, table_columns
 
 __all__ = ["Skylight", "clear_sky_irradiance", "daylight_attenuation", "surface_reflectance"]
@@ -33,12 +33,7 @@ _ALBEDO_400, _ALBEDO_SLOPE, _ASYMMETRY = 0.945, 0.095, 0.65
 
 
 class Skylight(NamedTuple):
-    """Irradiance on a horizontal surface [W/m²/nm].
-
-    Attributes:
-        direct: Of the sun's disc.
-        diffuse: Of the sky.
-    """
+    """Irradiance on a horizontal surface [W/m²/nm]: `direct` of the sun's disc, `diffuse` of the sky."""
 
     direct: Any
     diffuse: Any
@@ -77,48 +72,38 @@ def clear_sky_irradiance(
     albedo = _ALBEDO_400 * np.exp(-_ALBEDO_SLOPE * np.log(nm / 400.0) ** 2)
     um2, ozone_mass = (nm / 1000.0) ** 2, (1.0 + 22.0 / 6370.0) / math.sqrt(cosine**2 + 2.0 * 22.0 / 6370.0)
 
-    def through(mass: float) -> _Transmittances:
+    def through(mass: float) -> tuple[Any, ...]:
+        """Parts that an air mass lets through: air, scattering and absorbing aerosol, vapour, gases."""
         of_vapour, of_gases = vapour * _WATER_VAPOUR * mass, mixed * mass
-        return _Transmittances(
-            rayleigh=np.exp(-mass / (um2**2 * (115.6406 - 1.3366 / um2))),
-            aerosol=np.exp(-optical_depth * mass),
-            scattered=np.exp(-albedo * optical_depth * mass),
-            absorbed=np.exp(-(1.0 - albedo) * optical_depth * mass),
-            vapour=np.exp(-0.2385 * of_vapour / (1.0 + 20.07 * of_vapour) ** 0.45),
-            ozone=np.exp(-ozone * _OZONE * ozone_mass),
-            mixed=np.exp(-1.41 * of_gases / (1.0 + 118.3 * of_gases) ** 0.45),
+        return (
+            np.exp(-mass / (um2**2 * (115.6406 - 1.3366 / um2))),
+            np.exp(-albedo * optical_depth * mass),
+            np.exp(-(1.0 - albedo) * optical_depth * mass),
+            np.exp(-0.2385 * of_vapour / (1.0 + 20.07 * of_vapour) ** 0.45),
+            np.exp(-1.41 * of_gases / (1.0 + 118.3 * of_gases) ** 0.45),
         )
 
-    here, above = through(_air_mass(elevation)), through(1.8)
-    direct = sun * cosine * here.rayleigh * here.aerosol * here.vapour * here.ozone * here.mixed
+    # eq 2-4 to 2-11, 3-9 and 3-10 of the report, as in its code
+    mass = _air_mass(elevation)
+    rayleigh, scattered, absorbed, of_vapour, of_mixed = through(mass)
+    above_rayleigh, above_scattered, above_absorbed, above_vapour, above_mixed = through(1.8)
+    of_ozone, aerosol = np.exp(-ozone * _OZONE * ozone_mass), np.exp(-optical_depth * mass)
+    direct = sun * cosine * rayleigh * aerosol * of_vapour * of_ozone * of_mixed
 
     logarithm = math.log(1.0 - _ASYMMETRY)
     forward = logarithm * (1.459 + logarithm * (0.1595 + logarithm * 0.4129))
     backward = logarithm * (0.0783 + logarithm * (-0.3824 - logarithm * 0.5874))
     downwards = 1.0 - 0.5 * math.exp((forward + backward * cosine) * cosine)
     downwards_above = 1.0 - 0.5 * math.exp((forward + backward / 1.8) / 1.8)
-    common = sun * cosine * here.ozone * here.mixed * here.vapour * here.absorbed
-    by_air = common * (1.0 - here.rayleigh**0.95) * 0.5
-    by_aerosol = common * here.rayleigh**1.5 * (1.0 - here.scattered) * downwards
-    back = 0.5 * (1.0 - above.rayleigh) + (1.0 - downwards_above) * above.rayleigh * (1.0 - above.scattered)
-    sky = above.mixed * above.vapour * above.absorbed * back * _GROUND
+    common = sun * cosine * of_ozone * of_mixed * of_vapour * absorbed
+    by_air = common * (1.0 - rayleigh**0.95) * 0.5
+    by_aerosol = common * rayleigh**1.5 * (1.0 - scattered) * downwards
+    back = 0.5 * (1.0 - above_rayleigh) + (1.0 - downwards_above) * above_rayleigh * (1.0 - above_scattered)
+    sky = above_mixed * above_vapour * above_absorbed * back * _GROUND
     again = (direct + by_air + by_aerosol) * sky / (1.0 - sky)
     correction = np.where(nm <= 450.0, ((nm + 550.0) / 1000.0) ** 1.8, 1.0)
     diffuse = (by_air + by_aerosol + again) * correction
     return Skylight(direct, diffuse) if nm.ndim else Skylight(float(direct), float(diffuse))
-
-
-class _Transmittances(NamedTuple):
-    """Parts of the light that an air mass lets through, for each cause; eq 2-4 to 2-11, 3-9 and 3-10 of the report, as
-    in its code."""
-
-    rayleigh: Any
-    aerosol: Any
-    scattered: Any
-    absorbed: Any
-    vapour: Any
-    ozone: Any
-    mixed: Any
 
 
 def _air_mass(elevation_deg: float) -> float:

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError, FileError
 from spadwarp.io import write_text
-from spadwarp.limits import check_integer, check_real
+from spadwarp.values import ArgumentError, FileError, check_integer, check_real
 from spadwarp.water.scattering_matrix import MATRIX_COLUMNS, rayleigh_matrix
 from spadwarp.water.seawater import (
     Coefficients,
@@ -83,13 +82,8 @@ class ParticleOptics(Coefficients):
 
 @dataclass(frozen=True, eq=False)
 class SizeDistribution:
-    """How many particles have which diameter: numbers of any scale at diameters [m] in equal steps of the logarithm.
-
-    Attributes:
-        text: In words.
-        diameters: Ascending `[n]` [m].
-        numbers: Of particles about each of them `[n]`.
-    """
+    """How many particles have which diameter: its `text` in words, ascending diameters `[n]` [m] in equal steps of the
+    logarithm, and numbers of particles about each of them `[n]`, of any scale."""
 
     text: str
     diameters: Floats
@@ -251,32 +245,30 @@ def mixture(
 
 def save_phase_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Path:
     """Writes the phase function as a .csv file for `medium.phase_table`; its head has a and b. Raises `FileError`."""
-    lines = [
-        f"# {optics.wavelength_nm:g} nm: absorption {optics.absorption:.6g} 1/m, scattering {optics.scattering:.6g} "
-        f"1/m, mean cosine {optics.mean_cosine:.5f}, backscatter fraction {optics.backscatter_fraction:.5f}",
-        "angle_deg,value",
-        *(f"{angle:.6g},{value:.8g}" for angle, value in zip(optics.angles_deg, optics.density, strict=True)),
-    ]
-    return write_text("\n".join(lines) + "\n", Path(path))
+    head = (
+        f"absorption {optics.absorption:.6g} 1/m, scattering {optics.scattering:.6g} 1/m, mean cosine "
+        f"{optics.mean_cosine:.5f}, backscatter fraction {optics.backscatter_fraction:.5f}"
+    )
+    return _save(optics, path, head, "angle_deg,value", optics.angles_deg, optics.density[:, None])
 
 
 def save_matrix_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Path:
-    """Writes the scattering matrix as a .csv file for `medium.matrix_table`, 0° to 180°.
-
-    Raises:
-        ArgumentError: The matrix is not known.
-        FileError: The file cannot be written.
-    """
+    """Writes the scattering matrix as a .csv file for `medium.matrix_table`, 0° to 180°. Raises `ArgumentError` if it
+    is not known, `FileError` if the file cannot be written."""
     if optics.matrix is None:
         raise ArgumentError("optics.matrix: not known; measured phase functions come without a scattering matrix")
     # Straight on, symmetry leaves m12 = m34 = 0.
-    straight = optics.matrix[0] * (0.0, 1.0, 1.0, 0.0, 1.0)
-    rows = zip((0.0, *optics.angles_deg), (straight, *optics.matrix), strict=True)
-    lines = [
-        f"# {optics.wavelength_nm:g} nm: elements of the scattering matrix over m11, the phase function",
-        ",".join(MATRIX_COLUMNS),
-        *(f"{angle:.6g},{','.join(f'{element:.8g}' for element in row)}" for angle, row in rows),
-    ]
+    rows = np.concatenate([optics.matrix[:1] * (0.0, 1.0, 1.0, 0.0, 1.0), optics.matrix])
+    head = "elements of the scattering matrix over m11, the phase function"
+    return _save(optics, path, head, ",".join(MATRIX_COLUMNS), np.append(0.0, optics.angles_deg), rows)
+
+
+def _save(
+    optics: ParticleOptics, path: str | os.PathLike[str], head: str, names: str, angles: Floats, rows: Floats
+) -> Path:
+    lines = [f"# {optics.wavelength_nm:g} nm: {head}", names]
+    for angle, row in zip(angles, rows, strict=True):
+        lines.append(f"{angle:.6g},{','.join(f'{value:.8g}' for value in row)}")
     return write_text("\n".join(lines) + "\n", Path(path))
 
 

@@ -1,8 +1,9 @@
 """Scattering matrices: how one scattering changes the polarisation of light, apart from its phase function.
 
-Each function gives m12, m22, m33, m34 and m44 over m11, the phase function, in the form that matter without a preferred
-direction or handedness has (Bohren & Huffman 1983, eq 4.77): m21 = m12, m43 = −m34, and the others are zero. The
-reference direction of both Stokes vectors lies in the scattering plane.
+Each function takes cosines of the scattering angle `[n]`, in [-1, 1], and gives m12, m22, m33, m34 and m44, each over
+m11, the phase function, `[n, 5]`, in the form that matter without a preferred direction or handedness has (Bohren &
+Huffman 1983, eq 4.77): m21 = m12, m43 = −m34, and the others are zero. The reference direction of both Stokes vectors
+lies in the scattering plane.
 
 >>> spadwarp.water.voss_fry_matrix(np.cos(np.radians([0.0, 90.0, 180.0])))
 """
@@ -15,9 +16,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.errors import ConfigError
 from spadwarp.io.text import read_columns
-from spadwarp.limits import check_real
+from spadwarp.values import ConfigError, check_real
 from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION
 
 __all__ = ["MATRIX_COLUMNS", "rayleigh_matrix", "read_matrix_table", "scaled_rayleigh_matrix", "voss_fry_matrix"]
@@ -39,17 +39,7 @@ def rayleigh_matrix(cosine: Floats, depolarisation_ratio: float = WATER_DEPOLARI
     """Matrix of molecules, or of particles much smaller than the wavelength (Hansen & Travis 1974).
 
     With d = (1 − ρ)/(1 + ρ): −m12 = d·sin²θ, m22 = d·(1 + cos²θ), m33 = 2d·cosθ and m44 = (3d − 1)·cosθ, each over
-    1 + d·cos²θ.
-
-    Args:
-        cosine: Of the scattering angle `[n]`, in [-1, 1].
-        depolarisation_ratio: ρ, of unpolarised light scattered by 90°, in [0, 0.5].
-
-    Returns:
-        m12, m22, m33, m34 and m44, each over m11, `[n, 5]`.
-
-    Raises:
-        ArgumentError: The ratio is outside its range.
+    1 + d·cos²θ; ρ, of unpolarised light scattered by 90°, in [0, 0.5], else `ArgumentError`. `[n]` → `[n, 5]`.
     """
     ratio = check_real("depolarisation_ratio", depolarisation_ratio, RANGES["depolarisation_ratio"])
     cosine, d = np.asarray(cosine, np.float64), (1.0 - ratio) / (1.0 + ratio)
@@ -63,17 +53,8 @@ def scaled_rayleigh_matrix(cosine: Floats, largest: float = _AT_90_DEGREES) -> F
 
     −m12 = P·sin²θ, m33 = m44 = 2·cosθ, each over 1 + cos²θ, and m22 = 1: as of a mixture of spheres that all turn the
     plane of polarisation alike and of which a part P polarises. With it light that is scattered once straight back has
-    nothing across the laser's plane; `voss_fry_matrix` has.
-
-    Args:
-        cosine: Of the scattering angle `[n]`, in [-1, 1].
-        largest: P, −m12 at 90°, in [0, 1]; 0.66 is Voss & Fry's ocean.
-
-    Returns:
-        m12, m22, m33, m34 and m44, each over m11, `[n, 5]`.
-
-    Raises:
-        ArgumentError: P is outside its range.
+    nothing across the laser's plane; `voss_fry_matrix` has. `largest`: P, −m12 at 90°, in [0, 1], else `ArgumentError`;
+    0.66 is Voss & Fry's ocean. `[n]` → `[n, 5]`.
     """
     part, cosine = check_real("largest", largest, RANGES["largest"]), np.asarray(cosine, np.float64)
     zero, turned = 0.0 * cosine, 2.0 * cosine / (1.0 + cosine**2)
@@ -89,12 +70,7 @@ def voss_fry_matrix(cosine: Floats) -> Floats:
     for m44 = 1 − 2·m22, −0.58 in place of the fit's −0.80.
 
     Voss & Fry, Appl. Opt. 23, 4427 (1984); Kokhanovsky, J. Geophys. Res. 108, 3175 (2003), doi:10.1029/2001JC001222.
-
-    Args:
-        cosine: Of the scattering angle `[n]`, in [-1, 1].
-
-    Returns:
-        m12, m22, m33, m34 and m44, each over m11, `[n, 5]`.
+    `[n]` → `[n, 5]`.
     """
     cosine = np.asarray(cosine, np.float64)
     angle = np.arccos(cosine)

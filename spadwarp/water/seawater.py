@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.errors import ArgumentError
-from spadwarp.limits import Interval, shown
+from spadwarp.values import ArgumentError, Interval, shown
 
 __all__ = ["WATER_DEPOLARISATION", "WaterOptics", "group_index", "molecular_density", "pure_water_absorption"]
 __all__ += ["pure_water_scattering", "refractive_index", "water_optics"]
@@ -65,12 +64,8 @@ class Coefficients:
 
 @dataclass(frozen=True)
 class WaterOptics(Coefficients):
-    """Optical properties of one water at one wavelength; `absorption` and `scattering` are of all that is in it.
-
-    Attributes:
-        water_absorption, water_scattering: The part of the water itself [1/m].
-        phase_index, group_index: Refractive index, and the index for the time of flight.
-    """
+    """Optical properties of one water at one wavelength; `absorption` and `scattering` are of all that is in it,
+    `water_absorption` and `water_scattering` of the water itself [1/m]; the group index is for the time of flight."""
 
     water_absorption: float
     water_scattering: float

@@ -16,7 +16,7 @@ from spadwarp.analytic import (
     simulate_analytic,
     sweep,
 )
-from spadwarp.errors import ArgumentError, ConfigError, SpadwarpWarning
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
 
 SCENE = scene(
     medium={"extinction": 0.3, "albedo": 0.7},
@@ -186,7 +186,6 @@ POLARISED = SCENE.with_overrides(
         lambda scene: budget(scene, ranges=[2.2]),
         lambda scene: sweep(scene, vary=("laser.pulse_energy", [1e-9]), of="budget"),
     ],
-    ids=["analytic", "budget", "sweep"],
 )
 def test_the_model_says_that_it_has_no_polarisation(simulate):
     assert not model_notes(SCENE)

@@ -11,9 +11,9 @@ import spadwarp
 from helpers.scenes import scene
 from reference import crlb
 from spadwarp.analytic import simulate_analytic
-from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result.result import Truth
 from spadwarp.scene.sight import pixel_directions
+from spadwarp.values import ArgumentError, ConfigError
 
 MAPS = (
     *("signal", "arrival", "backscatter", "alpha", "fisher", "sigma_time", "sigma_depth"),
@@ -134,8 +134,8 @@ def test_without_a_given_part_background_is_reported_as_often_as_false_peaks_are
 def test_no_backscatter_is_an_infinite_ratio_and_no_outliers():
     one = lidar_scene(analytic={"backscatter": "constant"}, detector={"dark_count_rate": 0.0})
     result = simulate_analytic(one, frames=3)
-    seen = result.fisher > 0
-    assert np.isinf(result.signal_to_backscatter[seen]).all() and np.isnan(result.signal_to_backscatter[~seen]).all()
+    ratio, seen = result.signal_to_backscatter, result.fisher > 0
+    assert np.isinf(ratio[seen]).all() and np.isnan(ratio[~seen]).all()
     assert (result.outlier_probability[seen] == 0).all() and not result.labels.any()
 
 

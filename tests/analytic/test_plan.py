@@ -9,7 +9,7 @@ import pytest
 import spadwarp
 from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, planning
 from spadwarp.scene import Laser, Scene
-from spadwarp.units import range_from_time
+from spadwarp.values import range_from_time
 
 SCENE = {
     "medium": {"extinction": 0.4, "albedo": 0.7, "group_index": 1.36},

@@ -7,15 +7,15 @@ import pytest
 from scipy import stats
 
 import spadwarp
-from spadwarp.analytic import pixel_maps, scene_eye_limit
+from spadwarp.analytic import eye_limit, pixel_maps
 from spadwarp.analytic.eye_safety import as_if_bare
 from spadwarp.checks import summary
-from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.files.loader import gate_of, stored_depth
 from spadwarp.scene import Scene, daylight_rate
 from spadwarp.scene.scene import camera_port
 from spadwarp.scene.scene import laser_port as laser_port_of
 from spadwarp.scene.sight import lines_of_sight, pixel_directions
+from spadwarp.values import ArgumentError, ConfigError
 
 WATER = {"extinction": 0.3, "albedo": 0.8, "phase_index": "seawater", "group_index": "seawater"}
 WINDOW = {"distance": 0.05, "thickness": 0.01, "material": "BK7"}
@@ -174,15 +174,6 @@ def test_the_gate_of_a_plan_holds_the_return_of_a_simulation():
     assert path / one.medium.pulse_speed == pytest.approx(1.0 / found.scene.laser.repetition_rate, rel=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.physics
-def test_the_largest_range_behind_a_port_is_found():
-    laser = {"half_angle_deg": 12.0, "repetition_rate": 1e5, "pulse_energy": 1e-9}
-    one = ported(DOME, "camera", laser=laser, camera={"aperture_diameter": 0.01, "horizontal_fov_deg": 20.0})
-    found = spadwarp.plan(one, photons=20_000, depth_error=0.05, time=0.1, device="cpu")
-    assert found.largest_range > 3.0 and found.pilot.bound > 0
-
-
 @pytest.mark.physics
 @pytest.mark.parametrize("port", [WINDOW, WINDOW | {"normal": [0.1, 0.2, 1.0]}, DOME | {"offset": [0.0, 0.005, 0.01]}])
 def test_the_beam_is_as_narrow_as_its_photons(port):
@@ -202,10 +193,10 @@ def test_the_beam_is_as_narrow_as_its_photons(port):
     irradiance = behind.transmission(np.zeros(3), u)[inside].sum() / t.size / (np.pi * 0.05**2)
     bare = 1.0 / (2.0 * np.pi * (1.0 - math.cos(math.radians(3.0))) * as_if_bare(one, 4.0) ** 2)
     assert bare == pytest.approx(irradiance, rel=4.0 / math.sqrt(inside.sum()))
-    limit = scene_eye_limit(one, distance=4.0, exposure=100.0)
+    limit = eye_limit(one, distance=4.0, exposure=100.0)
     assert limit.distance == 4.0
     if 0.0 < limit.hazard_distance < math.inf:
-        wide = scene_eye_limit(one.with_overrides({"laser.port": None}), distance=4.0, exposure=100.0)
+        wide = eye_limit(one.with_overrides({"laser.port": None}), distance=4.0, exposure=100.0)
         assert as_if_bare(one, limit.hazard_distance) == pytest.approx(wide.hazard_distance, rel=1e-6)
 
 

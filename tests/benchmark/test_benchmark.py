@@ -14,10 +14,10 @@ from scipy import stats
 import spadwarp
 from helpers.cli import DEVICE, run
 from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, newest_report, report
-from spadwarp.benchmark.runs import measure_transport
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.benchmark.runs import measure
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
+from spadwarp.values import ArgumentError, FileError
 
 PEERS = Path(__file__).parents[2] / "bench" / "peers"
 
@@ -32,13 +32,6 @@ def staircase():
     return result
 
 
-@pytest.fixture
-def kept(staircase, tmp_path):
-    path = tmp_path / "kept.json"
-    path.write_text(json.dumps(report([staircase])))
-    return path
-
-
 def test_cases_have_the_faces_they_promise():
     faces = {name: build_mesh(scene(name)) for name in ("water", "plane_5m", "staircase_5m", "staircase_5m_dense")}
     assert faces["water"] is None
@@ -48,8 +41,7 @@ def test_cases_have_the_faces_they_promise():
 
 
 def test_a_million_faces_by_the_arithmetic_of_subdivision():
-    targets = scene("spheres").targets
-    assert sum(1280 * 4**target.subdivisions for target in targets) == pytest.approx(1e6, rel=0.02)
+    assert sum(1280 * 4**one.subdivisions for one in scene("spheres").targets) == pytest.approx(1e6, rel=0.02)
 
 
 def test_scenes_end_paths_with_the_gate():
@@ -92,14 +84,10 @@ def test_cube60_absorbs_what_mcx_says():
 
 def test_report_says_what_it_was_measured_on(staircase):
     kept = json.loads(json.dumps(report([staircase])))
-    assert kept["format"] == "spadwarp bench"
-    made = kept["provenance"]
-    assert {"device", "device_name", "driver", "warp", "spadwarp", "numpy", "python", "commit", "date"} <= made.keys()
-    assert made["device"] == "cpu"
-    assert made["driver"] is None
-    (row,) = kept["results"]
-    assert row["case"] == "staircase_5m"
-    assert row["rates"] == pytest.approx(staircase.rates)
+    made, (row,) = kept["provenance"], kept["results"]
+    assert kept["format"] == "spadwarp bench" and (made["device"], made["driver"]) == ("cpu", None)
+    assert {"device_name", "warp", "spadwarp", "numpy", "python", "commit", "date"} <= made.keys()
+    assert row["case"] == "staircase_5m" and row["rates"] == pytest.approx(staircase.rates)
 
 
 def timed(result, *seconds, case="staircase_5m"):
@@ -150,8 +138,9 @@ def test_the_newest_report_of_such_a_device_is_taken(staircase, tmp_path):
 
 
 @pytest.mark.slow
-def test_command_writes_and_compares(kept, tmp_path):
-    out = tmp_path / "new.json"
+def test_command_writes_and_compares(staircase, tmp_path):
+    kept, out = tmp_path / "kept.json", tmp_path / "new.json"
+    kept.write_text(json.dumps(report([staircase])))
     options = ("--photons", "4e3", "--repeats", 1, "--json", out, "--compare", kept)
     result = run("bench", "staircase_5m", *DEVICE, *options)
     assert "120" in result.output
@@ -257,7 +246,7 @@ def test_scaling_spans_what_it_is_meant_to_show():
 def test_runs_are_repeated_until_enough():
     case = replace(CASES["water"], error=False, time_limit=1e-9)
     device = spadwarp.device.pick_device("cpu")
-    result = measure_transport(case, device, 1000, 5)
+    result = measure(case, device, 1000, 5)
     assert len(result.seconds) == 1
     assert result.error_per_root_second is None
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from spadwarp.checks import CheckMessage, check, summary
-from spadwarp.errors import ConfigError
 from spadwarp.mesh import TriangleMesh
 from spadwarp.scene import Scene, load_scene
-from spadwarp.units import SPEED_OF_LIGHT
+from spadwarp.values import SPEED_OF_LIGHT, ConfigError
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))
 

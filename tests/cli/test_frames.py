@@ -47,7 +47,7 @@ def test_frames_without_a_detection(done, tmp_path):
 
 
 def test_frames_do_not_depend_on_the_parts_they_are_drawn_in(done, tmp_path, monkeypatch):
-    monkeypatch.setattr("spadwarp.frames.record._PART_BYTES", 1)
+    monkeypatch.setattr("spadwarp.frames.file._PART_BYTES", 1)
     run("detect", done, "--out", tmp_path, "--frames", 3, "--method", "peak", "--quiet", *DEVICE)
     with h5py.File(tmp_path / "frames.h5") as file:
         twin = spadwarp.detect(spadwarp.load_result(done / "result.h5"), frames=3, seed=0, device="cpu")
@@ -97,7 +97,7 @@ def test_depth_of_measured_histograms(tmp_path):
     arrival = 2 * 3.0 * index / 299_792_458.0
     edges = np.arange(401) * width + 20e-9
     irf = spadwarp.frames.instrument_response(pulse_fwhm=0.0, jitter_fwhm=300e-12)
-    expected = 4000 * irf.bin_fractions(edges, arrival=arrival) + 0.5
+    expected = 4000 * np.diff(irf.cumulative(edges - arrival)) + 0.5
     counts = np.random.default_rng(1).poisson(expected, (3, 4, 400)).astype(np.uint16)
     np.save(tmp_path / "counts.npy", counts)
     facts = ["bin_width=50ps", "gate_start=20ns", f"group_index={index}", "irf=300ps"]

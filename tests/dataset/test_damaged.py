@@ -9,7 +9,7 @@ import spadwarp
 from helpers.cli import run
 from helpers.datasets import make, recipe
 from spadwarp.dataset import FrameReader, read_manifest, verify_dataset
-from spadwarp.errors import FileError
+from spadwarp.values import FileError
 
 SMALL = {"targets.builtin": ["staircase"], "targets.validation": [], "frames.per_scene": 1, "scenes_per_target": 1}
 

@@ -13,7 +13,7 @@ from helpers.cli import run
 from helpers.datasets import make, recipe
 from spadwarp.dataset import FrameReader, export_dataset
 from spadwarp.dataset.export import FEATURE_NAMES, histogram_features
-from spadwarp.errors import ArgumentError, FileError
+from spadwarp.values import ArgumentError, FileError
 
 FIELDS = ("noisy", "clean", "label", "intensity", "bound")
 NUMBERS = ("sample", "scene", "backscatter_fraction", "attenuation_lengths", "distance")

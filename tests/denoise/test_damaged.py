@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from spadwarp.denoise.network_files import WEIGHTS, load_network, own_weights, weights_metadata  # noqa: E402
-from spadwarp.errors import FileError, SpadwarpError  # noqa: E402
+from spadwarp.values import FileError, SpadwarpError  # noqa: E402
 
 SOURCE = WEIGHTS / "usdn.safetensors"
 

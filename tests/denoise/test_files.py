@@ -8,8 +8,8 @@ from helpers.datasets import make, recipe
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file
 from spadwarp.denoise.reading import read_depth
-from spadwarp.errors import ArgumentError
 from spadwarp.frames import instrument_response
+from spadwarp.values import ArgumentError
 
 BIN = 80e-12
 KNOWN = {"bin_width": BIN, "gate_start": 0.0, "group_index": 1.0}

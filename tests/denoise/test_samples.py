@@ -13,7 +13,7 @@ from spadwarp.denoise import samples, training
 from spadwarp.denoise.recipe import Noise, Optimiser, Part, TrainingRecipe
 from spadwarp.denoise.samples import PORTIONS, Pool, Scenes, Sizes, crowded, in_open_water
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, procedural_scenes
-from spadwarp.errors import DeviceError
+from spadwarp.values import DeviceError
 
 CPU = torch.device("cpu")
 SHARES = (0.5, 0.3, 0.2)

@@ -11,12 +11,11 @@ import spadwarp
 from helpers import hostile
 from helpers.datasets import make, recipe
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.analytic import save_analytic
 from spadwarp.dataset import FIELDS, FrameReader
-from spadwarp.errors import FileError
 from spadwarp.files import open_source
 from spadwarp.frames import FramesFile, record_frames
 from spadwarp.transport import load_records, save_records, trace
+from spadwarp.values import FileError
 
 SMALL = {
     "targets.builtin": ["staircase"],
@@ -81,7 +80,7 @@ def valid(tmp_path_factory):
     result = make_result(scene)
     spadwarp.result.save_result(type(result)(**{**vars(result), **batches}), folder / "result.h5")
     record_frames(result, folder / "frames.h5", pulses=1000, frames=2, seed=1, tags=True, device="cpu")
-    save_analytic(spadwarp.simulate_analytic(scene, frames=2, seed=1, device="cpu"), folder / "analytic.h5")
+    spadwarp.simulate_analytic(scene, frames=2, seed=1, device="cpu").save(folder / "analytic.h5")
     save_records(trace(scene, photons=100, seed=1, device="cpu"), folder / "records.h5", scene=scene)
     make(recipe(**SMALL), folder / "data")
     for name, read in READERS.items():
@@ -115,26 +114,15 @@ def read_names(name, path):
 
 # Every way with a result; one of each kind with the others, which the same code reads.
 CASES = [("result.h5", way) for way in hostile.WAYS]
-CASES += [
-    (name, way)
-    for name in READERS
-    for way in (hostile.external_storage, hostile.other_shape, hostile.missing)
-    if name != "result.h5"
-]
+OTHERS = (hostile.external_storage, hostile.other_shape, hostile.missing)
+CASES += [(name, way) for name in READERS for way in OTHERS if name != "result.h5"]
 
 
 @pytest.mark.parametrize(("name", "way"), CASES, ids=lambda case: getattr(case, "__name__", case))
 def test_a_dataset_that_is_not_as_it_should_be_is_refused_by_name(name, way, valid, copy, tmp_path):
     path = copy / name
     # Optional ones may be missing.
-    optional = {
-        "expected",
-        "background",
-        "counts",
-        "event_index",
-        "event_start",
-        "event_count",
-    }
+    optional = {"expected", "background", "counts", "event_index", "event_start", "event_count"}
     optional |= {f"depth/{method}" for method in spadwarp.frames.METHODS}
     for dataset in read_names(name, path):
         if way is hostile.missing and dataset in optional:

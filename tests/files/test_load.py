@@ -50,18 +50,9 @@ def files(tmp_path_factory):
     }
 
 
-KINDS = {
-    "result": spadwarp.Result,
-    "run": spadwarp.Result,
-    "checkpoint": spadwarp.Result,
-    "unfinished": spadwarp.Result,
-    "frames": FramesFile,
-    "analytic": AnalyticFile,
-    "records": PhotonRecords,
-    "dataset": FrameReader,
-    "shard": FrameReader,
-    "shard's scenes": FrameReader,
-}
+KINDS = dict.fromkeys(("result", "run", "checkpoint", "unfinished"), spadwarp.Result)
+KINDS |= {"frames": FramesFile, "analytic": AnalyticFile, "records": PhotonRecords}
+KINDS |= dict.fromkeys(("dataset", "shard", "shard's scenes"), FrameReader)
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -17,7 +17,7 @@ def result():
 @pytest.fixture
 def path(result, tmp_path):
     options = {"pulses": 1000, "frames": 3, "seed": 2**64 - 1, "methods": ("centroid", "peak"), "device": "cpu"}
-    return record_frames(result, tmp_path / "frames.h5", **options).path
+    return record_frames(result, tmp_path / "frames.h5", **options).file.path
 
 
 def test_a_file_holds_what_detect_draws(result, path):

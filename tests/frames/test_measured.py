@@ -11,8 +11,8 @@ import pytest
 
 import spadwarp
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.errors import ArgumentError, FileError, SpadwarpWarning
 from spadwarp.frames import read_histograms, read_response
+from spadwarp.values import ArgumentError, FileError, SpadwarpWarning
 
 scipy_io = pytest.importorskip("scipy.io")
 
@@ -279,11 +279,9 @@ def changed(content, tag, value):
 
 MARKERS = ("ImgHdr_LineStart", "ImgHdr_LineStop", "ImgHdr_Frame")
 DAMAGED = [(tag, value, f"{tag} = ") for tag in MARKERS for value in (2**62, 2**31, 10**9, -1)]  # powers of two of them
-DAMAGED += [
-    ("MeasDesc_Resolution", value, r"frames\.ptu: ") for value in (0.0, -1.0, 1e300, float("nan"), float("inf"))
-]
-DAMAGED += [("TTResult_NumberOfRecords", 2**40, "TTResult_NumberOfRecords"), ("ImgHdr_PixX", 10**9, ".")]
-DAMAGED += [("ImgHdr_PixY", 10**9, ".")]
+DAMAGED += [("MeasDesc_Resolution", value, r"frames\.ptu: ") for value in (0.0, -1.0, 1e300, np.nan, np.inf)]
+DAMAGED += [("TTResult_NumberOfRecords", 2**40, "TTResult_NumberOfRecords")]
+DAMAGED += [(side, 10**9, ".") for side in ("ImgHdr_PixX", "ImgHdr_PixY")]
 
 
 @pytest.mark.parametrize(("tag", "value", "words"), DAMAGED)

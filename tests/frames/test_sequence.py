@@ -10,10 +10,10 @@ from PIL import Image
 import spadwarp
 from helpers.cli import run
 from helpers.synthetic_result import make_scene
-from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.frames import simulate_sequence
 from spadwarp.scene import Trajectory, load_trajectory
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.values import ArgumentError, ConfigError
 
 WIDTH, HEIGHT, BINS = 8, 6, 32
 TABLE = """# a camera that comes nearer, a target that moves to the side
@@ -127,16 +127,8 @@ def test_what_is_no_trajectory_is_named_before_the_first_photon(base, text, word
 
 def test_command_and_exports(base, poses, tmp_path):
     (tmp_path / "scene.toml").write_text(base.to_toml())
-    options = (
-        "--photons",
-        2000,
-        "--set",
-        "detector.pulses_per_frame=500",
-        "--device",
-        "cpu",
-        "--out",
-        tmp_path / "moving",
-    )
+    options = ("--photons", 2000, "--set", "detector.pulses_per_frame=500", "--device", "cpu", "--out")
+    options += (tmp_path / "moving",)
     printed = run("simulate", tmp_path / "scene.toml", "--trajectory", poses, "--frame-rate", 10, *options).output
     assert "0, 0.3 s" in printed and "camera.position[2]" in printed
     with Image.open(tmp_path / "moving" / "sequence.gif") as picture:

@@ -12,9 +12,9 @@ import spadwarp
 from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp import ArgumentError
-from spadwarp.errors import SpadwarpWarning
 from spadwarp.frames import InstrumentResponse, coates, detect, first_photon_probabilities, monte_carlo_noise
 from spadwarp.scene import Detector, Laser
+from spadwarp.values import SpadwarpWarning
 
 BIN = 100e-12
 LASER = Laser(repetition_rate=20e6, pulse_fwhm_ps=85.0)  # period 50 ns: 500 bins

@@ -100,7 +100,7 @@ def _load(what: str, path: str) -> tuple[int, str, list[str]]:
     import spadwarp
     from spadwarp.dataset.recipe import load_recipe
     from spadwarp.denoise.recipe import load_training_recipe
-    from spadwarp.errors import SpadwarpError
+    from spadwarp.values import SpadwarpError
 
     loaders = {
         "load": spadwarp.load,

@@ -8,7 +8,6 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.lit_box import lit_box
 from spadwarp_kernels import analytic
-from spadwarp_kernels.water.limits import reflection_images
 
 
 def valid_calls(mesh: wp.Mesh) -> dict:
@@ -37,10 +36,6 @@ def valid_calls(mesh: wp.Mesh) -> dict:
             | {"channels": [[1.0, 0.0, 0.0, 0.0]], "facet_index": [1.3], "device": "cpu"},
         ),
         "has_overflowed": (sk.has_overflowed, {"tally": wp.zeros(12, dtype=wp.int64, device="cpu"), "signed": False}),
-        "reflection_images": (
-            reflection_images,
-            {"low": [1.0, 0.0, 0.0], "high": [0.0, 1.0, 0.0], "max_reflections": 2},
-        ),
         "surface_choices": (sk.surface_choices, {"surfaces": sk.make_surfaces(mesh, 0.5)}),
         "sphere_integral": (sk.sphere_integral, {"function": np.ones_like}),
         "rayleigh": (sk.rayleigh_density, {"t": 0.5, "depolarisation_ratio": 0.03}),

@@ -2,8 +2,8 @@
 
 import pytest
 
-from spadwarp.errors import ConfigError
 from spadwarp.scene import Scene
+from spadwarp.values import ConfigError
 
 CAMERA = {"width": 8, "height": 6, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.01}
 MINIMAL = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spadwarp.frames import first_photon_probabilities
-from spadwarp.inverse.equations import Equations, Law, planned_pulses, solve
+from spadwarp.inverse.equations import Equations, Law, solve
 from spadwarp.inverse.rendering import subbin_shift
 
 LAWS = {"first photon": Law(True, 0.0, 20), "free running": Law(False, 0.6, 18)}
@@ -28,10 +28,10 @@ def test_slopes_of_the_mean_are_its_derivatives(law, rates):
 
 def test_mean_of_first_photons_is_their_law(rates):
     law = LAWS["first photon"]
-    mean = law.mean(rates, planned_pulses(law, rates, 1000))
+    mean = law.mean(rates, law.planned(rates, 1000))
     np.testing.assert_allclose(mean, 1000 * first_photon_probabilities(rates, device="cpu"), rtol=1e-5)
     # What is left varies as a binomial.
-    trials = planned_pulses(law, rates, 1000)
+    trials = law.planned(rates, 1000)
     share = mean / trials
     np.testing.assert_allclose(law.variance(mean, trials), trials * share * (1 - share), rtol=1e-5)
 

@@ -12,7 +12,7 @@ from helpers.inverse import TRUTH, UNKNOWN, plate
 from spadwarp.frames import Receiver
 from spadwarp.inverse import Fitter, lidar_initial_guess, read_exposure
 
-pytestmark = [pytest.mark.physics, pytest.mark.filterwarnings("ignore::spadwarp.errors.SpadwarpWarning")]
+pytestmark = [pytest.mark.physics, pytest.mark.filterwarnings("ignore::spadwarp.values.SpadwarpWarning")]
 DETECTORS = {
     "first photon": {},
     "free running": {"detector.mode": "free_running", "detector.dead_time_ns": 40.0, "laser.repetition_rate": 1e7},

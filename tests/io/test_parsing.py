@@ -10,11 +10,19 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spadwarp.errors import ArgumentError, ConfigError, FileError
 from spadwarp.io.arrays import write_exr
 from spadwarp.io.paths import file_problem
 from spadwarp.io.text import parse_json, parse_toml, read_columns, read_text
-from spadwarp.limits import Interval, check_integer, check_real, parse_number, shown
+from spadwarp.values import (
+    ArgumentError,
+    ConfigError,
+    FileError,
+    Interval,
+    check_integer,
+    check_real,
+    parse_number,
+    shown,
+)
 
 
 @given(st.floats(allow_nan=False))

@@ -48,6 +48,31 @@ def test_every_package_is_listed():
     assert found == set(PACKAGES)
 
 
+# Fields of a `TransportSpec` by the packages that resolve them, where they make Warp functions; others ask for what
+# `photon/spec.py` and `transport/compose.py` make of them. `transport/launch.py` checks a launch field by field.
+RESOLVED = {
+    "photon": "confocal derivatives grid mesh points polarised",
+    "riders": "blocks channels confocal derivatives laser_port layered mesh polarised port specular",
+    "estimators": "bounded confocal derivatives estimator grid lens merged mesh phase points polarised port reflecting "
+    "rotated_domain specular",
+    "transport": "blocks bounded confocal derivatives laser_port measured_beam mesh phase port random_albedo records "
+    "reflecting rotated_domain roulette specular stepped",
+}
+RESOLVING = {"photon/spec.py", "transport/compose.py", "transport/launch.py"}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_fields_of_a_spec_are_read_where_they_are_resolved(package):
+    read = {
+        node.attr
+        for path in (ROOT / package).rglob("*.py")
+        if path.relative_to(ROOT).as_posix() not in RESOLVING
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "spec"
+    }
+    assert read & set(sk.TransportSpec._fields) == set(RESOLVED.get(package, "").split())
+
+
 def test_public_names():
     for package in PACKAGES:
         module = importlib.import_module(f"spadwarp_kernels.{package}")

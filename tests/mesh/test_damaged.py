@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from spadwarp.errors import MeshError
 from spadwarp.mesh import load_target
 from spadwarp.scene import Target
+from spadwarp.values import MeshError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 PLY = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n{}"

@@ -9,8 +9,8 @@ import pytest
 import spadwarp
 from helpers.minimal_scene import problems
 from helpers.scenes import scene
-from spadwarp.errors import ConfigError
 from spadwarp.mesh import build_mesh, focus_distance
+from spadwarp.values import ConfigError
 
 SQUARE = {"builtin": "plane", "size": [0.2, 0.2]}
 

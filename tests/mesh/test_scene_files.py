@@ -5,9 +5,9 @@ import pytest
 import trimesh
 from scipy import sparse
 
-from spadwarp.errors import MeshError
 from spadwarp.mesh import describe_mesh, load_target
 from spadwarp.scene import Target
+from spadwarp.values import MeshError
 
 
 def loaded(path):

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from helpers.synthetic_result import cast_truth, make_scene
-from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import BUILTINS, build_mesh, builtin_names, describe_mesh, load_target
 from spadwarp.scene import Scene, Target
+from spadwarp.values import ConfigError, MeshError
 
 FORMATS = ("stl", "obj", "ply", "off", "glb")
 

@@ -61,7 +61,7 @@ RESULT_FUNCTIONS = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::spadwarp.errors.SpadwarpWarning")
+@pytest.mark.filterwarnings("ignore::spadwarp.values.SpadwarpWarning")
 @pytest.mark.parametrize("name", RESULT_FUNCTIONS)
 def test_a_result_may_be_its_path(name, result):
     found, folder = result

@@ -11,8 +11,8 @@ from helpers.cli import DEVICE, run, tables
 from helpers.datasets import make, recipe
 from helpers.minimal_scene import CAMERA, scene
 from spadwarp.dataset import export_dataset, iterate_dataset
-from spadwarp.errors import ArgumentError, ConfigError
 from spadwarp.result import COMPONENTS, analyser_channel, degree_of_polarisation
+from spadwarp.values import ArgumentError, ConfigError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Monte Carlo noise")  # few photons
 

@@ -9,9 +9,9 @@ import OpenEXR
 import pytest
 
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.arrays import read_exr
 from spadwarp.result import Result, load_result, load_truth_maps, merge, save_depth_exr, save_result, save_truth_maps
+from spadwarp.values import ConfigError, FileError
 
 TRUTH = ("depth", "range", "normal", "reflectance")
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
-from spadwarp.errors import FileError
 from spadwarp.io.arrays import write_exr
 from spadwarp.result.rendered_truth import load_truth_exr
 from spadwarp.scene.sight import pixel_directions
+from spadwarp.values import FileError
 
 CAMERA = scene(camera={"width": 4, "height": 3}).camera
 

@@ -8,7 +8,7 @@ import warp as wp
 
 import spadwarp
 from helpers.scenes import scene as make_scene
-from spadwarp.frames.frames import first_photon_probabilities
+from spadwarp.frames.spad import first_photon_probabilities
 
 torch = pytest.importorskip("torch")
 

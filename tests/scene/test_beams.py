@@ -10,12 +10,12 @@ from scipy import stats
 import spadwarp
 import spadwarp.checks.checks
 from helpers.scenes import scene
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import laser as beam_profile
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import photon_capacity, tally_scale
+from spadwarp.values import ConfigError, FileError
 from spadwarp_kernels import profile_tables
 
 PROFILE = np.random.default_rng(1).gamma(0.7, size=(12, 20))

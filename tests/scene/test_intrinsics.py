@@ -7,11 +7,11 @@ import pytest
 
 from helpers.opencv import project_points
 from spadwarp import load_scene
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.scene import Camera, look_at, opencv_pose, save_calibration
 from spadwarp.scene.camera import image_points, image_tangents, pixel_views, to_camera, to_world, view_box
 from spadwarp.scene.pose import rotation_angles, rotation_matrix
 from spadwarp.scene.sight import pixel_directions
+from spadwarp.values import ConfigError, FileError
 
 # Calibrations of a barrel, a pincushion and a decentred lens.
 LENSES = {
@@ -227,8 +227,13 @@ def test_what_is_no_calibration_is_refused(tmp_path, text, problem):
     with pytest.raises(ConfigError) as caught:
         Camera(calibration=str(path), aperture_diameter=0.01, width=64, height=48)
     assert problem in str(caught.value) and str(path) in str(caught.value)
-    with pytest.raises(FileError, match="No such file"):
-        Camera(calibration=str(tmp_path / "none.yml"), aperture_diameter=0.01, width=64, height=48)
+
+
+def test_calibrations_that_are_missing_or_too_long_are_refused_before_they_are_parsed(tmp_path):
+    (tmp_path / "camera.yml").write_text(_ROS_YAML + "\n" * 600_000)
+    for name, problem in (("none", "No such file"), ("camera", r"camera\.yml: has more than 524288 bytes")):
+        with pytest.raises(FileError, match=problem):
+            Camera(calibration=str(tmp_path / f"{name}.yml"), aperture_diameter=0.01, width=64, height=48)
 
 
 @pytest.mark.parametrize("ending", [".xml", ".yml", ".json"])
@@ -257,13 +262,6 @@ def test_opencv_reads_our_calibration_and_we_read_opencvs(tmp_path, ending):
     storage.release()
     theirs = Camera(calibration=str(tmp_path / f"theirs{ending}"), aperture_diameter=camera.aperture_diameter)
     assert theirs == camera
-
-
-def test_a_calibration_of_many_lines_is_refused_before_it_is_parsed(tmp_path):
-    path = tmp_path / "camera.yml"
-    path.write_text(_ROS_YAML + "\n" * 600_000)
-    with pytest.raises(FileError, match=r"camera\.yml: has more than 524288 bytes"):
-        Camera(calibration=str(path), aperture_diameter=0.01, width=64, height=48)
 
 
 def test_files_beside_a_scene_are_found_from_anywhere(tmp_path):

@@ -17,17 +17,11 @@ def message(tmp_path, *overrides):
     ("override", "text"),
     [
         # Ports
-        (
-            'camera.port={distance="5 cm", thickness="10 ns"}',
-            "thickness = '10 ns' (an override) is a time; a length",
-        ),
+        ('camera.port={distance="5 cm", thickness="10 ns"}', "thickness = '10 ns' (an override) is a time; a length"),
         ('camera.port={distance=0.05, thickness=0.01, material="glass"}', "is not one of 'BK7', 'fused silica'"),
         ('camera.port={preset="dome-acryl"}', "did you mean 'dome-acrylic'?"),
         ('camera.port={preset="dome-acrylic", distance=0.05}', "distance = 0.05 goes with shape = 'flat' only"),
-        (
-            'camera.port={preset="dome-acrylic", offset=[0, 0, 0.06]}',
-            "outside: it is 0.06 m from the dome's centre",
-        ),
+        ('camera.port={preset="dome-acrylic", offset=[0, 0, 0.06]}', "outside: it is 0.06 m from the dome's centre"),
         ("camera.port={distance=-0.05}", "camera.port.distance = -0.05 (an override) is outside [1e-6, 1e6] m"),
         ("laser.port=flat-glass", 'a preset is taken by {preset = "flat-glass"}'),
         ("laser.port=window", "is neither a table nor 'camera'; presets are 'flat-acrylic', "),

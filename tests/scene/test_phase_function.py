@@ -9,9 +9,9 @@ import spadwarp
 from helpers.scenes import scene
 from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.scene import Medium
-from spadwarp.scene.tables import PHASE_TABLES
+from spadwarp.scene.medium import PHASE_TABLES
+from spadwarp.values import ConfigError, FileError
 
 WATER = {"extinction": 0.3, "albedo": 0.8}
 PETZOLD = Medium(**WATER, phase_function="tabulated", phase_table="petzold-average-particle")

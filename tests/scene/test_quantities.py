@@ -9,7 +9,7 @@ import spadwarp
 from helpers.scenes import scene as make_scene
 from spadwarp.scene import Camera, Gate, Laser, Medium, Scene
 from spadwarp.scene.sections import field_unit, models_of
-from spadwarp.units import percent, quantity, with_prefix
+from spadwarp.values import percent, quantity, with_prefix
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_an_item_of_a_list_can_be_set():
     [
         ("targets[0].translation[3]=9", "targets[0].translation[3] does not exist; targets[0].translation has 3"),
         ("targets[4].translation[0]=9", "targets[4] does not exist"),
-        ("medium.layers[0].extinction=1", "medium.layers = None is not a list"),
+        ("medium.layers[0].extinction=1", "medium.layers[0].start is missing"),
         ("laser.pulse_energy[0]=1", "laser.pulse_energy = 3.75e-08 is not a list"),
         ("targets[0].translation[0]=5 ps", "holds '5 ps', which is a time"),
     ],

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.minimal_scene import CAMERA, MINIMAL, scene
-from spadwarp.errors import ConfigError
 from spadwarp.scene import Scene, load_scene, presets
+from spadwarp.values import ConfigError
 
 SCENES = sorted((Path(__file__).parents[2] / "configs" / "scenes").glob("*.toml"))
 

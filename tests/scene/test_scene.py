@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from helpers.minimal_scene import CAMERA, MINIMAL, problems, scene
 from spadwarp.dataset.recipe import Recipe
 from spadwarp.denoise.recipe import TrainingRecipe
-from spadwarp.errors import ConfigError, FileError, SpadwarpError
 from spadwarp.scene import Camera, Domain, Medium, Scene, load_scene, parse_override, presets
 from spadwarp.scene.sections import interval_of, models_of, parts_of
-from spadwarp.units import SPEED_OF_LIGHT
+from spadwarp.values import SPEED_OF_LIGHT, ConfigError, FileError, SpadwarpError
 
 coefficients = st.floats(1e-6, 1e3)
 
@@ -155,7 +154,9 @@ def test_overrides_reach_targets_by_index_and_may_add_the_next():
     assert base.with_overrides({"targets": []}).targets == ()
 
 
-@pytest.mark.parametrize("overrides", [["medium.a.b=1"], ["targets.reflectance=1"], ["medium[0]=1"], ["targets[0]=1"]])
+@pytest.mark.parametrize(
+    "overrides", [["medium.extinction.b=1"], ["targets.reflectance=1"], ["medium[0]=1"], ["targets[0]=1"]]
+)
 def test_overrides_that_name_no_field_are_refused(overrides):
     (text,) = problems(None, overrides)
     assert "does not name a field" in text
@@ -239,7 +240,11 @@ def test_fields_that_contradict_each_other_are_refused(section, fields, message)
             None,
             "camera needs either aperture_diameter or f_number with focal_length",
         ),
-        ({"targets": [{"builtin": "plane"}]}, ["targets[2].scale=2"], "targets[2] does not exist; the scene has 1"),
+        (
+            {"targets": [{"builtin": "plane"}]},
+            ["targets[2].scale=2"],
+            "targets[2] does not exist; targets has 1 values, from 0 on",
+        ),
         (
             {"targets": {"builtin": "plane"}},
             None,

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 import spadwarp
-from spadwarp.errors import ConfigError, FileError
 from spadwarp.scene import detection_efficiency, filter_transmission, spectral_lines, water_lines
+from spadwarp.values import ConfigError, FileError
 
 pytestmark = pytest.mark.fast
 

@@ -154,7 +154,7 @@ def test_names_and_what_is_refused(everywhere, tmp_path):
     for scene_, asked, blocks, error in (
         (one, NAMES[0], (4, 3, 4), "possible are 1, 2, 5, 10"),
         (one, NAMES[0], (4, 3), "list of 3 whole numbers"),
-        (one, "medium.grid.anisotropy", None, "is not one of medium.grid.absorption"),
+        (one, "medium.grid.anisotropy", None, "is not one of"),
         (one, names[1], (1, 2, 1), "blocks need names of all blocks"),
         (one, "medium.grid.absorption[0,1,0]", None, "are not all blocks in their order"),
         (one, "absorption", None, "medium.grid.absorption and others go by block"),

@@ -10,9 +10,9 @@ from helpers.estimators import agreeing_cells
 from helpers.opencv import project_points
 from helpers.scenes import PLATE, scene
 from spadwarp import simulate
-from spadwarp.errors import ConfigError
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_angles, rotation_matrix
+from spadwarp.values import ConfigError
 
 pytestmark = pytest.mark.physics
 

@@ -8,9 +8,9 @@ import spadwarp_kernels as sk
 from helpers.estimators import cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
-from spadwarp import RunOptions, simulate
-from spadwarp.errors import ConfigError
+from spadwarp import simulate
 from spadwarp.transport import trace
+from spadwarp.values import ConfigError
 from spadwarp_kernels.transport.launch import check_spec
 
 BARS = [
@@ -86,15 +86,6 @@ def test_three_points_where_a_warp_has_a_short_queue(kind, device, tmp_path):
 def test_records_of_photons_have_no_points(device):
     one, more = (trace(with_points(scene(), points), photons=500, device=device) for points in (1, 3))
     assert np.array_equal(one.position, more.position) and np.array_equal(one.weight, more.weight)
-
-
-def test_results_of_other_points_are_not_added(device):
-    one, two = (
-        simulate(with_points(scene(), points), photons=100, seed=1, device=device, run=RunOptions(first_photon=first))
-        for points, first in ((1, 0), (2, 100))
-    )
-    with pytest.raises(ConfigError, match="scene of the results differs in transport"):
-        spadwarp.merge([one, two])
 
 
 @pytest.mark.parametrize(

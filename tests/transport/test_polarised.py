@@ -15,7 +15,7 @@ from reference.rayleigh_tables import TABLES, UPPER
 from reference.single_scatter import single_scatter
 from reference.stokes import block_matrix
 from spadwarp import simulate
-from spadwarp.errors import ConfigError
+from spadwarp.values import ConfigError
 
 pytestmark = pytest.mark.physics
 

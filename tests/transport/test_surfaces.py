@@ -16,10 +16,10 @@ import spadwarp
 from helpers.estimators import agreeing_cells
 from helpers.scenes import scene
 from spadwarp import simulate
-from spadwarp.errors import ConfigError, MeshError
 from spadwarp.mesh import build_mesh
 from spadwarp.mesh.files import srgb_to_linear
 from spadwarp.scene import Target
+from spadwarp.values import ConfigError, MeshError
 
 pytestmark = pytest.mark.physics
 

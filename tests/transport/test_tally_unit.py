@@ -15,12 +15,11 @@ from helpers.launch import Floats, launched
 from helpers.scenes import scene
 from spadwarp import RunOptions, simulate
 from spadwarp.device import pick_device
-from spadwarp.errors import ConfigError, SpadwarpError
 from spadwarp.mesh import build_mesh
 from spadwarp.transport import PHOTON_CAPACITY, photon_capacity, tally_scale
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.units import path_from_time
-from spadwarp_kernels.tally.tally import to_fixed_point
+from spadwarp.values import ConfigError, SpadwarpError, path_from_time
+from spadwarp_kernels.photon.state import to_fixed_point
 
 
 def plate_at(distance, extinction, *, reflectance=0.5, estimator="next_event", **sections):
@@ -172,7 +171,7 @@ def _rounded(units: Floats, ups: wp.array(dtype=wp.int64)):
     i = wp.tid()
     total = wp.int64(0)
     for k in range(1 << 24):
-        total += to_fixed_point(units[i], 1.0, sk.u01(wp.uint32(k) << wp.uint32(8)))
+        total += to_fixed_point(units[i], sk.u01(wp.uint32(k) << wp.uint32(8)))
     ups[i] = total
 
 

@@ -16,7 +16,7 @@ from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.validate.cases import vessel_reading, white_vessel
+from spadwarp.validate.cases import vessel_reading, vessel_scene
 from spadwarp_kernels.estimators.guided import LARGEST_WEIGHT_RATIO
 
 
@@ -88,7 +88,7 @@ def test_weights_of_guided_photons_are_bounded(extinction, reflectance, bound, d
 @pytest.mark.parametrize(("estimator", "photons"), [("analog", 40_000), ("next_event", 50_000), ("guided", 60_000)])
 def test_a_closed_white_vessel_is_as_bright_as_its_volume_says(estimator, photons, device):
     """Imaging through the lens centre, with the lens point on a disc, loses 29 % of this light."""
-    one = Scene.from_dict(white_vessel(estimator))
+    one = Scene.from_dict(vessel_scene(estimator))
     read = [spadwarp.simulate(one, photons=photons, seed=seed, device=device).histogram.sum() for seed in range(16)]
     error = np.std(read, ddof=1) / math.sqrt(16)
     assert error < 0.02 * np.mean(read)

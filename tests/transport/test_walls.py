@@ -6,8 +6,8 @@ import pytest
 from helpers.estimators import agreeing_cells, clear_at_the_lens, means
 from helpers.scenes import scene
 from spadwarp import simulate
-from spadwarp.errors import ConfigError
 from spadwarp.transport import trace
+from spadwarp.values import ConfigError
 
 WATER = 1.34
 

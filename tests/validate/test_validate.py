@@ -12,10 +12,10 @@ from reference.adding_doubling import cumulative_reflectance, exit_cosine_fracti
 from reference.moments import after_collisions, after_path, isotropic_radial_cdf, snapped_mean_cosines
 from reference.single_scatter import Lidar, lambertian_plane, single_scatter, single_scatter_total
 from reference.slab_derivatives import slab_derivatives
-from spadwarp.errors import ArgumentError
 from spadwarp.io import json_text
 from spadwarp.validate import CASES, draw_results, references, report, run
-from spadwarp.validate.measure import Estimate, Quantity, ScoreMeans, batch_means, holm, two_sided_p
+from spadwarp.validate.measure import Estimate, Quantity, batch_means, block_means, holm, two_sided_p
+from spadwarp.values import ArgumentError
 
 # The statistics
 
@@ -34,26 +34,20 @@ def test_z_of_few_batches_allows_for_their_uncertain_error():
     assert two_sided_p(1.959964) == pytest.approx(0.05, abs=1e-7)
 
 
-def test_quantities_without_error_are_held_to_equality():
+def test_quantities_without_error_are_held_to_equality_and_a_rounded_reference_is_an_interval():
     assert Quantity("", Estimate(0.0, 0.0), 0.0).z == 0.0
     assert Quantity("", Estimate(1e-12, 0.0), 0.0).z == math.inf
-
-
-def test_a_rounded_reference_is_an_interval():
     near, far = (Quantity("", Estimate(value, 0.1), 1.0, rounding=0.05) for value in (1.04, 0.75))
-    assert near.z == 0.0
-    assert far.z == pytest.approx(-2.0)
+    assert near.z == 0.0 and far.z == pytest.approx(-2.0)
 
 
 def test_means_in_blocks_are_those_of_the_whole():
     scores = np.random.default_rng(0).random((1000, 2))
-    means = ScoreMeans()
-    for block in np.split(scores, [300, 700]):
-        means.add(block)
-    for i, estimate in enumerate(means.estimates()):
+    means = block_means(np.split(scores, [300, 700]))
+    for i, estimate in enumerate(means):
         assert estimate.value == pytest.approx(scores[:, i].mean(), rel=1e-12)
         assert estimate.standard_error == pytest.approx(scores[:, i].std(ddof=1) / math.sqrt(1000), rel=1e-9)
-    assert batch_means(scores)[1].standard_error == pytest.approx(means.estimates()[1].standard_error, rel=1e-9)
+    assert batch_means(scores)[1].standard_error == pytest.approx(means[1].standard_error, rel=1e-9)
 
 
 # The numbers that the cases are held to
@@ -92,10 +86,9 @@ def test_exit_cosine_references():
 
 @pytest.mark.physics
 def test_time_resolved_references():
-    pulse = references.TIME_RESOLVED
-    medium = {"scattering": pulse.scattering, "absorption": pulse.absorption, "anisotropy": pulse.anisotropy}
-    until = [0.0, *(cumulative_reflectance(path, **medium, nodes=24) for path in pulse.edges[1:])]
-    np.testing.assert_allclose(pulse.fractions, np.diff(until), atol=2e-8)
+    medium, edges = references.TIME_RESOLVED_MEDIUM, references.TIME_RESOLVED_EDGES
+    until = [0.0, *(cumulative_reflectance(path, **medium, nodes=24) for path in edges[1:])]
+    np.testing.assert_allclose(references.TIME_RESOLVED, np.diff(until), atol=2e-8)
 
 
 @pytest.mark.physics
@@ -121,10 +114,10 @@ def test_references_of_the_rules_that_bias():
 
 @pytest.mark.physics
 def test_fluence_references():
-    shells = references.FLUENCE
-    inside = isotropic_radial_cdf(shells.edges[1:-1], path=shells.path, scattering=1.0)
-    fractions = np.diff([0.0, *inside, 1.0]) * math.exp(-shells.absorption * shells.path)
-    np.testing.assert_allclose(shells.fractions, fractions, atol=2e-7)
+    path = references.FLUENCE_PATH
+    inside = isotropic_radial_cdf(references.FLUENCE_EDGES[1:-1], path=path, scattering=1.0)
+    fractions = np.diff([0.0, *inside, 1.0]) * math.exp(-references.FLUENCE_ABSORPTION * path)
+    np.testing.assert_allclose(references.FLUENCE, fractions, atol=2e-7)
 
 
 @pytest.mark.physics
@@ -168,15 +161,13 @@ def test_fournier_forand_references():
 # The cases
 
 
+LONG = {"ledger", "mean-path", "white-vessel"}  # trace most
+
+
 @pytest.fixture(scope="module")
 def results():
-    """A short run of all cases but the three that trace most."""
-    return run(
-        [name for name in CASES if name not in ("ledger", "mean-path", "white-vessel")],
-        photons=10_000,
-        seed=3,
-        device="cpu",
-    )
+    """A short run of all other cases."""
+    return run([name for name in CASES if name not in LONG], photons=10_000, seed=3, device="cpu")
 
 
 @pytest.mark.physics
@@ -184,7 +175,7 @@ def results():
 def test_engine_agrees_with_every_reference(results):
     failed = [f"{r.quantity}: {r.value} against {r.reference}, z {r.z:.1f}" for r in results if not r.passed]
     assert not failed
-    assert {r.name for r in results} == set(CASES) - {"ledger", "mean-path", "white-vessel"}
+    assert {r.name for r in results} == set(CASES) - LONG
 
 
 @pytest.mark.physics

@@ -7,39 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from matplotlib.image import imread
 
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.errors import FileError
 from spadwarp.result.result import Result
+from spadwarp.values import FileError
 from spadwarp.viz import draw_result
 
 NAMES = ["depth.png", "intensity.png", "histogram.png", "truth.png"]
-
-
-def check_pictures(result: Result, directory: Path, **options: object) -> list[np.ndarray]:
-    paths = draw_result(result, directory, **options)  # type: ignore[arg-type]
-    assert paths == [directory / name for name in NAMES]
-    assert sorted(path.name for path in directory.iterdir()) == sorted(NAMES)
-    images = [imread(path) for path in paths]
-    for image in images:
-        height, width, _ = image.shape
-        assert 200 < height < 4000
-        assert 200 < width < 4000
-    return images
-
-
-@pytest.mark.slow
-def test_previews_show_the_target(tmp_path: Path) -> None:
-    result = make_result(make_scene())
-    depth, *_ = check_pictures(result, tmp_path / "run", method="peak")
-    # The nearest and the farthest bar have the ends of the colour map: near is yellow, far is violet.
-    width = depth.shape[1]
-    truth = depth[:, width // 3 : 2 * width // 3, :3]
-    assert (np.linalg.norm(truth - [0.88, 0.89, 0.1], axis=-1) < 0.1).mean() > 0.05
-    assert (np.linalg.norm(truth - [0.28, 0.14, 0.46], axis=-1) < 0.15).mean() > 0.02
 
 
 @pytest.mark.parametrize(
@@ -53,16 +29,9 @@ def test_previews_show_the_target(tmp_path: Path) -> None:
     ids=["empty", "far away", "a pixel", "a line"],
 )
 def test_every_result_is_shown(result: Result, tmp_path: Path) -> None:
-    check_pictures(result, tmp_path, method="peak")
-
-
-@pytest.mark.slow
-def test_a_given_depth_frame_is_shown_as_it_is(tmp_path: Path) -> None:
-    result = make_result(make_scene())
-    frame = np.full(result.truth.depth.shape, np.nan)
-    depth, *_ = check_pictures(result, tmp_path, depth=frame)
-    measured = depth[depth.shape[0] // 3 : depth.shape[0] // 2, : depth.shape[1] // 3, :3]
-    assert (np.ptp(measured, axis=-1) < 0.02).all()  # grey, white and black: no return anywhere
+    paths = draw_result(result, tmp_path, method="peak")
+    assert paths == [tmp_path / name for name in NAMES] and sorted(tmp_path.iterdir()) == sorted(paths)
+    assert all(200 < side < 4000 for path in paths for side in imread(path).shape[:2])
 
 
 def test_folders_that_cannot_be_written_are_named(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spadwarp.viz.result import merged_edges, merged_means, shared_edges, typical_weight
+from spadwarp.viz.result import merged_edges, merged_means, typical_weight
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -38,14 +38,11 @@ def test_nothing_is_one_group_of_nothing():
     assert merged_means(np.zeros(8), edges).sum() == 0 and edges[-1] == 8
 
 
-def test_the_larger_component_has_the_bins_of_the_sum_and_none_begins_before_its_light():
+def test_no_group_of_the_sum_goes_across_the_first_light_of_a_component():
     random, bins = np.random.default_rng(4), np.arange(300)
     water = random.poisson(200 * np.exp(-bins / 30.0)) * 1.0
-    target = np.where(bins < 150, 0.0, random.poisson(80 * np.exp(-(bins - 150) / 20.0)))
-    parts = np.stack([water, target])
-    edges, (of_water, of_target) = shared_edges(parts, parts.sum(axis=0))
-    known = np.add.reduceat(target, edges[:-1]) > 0.5 * np.add.reduceat(parts.sum(axis=0), edges[:-1])
-    assert known.sum() > 20 and set(edges[:-1][known]) <= set(of_target) and set(edges[1:][known]) <= set(of_target)
-    assert 150 in edges and 150 in of_target
-    assert set(edges[edges <= 60]) <= set(of_water)
+    target = np.where(bins < 150, 0.0, random.poisson(2 * np.exp(-(bins - 150) / 20.0)))
+    total, first = water + target, int((target > 0).argmax())
+    edges, of_water = merged_edges(total, total, [first]), merged_edges(water, water)
+    assert first in edges and first in merged_edges(target, target)
     assert (np.diff(of_water)[-3:] > 1).any()  # beneath the target's light, its own wide groups

@@ -15,10 +15,10 @@ import spadwarp
 from helpers.cli import run
 from helpers.headless import BROWSER, Browser
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.errors import FileError
 from spadwarp.frames import record_frames
 from spadwarp.result.file import save_result
 from spadwarp.result.result import COMPONENTS
+from spadwarp.values import FileError
 from spadwarp.viz import viewer
 
 pytest.importorskip("plotly")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 from spadwarp.water import (
     clear_sky_irradiance,
     daylight_attenuation,

@@ -7,7 +7,7 @@ import pytest
 
 import spadwarp
 from helpers.cli import run
-from spadwarp.errors import ArgumentError
+from spadwarp.values import ArgumentError
 from spadwarp.water import (
     kopelevich_particles,
     log_normal,

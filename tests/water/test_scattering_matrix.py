@@ -6,7 +6,7 @@ import pytest
 import spadwarp
 from helpers.cli import run
 from reference.stokes import rayleigh_density, rayleigh_matrix
-from spadwarp.errors import ArgumentError, ConfigError
+from spadwarp.values import ArgumentError, ConfigError
 
 pytestmark = pytest.mark.physics
 

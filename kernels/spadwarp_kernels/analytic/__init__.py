@@ -2,19 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-from .backscatter import *
 from .cramer_rao import *
 from .depth_frames import *
-from .lidar import *
 from .optics import *
-from .signal import *
+from .rates import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = (
-        backscatter.__all__
-        + cramer_rao.__all__
-        + depth_frames.__all__
-        + lidar.__all__
-        + optics.__all__
-        + signal.__all__
-    )
+    __all__ = cramer_rao.__all__ + depth_frames.__all__ + optics.__all__ + rates.__all__

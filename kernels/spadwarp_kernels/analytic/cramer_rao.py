@@ -8,20 +8,12 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_arrays,
-    check_choice,
-    check_integer,
-    check_range,
-)
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_arrays, check_choice, check_range
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 
-from .backscatter import Scattering, make_background_rate, make_scattering
-from .lidar import Lidar
-from .optics import Optics, SightRay, check_optics
+from .optics import Lidar, Optics, SightRay, check_lidar
+from .rates import Scattering, make_scattering, make_single_scatter
 
 __all__ = ["histogram_information", "outlier_probabilities", "statistics_maps"]
 
@@ -160,26 +152,15 @@ class PulseIntegrals:
     signal: wp.float64  # ∫ S dt
 
 
-@wp.func
-def _gauss_legendre(node: int) -> wp.vec2d:
-    """Node in [-1, 1] and weight of the rule of five nodes."""
-    x = wp.float64(0.0)
-    w = wp.float64(0.5688888888888889)
-    if node == 1 or node == 2:
-        x = wp.float64(0.5384693101056831)
-        w = wp.float64(0.47862867049936647)
-    if node == 3 or node == 4:
-        x = wp.float64(0.9061798459386640)
-        w = wp.float64(0.23692688505618908)
-    if node % 2 == 0:
-        x = -x
-    return wp.vec2d(x, w)
+# Nodes in [-1, 1] and weights of the Gauss-Legendre rule of five nodes.
+_NODES = 0.0, 0.5384693101056831, -0.5384693101056831, 0.9061798459386640, -0.9061798459386640
+_WEIGHTS = 0.5688888888888889, 0.47862867049936647, 0.47862867049936647, 0.23692688505618908, 0.23692688505618908
+_RULE = wp.constant(wp.types.matrix((2, 5), wp.float64)(*_NODES, *_WEIGHTS))
 
 
 @memoised
 def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
-    see = optics.see
-    background_rate = make_background_rate(optics)
+    see, background_rate = optics.see, make_single_scatter(optics).background
 
     @wp.func
     def integrate_pulse(
@@ -203,9 +184,8 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
                     left = wp.float64(right)
                     right = background_rate(lidar, water, i, sight, side, middle + half) + ambient
                     for node in range(5):
-                        rule = _gauss_legendre(node)
-                        x = rule[0]
-                        w = rule[1]
+                        x = _RULE[0, node]
+                        w = _RULE[1, node] * half
                         t = middle + x * half
                         z = (t - mu) / sigma
                         pulse = s / (sigma * SQRT_2PI) * wp.exp(-HALF * z * z)
@@ -215,9 +195,9 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
                             noise_rate = background_rate(lidar, water, i, sight, side, t) + ambient
                         rate = noise_rate + pulse
                         if rate > ZERO:
-                            total.information += w * half * pulse * (pulse / rate) * z * z / (sigma * sigma)
-                        total.background += w * half * pulse * noise_rate
-                        total.signal += w * half * pulse
+                            total.information += w * pulse * (pulse / rate) * z * z / (sigma * sigma)
+                        total.background += w * pulse * noise_rate
+                        total.signal += w * pulse
         return total
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
@@ -253,7 +233,6 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
         if s > ZERO:
             fraction = normal_cdf((lidar.stop - mu) / sigma) - normal_cdf((lidar.start - mu) / sigma)
         a = noise + s * fraction
-        alpha[i] = a
         pulse = PulseIntegrals()
         if s * fraction > ZERO:
             pulse = integrate_pulse(lidar, water, i, see(lidar.ports, view[i]), s, mu, beside)
@@ -269,6 +248,7 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
             sigma_star = ONE / wp.sqrt(counts * f)
             if with_outliers == 1:
                 p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)
+        alpha[i] = a
         fisher[i] = f
         sigma_time[i] = sigma_star
         level[i] = flat * sigma
@@ -277,7 +257,7 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
     return statistics_kernel
 
 
-# The bound of a histogram
+# ---- The bound of a histogram.
 
 
 @wp.kernel
@@ -322,9 +302,6 @@ def _histogram_information(
     information[i] = total
 
 
-# Launchers
-
-
 def statistics_maps(
     lidar: Any,
     phase: wp.array,
@@ -365,24 +342,22 @@ def statistics_maps(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    optics = check_optics(lidar, optics)
-    check_array("view", view, wp.vec3d, (None,))
-    count, device = view.shape[0], view.device
+    columns = {"signal": signal, "arrival": arrival, "backscatter": backscatter}
+    optics, count, device = check_lidar(lidar, optics, view, **columns)
     check_array("profile", profile, wp.float32, (None, None), device)
-    check_integer("entries of profile", profile.size, 1)
+    if not profile.size:
+        raise ArgumentError(f"profile has shape {profile.shape}; (1 or pixels, bins) is needed")
     water = make_scattering(lidar, phase, device, lines=lines, profile=profile)
-    check_arrays(wp.float64, (count,), device, signal=signal, arrival=arrival, backscatter=backscatter)
     check_choice("count_law", count_law, COUNT_LAWS)
     check_range("(0, inf)", acquisitions=acquisitions, pulses_per_frame=pulses_per_frame)
-    out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(5))
-    counting = [COUNT_LAWS.index(count_law), acquisitions, pulses_per_frame, int(bool(outliers))]
-    if ambient is None:
-        ambient = wp.zeros(1, dtype=wp.float64, device=device)
+    ambient = wp.zeros(1, dtype=wp.float64, device=device) if ambient is None else ambient
     check_array("ambient", ambient, wp.float64, (None,), device)
     if ambient.size not in (1, count):
         raise ArgumentError(f"ambient has {ambient.size} entries; 1 or {count} are needed")
-    inputs = [lidar, water, view, signal, arrival, backscatter, ambient]
-    launch_pixels(_make_statistics_kernel(optics), count, [*inputs, *counting, *out], device=device)
+    out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(5))
+    counting = [COUNT_LAWS.index(count_law), acquisitions, pulses_per_frame, int(bool(outliers))]
+    inputs = [lidar, water, view, *columns.values(), ambient, *counting, *out]
+    launch_pixels(_make_statistics_kernel(optics), count, inputs, device=device)
     return out
 
 

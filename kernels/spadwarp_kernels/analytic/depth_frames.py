@@ -1,7 +1,7 @@
 """Depth frames of the analytic simulator: the true depth with Cramér–Rao noise, or a background photon instead.
 
-`sample_frames` gives depth [m] and labels; `draw_frames` gives them as a dataset stores them, as integers and bits, for
-frames that differ in the part of their pixels that reports background, with the number of recorded photons beside them.
+`sample_frames` gives depth [m] and labels; `draw_frames` the integers and bits that a dataset stores, for frames that
+differ in the part of their pixels that reports background, with the number of recorded photons beside them.
 """
 
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.binomial import count_quantile
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.philox import STREAM_ANALYTIC, STREAM_FRAMES, random_block, u01, u01_open
+from spadwarp_kernels.optics.laser import first_above
 
-from .lidar import Ports
-from .optics import IN_WATER, Optics, check_ports, point_at
+from .optics import IN_WATER, Optics, Ports, check_ports, point_at
 
 __all__ = ["FrameCoding", "draw_frames", "sample_frames"]
 
@@ -54,20 +54,13 @@ def path_at_share(paths: wp.array2d[float], cumulative: wp.array2d[float], pixel
     """The path [m] at which a pixel's cumulative distribution of backscatter reaches u."""
     row = pixel % cumulative.shape[0]
     edges = pixel % paths.shape[0]
-    low = wp.int32(0)
-    high = wp.int32(cumulative.shape[1] - 1)
-    while high - low > 1:
-        middle = (low + high) / 2
-        if cumulative[row, middle] <= u:
-            low = middle
-        else:
-            high = middle
-    below = cumulative[row, low]
-    width = cumulative[row, high] - below
+    k = wp.max(first_above(cumulative[row], u), 1)
+    below = cumulative[row, k - 1]
+    width = cumulative[row, k] - below
     w = wp.float32(0.5)
     if width > 0.0:
         w = wp.clamp((u - below) / width, 0.0, 1.0)
-    return paths[edges, low] + w * (paths[edges, high] - paths[edges, low])
+    return paths[edges, k - 1] + w * (paths[edges, k] - paths[edges, k - 1])
 
 
 @wp.func
@@ -161,32 +154,27 @@ def _make_sample_kernel(optics: Optics) -> wp.Kernel:
 
 
 def _pixel_maps(
-    optics: Any,
-    ports: Any,
-    laser: Sequence[float],
-    gate_paths: Sequence[float],
-    paths: Any,
-    cumulative: Any,
-    **maps: Any,
+    optics: Any, ports: Any, laser: Sequence[float], gate: Sequence[float], view: Any, **maps: Any
 ) -> tuple[Optics, PixelMaps]:
-    """The maps of all pixels, view among them, if they fit each other; raises `ArgumentError`."""
-    check_array("view", maps["view"], wp.vec3, (None,))
-    pixels, device = maps["view"].shape[0], maps["view"].device
-    check_arrays(wp.float32, (pixels,), device, **{name: array for name, array in maps.items() if name != "view"})
-    check_arrays(wp.float32, (None, None), device, paths=paths, cumulative=cumulative)
-    for name, array in {"paths": paths, "cumulative": cumulative}.items():
+    """The maps of all pixels, if they fit each other; raises `ArgumentError`."""
+    check_array("view", view, wp.vec3, (None,))
+    rows = {name: maps[name] for name in ("paths", "cumulative")}
+    check_arrays(wp.float32, (None, None), view.device, **rows)
+    check_arrays(wp.float32, view.shape, view.device, **{name: maps[name] for name in maps if name not in rows})
+    for name, array in rows.items():
         check_integer(f"rows of {name}", array.shape[0], 1)
         check_integer(f"columns of {name}", array.shape[1], 2)
-    if paths.shape[1] != cumulative.shape[1]:
-        raise ArgumentError(f"paths {paths.shape} and cumulative {cumulative.shape} have not as many columns")
+    if rows["paths"].shape[1] != rows["cumulative"].shape[1]:
+        raise ArgumentError(
+            f"paths {rows['paths'].shape} and cumulative {rows['cumulative'].shape} have not as many columns"
+        )
     check_vector("laser", laser)
-    check_vector("gate_paths", gate_paths, size=2)
-    check_number("gate_paths[1]", gate_paths[1], f"[{float(gate_paths[0])}, inf)")
-    optics, ports = check_ports("ports", ports, optics)
+    check_vector("gate_paths", gate, size=2)
+    check_number("gate_paths[1]", gate[1], f"[{float(gate[0])}, inf)")
     made = PixelMaps()
-    made.laser, made.ports = wp.vec3(*map(float, laser)), ports
-    made.nearest, made.farthest = gate_paths
-    for name, array in (maps | {"paths": paths, "cumulative": cumulative}).items():
+    optics, made.ports = check_ports("ports", ports, optics)
+    made.laser, (made.nearest, made.farthest), made.view = wp.vec3(*map(float, laser)), gate, view
+    for name, array in maps.items():
         setattr(made, name, array)
     return optics, made
 
@@ -231,28 +219,25 @@ def sample_frames(
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
     maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
-    optics, drawn = _pixel_maps(optics, ports, laser, gate_paths, paths, cumulative, view=view, **maps)
+    maps |= {"paths": paths, "cumulative": cumulative}
+    optics, drawn = _pixel_maps(optics, ports, laser, gate_paths, view, **maps)
     pixels, device = view.shape[0], view.device
     frames = check_integer("frames", frames, 0)
     first_frame, seed = check_integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check_seed(seed)
-    if out is None:
-        out = (
-            wp.empty((frames, pixels), dtype=float, device=device),
-            wp.empty((frames, pixels), dtype=wp.bool, device=device),
-        )
-    if not (isinstance(out, tuple) and len(out) == 2):
+    kinds = (wp.float32, wp.bool)
+    made: Any = tuple(wp.empty((frames, pixels), dtype=kind, device=device) for kind in kinds) if out is None else out
+    if not (isinstance(made, tuple) and len(made) == 2):
         raise ArgumentError("out is not a pair of arrays, of depth and of labels")
-    check_array("out[0]", out[0], wp.float32, (frames, pixels), device)
-    check_array("out[1]", out[1], wp.bool, (frames, pixels), device)
-    kernel = _make_sample_kernel(optics)
+    for k, kind in enumerate(kinds):
+        check_array(f"out[{k}]", made[k], kind, (frames, pixels), device)
     # wp.tid() is a 32-bit integer, and a thread draws two frames.
     step = 2 * max((1 << 30) // max(pixels, 1), 1)
     for start in range(0, frames, step):
         stop = min(start + step, frames)
         pairs = (first_frame + stop + 1) // 2 - (first_frame + start) // 2
-        inputs = [drawn, pixels, first_frame + start, stop - start, seed, out[0][start:stop], out[1][start:stop]]
-        launch_pixels(kernel, pairs * pixels, inputs, device=device)
-    return out
+        inputs = [drawn, pixels, first_frame + start, stop - start, seed, *(array[start:stop] for array in made)]
+        launch_pixels(_make_sample_kernel(optics), pairs * pixels, inputs, device=device)
+    return made
 
 
 # ---- Frames as a dataset stores them.
@@ -342,15 +327,6 @@ def _make_coding_kernel(optics: Optics) -> wp.Kernel:
     return frames_kernel
 
 
-def _check_coding(coding: Any) -> None:
-    check_struct("coding", coding, FrameCoding)
-    width = check_integer("coding.width", coding.width, 1)
-    if check_integer("coding.pixels", coding.pixels, 1) % width:
-        raise ArgumentError(f"coding.width = {width} does not divide coding.pixels = {coding.pixels}")
-    check_fields("coding", coding, {"depth_offset": "(-inf, inf)", "depth_step": "(0, inf)"})
-    check_fields("coding", coding, {"intensity_step": "(0, inf)", "pulses": "[0, inf)"})
-
-
 def draw_frames(
     coding: FrameCoding,
     view: wp.array,
@@ -384,16 +360,20 @@ def draw_frames(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    _check_coding(coding)
+    check_struct("coding", coding, FrameCoding)
+    width = check_integer("coding.width", coding.width, 1)
+    if check_integer("coding.pixels", coding.pixels, 1) % width:
+        raise ArgumentError(f"coding.width = {width} does not divide coding.pixels = {coding.pixels}")
+    check_fields("coding", coding, {"depth_offset": "(-inf, inf)", "depth_step": "(0, inf)"})
+    check_fields("coding", coding, {"intensity_step": "(0, inf)", "pulses": "[0, inf)"})
     check_array("view", view, wp.vec3, (coding.pixels,))
     maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
-    gate = (coding.nearest, coding.farthest)
-    optics, drawn = _pixel_maps(optics, ports, coding.laser, gate, paths, cumulative, view=view, **maps)
+    maps |= {"paths": paths, "cumulative": cumulative}
+    optics, drawn = _pixel_maps(optics, ports, coding.laser, (coding.nearest, coding.farthest), view, **maps)
     check_array("alpha", alpha, wp.float32, (coding.pixels,), view.device)
     check_array("fraction", fraction, wp.float32, (None,), view.device)
     device, frames = view.device, fraction.size
-    row_bytes = (coding.width + 7) // 8
-    label_count = coding.pixels // coding.width * row_bytes
+    label_count = coding.pixels // width * ((width + 7) // 8)
     depth_codes = wp.empty((frames, coding.pixels), dtype=wp.uint16, device=device)
     intensity_codes = wp.empty((frames, coding.pixels), dtype=wp.uint8, device=device)
     labels = wp.empty((frames, label_count), dtype=wp.uint8, device=device)

@@ -1,22 +1,29 @@
-"""Geometry of the analytic model: how light gets from the laser to the water and on to the camera, each of which is in
-the water or behind a port.
+"""Laser, water and camera of the analytic model, and how light gets from the laser to the water and on to the camera,
+each of which is in the water or behind a port.
 
-A range r is the length of the way in the water along a line of sight; without a port it begins at the lens. Rays
-through ports are traced by the functions of the ports, in float32: lengths are right to 1e-7 of themselves.
+A range r is the length of the way in the water along a line of sight; without a port it begins at the lens. In float64,
+but rays through ports are traced by the functions of the ports, in float32: lengths are right to 1e-7 of themselves.
 """
 
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_struct
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_arrays,
+    check_fields,
+    check_integer,
+    check_number,
+    check_struct,
+    check_vector,
+)
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
-from spadwarp_kernels.optics.port import DOME_PORT, FLAT_PORT, PortKind, check_port
+from spadwarp_kernels.optics.port import DOME_PORT, FLAT_PORT, Port, PortKind, check_port
 
-from .lidar import Lidar, Ports, beam_direction, beam_fluence, beam_path, check_lidar
-
-__all__ = ["make_optics"]
+__all__ = ["BACKSCATTER_SOURCES", "Lidar", "Ports", "make_optics"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
@@ -27,6 +34,73 @@ _EDGES = wp.constant(49)
 _PART = wp.constant(wp.float64(1.0 / 48.0))
 _HALVINGS = wp.constant(24)
 _NONE = wp.constant(wp.float64(-1.0e30))
+
+BACKSCATTER_SOURCES = ("constant", "single_scatter", "monte_carlo")
+
+
+@wp.struct
+class Ports:
+    """The ports that an `Optics` of them reads; those of a camera and a laser in the water are as they are made.
+
+    Attributes:
+        camera: What the camera looks through.
+        laser: What the laser shines through.
+    """
+
+    camera: Port
+    laser: Port
+
+
+@wp.struct
+class Lidar:
+    """Laser, water, camera and gate as the analytic model needs them.
+
+    Attributes:
+        lu2024: 1 if the photon budget of Lu et al. 2024 (K = 8, small angles, no cosines) replaces radiometry, else 0.
+        photons: Photons per pulse, E0 λ/hc.
+        pde: Photon detection efficiency, PDP times fill factor.
+        extinction, scattering: Of the water [1/m].
+        speed: Group velocity c0/n_g [m/s].
+        laser, axis: Position [m] and unit direction of the laser.
+        profile: Index into LASER_PROFILES.
+        spread: 1 - cos(half angle) (uniform cone); unused otherwise.
+        tan2: tan^2 of the half angle.
+        radius: Beam radius [m] (collimated).
+        pixel_tangent: Pixel pitch over focal length.
+        aperture_area: [m^2].
+        start, stop: The gate [s].
+        sigma: Standard deviation of the instrument response [s].
+        dark: Rate of dark counts and ambient light [1/s].
+        source: Index into BACKSCATTER_SOURCES.
+        constant: Backscatter rate [1/s] (source 0).
+        nearest: Range below which single scattering is left out [m] (source 1).
+        bin_width: Of the Monte Carlo profile [s] (source 2).
+        ports: What camera and laser are behind, for the optics that say so.
+    """
+
+    lu2024: int
+    photons: wp.float64
+    pde: wp.float64
+    extinction: wp.float64
+    scattering: wp.float64
+    speed: wp.float64
+    laser: wp.vec3d
+    axis: wp.vec3d
+    profile: int
+    spread: wp.float64
+    tan2: wp.float64
+    radius: wp.float64
+    pixel_tangent: wp.float64
+    aperture_area: wp.float64
+    start: wp.float64
+    stop: wp.float64
+    sigma: wp.float64
+    dark: wp.float64
+    source: int
+    constant: wp.float64
+    nearest: wp.float64
+    bin_width: wp.float64
+    ports: Ports
 
 
 @wp.struct
@@ -70,43 +144,22 @@ class LensConnection:
 
 
 class Optics(NamedTuple):
-    """Warp functions for a camera and a laser, each in the water or behind a port.
+    """Warp functions for a camera and a laser, each in the water or behind a port."""
 
-    Attributes:
-        kinds: Of the ports of camera and laser; None: in the water.
-        see: (ports, view) -> SightRay of a pixel, from the unit vector in which the lens sees it.
-        beside: (lidar, sight, x, a, b) -> the point at the depth of x that the lens sees a and b pixels beside it.
-        footprint: (lidar, distance) -> about the side of a pixel [m].
-        receive: (lidar, normal, x) -> LensConnection of a point of a surface.
-        spot: (lidar, path) -> about the radius of the beam [m].
-        emit: (lidar, x, u) -> BeamRay in the water of a ray from the laser.
-        light: (lidar, x) -> LaserConnection of a point.
-        range_of_path: (laser, ports, sight, path) -> range at which light has gone a path from laser to target to
-            lens [m]; 0 or less if there is none.
-        illuminated: (lidar, sight, near, far) -> the part of an interval of ranges that the laser's uniform cone
-            illuminates; far < near if there is none.
-    """
-
-    kinds: tuple[PortKind | None, PortKind | None]
-    see: wp.Function
-    beside: wp.Function
-    footprint: wp.Function
-    receive: wp.Function
-    spot: wp.Function
-    emit: wp.Function
-    light: wp.Function
+    kinds: tuple[PortKind | None, PortKind | None]  # of the ports of camera and laser; None: in the water
+    see: wp.Function  # (ports, view) -> SightRay of a pixel, from the unit vector in which the lens sees it
+    beside: wp.Function  # (lidar, sight, x, a, b) -> point at the depth of x that is seen a and b pixels beside it
+    footprint: wp.Function  # (lidar, distance) -> about the side of a pixel [m]
+    receive: wp.Function  # (lidar, normal, x) -> LensConnection of a point of a surface
+    spot: wp.Function  # (lidar, path) -> about the radius of the beam [m]
+    emit: wp.Function  # (lidar, x, u) -> BeamRay in the water of a ray from the laser
+    light: wp.Function  # (lidar, x) -> LaserConnection of a point
+    # (laser, ports, sight, path) -> range at which light has gone a path from laser to target to lens [m]; 0 or less if
+    # there is none
     range_of_path: wp.Function
+    # (lidar, sight, near, far) -> the part of an interval of ranges that the laser's uniform cone illuminates; far <
+    # near if there is none
     illuminated: wp.Function
-
-
-@wp.func
-def _single(x: wp.vec3d) -> wp.vec3:
-    return wp.vec3(float(x[0]), float(x[1]), float(x[2]))
-
-
-@wp.func
-def _double(x: wp.vec3) -> wp.vec3d:
-    return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
 
 
 @wp.func
@@ -118,9 +171,8 @@ def point_at(sight: SightRay, r: wp.float64) -> wp.vec3d:
 # ---- The camera.
 
 
-@memoised
-def _make_camera(kind: PortKind | None) -> dict[str, wp.Function]:
-    """What `Optics` has of a camera behind a kind of port, or in the water."""
+def _make_camera(kind: PortKind | None) -> tuple[wp.Function, ...]:
+    """`Optics.see` to `receive` of a camera behind a kind of port, or in the water."""
     has_port, is_flat = kind is not None, kind == FLAT_PORT
     enter, connect = (kind or FLAT_PORT).enter, (kind or FLAT_PORT).connect
 
@@ -131,11 +183,11 @@ def _make_camera(kind: PortKind | None) -> dict[str, wp.Function]:
         s.u = view
         s.radiance = ONE
         if wp.static(has_port):
-            p = enter(ports.camera, wp.vec3(0.0), _single(view))
+            p = enter(ports.camera, wp.vec3(0.0), wp.vec3(view))
             s.radiance = ZERO
             if p.transmission > 0.0:
-                s.start = _double(p.x)
-                s.u = wp.normalize(_double(p.u))
+                s.start = wp.vec3d(p.x)
+                s.u = wp.normalize(wp.vec3d(p.u))
                 s.distance = wp.length(s.start)
                 s.delay = wp.float64(p.path)
                 ratio = wp.float64(ports.camera.index[0]) / wp.float64(ports.camera.index[2])
@@ -166,38 +218,67 @@ def _make_camera(kind: PortKind | None) -> dict[str, wp.Function]:
             out.share = -wp.dot(normal, x) / r * (x[2] / r) / (r * r)
             out.water = r
             return out
-        c = connect(lidar.ports.camera, _single(x), wp.vec3(0.0))
+        c = connect(lidar.ports.camera, wp.vec3(x), wp.vec3(0.0))
         if c.density > 0.0:
-            out.ray = -_double(c.inside)
-            cos_out = wp.dot(normal, _double(c.to_port))
+            out.ray = -wp.vec3d(c.inside)
+            cos_out = wp.dot(normal, wp.vec3d(c.to_port))
             out.share = cos_out * out.ray[2] * wp.float64(c.density * c.transmission)
             out.water = wp.float64(c.water)
         return out
 
-    return {"see": see, "beside": beside, "footprint": footprint, "receive": receive}
+    return see, beside, footprint, receive
 
 
 # ---- The laser.
 
 
 @wp.func
-def _intensity(lidar: Lidar, u: wp.vec3d) -> wp.float64:
-    """Fraction of a pulse that a laser emits into a unit of solid angle about u [1/sr]."""
-    along = wp.dot(u, lidar.axis)
-    across = wp.length_sq(wp.cross(u, lidar.axis))
+def beam_path(lidar: Lidar, x: wp.vec3d) -> wp.float64:
+    """Distance that light goes in water from the laser to x [m]; along the axis for a collimated beam."""
+    y = x - lidar.laser
+    if lidar.profile == 2:
+        return wp.dot(y, lidar.axis)
+    return wp.length(y)
+
+
+@wp.func
+def beam_fluence(lidar: Lidar, y: wp.vec3d, r2: wp.float64) -> wp.float64:
+    """Fraction of a pulse per area across a diverging beam, at y from its laser in clear water [1/m^2], y² being r2;
+    at a unit vector, that per solid angle [1/sr]."""
+    along = wp.dot(y, lidar.axis)
     if along <= ZERO:
         return ZERO
+    # 1 - cos and tan from the cross product: keeps narrow cones exact.
+    across = wp.length_sq(wp.cross(y, lidar.axis))
+    r = wp.sqrt(r2)
     if lidar.profile == 0:
-        if across > lidar.spread * (ONE + along):
+        if across > lidar.spread * r * (r + along):
             return ZERO
-        return ONE / (TWO * PI * lidar.spread)
+        return ONE / (TWO * PI * lidar.spread * r2)
     tan2 = across / (along * along)
-    return TWO / (PI * lidar.tan2) * wp.exp(-TWO * tan2 / lidar.tan2) / (along * along * along)
+    cos = along / r
+    return TWO / (PI * lidar.tan2) * wp.exp(-TWO * tan2 / lidar.tan2) / (cos * cos * cos * r2)
 
 
-@memoised
-def _make_beam(kind: PortKind | None) -> dict[str, wp.Function]:
-    """What `Optics` has of a laser behind a kind of port, or in the water."""
+@wp.func
+def _light_in_water(lidar: Lidar, x: wp.vec3d) -> LaserConnection:
+    light = LaserConnection()
+    y = x - lidar.laser
+    light.path = beam_path(lidar, x)
+    light.water = light.path
+    if lidar.profile == 2:
+        light.u = lidar.axis
+        aside2 = wp.length_sq(wp.cross(y, lidar.axis))
+        if light.path > ZERO and aside2 <= lidar.radius * lidar.radius:
+            light.fluence = ONE / (PI * lidar.radius * lidar.radius)
+    else:
+        light.u = wp.normalize(y)
+        light.fluence = beam_fluence(lidar, y, wp.dot(y, y))
+    return light
+
+
+def _make_beam(kind: PortKind | None) -> tuple[wp.Function, ...]:
+    """`Optics.spot` to `light` of a laser behind a kind of port, or in the water."""
     has_port, is_flat = kind is not None, kind == FLAT_PORT
     enter, leave, connect = (kind or FLAT_PORT).enter, (kind or FLAT_PORT).leave, (kind or FLAT_PORT).connect
 
@@ -213,15 +294,14 @@ def _make_beam(kind: PortKind | None) -> dict[str, wp.Function]:
     @wp.func
     def emit(lidar: Lidar, x: wp.vec3d, u: wp.vec3d) -> BeamRay:
         ray = BeamRay()
-        if wp.static(not has_port):
-            ray.x = x
-            ray.u = u
-            ray.transmission = ONE
-            return ray
-        p = enter(lidar.ports.laser, _single(x), _single(u))
-        ray.x = _double(p.x)
-        ray.u = _double(p.u)
-        ray.transmission = wp.float64(p.transmission)
+        ray.x = x
+        ray.u = u
+        ray.transmission = ONE
+        if wp.static(has_port):
+            p = enter(lidar.ports.laser, wp.vec3(x), wp.vec3(u))
+            ray.x = wp.vec3d(p.x)
+            ray.u = wp.vec3d(p.u)
+            ray.transmission = wp.float64(p.transmission)
         return ray
 
     @wp.func
@@ -229,45 +309,39 @@ def _make_beam(kind: PortKind | None) -> dict[str, wp.Function]:
         """Of a collimated beam, which stays one behind a flat port: back along the ray through x."""
         light = LaserConnection()
         port = lidar.ports.laser
-        u = enter(port, _single(lidar.laser), _single(lidar.axis)).u
-        back = leave(port, _single(x), -u)
+        u = enter(port, wp.vec3(lidar.laser), wp.vec3(lidar.axis)).u
+        back = leave(port, wp.vec3(x), -u)
         if back.transmission <= 0.0:
             return light
-        y = _double(back.x) - lidar.laser
+        y = wp.vec3d(back.x) - lidar.laser
         along = wp.dot(y, lidar.axis)
-        light.u = _double(u)
+        light.u = wp.vec3d(u)
         light.water = wp.float64(back.water)
         light.path = light.water + wp.float64(back.path) + wp.float64(port.delay[0]) * along
         if wp.length_sq(y - along * lidar.axis) <= lidar.radius * lidar.radius and light.water > ZERO:
-            narrower = wp.dot(lidar.axis, _double(port.normal)) / wp.float64(wp.dot(u, port.normal))
+            narrower = wp.dot(lidar.axis, wp.vec3d(port.normal)) / wp.float64(wp.dot(u, port.normal))
             light.fluence = wp.float64(back.transmission) * narrower / (PI * lidar.radius * lidar.radius)
         return light
 
     @wp.func
-    def light(lidar: Lidar, x: wp.vec3d) -> LaserConnection:
+    def light_behind_port(lidar: Lidar, x: wp.vec3d) -> LaserConnection:
         out = LaserConnection()
-        if wp.static(not has_port):
-            out.path = beam_path(lidar, x)
-            out.water = out.path
-            out.u = beam_direction(lidar, x)
-            out.fluence = beam_fluence(lidar, x)
-            return out
         port = lidar.ports.laser
         if wp.static(is_flat) and lidar.profile == 2:
             return parallel_light(lidar, x)
-        c = connect(port, _single(x), _single(lidar.laser))
+        c = connect(port, wp.vec3(x), wp.vec3(lidar.laser))
         if c.density <= 0.0:
             return out
         out.path = wp.float64(c.path)
         out.water = wp.float64(c.water)
-        out.u = -wp.normalize(_double(c.to_port))
+        out.u = -wp.normalize(wp.vec3d(c.to_port))
         # The density is that of light from x to the laser; the other way the index goes with it.
         ratio = wp.float64(port.index[2]) / wp.float64(port.index[0])
         spread = ratio * ratio * wp.float64(c.density) * wp.float64(c.transmission)
-        out.fluence = _intensity(lidar, -wp.normalize(_double(c.inside))) * spread
+        out.fluence = beam_fluence(lidar, -wp.normalize(wp.vec3d(c.inside)), ONE) * spread
         return out
 
-    return {"spot": spot, "emit": emit, "light": light}
+    return spot, emit, light_behind_port if has_port else _light_in_water
 
 
 # ---- Both.
@@ -288,30 +362,28 @@ def _straight_range(laser: wp.vec3d, sight: SightRay, path: wp.float64) -> wp.fl
     return (path * path - wp.length_sq(y)) / (TWO * (path + wp.dot(sight.u, y)))
 
 
-@memoised
 def _make_range_of_path(kind: PortKind | None) -> wp.Function:
     """`Optics.range_of_path` for a laser behind a kind of port, or in the water."""
-    has_port = kind is not None
-    connect = (kind or FLAT_PORT).connect
+    has_port, connect = kind is not None, (kind or FLAT_PORT).connect
 
     @wp.func
     def range_of_path(laser: wp.vec3d, ports: Ports, sight: SightRay, path: wp.float64) -> wp.float64:
         left = path - sight.delay
         if wp.static(not has_port):
             return _straight_range(laser, sight, left)
-        o = _single(laser)
+        o = wp.vec3(laser)
         least = least_range(sight)
-        c = connect(ports.laser, _single(sight.start + least * sight.u), o)
+        c = connect(ports.laser, wp.vec3(sight.start + least * sight.u), o)
         if c.density > 0.0 and wp.float64(c.path) + least >= left:
             return _NONE
         r = wp.max(_straight_range(laser, sight, left), least)
         for _ in range(_STEPS):
-            c = connect(ports.laser, _single(sight.start + r * sight.u), o)
+            c = connect(ports.laser, wp.vec3(sight.start + r * sight.u), o)
             if c.density <= 0.0:  # not yet where the laser's water is
                 r = TWO * r + wp.float64(1.0e-3)
             else:
                 # The path rises with the range by 1 + the cosine between both directions of light.
-                slope = wp.max(ONE - wp.dot(_double(c.to_port), sight.u), wp.float64(1.0e-3))
+                slope = wp.max(ONE - wp.dot(wp.vec3d(c.to_port), sight.u), wp.float64(1.0e-3))
                 step = (left - wp.float64(c.path) - r) / slope
                 r = wp.max(r + step, least)
                 if wp.abs(step) <= wp.float64(1.0e-4) * r:
@@ -334,9 +406,7 @@ def cone_interval(lidar: Lidar, apex: wp.vec3d, u: wp.vec3d) -> wp.vec2d:
     pa = wp.dot(apex, lidar.axis)
     a = da * da - k
     b = da * pa - k * wp.dot(u, apex)
-    c = pa * pa - k * wp.length_sq(apex)
-    disc = b * b - a * c
-    none = wp.vec2d(ONE, -ONE)
+    disc = b * b - a * (pa * pa - k * wp.length_sq(apex))
     if wp.abs(a) < wp.float64(1.0e-15):
         return wp.vec2d(ZERO, far)
     root = wp.sqrt(wp.max(disc, ZERO))
@@ -347,11 +417,10 @@ def cone_interval(lidar: Lidar, apex: wp.vec3d, u: wp.vec3d) -> wp.vec2d:
             return wp.vec2d(wp.max(high, ZERO), far)
         return wp.vec2d(ZERO, low)
     if disc <= ZERO or HALF * (low + high) * da - pa <= ZERO:
-        return none
+        return wp.vec2d(ONE, -ONE)
     return wp.vec2d(wp.max(low, ZERO), high)
 
 
-@memoised
 def _make_illuminated(kinds: tuple[PortKind | None, PortKind | None], light: wp.Function) -> wp.Function:
     """`Optics.illuminated` for kinds of ports of camera and laser."""
     in_water, has_port = kinds == (None, None), kinds[1] is not None
@@ -413,19 +482,30 @@ def make_optics(port: PortKind | None = None, laser_port: PortKind | None = None
     for name, kind in {"port": port, "laser_port": laser_port}.items():
         if not isinstance(kind, PortKind | None):
             raise ArgumentError(f"{name} = {kind!r} is not a PortKind or None")
-    return _make_optics(port, laser_port)
+    return _make_optics((port, laser_port))
 
 
 @memoised
-def _make_optics(port: PortKind | None, laser_port: PortKind | None) -> Optics:
-    beam = _make_beam(laser_port)
-    illuminated = _make_illuminated((port, laser_port), beam["light"])
-    ranges = {"range_of_path": _make_range_of_path(laser_port), "illuminated": illuminated}
-    return Optics((port, laser_port), **_make_camera(port), **beam, **ranges)
+def _make_optics(kinds: tuple[PortKind | None, PortKind | None]) -> Optics:
+    beam = _make_beam(kinds[1])
+    ranges = _make_range_of_path(kinds[1]), _make_illuminated(kinds, beam[-1])
+    return Optics(kinds, *_make_camera(kinds[0]), *beam, *ranges)
 
 
 IN_WATER = make_optics()
 """A camera and a laser in the water."""
+
+
+# ---- Checks of arguments.
+
+
+_RANGES = {
+    "[0, inf)": ("photons", "extinction", "scattering", "start", "dark", "constant", "nearest"),
+    "(0, inf)": ("speed", "pixel_tangent", "aperture_area", "sigma"),
+    "[0, 1]": ("pde",),
+}
+# What each laser profile reads.
+_BEAM = ({"spread": "[0, 2]"}, {"tan2": "[0, inf)"}, {"radius": "[0, inf)"})
 
 
 def check_ports(name: str, ports: Any, optics: Any) -> tuple[Optics, Any]:
@@ -441,12 +521,26 @@ def check_ports(name: str, ports: Any, optics: Any) -> tuple[Optics, Any]:
     return optics, ports
 
 
-def check_optics(lidar: Any, optics: Any) -> Optics:
-    """A `Lidar` whose numbers are in range, and optics that its laser can have; raises `ArgumentError`."""
-    check_lidar(lidar)
+def check_lidar(lidar: Any, optics: Any, view: Any, **columns: Any) -> tuple[Optics, int, Any]:
+    """A `Lidar` whose numbers are in range, optics that its laser can have, lines of sight, and float64 columns of a
+    number for each: the optics, number and device of the lines. Raises `ArgumentError`."""
+    check_struct("lidar", lidar, Lidar)
+    check_integer("lidar.lu2024", lidar.lu2024, 0, 1)
+    check_fields("lidar", lidar, {name: interval for interval, names in _RANGES.items() for name in names})
+    check_number("lidar.stop", lidar.stop, f"({float(lidar.start)}, inf)")
+    check_vector("lidar.laser", lidar.laser)
+    check_vector("lidar.axis", lidar.axis, unit=True)
+    check_fields("lidar", lidar, _BEAM[check_integer("lidar.profile", lidar.profile, 0, len(_BEAM) - 1)])
+    source = check_integer("lidar.source", lidar.source, 0, len(BACKSCATTER_SOURCES) - 1)
+    if lidar.lu2024:
+        check_number("lidar.tan2", lidar.tan2, "(0, inf)")
+    if BACKSCATTER_SOURCES[source] == "monte_carlo":
+        check_number("lidar.bin_width", lidar.bin_width, "(0, inf)")
     optics, _ = check_ports("lidar.ports", lidar.ports, optics)
     if optics is not IN_WATER and lidar.lu2024:
         raise ArgumentError("lidar.lu2024 = 1 is for a camera and a laser in the water, not for optics of ports")
     if lidar.profile == 2 and optics.kinds[1] == DOME_PORT:
         raise ArgumentError("lidar.profile = 2: a collimated beam does not stay one behind a dome")
-    return optics
+    check_array("view", view, wp.vec3d, (None,))
+    check_arrays(wp.float64, (view.shape[0],), view.device, **columns)
+    return optics, view.shape[0], view.device

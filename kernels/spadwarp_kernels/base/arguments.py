@@ -8,13 +8,17 @@ import math
 import operator
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 __all__ = ["ArgumentError"]
+
+
+# What a field of a struct must be, see `check_fields`.
+Need: TypeAlias = str | tuple[int | None, ...]
 
 
 class ArgumentError(ValueError):
@@ -37,9 +41,8 @@ def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
     except (TypeError, ValueError, OverflowError):
         raise ArgumentError(f"{name} = {value!r} is not a number") from None
     low, high, low_open, high_open = _limits(interval)
-    outside = number <= low if low_open else number < low
-    outside = outside or (number >= high if high_open else number > high)
-    if outside or not math.isfinite(number):
+    inside = (low < number if low_open else low <= number) and (number < high if high_open else number <= high)
+    if not (inside and math.isfinite(number)):
         raise ArgumentError(f"{name} = {value} is outside {interval}")
     return number
 
@@ -86,10 +89,21 @@ def check_struct(name: str, value: Any, struct: Any) -> None:
         raise ArgumentError(f"{name} is {_kind(value)}; a {struct.key.rsplit('.')[-1]} is needed")
 
 
-def check_fields(name: str, value: Any, intervals: Mapping[str, str]) -> None:
-    """Numbers of a struct."""
-    for field, interval in intervals.items():
-        check_number(f"{name}.{field}", getattr(value, field), interval)
+def check_fields(name: str, struct: Any, needs: Mapping[str, Need], device: Any = None) -> None:
+    """Fields of a struct, each by what it must be: numbers, also those of a vector, in an interval such as `"[0, 1)"`;
+    `"unit"`, a unit vector or a matrix of them; a shape: an array of the field's dtype, see `check_array`."""
+    for field, need in needs.items():
+        path, value = f"{name}.{field}", getattr(struct, field)
+        if isinstance(need, tuple):
+            check_array(path, value, struct._cls.vars[field].type.dtype, need, device)
+        elif need == "unit":
+            for row in np.reshape(value, (-1, 3)):
+                check_vector(path, row, unit=True)
+        elif hasattr(value, "__len__"):
+            for k, number in enumerate(value):
+                check_number(f"{path}[{k}]", number, need)
+        else:
+            check_number(path, value, need)
 
 
 def check_vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
@@ -98,9 +112,9 @@ def check_vector(name: str, value: Sequence[float], *, unit: bool = False, size:
         components = [float(x) for x in value]
     except (TypeError, ValueError):
         components = []
-    if len(components) != size or not all(map(math.isfinite, components)):
-        raise ArgumentError(f"{name} = {value} is not a vector of {size} finite numbers")
     length = math.hypot(*components)
+    if len(components) != size or not math.isfinite(length):
+        raise ArgumentError(f"{name} = {value} is not a vector of {size} finite numbers")
     if unit and abs(length - 1.0) > 1e-3:
         raise ArgumentError(f"{name} = {tuple(components)} has the length {length:g}; a unit vector is needed")
 
@@ -134,36 +148,29 @@ def check_array(
 ) -> Any:
     """A `wp.array` of one of the dtypes, with the sizes given (None: any), on a device (None: any)."""
     allowed = dtypes if isinstance(dtypes, tuple) else (dtypes,)
-    problem = None
     if not isinstance(array, wp.array):
         problem = f"is {_kind(array)}"
-    elif not (_fits(array.shape, shape) and any(wp.types.types_equal(array.dtype, dtype) for dtype in allowed)):
+    elif not (
+        len(array.shape) == len(shape)
+        and all(needed in (None, size) for size, needed in zip(array.shape, shape, strict=True))
+        and any(wp.types.types_equal(array.dtype, dtype) for dtype in allowed)
+    ):
         problem = f"is a wp.array of {_dtype_name(array.dtype)}, shape {tuple(array.shape)}"
     elif device is not None and array.device != device:
         problem = f"is on {array.device} and not on {device}"
     elif contiguous and not array.is_contiguous:
         problem = "is not contiguous"
-    if problem is not None:
-        kinds = " or ".join(map(_dtype_name, allowed))
-        raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape {_shape_text(shape)}, is needed")
-    return array
-
-
-def check_attributes(name: str, struct: Any, device: wp.Device, **shapes: tuple[int | None, ...]) -> None:
-    """Arrays of a Warp struct, each with the dtype of its attribute and of such a shape, see `check_array`."""
-    for attribute, shape in shapes.items():
-        dtype = struct._cls.vars[attribute].type.dtype
-        check_array(f"{name}.{attribute}", getattr(struct, attribute), dtype, shape, device)
+    else:
+        return array
+    kinds = " or ".join(map(_dtype_name, allowed))
+    sizes = ", ".join("any" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
+    raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape ({sizes}), is needed")
 
 
 def check_arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **arrays: Any) -> None:
     """`check_array` for several arrays of one kind, by name."""
     for name, array in arrays.items():
         check_array(name, array, dtypes, shape, device)
-
-
-def _fits(sizes: Sequence[int], shape: Sequence[int | None]) -> bool:
-    return len(sizes) == len(shape) and all(b is None or a == b for a, b in zip(sizes, shape, strict=True))
 
 
 def check_values(name: str, array: wp.array, interval: str) -> None:
@@ -188,8 +195,3 @@ def _kind(value: Any) -> str:
 
 def _dtype_name(dtype: Any) -> str:
     return {float: "float32", int: "int32"}.get(dtype) or getattr(dtype, "__name__", str(dtype))
-
-
-def _shape_text(shape: Sequence[int | None]) -> str:
-    sizes = ["any" if size is None else str(size) for size in shape]
-    return f"({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"

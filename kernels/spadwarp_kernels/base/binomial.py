@@ -6,7 +6,7 @@ process of that mean. Small p keeps all its digits, and so does 1 − p where p 
 
 import warp as wp
 
-from .native import expm1, log1p
+from .native import HALF, ONE, TWO, ZERO, expm1, log1p
 from .philox import STREAM_DETECTOR, random_block
 
 wp.set_module_options({"enable_backward": False})
@@ -54,7 +54,7 @@ def uniforms(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.uint3
 def _stirling_rest(k: wp.float64) -> wp.float64:
     if k < wp.float64(9.5):
         return _STIRLING_REST[int(k)]
-    x = wp.float64(1.0) / (k + wp.float64(1.0))
+    x = ONE / (k + ONE)
     y = x * x
     return (wp.float64(1.0 / 12.0) - (wp.float64(1.0 / 360.0) - y * wp.float64(1.0 / 1260.0)) * y) * x
 
@@ -68,8 +68,8 @@ def _inversion(n: wp.float64, hazard: wp.float64, u: wp.float64) -> wp.float64:
     count = wp.float64(0.0)
     while rest > probability and count < n:
         rest = rest - probability
-        count = count + wp.float64(1.0)
-        probability = probability * odds * (n + wp.float64(1.0) - count) / count
+        count = count + ONE
+        probability = probability * odds * (n + ONE - count) / count
         if probability < wp.float64(1e-300):
             return count
     return count
@@ -86,7 +86,7 @@ def binomial(
     Simul. 46, 101 (1993).
     """
     block = wp.uint32(first_block)
-    if n <= 0 or hazard <= wp.float64(0.0):
+    if n <= 0 or hazard <= ZERO:
         return 0, block
     trials = wp.float64(n)
     swapped = hazard > _LN2
@@ -102,41 +102,39 @@ def binomial(
             few = trials - few
         return int(few), block + wp.uint32(1)
 
-    q = wp.float64(1.0) - p
+    q = ONE - p
     odds = p / q
     deviation = wp.sqrt(mean * q)
     b = wp.float64(1.15) + wp.float64(2.53) * deviation
     a = wp.float64(-0.0873) + wp.float64(0.0248) * b + wp.float64(0.01) * p
-    centre = mean + wp.float64(0.5)
+    centre = mean + HALF
     squeeze = wp.float64(0.92) - wp.float64(4.2) / b
     alpha = (wp.float64(2.83) + wp.float64(5.1) / b) * deviation
-    mode = wp.floor((trials + wp.float64(1.0)) * p)
-    one = wp.float64(1.0)
-    half = wp.float64(0.5)
+    mode = wp.floor((trials + ONE) * p)
     at_mode = wp.float64(0.0)
     ready = int(0)
     count = wp.float64(-1.0)
-    while count < wp.float64(0.0):
+    while count < ZERO:
         draw = uniforms(seed, id, purpose, block)
         block = block + wp.uint32(1)
-        u = draw[0] - half
+        u = draw[0] - HALF
         v = draw[1]
-        us = half - wp.abs(u)
-        k = wp.floor((wp.float64(2.0) * a / us + b) * u + centre)
+        us = HALF - wp.abs(u)
+        k = wp.floor((TWO * a / us + b) * u + centre)
         if us >= wp.float64(0.07) and v <= squeeze:
             count = k
-        elif us > wp.float64(0.0) and k >= wp.float64(0.0) and k <= trials:
+        elif us > ZERO and k >= ZERO and k <= trials:
             if ready == 0:
                 at_mode = (
-                    (mode + half) * wp.log((mode + one) / (odds * (trials - mode + one)))
+                    (mode + HALF) * wp.log((mode + ONE) / (odds * (trials - mode + ONE)))
                     + _stirling_rest(mode)
                     + _stirling_rest(trials - mode)
                 )
                 ready = 1
             bound = (
                 at_mode
-                + (trials + one) * wp.log((trials - mode + one) / (trials - k + one))
-                + (k + half) * wp.log(odds * (trials - k + one) / (k + one))
+                + (trials + ONE) * wp.log((trials - mode + ONE) / (trials - k + ONE))
+                + (k + HALF) * wp.log(odds * (trials - k + ONE) / (k + ONE))
                 - _stirling_rest(k)
                 - _stirling_rest(trials - k)
             )

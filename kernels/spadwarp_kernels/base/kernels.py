@@ -14,7 +14,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-import numpy as np
 import warp as wp
 
 __all__ = ["unpack_kernels"]
@@ -53,11 +52,11 @@ def memoised(make: Callable[P, R]) -> Callable[P, R]:
 # ---- Kernels with one thread a pixel: launches over any number of them, on every core of a CPU.
 
 
-def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any) -> None:
+def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any, threads: int = 0) -> None:
     """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow.
 
-    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads; but not
-    while a graph is captured, which records the launches of one thread.
+    On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads (0: one for
+    each core); but not while a graph is captured, which records the launches of one thread.
     """
     device = wp.get_device(device)
     if count == 0:
@@ -66,15 +65,15 @@ def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, devic
         wp.launch(kernel, count, [0, *inputs], device=device)
         return
     wp.load_module(kernel.module, device=device)  # compiled once, before the threads
-    workers = os.cpu_count() or 1
-    edges = np.unique(np.linspace(0, count, 8 * workers + 1).astype(int)) if workers > 1 else np.array([0, count])
+    workers = threads or os.cpu_count() or 1
+    parts = min(count, 8 * workers if workers > 1 else 1)
+    edges = [count * part // parts for part in range(parts + 1)]
 
-    def part(index: int) -> None:
-        low, high = int(edges[index]), int(edges[index + 1])
+    def launch(low: int, high: int) -> None:
         wp.launch(kernel, high - low, [low, *inputs], device=device)
 
     with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(part, range(len(edges) - 1)))
+        list(pool.map(launch, edges, edges[1:]))
 
 
 # ---- Kernels that were compiled when the package was built: a first run then compiles nothing on common CPUs.
@@ -119,20 +118,17 @@ def this_system() -> dict[str, str]:
 
 
 def _processor_features() -> set[str]:
-    for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-        if line.startswith("flags"):
-            return set(line.split())
-    return set()
+    """With other words of that file."""
+    return set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
 
 
 def _unpack(archive: zipfile.ZipFile, name: str, ending: str) -> bool:
     module = name.removesuffix(".o")
     folder = Path(wp.config.kernel_cache_dir) / module
-    parts = {f"{module}.o": folder / f"{module}.{ending}.o", f"{module}.meta": folder / f"{module}.meta"}
-    missing = {part: path for part, path in parts.items() if not path.exists()}
-    for part, path in missing.items():
+    missing = [part for part in (f"{ending}.o", "meta") if not (folder / f"{module}.{part}").exists()]
+    for part in missing:
         folder.mkdir(parents=True, exist_ok=True)
         temporary = folder / f".{secrets.token_hex(8)}"
-        temporary.write_bytes(archive.read(part))
-        os.replace(temporary, path)
+        temporary.write_bytes(archive.read(f"{module}.{part.removeprefix(f'{ending}.')}"))
+        os.replace(temporary, folder / f"{module}.{part}")
     return bool(missing)

@@ -4,24 +4,16 @@ import numpy as np
 import warp as wp
 
 
-@wp.func_native("""
-    union { float number; int bits; } both;
-    both.number = number;
-    return both.bits;
-""")
+@wp.func
 def bits_of(number: float) -> int:
     """The int32 with the bits of a float32."""
-    ...
+    return wp.cast(number, int)
 
 
-@wp.func_native("""
-    union { float number; int bits; } both;
-    both.bits = bits;
-    return both.number;
-""")
+@wp.func
 def from_bits(bits: int) -> float:
     """The float32 with the bits of an int32; to be moved and not to be computed with."""
-    ...
+    return wp.cast(bits, float)
 
 
 # ---- Memory that is read and written all over.
@@ -96,20 +88,18 @@ TWO = wp.constant(wp.float64(2.0))
 def expm1(x: wp.float64) -> wp.float64:
     """exp(x) − 1 without cancellation: relative error below 1e-13."""
     if wp.abs(x) > wp.float64(0.01):
-        return wp.exp(x) - wp.float64(1.0)
-    series = wp.float64(1.0) + x * (
-        wp.float64(1.0 / 2.0) + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0)))
-    )
+        return wp.exp(x) - ONE
+    series = ONE + x * (HALF + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0))))
     return x * series
 
 
 @wp.func
 def log1p(x: wp.float64) -> wp.float64:
     """ln(1 + x) without cancellation (Kahan's correction)."""
-    y = wp.float64(1.0) + x
-    if y == wp.float64(1.0):
+    y = ONE + x
+    if y == ONE:
         return x
-    return x * wp.log(y) / (y - wp.float64(1.0))
+    return x * wp.log(y) / (y - ONE)
 
 
 @wp.func

@@ -66,29 +66,16 @@ def _round(words: wp.vec4ui, x: wp.uint32, y: wp.uint32) -> wp.vec4ui:
 
 
 @wp.func
-def philox4x32(c0: wp.uint32, c1: wp.uint32, c2: wp.uint32, c3: wp.uint32, k0: wp.uint32, k1: wp.uint32) -> wp.vec4ui:
-    """Philox4x32 with ten rounds: four 32-bit words from a 128-bit counter and a 64-bit key."""
-    words = wp.vec4ui(c0, c1, c2, c3)
-    x = _opaque(k0)
-    y = _opaque(k1)
+def random_block(seed: wp.uint64, id: wp.uint64, event: wp.uint32, stream: wp.uint32) -> wp.vec4ui:
+    """The four 32-bit random words of (seed, id, event, stream); id is 64-bit (a photon, a pixel, ...)."""
+    words = wp.vec4ui(wp.uint32(id & _LOW32), wp.uint32(id >> wp.uint64(32)), event, stream)
+    x = _opaque(wp.uint32(seed & _LOW32))
+    y = _opaque(wp.uint32(seed >> wp.uint64(32)))
     for _ in range(wp.static(_ROUNDS)):
         words = _round(words, x, y)
         x = x + _W0
         y = y + _W1
     return words
-
-
-@wp.func
-def random_block(seed: wp.uint64, id: wp.uint64, event: wp.uint32, stream: wp.uint32) -> wp.vec4ui:
-    """The four 32-bit random words of (seed, id, event, stream); id is 64-bit (a photon, a pixel, ...)."""
-    return philox4x32(
-        wp.uint32(id & _LOW32),
-        wp.uint32(id >> wp.uint64(32)),
-        event,
-        stream,
-        wp.uint32(seed & _LOW32),
-        wp.uint32(seed >> wp.uint64(32)),
-    )
 
 
 @wp.struct

@@ -137,18 +137,12 @@ OFF_AXIS = wp.constant(2.0)
 
 
 @wp.func
-def snap_direction(u: wp.vec3, axis_threshold: float) -> wp.vec3:
-    """The near-axis rule (Lu et al. 2024, eq 16): the z axis with u's sign where |u_z| >= axis_threshold, else u.
+def snap_from(u: wp.vec3, least: float) -> wp.vec3:
+    """The near-axis rule (Lu et al. 2024, eq 16): the z axis with u's sign where |u_z| >= least, else u.
 
     A scattering takes the result as its incoming direction, in the density and as the axis of the sampled phase
-    function; the flight keeps u. A threshold of 0.9998 drops up to 1.15 degrees of tilt, 1 switches the rule off.
+    function; the flight keeps u. 0.9998 drops up to 1.15 degrees of tilt, OFF_AXIS switches the rule off.
     """
-    return snap_from(u, wp.where(axis_threshold < 1.0, axis_threshold, OFF_AXIS))
-
-
-@wp.func
-def snap_from(u: wp.vec3, least: float) -> wp.vec3:
-    """`snap_direction`, for a threshold that is OFF_AXIS in place of 1."""
     if wp.abs(u[2]) >= least:
         return wp.vec3(0.0, 0.0, one_with_sign(u[2]))
     return u

@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 from .arrival_time import *
 from .counts import *
-from .expected import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = arrival_time.__all__ + counts.__all__ + expected.__all__
+    __all__ = arrival_time.__all__ + counts.__all__

@@ -12,7 +12,7 @@ import warp as wp
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 
-from .expected import RATES
+from .counts import RATES
 
 __all__ = ["PHASES", "arrival_bins"]
 
@@ -47,100 +47,92 @@ def _parabola_vertex(left: float, centre: float, right: float) -> float:
     return wp.clamp(0.5 * (left - right) / curvature, -0.5, 0.5)
 
 
+@wp.struct
+class _Search:
+    """The search in a histogram, see `arrival_bins`."""
+
+    background: wp.array2d[float]
+    first: int
+    stop: int
+    half_width: int
+    response: wp.array2d[float]  # of the likelihood; of the matched filter its gain
+    lowest_tap: int
+    floor: float  # of the background, a part of the counts
+    coarse_step: int  # of the first search [phases]
+
+
+@wp.func
+def _level(search: _Search, pixel: int, bin: int) -> float:
+    background = search.background
+    return background[pixel % background.shape[0], wp.min(bin, background.shape[1] - 1)]
+
+
 @memoised
 def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
-    def peak(
-        first_pixel: int,
-        histogram: wp.array2d[dtype],
-        background: wp.array2d[float],
-        first: int,
-        stop: int,
-        half_width: int,
-        # Out:
-        arrival: wp.array[float],
-    ):
+    def peak(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
-        level = pixel % background.shape[0]
-        bins = background.shape[1]
         peak_bin = int(-1)
         highest = float(0.0)
-        for k in range(first, stop):
-            excess = float(histogram[pixel, k]) - background[level, wp.min(k, bins - 1)]
+        for k in range(search.first, search.stop):
+            excess = float(histogram[pixel, k]) - _level(search, pixel, k)
             if excess > highest:
                 highest = excess
                 peak_bin = k
         if peak_bin < 0:
             arrival[pixel] = wp.nan
             return
+        shift = float(0.0)
         if wp.static(centroid):
             weight = float(0.0)
             moment = float(0.0)
-            for k in range(wp.max(first, peak_bin - half_width), wp.min(stop, peak_bin + half_width + 1)):
+            half_width = search.half_width
+            for k in range(wp.max(search.first, peak_bin - half_width), wp.min(search.stop, peak_bin + half_width + 1)):
                 # Relative to the peak, so that rates of any size keep their digits.
-                excess = (float(histogram[pixel, k]) - background[level, wp.min(k, bins - 1)]) / highest
+                excess = (float(histogram[pixel, k]) - _level(search, pixel, k)) / highest
                 weight += excess
                 moment += excess * float(k - peak_bin)
-            shift = float(0.0)
             if weight > 0.0:
                 shift = wp.clamp(moment / weight, -float(half_width), float(half_width))
-            arrival[pixel] = float(peak_bin) + 0.5 + shift
-        else:
-            arrival[pixel] = float(peak_bin) + 0.5
+        arrival[pixel] = float(peak_bin) + 0.5 + shift
 
     return peak
 
 
 @memoised
 def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
-    """The score of a delay: by the log-matched filter, whose `response` is its gain, or the likelihood."""
+    """The score of a delay, by the log-matched filter or the likelihood."""
 
     @wp.func
     def filter_score(
-        histogram: wp.array2d[dtype],
-        background: wp.array2d[float],
-        response: wp.array2d[float],
-        pixel: int,
-        window: wp.vec3i,
-        phases: int,
-        least: float,
-        beat: float,
+        histogram: wp.array2d[dtype], search: _Search, pixel: int, phases: int, least: float, beat: float
     ) -> float:
         phase = phases & (PHASES - 1)
-        base = (phases >> _PHASE_BITS) + window[2]
+        base = (phases >> _PHASE_BITS) + search.lowest_tap
         score = float(0.0)
-        for tap in range(wp.max(0, window[0] - base), wp.min(response.shape[1], window[1] - base)):
-            score += float(histogram[pixel, base + tap]) * response[phase, tap]
+        for tap in range(wp.max(0, search.first - base), wp.min(search.response.shape[1], search.stop - base)):
+            score += float(histogram[pixel, base + tap]) * search.response[phase, tap]
         return score
 
     @wp.func
     def profile_likelihood(
-        histogram: wp.array2d[dtype],
-        background: wp.array2d[float],
-        response: wp.array2d[float],
-        pixel: int,
-        window: wp.vec3i,
-        phases: int,
-        least: float,
-        beat: float,
+        histogram: wp.array2d[dtype], search: _Search, pixel: int, phases: int, least: float, beat: float
     ) -> float:
         # max over S >= 0 of sum n ln(1 + S h / B) - S sum h: the log-likelihood ratio of a return at this delay.
         phase = phases & (PHASES - 1)
-        base = (phases >> _PHASE_BITS) + window[2]
-        low = wp.max(0, window[0] - base)
-        high = wp.min(response.shape[1], window[1] - base)
-        level = pixel % background.shape[0]
-        last = background.shape[1] - 1
+        base = (phases >> _PHASE_BITS) + search.lowest_tap
+        low = wp.max(0, search.first - base)
+        high = wp.min(search.response.shape[1], search.stop - base)
         counts = float(0.0)
         slope = float(0.0)
         seen = float(0.0)
         for tap in range(low, high):
-            h = response[phase, tap]
+            h = search.response[phase, tap]
             n = float(histogram[pixel, base + tap])
             seen += h
             if n > 0.0:
                 counts += n
-                slope += n * h / wp.max(background[level, wp.min(base + tap, last)], least)
+                slope += n * h / wp.max(_level(search, pixel, base + tap), least)
         if slope <= seen or seen <= 0.0:
             return 0.0  # the likelihood falls with S from 0 on
         # Jensen's inequality bounds the maximum by that of one bin with the mean h / B: most delays end here.
@@ -155,8 +147,8 @@ def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
             for tap in range(low, high):
                 n = float(histogram[pixel, base + tap])
                 if n > 0.0:
-                    h = response[phase, tap]
-                    ratio = h / (wp.max(background[level, wp.min(base + tap, last)], least) + signal * h)
+                    h = search.response[phase, tap]
+                    ratio = h / (wp.max(_level(search, pixel, base + tap), least) + signal * h)
                     slope += n * ratio
                     curvature += n * ratio * ratio
             signal = wp.max(signal + (slope / seen - 1.0) * slope / curvature, signal)
@@ -164,8 +156,8 @@ def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
         for tap in range(low, high):
             n = float(histogram[pixel, base + tap])
             if n > 0.0:
-                floor = wp.max(background[level, wp.min(base + tap, last)], least)
-                value += n * wp.log(1.0 + signal * response[phase, tap] / floor)
+                floor = wp.max(_level(search, pixel, base + tap), least)
+                value += n * wp.log(1.0 + signal * search.response[phase, tap] / floor)
         return value
 
     return profile_likelihood if likelihood else filter_score
@@ -177,28 +169,18 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     score_of = _make_score(dtype, likelihood)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def search(
-        first_pixel: int,
-        histogram: wp.array2d[dtype],
-        background: wp.array2d[float],
-        response: wp.array2d[float],
-        response_floor: float,
-        window: wp.vec3i,
-        coarse_step: int,
-        # Out:
-        arrival: wp.array[float],
-    ):
-        """`window`: the first bin, the one after the last, the bin of the first tap. Launch: pixels."""
+    def find(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
+        coarse_step = search.coarse_step
         total = float(0.0)
-        for k in range(window[0], window[1]):
+        for k in range(search.first, search.stop):
             total += float(histogram[pixel, k])
-        least = response_floor * total
+        least = search.floor * total
         best = wp.vec3(0.0, -1.0, -1.0)
         if total > 0.0:
-            for step in range(window[0] * PHASES / coarse_step, window[1] * PHASES / coarse_step):
+            for step in range(search.first * PHASES / coarse_step, search.stop * PHASES / coarse_step):
                 phases = step * coarse_step
-                score = score_of(histogram, background, response, pixel, window, phases, least, best[0])
+                score = score_of(histogram, search, pixel, phases, least, best[0])
                 if score > 0.0:
                     best = _offer(float(phases), score, best)
         if best[1] < 0.0:
@@ -207,35 +189,26 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
         middle = int(0.5 * (best[1] + wp.min(best[2], best[1] + float(coarse_step))))
         fine = wp.vec3(-1.0, 0.0, 0.0)
         for phases in range(middle - coarse_step, middle + coarse_step + 1):
-            score = score_of(histogram, background, response, pixel, window, phases, least, 0.0)
+            score = score_of(histogram, search, pixel, phases, least, 0.0)
             fine = _offer(float(phases), score, fine)
         top = 0.5 * (fine[1] + fine[2])
         if fine[1] == fine[2]:
             centre = int(fine[1])
-            left = score_of(histogram, background, response, pixel, window, centre - 1, least, 0.0)
-            right = score_of(histogram, background, response, pixel, window, centre + 1, least, 0.0)
+            left = score_of(histogram, search, pixel, centre - 1, least, 0.0)
+            right = score_of(histogram, search, pixel, centre + 1, least, 0.0)
             top += _parabola_vertex(left, fine[0], right)
         arrival[pixel] = top / float(PHASES)
 
-    return search
+    return find
 
 
 class ArrivalEstimator:
-    """`arrival_bins` with everything prepared: a call allocates nothing and reads no value on the host.
-
-    Args:
-        bins: Of the histograms.
-        device: Where they are.
-        method, background, response, lowest_tap, first, stop, half_width: As for `arrival_bins`.
-
-    Raises:
-        ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
-    """
+    """`arrival_bins` for histograms of so many bins on a device, with everything prepared: a call allocates nothing and
+    reads no value on the host. Arguments and errors are those of `arrival_bins`."""
 
     def __init__(
         self,
         bins: int,
-        *,
         device: wp.DeviceLike,
         method: str = "centroid",
         background: wp.array | None = None,
@@ -248,36 +221,37 @@ class ArrivalEstimator:
         check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
         self.device, self.method = wp.get_device(device), method
         self.bins = check_integer("bins", bins, 0)
-        first = check_integer("first", first, 0, bins)
-        stop = bins if stop is None else check_integer("stop", stop, first, bins)
-        half_width = check_integer("half_width", half_width, 0, 2**24)
-        lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
+        self._search = search = _Search()
+        search.first = check_integer("first", first, 0, bins)
+        search.stop = bins if stop is None else check_integer("stop", stop, first, bins)
+        search.half_width = check_integer("half_width", half_width, 0, 2**24)
+        search.lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
         if background is None:
             background = wp.zeros((1, 1), dtype=float, device=self.device)
         check_array("background", background, wp.float32, (None, None), self.device)
         if background.shape[0] < 1 or background.shape[1] not in (1, bins):
             raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {bins}) is needed")
-        self._inputs = [background, first, stop, half_width]
-        if method in ("peak", "centroid"):
-            return
-        response = _check_response(method, response)
-        floor = RESPONSE_FLOOR * float(response.max())
-        # A narrow response loses signal between the delays of the coarse search, a wide one does not.
-        coarse_step = PHASES if response.max() < 0.25 else PHASES // 2 if response.max() < 0.5 else PHASES // 4
-        if method == "matched":
-            # ln(h / floor): counts outside the response add the same to every delay.
-            response = np.log(np.maximum(response, floor) / floor)
-        taps = wp.array(response.astype(np.float32), device=self.device)
-        self._inputs = [background, taps, floor, wp.vec3i(first, stop, lowest_tap), coarse_step]
+        search.background = background
+        taps = np.zeros((0, 0))
+        if method in ("matched", "likelihood"):
+            taps = _check_response(method, response)
+            largest = taps.max()
+            search.floor = floor = RESPONSE_FLOOR * float(largest)
+            # A narrow response loses signal between the delays of the coarse search, a wide one does not.
+            search.coarse_step = PHASES if largest < 0.25 else PHASES // 2 if largest < 0.5 else PHASES // 4
+            if method == "matched":
+                # ln(h / floor): counts outside the response add the same to every delay.
+                taps = np.log(np.maximum(taps, floor) / floor)
+        search.response = wp.array(taps.astype(np.float32), device=self.device)
 
     def __call__(self, histogram: wp.array, arrival: wp.array) -> None:
-        """Writes the arrival times of a histogram `[pixel, bin]` into `arrival`, float32 `[pixel]`."""
+        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`."""
         check_array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
         check_array("arrival", arrival, wp.float32, (pixels,), self.device)
         make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
         kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
-        launch_pixels(kernel, pixels, [histogram, *self._inputs, arrival], device=self.device)
+        launch_pixels(kernel, pixels, [histogram, self._search, arrival], device=self.device)
 
 
 def _check_response(method: str, response: np.ndarray | None) -> np.ndarray:
@@ -327,17 +301,8 @@ def arrival_bins(
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
     check_array("histogram", histogram, RATES, (None, None))
-    estimator = ArrivalEstimator(
-        histogram.shape[1],
-        device=histogram.device,
-        method=method,
-        background=background,
-        response=response,
-        lowest_tap=lowest_tap,
-        first=first,
-        stop=stop,
-        half_width=half_width,
-    )
-    arrival = wp.empty(histogram.shape[0], dtype=float, device=histogram.device)
-    estimator(histogram, arrival)
+    bins, device = histogram.shape[1], histogram.device
+    search = (method, background, response, lowest_tap, first, stop, half_width)
+    arrival = wp.empty(histogram.shape[0], dtype=float, device=device)
+    ArrivalEstimator(bins, device, *search)(histogram, arrival)
     return arrival

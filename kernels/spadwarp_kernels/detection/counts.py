@@ -1,10 +1,13 @@
-"""Counts of a SPAD: first-photon TCSPC, with at most one count a pulse and pixel, and a detector that is followed event
-by event, with dead time and afterpulses.
+"""Expected detections of a SPAD per pulse and bin, and counts drawn from them.
 
-Every draw is keyed by (seed, frame · pixels + pixel), so that counts do not depend on how a launch is cut up.
+λ[pixel, bin] is a hazard: the mean number of detections that a pulse would cause in the bin if the detector were always
+ready. Counts are those of first-photon TCSPC, with at most one a pulse and pixel, or of a detector that is followed
+event by event, with dead time and afterpulses. Every draw is keyed by (seed, frame · pixels + pixel), so that counts do
+not depend on how a launch is cut up.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,19 +15,28 @@ import warp as wp
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
+    check_device,
     check_integer,
     check_number,
     check_numbers,
     check_range,
     check_seed,
 )
-from spadwarp_kernels.base.binomial import PURPOSE_COUNTS, PURPOSE_EVENTS, binomial, uniforms
-from spadwarp_kernels.base.kernels import launch_pixels
-from spadwarp_kernels.base.native import log1p
+from spadwarp_kernels.base.binomial import PURPOSE_COUNTS, PURPOSE_DARK_COUNTS, PURPOSE_EVENTS, binomial, uniforms
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
+from spadwarp_kernels.base.native import expm1, log1p
 
-from .expected import first_invalid_row
-
-__all__ = ["event_counts", "first_photon_counts"]
+__all__ = [
+    "add_crosstalk",
+    "coates",
+    "dark_count_rates",
+    "event_counts",
+    "expected_detections",
+    "first_invalid_row",
+    "first_photon_counts",
+    "first_photon_probabilities",
+    "free_running_probabilities",
+]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,36 +48,302 @@ _SPARSE = wp.constant(wp.float64(2.0))
 EVENT_LIMIT = 2**27
 """Most detections of a pixel in one frame of the event-driven detector: random blocks are numbered in 28 bits."""
 
+RATES = (wp.int32, wp.int64, wp.float32, wp.float64)
+"""Types of rows of counts, tallies or rates."""
 
-class _Exposure(NamedTuple):
-    """The numbers of an exposure, in range, and the largest count of a bin."""
 
-    pulses: int
-    frames: int
-    first_frame: int
-    depth: int
-    seed: int
+def _by_row(kernel: wp.Kernel, inputs: Sequence[Any], out: wp.array) -> wp.array:
+    """Launches a kernel over the rows of its last argument, and returns that."""
+    launch_pixels(kernel, out.shape[0], [*inputs, out], device=out.device)
+    return out
+
+
+@memoised
+def _invalid_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def invalid(first_pixel: int, values: wp.array2d[dtype], worst: wp.array[int]):
+        pixel = first_pixel + wp.tid()
+        for k in range(values.shape[1]):
+            value = float(values[pixel, k])
+            if value < 0.0 or not wp.isfinite(value):
+                wp.atomic_min(worst, 0, pixel)
+                return
+
+    return invalid
+
+
+def first_invalid_row(values: wp.array) -> int | None:
+    """The first row of `values` `[pixel, bin]` that holds a negative or non-finite number, or None."""
+    check_array("values", values, RATES, (None, None))
+    if values.shape[0] == 0:
+        return None
+    worst = wp.full(1, 2**31 - 1, dtype=int, device=values.device)
+    launch_pixels(_invalid_kernel(values.dtype), values.shape[0], [values, worst], device=values.device)
+    row = int(worst.numpy()[0])
+    return None if row == 2**31 - 1 else row
+
+
+# ---- Expected detections.
+
+
+@memoised
+def _response_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def respond(
+        first_pixel: int,
+        source: wp.array2d[dtype],
+        # Sparse rows, one a detector bin:
+        row_start: wp.array[int],
+        source_bin: wp.array[int],
+        weight: wp.array[float],
+        width: wp.array[float],
+        noise_rate: wp.array[float],
+        # Out:
+        hazard: wp.array2d[float],
+    ):
+        pixel = first_pixel + wp.tid()
+        noise = noise_rate[pixel]
+        for k in range(width.shape[0]):
+            total = float(noise * width[k])
+            for entry in range(row_start[k], row_start[k + 1]):
+                total += weight[entry] * float(source[pixel, source_bin[entry]])
+            hazard[pixel, k] = total
+
+    return respond
+
+
+def expected_detections(
+    source: wp.array,
+    *,
+    row_start: np.ndarray,
+    source_bin: np.ndarray,
+    weight: np.ndarray,
+    width: np.ndarray,
+    noise_rate: wp.array,
+) -> wp.array:
+    """λ per pulse in each detector bin, float32 `[pixel, detector bin]`.
+
+    λ_k = Σ weight · source[source_bin] over the entries row_start[k] … row_start[k + 1] + noise_rate · width_k.
+
+    Args:
+        source: `[pixel, source bin]`, detections per pulse.
+        row_start, source_bin, weight: sparse matrix (CSR) of the response, detector bins by source bins.
+        width: of the detector bins [s].
+        noise_rate: of dark counts and ambient light per pixel [1/s], float32.
+
+    Raises:
+        ArgumentError: Arrays that do not fit each other, or a matrix that points outside the source.
+    """
+    check_array("source", source, RATES, (None, None))
+    device = source.device
+    check_array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
+    _check_matrix(source.shape[1], row_start, source_bin, weight, width)
+    hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
+    kinds = ((row_start, int), (source_bin, int), (weight, float), (width, float))
+    matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
+    return _by_row(_response_kernel(source.dtype), [source, *matrix, noise_rate], hazard)
+
+
+def _check_matrix(columns: int, row_start: Any, source_bin: Any, weight: Any, width: Any) -> None:
+    given = {"row_start": row_start, "source_bin": source_bin, "weight": weight, "width": width}
+    rows, entries, weight, width = (check_numbers(name, values, 1) for name, values in given.items())
+    if rows.size != width.size + 1:
+        raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {width.shape}, is needed")
+    if weight.shape != entries.shape:
+        raise ArgumentError(f"source_bin {entries.shape} and weight {weight.shape} are not two equal lists")
+    if rows[0] != 0 or rows[-1] != entries.size or (np.diff(rows) < 0).any():
+        raise ArgumentError(f"row_start does not rise from 0 to {entries.size}, the number of entries")
+    if entries.size and not (entries.min() >= 0 and entries.max() < columns):
+        raise ArgumentError(f"source_bin holds {entries.min():g} to {entries.max():g}, outside [0, {columns - 1}]")
+    for name, values in {"weight": weight, "width": width}.items():
+        if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
+            raise ArgumentError(f"{name} holds numbers that are negative or not finite")
+
+
+@wp.kernel(enable_backward=False)
+def _dark_count_kernel(
+    first_pixel: int,
+    seed: wp.uint64,
+    median: float,
+    spread: float,
+    hot_fraction: float,
+    hot_rate: float,
+    offset: float,
+    # Out:
+    rate: wp.array[float],
+):
+    pixel = first_pixel + wp.tid()
+    id = wp.uint64(pixel)
+    u = uniforms(seed, id, PURPOSE_DARK_COUNTS, wp.uint32(0))
+    chance = uniforms(seed, id, PURPOSE_DARK_COUNTS, _ONE)
+    if chance[0] < wp.float64(hot_fraction):
+        rate[pixel] = hot_rate + offset
+    else:
+        # Box–Muller
+        radius = wp.sqrt(wp.float64(-2.0) * wp.log(wp.float64(1.0) - u[0]))
+        normal = radius * wp.cos(wp.float64(6.283185307179586) * u[1])
+        rate[pixel] = median * float(wp.exp(wp.float64(spread) * normal)) + offset
+
+
+def dark_count_rates(
+    pixels: int,
+    *,
+    median: float,
+    spread: float = 0.0,
+    hot_fraction: float = 0.0,
+    hot_rate: float = 0.0,
+    offset: float = 0.0,
+    seed: int = 0,
+    device: Any = None,
+) -> wp.array:
+    """Dark count rate of every pixel [1/s], float32.
+
+    Lognormal about `median` with `spread` the standard deviation of ln(rate); hot pixels, a `hot_fraction` of all, have
+    `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure. Raises `ArgumentError`.
+    """
+    pixels, seed = check_integer("pixels", pixels, 0), check_seed(seed)
+    check_range("[0, inf)", median=median, spread=spread, hot_rate=hot_rate, offset=offset)
+    check_number("hot_fraction", hot_fraction, "[0, 1]")
+    rate = wp.empty(pixels, dtype=float, device=check_device("device", device))
+    return _by_row(_dark_count_kernel, [seed, median, spread, hot_fraction, hot_rate, offset], rate)
+
+
+@wp.kernel(enable_backward=False)
+def _crosstalk_kernel(
+    first_pixel: int,
+    width: int,
+    probability: float,
+    detections: wp.array2d[float],
+    # In and out:
+    hazard: wp.array2d[float],
+):
+    pixel = first_pixel + wp.tid()
+    x = pixel % width
+    for k in range(hazard.shape[1]):
+        light = float(0.0)
+        if x > 0:
+            light += detections[pixel - 1, k]
+        if x < width - 1:
+            light += detections[pixel + 1, k]
+        if pixel >= width:
+            light += detections[pixel - width, k]
+        if pixel + width < hazard.shape[0]:
+            light += detections[pixel + width, k]
+        hazard[pixel, k] = hazard[pixel, k] + probability * light
+
+
+def add_crosstalk(hazard: wp.array, detections: wp.array, *, image_width: int, probability: float) -> None:
+    """Add `probability` times the four neighbours' expected detections to λ, in place; both float32 `[pixel, bin]`.
+
+    Raises `ArgumentError`.
+    """
+    check_array("hazard", hazard, wp.float32, (None, None))
+    check_array("detections", detections, wp.float32, hazard.shape, hazard.device)
+    image_width = check_integer("image_width", image_width, 1)
+    check_number("probability", probability, "[0, 1]")
+    if hazard.shape[0] % image_width:
+        raise ArgumentError(f"image_width = {image_width} does not divide hazard's {hazard.shape[0]} pixels")
+    _by_row(_crosstalk_kernel, [image_width, probability, detections], hazard)
+
+
+# ---- The mean of what a detector makes of them.
+
+
+@memoised
+def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
+    @wp.kernel(enable_backward=False, module="unique")
+    def law(first_pixel: int, hazard: wp.array2d[dtype], probability: wp.array2d[dtype]):
+        pixel = first_pixel + wp.tid()
+        before = wp.float64(0.0)
+        for k in range(hazard.shape[1]):
+            h = wp.float64(hazard[pixel, k])
+            probability[pixel, k] = probability.dtype(-wp.exp(-before) * expm1(-h))
+            before += h
+
+    return law
+
+
+def first_photon_probabilities(hazard: wp.array) -> wp.array:
+    """P(first photon in bin k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)), of λ's shape `[pixel, bin]` and float type."""
+    check_array("hazard", hazard, (wp.float32, wp.float64), (None, None))
+    law = wp.empty(hazard.shape, dtype=hazard.dtype, device=hazard.device)
+    return _by_row(_first_photon_law_kernel(hazard.dtype), [hazard], law)
+
+
+@wp.kernel(enable_backward=False)
+def _free_running_kernel(
+    first_pixel: int, hazard: wp.array2d[float], dead_time: float, period: float, probability: wp.array2d[float]
+):
+    pixel = first_pixel + wp.tid()
+    total = float(0.0)
+    for k in range(hazard.shape[1]):
+        total += hazard[pixel, k]
+    ready = 1.0 / (1.0 + total * dead_time / period)
+    for k in range(hazard.shape[1]):
+        probability[pixel, k] = hazard[pixel, k] * ready
+
+
+def free_running_probabilities(hazard: wp.array, *, dead_time: float, period: float) -> wp.array:
+    """Mean detections per pulse and bin behind a dead time, λ_k / (1 + Σλ · dead_time / period), `[pixel, bin]`.
+
+    Exact in the sum for a steady rate; the shadow that a strong return casts over the bins behind it is spread out.
+    """
+    check_array("hazard", hazard, wp.float32, (None, None))
+    check_number("dead_time", dead_time, "[0, inf)")
+    check_number("period", period, "(0, inf)")
+    seen = wp.empty(hazard.shape, dtype=float, device=hazard.device)
+    return _by_row(_free_running_kernel, [hazard, dead_time, period], seen)
+
+
+@wp.kernel(enable_backward=False)
+def _coates_kernel(first_pixel: int, counts: wp.array2d[int], pulses: wp.float64, hazard: wp.array2d[wp.float64]):
+    pixel = first_pixel + wp.tid()
+    left = wp.float64(pulses)
+    for k in range(counts.shape[1]):
+        n = wp.float64(counts[pixel, k])
+        if n < left:
+            hazard[pixel, k] = -log1p(-n / left)
+        else:
+            hazard[pixel, k] = wp.float64(wp.nan)
+        left = left - n
+
+
+def coates(counts: wp.array, *, pulses: float) -> wp.array:
+    """Coates' correction: λ̂_k = −ln(1 − n_k / (pulses − Σ_{j<k} n_j)), float64 `[pixel, bin]` of int32 counts.
+
+    NaN from the bin on that holds the last pulse left: nothing can be said of what follows.
+    Source: P. B. Coates, "The correction for photon pile-up in the measurement of radiative lifetimes", J. Phys. E 1,
+    878 (1968).
+    """
+    check_array("counts", counts, wp.int32, (None, None))
+    check_number("pulses", pulses, "(0, inf)")
+    hazard = wp.empty(counts.shape, dtype=wp.float64, device=counts.device)
+    return _by_row(_coates_kernel, [counts, pulses], hazard)
+
+
+# ---- Counts.
 
 
 def _check_exposure(
-    hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int = 1, first_frame: int = 0
-) -> _Exposure:
-    """At most 2^31 - 1 rows in one call; raises `ArgumentError`."""
+    hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int, first_frame: int | wp.array
+) -> tuple[int, int, int, int]:
+    """Pulses, frames, the largest count of a bin and the seed, in range: at most 2^31 - 1 rows in one call.
+
+    Every rate is one, which is checked on the CPU, where nobody has to wait for it.
+    """
     check_array("hazard", hazard, wp.float32, (None, None))
-    return _Exposure(
+    if isinstance(first_frame, wp.array):
+        check_array("first_frame", first_frame, wp.int64, (1,), hazard.device)
+    else:
+        check_integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31)
+        if hazard.device.is_cpu and (row := first_invalid_row(hazard)) is not None:
+            raise ArgumentError(f"hazard of pixel {row} holds numbers that are negative or not finite")
+    return (
         check_integer("pulses", pulses, 0),
         check_integer("frames", frames, 1, (2**31 - 1) // max(hazard.shape[0], 1)),
-        check_integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31),
         check_integer("counter_depth", counter_depth, 0) or 2**31 - 1,
         check_seed(seed),
     )
-
-
-def _check_rates(hazard: wp.array) -> None:
-    """Every rate is one, on the CPU, where nobody has to wait for it."""
-    check_array("hazard", hazard, wp.float32, (None, None))
-    if hazard.device.is_cpu and (row := first_invalid_row(hazard)) is not None:
-        raise ArgumentError(f"hazard of pixel {row} holds numbers that are negative or not finite")
 
 
 def _zeroed_counts(array: wp.array | None, shape: tuple[int, int], device: Any) -> wp.array:
@@ -158,7 +436,7 @@ def first_photon_counts(
     *,
     pulses: int,
     frames: int = 1,
-    first_frame: int = 0,
+    first_frame: int | wp.array = 0,
     summed: bool = False,
     counter_depth: int = 0,
     seed: int,
@@ -170,7 +448,9 @@ def first_photon_counts(
         hazard: λ, float32 `[pixel, bin]`, finite and not negative, which is checked on the CPU alone: on a GPU every
             call would wait for it.
         pulses: per frame, below 2^31.
-        frames, first_frame: numbers of the frames; a frame's counts depend on its number, not on the call.
+        frames, first_frame: numbers of the frames; a frame's counts depend on its number, not on the call. A first
+            frame that is int64 `[1]` on the device is for a step that is captured in a graph: with `counts` nothing is
+            then allocated or read on the host, and λ is not checked.
         summed: add the frames up.
         counter_depth: largest count of a bin and frame, 0: unlimited.
         seed: 64 bits.
@@ -182,40 +462,13 @@ def first_photon_counts(
     Raises:
         ArgumentError: A number out of range, or an array of another kind.
     """
-    _check_rates(hazard)
-    shot = _check_exposure(hazard, pulses, counter_depth, seed, frames, first_frame)
+    pulses, frames, depth, seed = _check_exposure(hazard, pulses, counter_depth, seed, frames, first_frame)
     pixels, bins = hazard.shape
-    rows = pixels if summed else shot.frames * pixels
+    rows = pixels if summed else frames * pixels
     counts = _zeroed_counts(counts, (rows, bins), hazard.device)
-    first = wp.array([shot.first_frame], dtype=wp.int64, device=hazard.device)
-    inputs = [hazard, shot.pulses, first, shot.frames if summed else 1, shot.depth, shot.seed, counts]
-    launch_pixels(_first_photon_kernel, rows, inputs, device=hazard.device)
-    return counts
-
-
-def first_photon_step(
-    hazard: wp.array, *, pulses: int, frame: wp.array, counter_depth: int = 0, seed: int, counts: wp.array
-) -> None:
-    """One frame of `first_photon_counts` whose number is on the device, for a step that is captured in a graph.
-
-    Nothing is allocated and no value is read on the host: the counts are those of `first_photon_counts` with
-    `first_frame` = frame[0].
-
-    Args:
-        hazard: As there; its values are not checked.
-        frame: int64 `[1]`, the number of the frame, which the caller moves on.
-        counts: int32 `[pixel, bin]`, overwritten.
-        pulses, counter_depth, seed: As there.
-
-    Raises:
-        ArgumentError: A number out of range, or an array of another kind.
-    """
-    shot = _check_exposure(hazard, pulses, counter_depth, seed)
-    check_array("frame", frame, wp.int64, (1,), hazard.device)
-    check_array("counts", counts, wp.int32, hazard.shape, hazard.device, contiguous=True)
-    counts.zero_()
-    inputs = [hazard, shot.pulses, frame, 1, shot.depth, shot.seed, counts]
-    launch_pixels(_first_photon_kernel, hazard.shape[0], inputs, device=hazard.device)
+    if not isinstance(first_frame, wp.array):
+        first_frame = wp.array([first_frame], dtype=wp.int64, device=hazard.device)
+    return _by_row(_first_photon_kernel, [hazard, pulses, first_frame, frames if summed else 1, depth, seed], counts)
 
 
 # ---- Event by event.
@@ -248,6 +501,20 @@ def _cumulative_kernel(first_pixel: int, offset: int, hazard: wp.array2d[float],
 
 
 @wp.struct
+class _Detector:
+    """See `event_counts`."""
+
+    edges: wp.array2d[wp.float64]  # one row
+    recorded: int
+    pulses: wp.int64
+    period: wp.float64
+    gated: bool
+    dead_time: wp.float64
+    afterpulsing: wp.float64
+    time_constant: wp.float64
+
+
+@wp.struct
 class Moment:
     """A time since the start of the window of a pulse [s]; `pulse` at the number of pulses stands for never."""
 
@@ -257,10 +524,9 @@ class Moment:
 
 @wp.func
 def _next_primary(
+    detector: _Detector,
     cumulative: wp.array2d[wp.float64],
-    edges: wp.array2d[wp.float64],
     local: int,
-    pulses: wp.int64,
     pulse: wp.int64,
     passed: wp.float64,
     xi: wp.float64,
@@ -268,12 +534,12 @@ def _next_primary(
     """The next photon or dark count after the hazard `passed` of a pulse. The hazard repeats with the period."""
     zero = wp.float64(0.0)
     found = Moment()
-    found.pulse = pulses
+    found.pulse = detector.pulses
     total = cumulative[local, cumulative.shape[1] - 1]
     if total > zero:
         target = passed - wp.log(wp.float64(1.0) - xi)
         periods = wp.floor(target / total)
-        if periods < wp.float64(pulses - pulse):
+        if periods < wp.float64(detector.pulses - pulse):
             target = wp.max(target - periods * total, zero)
             k = _last_not_above(cumulative, local, target)
             span = cumulative[local, k + 1] - cumulative[local, k]
@@ -281,30 +547,22 @@ def _next_primary(
             if span > zero:
                 part = wp.clamp((target - cumulative[local, k]) / span, zero, wp.float64(1.0))
             found.pulse = pulse + wp.int64(periods)
-            found.time = edges[0, k] + part * (edges[0, k + 1] - edges[0, k])
+            found.time = detector.edges[0, k] + part * (detector.edges[0, k + 1] - detector.edges[0, k])
     return found
 
 
 @wp.func
-def _next_afterpulse(
-    first: Moment,
-    now: Moment,
-    pulses: wp.int64,
-    period: wp.float64,
-    time_constant: wp.float64,
-    trapped: wp.float64,
-    xi: wp.float64,
-) -> Moment:
+def _next_afterpulse(detector: _Detector, first: Moment, now: Moment, trapped: wp.float64, xi: wp.float64) -> Moment:
     """The next afterpulse if it comes before `first`, else that: the traps empty as one exponential, because all share
     the time constant."""
     wait = -wp.log(wp.float64(1.0) - xi)
     if wait < trapped:
-        later = now.time - time_constant * log1p(-wait / trapped)
-        periods = wp.floor(later / period)
-        if periods < wp.float64(pulses - now.pulse):
+        later = now.time - detector.time_constant * log1p(-wait / trapped)
+        periods = wp.floor(later / detector.period)
+        if periods < wp.float64(detector.pulses - now.pulse):
             after = Moment()
             after.pulse = now.pulse + wp.int64(periods)
-            after.time = later - periods * period
+            after.time = later - periods * detector.period
             if after.pulse < first.pulse or (after.pulse == first.pulse and after.time < first.time):
                 return after
     return first
@@ -313,22 +571,15 @@ def _next_afterpulse(
 @wp.kernel(enable_backward=False)
 def _event_kernel(
     first_row: int,
+    detector: _Detector,
     # Pixels `offset` … of an image of `pixels`:
     cumulative: wp.array2d[wp.float64],
     offset: int,
     pixels: int,
-    edges: wp.array2d[wp.float64],
-    recorded: int,
-    pulses: wp.int64,
-    period: wp.float64,
-    gated: int,
-    dead_time: wp.float64,
-    afterpulsing: wp.float64,
-    time_constant: wp.float64,
     first_frame: wp.int64,
     depth: int,
     seed: wp.uint64,
-    write_tags: int,
+    # Where a row's tags begin in those of all; empty if none are written:
     tag_start: wp.array[wp.int64],
     # Out, counts zero before:
     counts: wp.array2d[int],
@@ -342,51 +593,52 @@ def _event_kernel(
     pixel = offset + local
     row = frame * pixels + pixel
     id = (wp.uint64(first_frame) + wp.uint64(frame)) * wp.uint64(pixels) + wp.uint64(pixel)
-    bins = edges.shape[1] - 1
-    end = edges[0, bins]
+    edges = detector.edges
+    end = edges[0, edges.shape[1] - 1]
     zero = wp.float64(0.0)
     block = wp.uint32(0)
     tags = int(0)
     now = Moment()
     passed = wp.float64(0.0)  # hazard of the window up to now
     trapped = wp.float64(0.0)  # mean number of afterpulses still to come
-    while now.pulse < pulses:
+    while now.pulse < detector.pulses:
         draw = uniforms(seed, id, PURPOSE_EVENTS, block)
         block = block + _ONE
-        found = _next_primary(cumulative, edges, local, pulses, now.pulse, passed, draw[0])
-        found = _next_afterpulse(found, now, pulses, period, time_constant, trapped, draw[1])
-        if found.pulse >= pulses:
-            now.pulse = pulses
+        found = _next_primary(detector, cumulative, local, now.pulse, passed, draw[0])
+        found = _next_afterpulse(detector, found, now, trapped, draw[1])
+        if found.pulse >= detector.pulses:
+            now.pulse = detector.pulses
         else:
-            elapsed = wp.float64(found.pulse - now.pulse) * period + (found.time - now.time)
-            trapped = trapped * wp.exp(-elapsed / time_constant)
+            elapsed = wp.float64(found.pulse - now.pulse) * detector.period + (found.time - now.time)
+            trapped = trapped * wp.exp(-elapsed / detector.time_constant)
             now.pulse = found.pulse
             now.time = found.time
-            fires = gated == 0 or now.time < end  # between two windows a gated detector is off
+            fires = not detector.gated or now.time < end  # between two windows a gated detector is off
             if fires:
                 k = _last_not_above(edges, 0, now.time)
-                if k < recorded and now.time < edges[0, recorded]:
-                    if write_tags == 1:
+                if k < detector.recorded and now.time < edges[0, detector.recorded]:
+                    if tag_start.shape[0] > 0:
                         tag_pulse[tag_start[row] + wp.int64(tags)] = now.pulse
                         tag_bin[tag_start[row] + wp.int64(tags)] = k
                     elif counts[row, k] < depth:
                         counts[row, k] = counts[row, k] + 1
                     tags += 1
-            if gated == 1:
-                off = period - now.time
-                trapped = trapped * wp.exp(-off / time_constant)
+            if detector.gated:
+                off = detector.period - now.time
+                trapped = trapped * wp.exp(-off / detector.time_constant)
                 if fires:
-                    trapped += afterpulsing * wp.exp(-wp.max(off - dead_time, zero) / time_constant)
+                    after = wp.max(off - detector.dead_time, zero)
+                    trapped += detector.afterpulsing * wp.exp(-after / detector.time_constant)
                 now.pulse = now.pulse + wp.int64(1)
                 now.time = zero
                 passed = zero
             else:
                 # `afterpulsing` is what is left of the traps when the dead time ends.
-                trapped = trapped * wp.exp(-dead_time / time_constant) + afterpulsing
-                later = now.time + dead_time
-                periods = wp.floor(later / period)
+                trapped = trapped * wp.exp(-detector.dead_time / detector.time_constant) + detector.afterpulsing
+                later = now.time + detector.dead_time
+                periods = wp.floor(later / detector.period)
                 now.pulse = now.pulse + wp.int64(periods)
-                now.time = later - periods * period
+                now.time = later - periods * detector.period
                 k = _last_not_above(edges, 0, now.time)
                 part = wp.clamp((now.time - edges[0, k]) / (edges[0, k + 1] - edges[0, k]), zero, wp.float64(1.0))
                 passed = cumulative[local, k] + part * (cumulative[local, k + 1] - cumulative[local, k])
@@ -442,15 +694,17 @@ def event_counts(
     Raises:
         ArgumentError: A number out of range, an array of another kind, or too many detections in a frame.
     """
-    _check_rates(hazard)
-    shot = _check_exposure(hazard, pulses, counter_depth, seed, frames, first_frame)
-    pulses, frames, device = shot.pulses, shot.frames, hazard.device
-    pixels, bins = hazard.shape
-    recorded = check_integer("recorded", recorded, 1, bins)
+    pulses, frames, depth, seed = _check_exposure(hazard, pulses, counter_depth, seed, frames, first_frame)
+    device, (pixels, bins) = hazard.device, hazard.shape
+    detector = _Detector()
+    detector.recorded = recorded = check_integer("recorded", recorded, 1, bins)
     check_range("(0, inf)", period=period, afterpulsing_time_constant=afterpulsing_time_constant)
-    check_number("dead_time", dead_time, "[0, inf)")
-    check_number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
-    edges = _rising_edges(edges, bins, period)
+    detector.pulses, detector.period, detector.gated = pulses, period, bool(gated)
+    detector.dead_time = check_number("dead_time", dead_time, "[0, inf)")
+    detector.afterpulsing = check_number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
+    detector.time_constant = afterpulsing_time_constant
+    rising = _rising_edges(edges, bins, period)
+    detector.edges = wp.array(rising[None, :], dtype=wp.float64, device=device)
     rows = frames * pixels
     counts = _zeroed_counts(counts, (rows, recorded), device)
     number = wp.zeros(rows, dtype=int, device=device)
@@ -463,29 +717,23 @@ def event_counts(
         raise ArgumentError(
             f"a pixel may see {pulses * most:.3g} counts in a frame, above {EVENT_LIMIT}: use more frames"
         )
-    edge_row = wp.array(edges[None, :], dtype=wp.float64, device=device)
     chunk = max(1, min(pixels, 2**25 // (bins + 1)))
 
-    def run(write: int, start: wp.array, pulse: wp.array, bin: wp.array) -> None:
+    def run(start: wp.array, pulse: wp.array, bin: wp.array) -> None:
         for offset in range(0, pixels, chunk):
             size = min(chunk, pixels - offset)
             cumulative = wp.empty((size, bins + 1), dtype=wp.float64, device=device)
-            launch_pixels(_cumulative_kernel, size, [offset, hazard, cumulative], device=device)
-            inputs = [cumulative, offset, pixels, edge_row, recorded, pulses, period, int(bool(gated)), dead_time]
-            inputs += [afterpulsing_probability, afterpulsing_time_constant, shot.first_frame]
-            inputs += [shot.depth, shot.seed, write, start, counts, number, pulse, bin]
+            _by_row(_cumulative_kernel, [offset, hazard], cumulative)
+            inputs = [detector, cumulative, offset, pixels, first_frame, depth, seed, start, counts, number, pulse, bin]
             launch_pixels(_event_kernel, frames * size, inputs, device=device)
 
-    none = wp.zeros(1, dtype=wp.int64, device=device)
-    run(0, none, none, wp.zeros(1, dtype=int, device=device))
+    none = wp.zeros(0, dtype=wp.int64, device=device)
+    run(none, none, wp.zeros(0, dtype=int, device=device))
     if not tags:
         return counts, None
     # The same draws again, now that the position of each row in the stream is known.
     per_row = number.numpy().astype(np.int64)
-    start = np.concatenate([[0], np.cumsum(per_row)])
-    pulse = wp.empty(max(int(start[-1]), 1), dtype=wp.int64, device=device)
-    bin = wp.empty(max(int(start[-1]), 1), dtype=int, device=device)
-    run(1, wp.array(start, dtype=wp.int64, device=device), pulse, bin)
-    stream = {"row": np.repeat(np.arange(rows), per_row)}
-    stream |= {"pulse": pulse.numpy()[: start[-1]], "bin": bin.numpy()[: start[-1]]}
-    return counts, stream
+    start = np.append(0, np.cumsum(per_row))
+    pulse, bin = (wp.empty(int(start[-1]), dtype=kind, device=device) for kind in (wp.int64, wp.int32))
+    run(wp.array(start, dtype=wp.int64, device=device), pulse, bin)
+    return counts, {"row": np.repeat(np.arange(rows), per_row), "pulse": pulse.numpy(), "bin": bin.numpy()}

@@ -1,25 +1,25 @@
 """What a photon adds to a pixel by a next event: from where it scatters, or from a sampled point of its flight."""
 
+from typing import NamedTuple
+
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
-from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
+from spadwarp_kernels.base.rotations import cos_sin_turn, cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.visibility import port_view
+from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import Contribution, PhotonState, World, tally_index
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.ray_cast import patch_face, tree_face
-from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
-from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
-
-from .flight_sampling import make_sample_flight
+from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
+from spadwarp_kernels.water.medium import Layers, Medium, Profile
+from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
 
 __all__ = ["next_event_value"]
 
@@ -29,23 +29,14 @@ __all__ = ["next_event_value"]
 
 @wp.struct
 class Link:
-    """A way to the lens.
+    """A way to the lens."""
 
-    Attributes:
-        to_lens: Unit direction at the point.
-        image: A point that the lens sees in the same direction, in air alone [m].
-        end: Where the way leaves the water [m].
-        water: Its length in the water [m].
-        path: Length in water that takes as long as all of it [m].
-        gather: What the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2];
-            through a port.
-    """
-
-    to_lens: wp.vec3
-    image: wp.vec3
-    end: wp.vec3
-    water: float
-    path: float
+    to_lens: wp.vec3  # unit direction at the point
+    image: wp.vec3  # a point that the lens sees in the same direction, in air alone [m]
+    end: wp.vec3  # where the way leaves the water [m]
+    water: float  # its length in the water [m]
+    path: float  # length in water that takes as long as all of it [m]
+    # what the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2]; by a port
     gather: float
 
 
@@ -56,114 +47,258 @@ def next_event_value(
     """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
     unit vector."""
     cos_lens = wp.max(-to_lens[2], 0.0)
-    return (
-        # Times -1: Warp's unary minus is 0 - x, an addition.
-        weight
-        * scattering
-        * wp.exp((-1.0 * extinction) * distance)
-        * camera.aperture_area
-        * cos_lens
-        / (distance * distance)
-    )
+    # Times -1: Warp's unary minus is 0 - x, an addition.
+    passed = wp.exp((-1.0 * extinction) * distance)
+    return weight * scattering * passed * camera.aperture_area * cos_lens / (distance * distance)
 
 
-@wp.func
-def _link_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
-    link = Link()
-    to_lens = o - x
-    r = wp.length(to_lens)
-    link.to_lens = to_lens / r
-    link.image = x
-    link.end = o
-    link.water = r
-    link.path = r
-    return link
+class LensWay(NamedTuple):
+    """Warp functions of the way from x in the water to the point o of the lens."""
 
-
-@wp.func
-def _value_in_water(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
-    return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
-
-
-@wp.func
-def _value_behind_port(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
-    return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
+    link: wp.Function  # ``(camera, x, o) -> Link``
+    value: wp.Function  # ``(camera, extinction, weight, scattering, link) -> float``, part of the photon that arrives
+    apparent: wp.Function  # ``(camera, x, o) -> vec3``, from where the light of o seems to come at x
+    toward: wp.Function  # ``(camera, x, o) -> vec3``, unit direction of the way at x; straight where there is no way
+    toward_centre: wp.Function  # ``(camera, x) -> vec3``, about that to the lens's centre
 
 
 @memoised
-def make_link(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions: ``(camera, x, o) -> Link`` from x to the lens point o, and ``(camera, extinction, weight,
-    scattering, link) -> float``, the fraction of the photon that arrives."""
-    if spec.port is None:
-        return _link_in_water, _value_in_water
-    connect = spec.port.connect
+def make_lens_way(port: PortKind | None) -> LensWay:
+    """The ways behind a kind of port; None: without one."""
+    has_port, kind = port is not None, port or FLAT_PORT
+    connect, apparent_of, apparent_centre = kind.connect, kind.apparent, kind.apparent_centre
 
     @wp.func
-    def link_behind_port(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
-        way = connect(camera.port, x, o)
+    def link_to(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
         link = Link()
-        link.to_lens = way.to_port
-        link.image = o - way.inside
-        link.end = way.exit
-        link.water = way.water
-        link.path = way.path
-        link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            link.to_lens = way.to_port
+            link.image = o - way.inside
+            link.end = way.exit
+            link.water = way.water
+            link.path = way.path
+            link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+        else:
+            to_lens = o - x
+            r = wp.length(to_lens)
+            link.to_lens = to_lens / r
+            link.image = x
+            link.end = o
+            link.water = r
+            link.path = r
         return link
 
-    return link_behind_port, _value_behind_port
-
-
-@wp.func
-def _lens_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-    return o
-
-
-@memoised
-def make_apparent_lens(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(camera, x, o) -> vec3``: from where the light of the lens point o seems to come at x."""
-    if spec.port is None:
-        return _lens_in_water
-    connect, apparent = spec.port.connect, spec.port.apparent
+    @wp.func
+    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
+        if wp.static(has_port):
+            return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
+        return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
 
     @wp.func
-    def apparent_lens(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        way = connect(camera.port, x, o)
+    def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         seen = wp.vec3(o)
-        if way.density > 0.0:
-            seen = apparent(camera.port, x, o, way)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            if way.density > 0.0:
+                seen = apparent_of(camera.port, x, o, way)
         return seen
 
-    return apparent_lens
+    @wp.func
+    def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        straight = wp.normalize(o - x)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            straight = wp.where(way.density > 0.0, way.to_port, straight)
+        return straight
+
+    @wp.func
+    def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
+        if wp.static(has_port):
+            return wp.normalize(apparent_centre(camera.port) - x)
+        return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
+
+    return LensWay(link_to, value_of, apparent, toward, toward_centre)
 
 
-@wp.func
-def _toward_in_water(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-    return wp.normalize(o - x)
+# ---- Points of flights, drawn by distance and angle at once, after Kulla & Fajardo 2012 (equi-angular sampling) and
+# Georgiev et al. 2013 (joint distance-angle sampling).
 
 
-@wp.func
-def _toward_centre_in_water(camera: Camera, x: wp.vec3) -> wp.vec3:
-    return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
+@wp.struct
+class FlightSample:
+    """A point of a flight: distance s along it, distance r to the lens point [m], its density over s [1/m]; 0 for
+    none. With a `Profile`: its optical depth up to there."""
+
+    s: float
+    r: float
+    density: float
+    depth: float
+
+
+@wp.struct
+class LensSample:
+    """A point of the lens [m]; its density if it were uniform, over that of the draw."""
+
+    point: wp.vec3
+    weight: float
 
 
 @memoised
-def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
-    """Two Warp functions: ``(camera, x, o) -> vec3``, the unit direction at x in which light gets to the lens point o,
-    and ``(camera, x) -> vec3`` about that to the lens's centre; the straight one where there is no way."""
-    if spec.port is None:
-        return _toward_in_water, _toward_centre_in_water
-    connect, apparent_centre = spec.port.connect, spec.port.apparent_centre
+def make_sample_lens(port: PortKind | None) -> wp.Function:
+    """The Warp function ``(camera, x, u, xi1, xi2) -> LensSample``: a point of the lens by which the flight x + s u is
+    scored.
+
+    The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the lens,
+    the point is drawn with that density, uniform in angle and distance about the place: even draws would have no finite
+    variance. Else it is even.
+    """
+    has_port, leave = port is not None, (port or FLAT_PORT).leave
 
     @wp.func
-    def toward_port(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        way = connect(camera.port, x, o)
-        return wp.where(way.density > 0.0, way.to_port, wp.normalize(o - x))
+    def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
+        p = wp.vec2(1.0e30, 0.0)
+        if wp.static(has_port):
+            ray = leave(camera.port, x, wp.where(u[2] < 0.0, u, -u))
+            if ray.transmission > 0.0:
+                p = wp.vec2(ray.x[0], ray.x[1])
+        else:
+            s = -x[2] / u[2]
+            p = wp.vec2(x[0] + s * u[0], x[1] + s * u[1])
+        sample = LensSample()
+        sample.point = lens_point(camera, xi1, xi2)
+        sample.weight = 1.0
+        radius2 = camera.aperture_radius * camera.aperture_radius
+        if wp.dot(p, p) < radius2:
+            turn = cos_sin_turn(xi2)
+            aside = p[0] * turn[1] - p[1] * turn[0]
+            to_rim = wp.sqrt(wp.max(radius2 - aside * aside, 0.0)) - wp.dot(p, turn)
+            distance = xi1 * to_rim
+            sample.point = wp.vec3(p[0] + distance * turn[0], p[1] + distance * turn[1], 0.0)
+            sample.weight = 2.0 * to_rim * distance / radius2
+        return sample
+
+    return sample_lens
+
+
+@wp.func
+def _turn(d: float, along: float, r: float) -> wp.vec2:
+    """(1 - cos, 1 + cos) of the angle theta = atan2(d, -along), neither as a difference; r^2 = d^2 + along^2."""
+    far = r + wp.abs(along)
+    small = d * d / (r * far)
+    large = far / r
+    return wp.where(along < 0.0, wp.vec2(small, large), wp.vec2(large, small))
+
+
+@memoised
+def _make_variable(chord: bool) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """The variable of a guide, angle or chord: at a point of the flight ``(d, along, r)``, the point that has it
+    ``(d, value)``, and its derivative along the flight ``(d, along, r)``."""
 
     @wp.func
-    def toward_centre_behind_port(camera: Camera, x: wp.vec3) -> wp.vec3:
-        return wp.normalize(apparent_centre(camera.port) - x)
+    def turn_of(d: float, along: float, r: float) -> float:
+        if wp.static(chord):
+            return wp.sqrt(2.0 * _turn(d, along, r)[0])
+        return wp.atan2(d, -along)
 
-    return toward_port, toward_centre_behind_port
+    @wp.func
+    def along_of(d: float, value: float) -> float:
+        if wp.static(chord):
+            h = 0.25 * value * value
+            return -d * (1.0 - 2.0 * h) / (value * wp.sqrt(wp.max(1.0 - h, 1.0e-12)))
+        return -d * cotangent(value)
+
+    @wp.func
+    def slope(d: float, along: float, r: float) -> float:
+        if wp.static(chord):
+            return wp.sqrt(0.5 * _turn(d, along, r)[1]) * d / (r * r)
+        return d / (r * r)
+
+    return turn_of, along_of, slope
+
+
+@memoised
+def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Profile | None = None) -> wp.Function:
+    """`sample_flight` for a guide. Its extinction is read without a profile; its layers, and the point where the
+    interval begins, with one. With a profile that draws nothing xi is the distance to the collision unless the point is
+    to be drawn from the angle, and the density is that of the angle alone."""
+    has_profile, draws = profile is not None, profile is not None and profile.draw is not None
+    draw = profile.draw if profile is not None and profile.draw is not None else _turn  # any: it is not called
+    complement, inverse, guide_density = guide.complement, guide.angle, guide.density
+    turn_of, along_of, slope = _make_variable(guide.chord)
+
+    @wp.func
+    def sample_flight(
+        x: wp.vec3,
+        u: wp.vec3,
+        interval: wp.vec2,
+        extinction: float,
+        medium: Medium,
+        xi_choice: float,
+        xi: float,
+        layers: Layers,
+        begin_point: wp.vec3,
+    ) -> FlightSample:
+        """A point of the flight x + s u within the interval, x relative to the lens point.
+
+        Half the points are drawn from exp(-c s), with a profile from c(s) exp(-depth(s)), half in the angle theta(s) =
+        atan2(D, t_c - s), D = |x cross u|, by which the light must turn to reach the lens: from the guide, which
+        follows the phase function; on flights that lead away from the lens (s0 >= t_c) uniformly in tan(psi/2), psi =
+        pi - theta, small far from the lens.
+        """
+        sample = FlightSample()
+        s0 = interval[0]
+        s1 = interval[1]
+        width = s1 - s0
+        t_c = -wp.dot(x, u)
+        # The cross product, not |x|^2 - t_c^2, which cancels. The floor keeps float32 angles of a coaxial laser apart.
+        d = wp.max(wp.length(wp.cross(x, u)), 1.0e-7)
+        kept = 1.0 - wp.exp(-extinction * width)
+        thick = extinction * width > 1.0e-4
+        first = s0 - t_c
+        last = s1 - t_c
+        r_first = wp.sqrt(d * d + first * first)
+        r_last = wp.sqrt(d * d + last * last)
+        away = first >= 0.0
+        begin = wp.where(away, d / (r_first + first), complement(turn_of(d, first, r_first), medium))
+        end = wp.where(away, d / (r_last + last), complement(turn_of(d, last, r_last), medium))
+        span = begin - end
+        angular = wp.where(span > 1.0e-7 * begin, 0.5, 0.0)
+        s = float(0.0)
+        given = float(-1.0)
+        if xi_choice < angular:
+            g = begin - xi * span
+            s = t_c + 0.5 * d * (1.0 - g * g) / g if away else t_c + along_of(d, inverse(g, medium))
+            if wp.static(draws):
+                given = wp.clamp(s, s0, s1) - s0
+        else:
+            if wp.static(not has_profile):
+                s = s0 + wp.where(thick, -wp.log(1.0 - xi * kept) / extinction, xi * width)
+            if wp.static(has_profile and not draws):
+                s = xi
+        if wp.static(draws):
+            drawn = draw(medium, layers, begin_point, u, width, given, xi)
+            s = s0 + drawn.s
+            sample.depth = drawn.depth
+        s = wp.clamp(s, s0, s1)
+        along = s - t_c
+        r = wp.sqrt(d * d + along * along)
+        if wp.static(draws):
+            linear_density = drawn.density
+        elif wp.static(has_profile):
+            linear_density = 0.0
+        else:
+            linear_density = wp.where(thick, extinction * wp.exp(-extinction * (s - s0)) / kept, 1.0 / width)
+        towards = guide_density(turn_of(d, along, r), medium) * slope(d, along, r)
+        angular_density = wp.where(away, d / (r * (r + along)), towards) / wp.max(span, 1.0e-30)
+        if angular == 0.0:
+            angular_density = 0.0
+        sample.s = s
+        sample.r = r
+        sample.density = (1.0 - angular) * linear_density + angular * angular_density
+        return sample
+
+    return sample_flight
 
 
 # ---- Requests, and what they come to.
@@ -171,34 +306,27 @@ def make_toward(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
 
 @wp.struct
 class Scored:
-    """What a request comes to.
+    """What a request comes to."""
 
-    Attributes:
-        contribution: To the tally, if nothing stands between the scored point and the lens.
-        origin, lens: The scored point, and where its light leaves the water: the point of the lens, or of a port [m].
-    """
-
-    contribution: Contribution
-    origin: wp.vec3
-    lens: wp.vec3
+    contribution: Contribution  # to the tally, if nothing stands between the scored point and the lens
+    origin: wp.vec3  # the scored point [m]
+    lens: wp.vec3  # where its light leaves the water: the point of the lens, or of a port [m]
 
 
 @wp.struct
 class ScoredPoint:
-    """The point of a request: where it is [m], the photon's weight there, and the path up to it [m]; with
-    `scores_collisions` the length of the flight up to there that the weight does not account for yet [m]."""
+    """The point of a request."""
 
-    x: wp.vec3
-    weight: float
-    path: float
-    ahead: float
+    x: wp.vec3  # where it is [m]
+    weight: float  # the photon's weight there
+    path: float  # up to it [m]
+    ahead: float  # of `scores_collisions`, length of the flight up to there that the weight does not account for [m]
 
 
 @memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
-    view_of = spec.lens.view
-    shows = spec.lens.shows if spec.port is None else port_view(spec.port).shows
+    view_of, shows = spec.lens.view, spec.in_view
     reflecting, tracks, has_mesh = spec.reflecting, spec.grid is not None, spec.mesh
     rides = make_rider(spec) is not NOTHING
 
@@ -250,13 +378,13 @@ def scores_collision(word: wp.uint32) -> bool:
 @memoised
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, world) -> ScoredPoint`` that draws the point of a flight to be scored."""
-    local_albedo = spec.varies and not spec.random_albedo
+    local_albedo = spec.local_albedo
     water, profile = spec.water, spec.water.profile
     water_extinction, water_at = water.extinction, water.at
     sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
     has_profile, collides = profile is not None, spec.scores_collisions
     depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
-    apparent_lens = make_apparent_lens(spec)
+    apparent_lens = make_lens_way(spec.port).apparent
 
     @wp.func
     def flight_point(request: Request, world: wp.ref[World]) -> ScoredPoint:
@@ -273,13 +401,12 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         if wp.static(collides):
             if scores_collision(request.first):
                 xi = from_bits(int(request.second))
-        if wp.static(has_profile):
-            flight = sample_flight(
-                from_lens, request.u, request.interval, 0.0, world.medium, xi_choice, xi, world.layers, begin
-            )
-        else:
+        mean = float(0.0)
+        if wp.static(not has_profile):
             mean = water_extinction(world.medium, world.layers, begin, request.u, width, seed)
-            flight = sample_flight(from_lens, request.u, request.interval, mean, world.medium, xi_choice, xi)
+        flight = sample_flight(
+            from_lens, request.u, request.interval, mean, world.medium, xi_choice, xi, world.layers, begin
+        )
         point.x = request.x + flight.s * request.u
         point.path = request.path + flight.s
         there = water_at(world.medium, world.layers, point.x)
@@ -339,8 +466,8 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     has_mesh, specular = spec.mesh, spec.specular
     water_at = spec.water.at
     phase_pdf = spec.phase.pdf
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
-    face_at = patch_face if spec.brute_force and not spec.use_warp_bvh else tree_face
+    reflectance_at = spec.reflectance_at
+    face_at = patch_face if spec.tries_faces else tree_face
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
@@ -371,9 +498,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """
     confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
-    image_of = spec.lens.image or spec.lens.project
+    image_of = spec.image_of
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    link_to, value_of = make_link(spec)
+    link_to, value_of, *_ = make_lens_way(spec.port)
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, _mirror, deliver) = rider is not NOTHING, rider
 

@@ -12,30 +12,19 @@ __all__ = ["Estimator"]
 
 @wp.struct
 class FlightPlan:
-    """What an estimator draws for a flight before it is traced.
+    """What an estimator draws for a flight before it is traced."""
 
-    Attributes:
-        lens: The point of the lens that the flight is scored through [m].
-        lens_weight: Its density if it were uniform, over that of the draw.
-        interval: The part of the flight that is to be scored, unless a surface stands before it [m]; empty for none.
-    """
-
-    lens: wp.vec3
-    lens_weight: float
-    interval: wp.vec2
+    lens: wp.vec3  # the point of the lens that the flight is scored through [m]
+    lens_weight: float  # its density if it were uniform, over that of the draw
+    interval: wp.vec2  # the part of it that is scored, unless a surface stands before it [m]; empty for none
 
 
 @wp.struct
 class Direction:
-    """A new direction after an event.
+    """A new direction after an event."""
 
-    Attributes:
-        u: Unit vector.
-        factor: By which the weight changes: density of the physics over that of the draw.
-    """
-
-    u: wp.vec3
-    factor: float
+    u: wp.vec3  # unit vector
+    factor: float  # by which the weight changes: density of the physics over that of the draw
 
 
 class Estimator(NamedTuple):

@@ -10,18 +10,17 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
-from spadwarp_kernels.optics.camera import lens_point
+from spadwarp_kernels.optics.camera import clip_to_gate, lens_point
 from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import PhotonState, World
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import reflection_pdf, sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
-from spadwarp_kernels.water.limits import exit_distance, exit_distance_rotated
-from spadwarp_kernels.water.medium import Layers, Medium
+from spadwarp_kernels.water.limits import make_domain
+from spadwarp_kernels.water.medium import Medium
 from spadwarp_kernels.water.phase_functions import (
     HENYEY_GREENSTEIN,
     HENYEY_GREENSTEIN_GUIDE,
@@ -31,9 +30,8 @@ from spadwarp_kernels.water.phase_functions import (
     sample_henyey_greenstein,
 )
 
-from .contribution import make_event_request, make_score, make_toward, scores_collision
+from .contribution import make_event_request, make_lens_way, make_sample_lens, make_score, scores_collision
 from .estimator import Direction, Estimator, FlightPlan
-from .flight_sampling import make_sample_lens
 
 # A photon's weight is at most this times its analog weight, see `guided_part`.
 LARGEST_WEIGHT_RATIO = wp.constant(64.0)
@@ -65,8 +63,8 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
     view_of = spec.lens.view
     varies, bounded, has_phase_guide = spec.varies, spec.bounded, spec.phase.guide is not None
-    to_exit = exit_distance_rotated if spec.rotated_domain else exit_distance
-    clip_to_view, _, clip_to_gate = port_view(spec.port)
+    to_exit = make_domain(spec.rotated_domain).exit_distance
+    clip_to_view, _, gate_of = port_view(spec.port)
     sample_lens = make_sample_lens(spec.port)
 
     @wp.func
@@ -84,7 +82,8 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
         if wp.static(bounded):
             limit = wp.min(limit, to_exit(world.limits, s.x, s.u))
         plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), s.x, s.u, plan.lens, limit)
-        plan.interval = clip_to_gate(world.camera, world.gate, s.x, s.u, s.path, plan.lens, plan.interval)
+        gate = gate_of(world.camera, world.gate)
+        plan.interval = clip_to_gate(gate, s.x, s.u, s.path, plan.lens, plan.interval)
         if not (wp.static(varies) or world.medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
         return plan
@@ -105,7 +104,7 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, rides = spec.varies and not spec.random_albedo, make_rider(spec) is not NOTHING
+    local_albedo, rides = spec.local_albedo, make_rider(spec) is not NOTHING
     collides = spec.scores_collisions
     spares = collides and not spec.reflecting  # mirrored, any flight may lead to an image of the lens
 
@@ -201,56 +200,17 @@ def guided_part(weight: float, analog_weight: float, surfaces_met: int, probabil
     return wp.clamp(bound / wp.max(probability, 1.0e-6), 0.0, 1.0 / (1.0 + vessel))
 
 
-@memoised
-def _make_extinction_at(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(here, wanted, medium, layers, x) -> float``: the extinction at x, where the water is `here`;
-    of a grid only if it is wanted, since a cell must be looked up for it."""
-    tracks, water_at = spec.grid is not None, spec.water.at
-
-    @wp.func
-    def extinction_at(here: Medium, wanted: bool, medium: Medium, layers: Layers, x: wp.vec3) -> float:
-        extinction = float(0.0)
-        if wp.static(not tracks):
-            extinction = here.extinction
-        elif wanted:
-            extinction = water_at(medium, layers, x).extinction
-        return extinction
-
-    return extinction_at
-
-
-@memoised
-def _make_lens_chance(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(u, guiding) -> float``: chance that a water collision guides light that came along u towards
-    the lens.
-
-    With delta tracking, light that already flies back has two chances to be guided: what comes late through a cloud has
-    turned in several steps, and such histories are few and heavy. Other water has one: a grid that repeats layers has
-    their histories.
-    """
-    twice = spec.scores_collisions
-
-    @wp.func
-    def lens_chance(u: wp.vec3, guiding: Guiding) -> float:
-        chance = guiding.probability
-        if wp.static(twice):
-            chance = wp.where(u[2] < 0.0, chance * (2.0 - chance), chance)
-        return chance
-
-    return lens_chance
-
-
 def make_direct(spec: TransportSpec) -> wp.Function:
     """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
     phase_pdf = spec.phase.pdf
     guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
     has_phase_guide = spec.phase.guide is not None
     lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
-    water_at, extinction_at, lens_chance = spec.water.at, _make_extinction_at(spec), _make_lens_chance(spec)
+    water_at, tracks, collides = spec.water.at, spec.grid is not None, spec.scores_collisions
     view_of, toward_middle = spec.lens.view, spec.lens.toward_middle
     has_mesh, specular = spec.mesh, spec.specular
-    in_view = spec.lens.shows if spec.port is None else port_view(spec.port).shows
-    toward, toward_centre = make_toward(spec)
+    in_view = spec.in_view
+    *_, toward, toward_centre = make_lens_way(spec.port)
 
     @wp.func
     def direct(
@@ -262,9 +222,18 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             on_surface = s.hit.face >= 0
         here = water_at(world.medium, world.layers, s.x)
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
-        extinction = extinction_at(here, on_surface, world.medium, world.layers, s.x)
+        extinction = float(0.0)
+        if wp.static(not tracks):
+            extinction = here.extinction
+        elif on_surface:  # else no cell need be looked up
+            extinction = water_at(world.medium, world.layers, s.x).extinction
         at_surface = world.guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
-        to_lens_chance = wp.where(on_surface, at_surface, lens_chance(s.u, world.guiding))
+        to_lens_chance = world.guiding.probability
+        if wp.static(collides):
+            # Two chances for light that flies back: what comes late through a cloud has turned in several steps, and
+            # such histories are few and heavy. A grid that repeats layers has the histories of layers, and one chance.
+            to_lens_chance = wp.where(s.u[2] < 0.0, to_lens_chance * (2.0 - to_lens_chance), to_lens_chance)
+        to_lens_chance = wp.where(on_surface, at_surface, to_lens_chance)
         met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_from(s.u, world.medium.axis_threshold)
         v = toward_centre(world.camera, s.x)

@@ -6,28 +6,26 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import join_words, u01, u01_high, u01_low
 from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.photon.queue import Request
-from spadwarp_kernels.photon.sink import Sink, make_deposit
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import Contribution, PhotonState, Sink, World, make_deposit, tally_index
 from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
-from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED, Contribution, tally_index
+from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED
 from spadwarp_kernels.water.limits import (
-    Limits,
     face_index,
     flipped,
     image_direction,
     image_point,
     image_reflectance,
+    make_domain,
     next_face,
     reflections_of,
     to_next_face,
 )
 
-from .contribution import make_link, make_scattering
+from .contribution import make_lens_way, make_scattering
 
 
 @wp.struct
@@ -41,38 +39,14 @@ class Mirrored:
     shadow_queries: int
 
 
-@wp.func
-def _to_domain(limits: Limits, v: wp.vec3) -> wp.vec3:
-    return limits.rotation * v
-
-
-@wp.func
-def _from_domain(limits: Limits, v: wp.vec3) -> wp.vec3:
-    return wp.transpose(limits.rotation) * v
-
-
-@wp.func
-def _same(limits: Limits, v: wp.vec3) -> wp.vec3:
-    return v
-
-
-@wp.func
-def _origin(limits: Limits) -> wp.vec3:
-    return limits.origin
-
-
-@wp.func
-def _no_origin(limits: Limits) -> wp.vec3:
-    return wp.vec3(0.0)
-
-
 @memoised
 def _make_follow(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(found, request, x, v, length, reflections, end, inside, world, seed)`` that follows the
     light of a request's event, which leaves x along v in the domain's axes and is reflected so many times within that
     length, to the end of the water, and delivers what rides along."""
     has_mesh, water_extinction = spec.mesh, spec.water.extinction
-    turn_back, origin = (_from_domain, _origin) if spec.rotated_domain else (_same, _no_origin)
+    domain = make_domain(spec.rotated_domain)
+    point_back, turn_back = domain.point_back, domain.turn_back
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, mirror, deliver) = rider is not NOTHING, rider
 
@@ -103,8 +77,8 @@ def _make_follow(spec: TransportSpec, brute_force: bool) -> wp.Function:
             face = int(0)
             if k < reflections:
                 part = wp.min(rest, to_next_face(limits, begin, along))
-                face = next_face(limits, begin, along)
-            start = turn_back(limits, begin - origin(limits))
+                face = next_face(limits, 9.0e29, begin, along).face
+            start = point_back(limits, begin)
             extinction = water_extinction(world.medium, world.layers, start, heading, part, seed + wp.uint64(k))
             found.depth += part * extinction
             if wp.static(rides):
@@ -135,10 +109,11 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
     """The Warp function ``(request, number, world) -> Mirrored`` of an event by way of one of `Boundary.images`."""
     confocal, measured = spec.confocal, spec.mesh or spec.varies
     followed = measured or make_rider(spec) is not NOTHING
-    image_of = spec.lens.image or spec.lens.project
+    image_of = spec.image_of
     scattering_density, follow = make_scattering(spec), _make_follow(spec, brute_force)
-    link_to, value_of = make_link(spec)
-    turn, turn_back, origin = (_to_domain, _from_domain, _origin) if spec.rotated_domain else (_same, _same, _no_origin)
+    link_to, value_of, *_ = make_lens_way(spec.port)
+    domain = make_domain(spec.rotated_domain)
+    point, point_back, turn, turn_back = domain.point, domain.point_back, domain.turn, domain.turn_back
 
     @wp.func
     def score_image(request: Request, number: int, world: wp.ref[World]) -> Mirrored:
@@ -146,8 +121,8 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
         found.clear = True
         limits = world.limits
         image = limits.boundary.images[number]
-        x = turn(limits, request.x) + origin(limits)
-        seen = turn_back(limits, image_point(limits.lower, limits.upper, image, x) - origin(limits))
+        x = point(limits, request.x)
+        seen = point_back(limits, image_point(limits.lower, limits.upper, image, x))
         lens = lens_point(world.camera, u01_high(request.first), u01_low(request.first))
         view = world.camera.view
         if wp.static(confocal):

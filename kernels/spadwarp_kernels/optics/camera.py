@@ -64,24 +64,12 @@ def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def project(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
-    """Row-major index of the pixel that images the point x by way of the lens point o, or -1 outside the view."""
-    scale = 1.0 / camera.pixel_tangent
-    centre = wp.vec2(0.5 * float(camera.width), 0.5 * float(camera.height))
-    return _pixel(camera, wp.vec2(scale, scale), centre, x, o)
-
-
-@wp.func
-def project_about_axis(camera: Camera, x: wp.vec3, o: wp.vec3) -> int:
-    """`project` for a camera from `ready_camera`."""
-    return _pixel(camera, camera.focal, camera.principal, x, o)
-
-
-@wp.func
-def _pixel(camera: Camera, focal: wp.vec2, principal: wp.vec2, x: wp.vec3, o: wp.vec3) -> int:
+def project(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    """Row-major index of the pixel that images the point x by way of the lens point o, or -1 outside the view; of a
+    camera from `ready_camera`."""
     t = image_tangents(camera, x, o)
-    column = t[0] * focal[0] + principal[0]
-    row = t[1] * focal[1] + principal[1]
+    column = t[0] * camera.focal[0] + camera.principal[0]
+    row = t[1] * camera.focal[1] + camera.principal[1]
     # Compared as floats: a float beyond the int range has no defined int value. Also false for what is not a number.
     inside = column >= 0.0 and row >= 0.0 and column < float(camera.width) and row < float(camera.height)
     if not (inside and x[2] > 0.0):
@@ -144,17 +132,6 @@ def lens_point(camera: Camera, xi1: float, xi2: float) -> wp.vec3:
 
 
 @wp.func
-def clip_to_planes(planes: wp.vec4, x: wp.vec3, u: wp.vec3, limit: float) -> wp.vec2:
-    """The part [s0, s1] of the flight x + s u, 0 <= s <= limit, between the side planes through the origin with the
-    given tangents (left, top, right, bottom), which meet there: all of it has z > 0; empty where s0 >= s1."""
-    interval = wp.vec2(0.0, limit)
-    interval = clip_half_space(planes[2] * x[2] - x[0], planes[2] * u[2] - u[0], interval)
-    interval = clip_half_space(x[0] - planes[0] * x[2], u[0] - planes[0] * u[2], interval)
-    interval = clip_half_space(planes[3] * x[2] - x[1], planes[3] * u[2] - u[1], interval)
-    return clip_half_space(x[1] - planes[1] * x[2], u[1] - planes[1] * u[2], interval)
-
-
-@wp.func
 def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     """The part of the interval of s in which value + slope s > 0."""
     # Selected rather than branched to: half the lanes of a warp go either way. For a flight along the plane the
@@ -192,9 +169,13 @@ def clip_to_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.ve
     # Sheared so that the side planes, which go through o and the view on the focus plane, go through the origin.
     slope_x = camera.inverse_focus * o[0]
     slope_y = camera.inverse_focus * o[1]
-    start = wp.vec3(x[0] - o[0] + slope_x * x[2], x[1] - o[1] + slope_y * x[2], x[2])
-    along = wp.vec3(u[0] + slope_x * u[2], u[1] + slope_y * u[2], u[2])
-    return clip_to_planes(view, start, along, limit)
+    y = wp.vec3(x[0] - o[0] + slope_x * x[2], x[1] - o[1] + slope_y * x[2], x[2])
+    v = wp.vec3(u[0] + slope_x * u[2], u[1] + slope_y * u[2], u[2])
+    # The planes meet at the origin: all of what is between them has z > 0.
+    part = clip_half_space(view[2] * y[2] - y[0], view[2] * v[2] - v[0], wp.vec2(0.0, limit))
+    part = clip_half_space(y[0] - view[0] * y[2], v[0] - view[0] * v[2], part)
+    part = clip_half_space(view[3] * y[2] - y[1], view[3] * v[2] - v[1], part)
+    return clip_half_space(y[1] - view[1] * y[2], v[1] - view[1] * v[2], part)
 
 
 @wp.func
@@ -316,15 +297,14 @@ def clip_to_gate(gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3,
 
 
 class Lens(NamedTuple):
-    """A way of imaging; its name identifies it in the kernel cache.
+    """A way of imaging, as Warp functions for the camera that the transport kernel gets, see `Camera.focal`.
 
     Attributes:
-        name: "plain" or "calibrated".
-        project: Warp function (camera, view, target, x, o) -> the pixel that images x by way of o, or -1.
-        view: Warp function (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image,
-            or the pixel of a scan, shows.
+        name: "plain" or "calibrated"; identifies it in the kernel cache.
+        project: (camera, view, target, x, o) -> the pixel that images x by way of o, or -1.
+        view: (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image, or the pixel of
+            a scan, shows.
         shows: As `in_view`, for such a view without a port.
-        image: As `project`, for the camera that the transport kernel gets, see `Camera.focal`; None: `project`.
         toward_middle: As the function of that name, for such a view.
     """
 
@@ -332,18 +312,7 @@ class Lens(NamedTuple):
     project: wp.Function
     view: wp.Function
     shows: wp.Function = in_view
-    image: wp.Function | None = None
     toward_middle: wp.Function = toward_middle
-
-
-@wp.func
-def _project_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
-    return project(camera, x, o)
-
-
-@wp.func
-def _image_plain(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
-    return project_about_axis(camera, x, o)
 
 
 @wp.func
@@ -356,7 +325,7 @@ def _view_calibrated(camera: Camera, view: wp.vec4) -> wp.vec4:
     return view
 
 
-PLAIN = Lens("plain", _project_plain, _view_plain, in_field, _image_plain, toward_axis)
+PLAIN = Lens("plain", project, _view_plain, in_field, toward_axis)
 """Square pixels about the optical axis: the first six attributes of `Camera`, the others stay 0."""
 
 CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated)

@@ -118,8 +118,8 @@ def beam_frame(axis: wp.vec3):
 
 
 @wp.func
-def _first_above(table: wp.array[float], u: float) -> int:
-    """Index of the first entry above u of a rising table that ends with 1, for u in [0, 1)."""
+def first_above(table: wp.array[float], u: float) -> int:
+    """Index of the first entry above u of a rising table, of the last if there is none."""
     low = int(0)
     high = int(table.shape[0] - 1)
     while low < high:
@@ -138,8 +138,8 @@ def emit_measured(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
     The profile is the irradiance on a plane across the axis; a pixel is drawn by its power and a point evenly in it.
     """
     block = random_block(seed, id, wp.uint32(0), STREAM_EMISSION)
-    row = _first_above(laser.rows, u01(block[0]))
-    column = _first_above(laser.columns[row], u01(block[1]))
+    row = first_above(laser.rows, u01(block[0]))
+    column = first_above(laser.columns[row], u01(block[1]))
     x = 2.0 * (float(column) + u01(block[2])) / float(laser.columns.shape[1]) - 1.0
     y = 2.0 * (float(row) + u01(block[3])) / float(laser.columns.shape[0]) - 1.0
     right, down = beam_frame(axis)

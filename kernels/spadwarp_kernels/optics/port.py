@@ -383,8 +383,7 @@ def apparent_centre_dome(port: Port) -> wp.vec3:
 
 @wp.func
 def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
-    """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
-    ray as it goes straight on."""
+    """As `leave_flat`."""
     p = PortRay()
     n = port.index
     inner = port.radius

@@ -6,7 +6,7 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import check_array, check_kind
 
-from .camera import Camera, Gate, check_camera, clip_half_space, clip_to_gate, clip_to_view, field, in_view
+from .camera import Camera, Gate, check_camera, clip_half_space, clip_to_view, field, in_view
 from .port import DOME_PORT, FLAT_PORT, Port, PortKind
 
 # Texels along each side of the field of view: fine against the relief of a target, small against a GPU's cache.
@@ -136,25 +136,23 @@ class PortView(NamedTuple):
 
     clip: wp.Function  # as `clip_to_view`, holding the part that lies in the view
     shows: wp.Function  # as `in_view`
-    clip_gate: wp.Function  # (camera, gate, x, u, path, lens, interval) -> the part whose light arrives within the gate
+    gate: (
+        wp.Function
+    )  # (camera, gate) -> Gate of `clip_to_gate` that holds the part whose light arrives within the gate
 
 
 @wp.func
-def _clip_gate_bare(
-    camera: Camera, gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, interval: wp.vec2
-) -> wp.vec2:
-    return clip_to_gate(gate, x, u, path, lens, interval)
+def _same_gate(camera: Camera, gate: Gate) -> Gate:
+    return gate
 
 
 @wp.func
-def clip_gate_behind_port(
-    camera: Camera, gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, interval: wp.vec2
-) -> wp.vec2:
-    """As `clip_to_gate`, for the least and the largest time that the port may save against the straight line."""
-    wide = Gate()
+def _gate_behind_port(camera: Camera, gate: Gate) -> Gate:
+    """For the least and the largest time that the port may save against the straight line."""
+    wide = gate
     wide.start = gate.start - camera.port.late
     wide.stop = gate.stop + camera.port.early
-    return clip_to_gate(wide, x, u, path, lens, interval)
+    return wide
 
 
 @wp.func
@@ -178,14 +176,10 @@ def _view_from(camera: Camera, view: wp.vec4, o: wp.vec3) -> wp.vec4:
 
 
 @wp.func
-def _rise(port: Port, beyond: float, outward: float, largest: bool) -> float:
-    """By how much a side plane lies further out for a point that is seen nearer than it is, along the normal.
-
-    Rays go as if straight to a point whose depths in glass and water are shorter by the ratio of the tangents; ratios
-    are taken at that end of their range which widens the view.
-    """
-    take = wp.where(largest, 1, 0)
-    return -outward * (port.thickness * (port.glass_slope[take] - 1.0) + beyond * (port.water_slope[take] - 1.0))
+def _nearer(port: Port, beyond: float, end: int) -> float:
+    """By how much a point is seen nearer than it is, along the normal [m]: rays go as if straight to a point whose
+    depths in glass and water are shorter by the ratio of the tangents, here the least (end 0) or the largest (1)."""
+    return port.thickness * (port.glass_slope[end] - 1.0) + beyond * (port.water_slope[end] - 1.0)
 
 
 @wp.func
@@ -199,8 +193,9 @@ def clip_to_flat_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: 
     for k in range(4):
         side = _side(seen, k)
         outward = wp.dot(side, port.normal)
-        slope = port.water_slope[wp.where(outward < 0.0, 1, 0)] - 1.0
-        value = _rise(port, beyond, outward, outward < 0.0) - wp.dot(side, x - o)
+        end = wp.where(outward < 0.0, 1, 0)  # that which widens the view
+        slope = port.water_slope[end] - 1.0
+        value = -outward * _nearer(port, beyond, end) - wp.dot(side, x - o)
         interval = clip_half_space(value, -wp.dot(side, u) - outward * climb * slope, interval)
     return interval
 
@@ -216,7 +211,7 @@ def flat_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
         outward = wp.dot(side, port.normal)
         value = float(-1.0e30)
         for end in range(2):
-            near = port.thickness * (port.glass_slope[end] - 1.0) + beyond * (port.water_slope[end] - 1.0)
+            near = _nearer(port, beyond, end)
             blur = camera.aperture_radius * wp.abs((x[2] + near * port.normal[2]) * camera.inverse_focus - 1.0)
             value = wp.max(value, blur - outward * near)
         shown = shown and value > wp.dot(side, x)
@@ -255,13 +250,13 @@ def dome_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
     return shown
 
 
-_BARE = PortView(clip_to_view, in_view, _clip_gate_bare)
 _VIEWS = {
-    FLAT_PORT.name: PortView(clip_to_flat_view, flat_view_shows, clip_gate_behind_port),
-    DOME_PORT.name: PortView(clip_to_dome_view, dome_view_shows, clip_gate_behind_port),
+    None: PortView(clip_to_view, in_view, _same_gate),
+    FLAT_PORT.name: PortView(clip_to_flat_view, flat_view_shows, _gate_behind_port),
+    DOME_PORT.name: PortView(clip_to_dome_view, dome_view_shows, _gate_behind_port),
 }
 
 
 def port_view(port: PortKind | None) -> PortView:
     """What a camera sees behind a kind of port; None: without one."""
-    return _BARE if port is None else _VIEWS[port.name]
+    return _VIEWS[port and port.name]

@@ -1,4 +1,4 @@
-"""Requests for contributions, and on CUDA a warp's queue of them, which its 32 lanes serve together."""
+"""Requests for contributions, and what the 32 lanes of a CUDA warp hand to each other; on a CPU a warp has one lane."""
 
 import warp as wp
 
@@ -6,64 +6,200 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of, from_bits
 from spadwarp_kernels.tally.tally import BACKSCATTER
 
-from .lanes import (
-    ADD_ENTRY,
-    MOST_LEFT,
-    count_lanes_before,
-    fits_in_block,
-    make_warp_memory,
-    queue_pair,
-    queue_size,
-    queue_vector,
-)
 from .spec import TransportSpec
-from .state import Carried
+from .state import Carried, PhotonRef, SinkRef, WorldRef
+
+# Threads of a block of the transport kernel on CUDA.
+BLOCK_SIZE = 128
+
+# Requests that a warp's queue may hold when new ones come.
+MOST_LEFT = 31
 
 
 @wp.struct
 class Request:
-    """What is to be scored; plain enough for another thread to do it.
+    """What is to be scored; plain enough for another thread to do it."""
 
-    Attributes:
-        wanted: Whether there is anything.
-        x: Where the photon scatters, or where the flight begins [m].
-        u: Its direction until there, or of the flight.
-        weight: Of the photon; in water times the albedo, but for flights through water that varies, whose albedo is
-            that of the sampled point.
-        path: Geometric path up to x [m].
-        lens: The point of the lens by which a flight is scored; others draw one from `first`.
-        interval: The part of the flight to take a point from [m]; empty for a scattering.
-        first, second: Random words: of the lens's point or, of a flight, of the choice and the distance; both of the
-            tracking through a grid. Of a spec that `scores_collisions` the second has the bits of the distance to the
-            collision [m] where that is scored.
-        rounding_sample: A random word, 24 bits of which are for the tally; what is scored must not depend on it.
-        component: Index into COMPONENTS.
-        slot: Of the face that scatters, see `SurfaceHit`; -1 for water.
-        target: The pixel of a scan, else -1.
-        carried: What rides along with the photon up to x.
-    """
-
-    wanted: bool
-    x: wp.vec3
-    u: wp.vec3
+    wanted: bool  # whether there is anything
+    x: wp.vec3  # where the photon scatters, or where the flight begins [m]
+    u: wp.vec3  # its direction until there, or of the flight
+    # Of the photon; in water times the albedo, but for flights through water that varies, whose albedo is that of the
+    # sampled point.
     weight: float
-    path: float
-    lens: wp.vec3
-    interval: wp.vec2
+    path: float  # geometric path up to x [m]
+    lens: wp.vec3  # the point of the lens by which a flight is scored; others draw one from `first`
+    interval: wp.vec2  # the part of the flight to take a point from [m]; empty for a scattering
+    # Random words: of the lens's point or, of a flight, of the choice and the distance; both of the tracking through a
+    # grid. Of a spec that `scores_collisions` the second has the bits of the distance to the collision [m] where that
+    # is scored.
     first: wp.uint32
     second: wp.uint32
-    rounding_sample: wp.uint32
-    component: int
-    slot: int
-    target: int
-    carried: Carried
+    rounding_sample: wp.uint32  # random: 24 bits of it are for the tally; what is scored must not depend on it
+    component: int  # index into COMPONENTS
+    slot: int  # of the face that scatters, see `SurfaceHit`; -1 for water
+    target: int  # the pixel of a scan, else -1
+    carried: Carried  # what rides along with the photon up to x
+
+
+# ---- Votes.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned int lanes = __ballot_sync(0xffffffffu, condition);
+    return wp::vec2i(__popc(lanes & ((1u << (threadIdx.x & 31u)) - 1u)), __popc(lanes));
+#else
+    return wp::vec2i(0, condition ? 32 : 0);
+#endif
+""")
+def vote(condition: bool) -> wp.vec2i:
+    """Number of lanes of the warp before this one, and of all 32, in which the condition holds; every lane must take
+    part, and all meet here."""
+    ...
+
+
+@wp.func
+def count_lanes(condition: bool) -> int:
+    """Number of lanes, out of 32, in which the condition holds, by a `vote`."""
+    return vote(condition)[1]
+
+
+# ---- A warp's shared memory, in units of 16 bytes: 32 vectors of six numbers, the size of its queue, and that.
+
+
+_SIZE = 48
+_QUEUE = 49
+
+_MEMORY = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 memory[%d];
+    unsigned int begin = __cvta_generic_to_shared(memory + %du * (threadIdx.x >> 5u));
+    // Out of the compiler's sight, which else computes it anew, in six instructions, wherever it is used.
+    asm volatile("" : "+r"(begin));
+    return %s;
+#else
+    return 0;
+#endif
+"""
+
+# As if another lane had it: the assembler too, which looks through the above, then keeps it in a register.
+_HELD = "__shfl_sync(0xffffffffu, begin, threadIdx.x & 31u)"
+
+
+def _make_memory(vectors: int, held: bool) -> wp.Function:
+    """The Warp function ``() -> int``: where the shared memory of a warp begins, with so many vec4 in its queue; CUDA
+    alone. Kernels take no more than they need, since the cache has the rest. `held`: in a register, come what may."""
+    of_warp = _QUEUE + vectors
+
+    @wp.func_native(_MEMORY % (of_warp * BLOCK_SIZE // 32, of_warp, _HELD if held else "begin"))
+    def warp_memory() -> int: ...
+
+    return warp_memory
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float* mine = static_cast<float*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory)));
+    if (put) {
+        __syncwarp();
+        for (int i = 0; i < 6; ++i) mine[32 * i + entry] = value[i];
+        __syncwarp();
+        return value;
+    }
+    wp::spatial_vector taken;
+    for (int i = 0; i < 6; ++i) taken[i] = mine[32 * i + entry];
+    return taken;
+#else
+    return value;
+#endif
+""")
+def exchange(memory: int, put: bool, entry: int, value: wp.spatial_vector) -> wp.spatial_vector:
+    """32 vectors that a warp shares: every lane puts one, and later any lane takes any; CUDA alone."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    int first = 0;
+    if ((threadIdx.x & 31u) == 0u) first = atomicAdd(cursor.data, 32);
+    return __shfl_sync(0xffffffffu, first, 0);
+#else
+    return 0;
+#endif
+""")
+def take_photons(cursor: wp.array[int]) -> int:
+    """First of the next 32 photons, which are this warp's; every lane must take part. Warps come for more as they get
+    done, so that all end together; CUDA alone."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    float4* mine = static_cast<float4*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + {_QUEUE};
+    if (put) mine[entry] = make_float4(value[0], value[1], value[2], value[3]);
+    const float4 held = mine[entry];
+    return wp::vec4(held.x, held.y, held.z, held.w);
+#else
+    return value;
+#endif
+""")
+def queue_vector(memory: int, put: bool, entry: int, value: wp.vec4) -> wp.vec4:
+    """Writes or reads one of the vectors of the warp's queue; CUDA alone."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    float4* mine = static_cast<float4*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + {_QUEUE} + begin;
+    float2* pairs = reinterpret_cast<float2*>(mine);
+    if (put) pairs[entry] = make_float2(value[0], value[1]);
+    const float2 held = pairs[entry];
+    return wp::vec2(held.x, held.y);
+#else
+    return value;
+#endif
+""")
+def queue_pair(memory: int, put: bool, begin: int, entry: int, value: wp.vec2) -> wp.vec2:
+    """Writes or reads one of the pairs of numbers that the warp's queue has where its vectors from `begin` on would be;
+    CUDA alone."""
+    ...
+
+
+ADD_ENTRY, READ_SIZE, SET_SIZE = (wp.constant(i) for i in range(3))
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    int* size = static_cast<int*>(__cvta_shared_to_generic(static_cast<unsigned int>(memory))) + 4 * {_SIZE};
+    if (act == 0) return atomicAdd(size, 1);
+    __syncwarp();
+    if (act == 1) {{
+        const int held = *size;
+        __syncwarp();  // all have read it before one adds an entry
+        return held;
+    }}
+    if ((threadIdx.x & 31u) == 0u) *size = number;
+    __syncwarp();
+#endif
+    return number;
+""")
+def queue_size(memory: int, act: int, number: int) -> int:
+    """The number of entries of the warp's queue; CUDA alone.
+
+    ADD_ENTRY: any lane adds one and gets its index. READ_SIZE: all lanes together read the size, after which they see
+    what the entries hold. SET_SIZE: all lanes together set it to a number.
+    """
+    ...
+
+
+# ---- The queue.
 
 
 # A request's 24 bits for the tally share a word with its component.
 _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
 
-# Of a block's shared memory where a tree is walked: with 96 registers five blocks then leave 92 of an H200's 256 KiB to
-# the cache, which holds the stacks.
+# Of a block's shared memory, 48 KiB, where a tree is walked: with 96 registers five blocks then leave 92 of an H200's
+# 256 KiB to the cache, which holds the stacks.
 _KIB_IN_TREE = 31
 
 
@@ -74,17 +210,19 @@ def _lane(lane: int, takes: bool) -> int:
 
 @wp.func
 def _among_takers(lane: int, takes: bool) -> int:
-    return count_lanes_before(takes)
+    return vote(takes)[0]
 
 
-def _vectors(more: bool, derivatives: int, polarised: bool) -> int:
-    """Of a request, four numbers each; `more`: it has an interval, a point of the lens or a target."""
-    return (4 if more else 3) + (1 if polarised else -(-derivatives // 4))
+def _has_more(spec: TransportSpec, flights: bool) -> bool:
+    """Whether a request has an interval, a point of the lens or a target."""
+    return flights or spec.confocal
 
 
-def queue_entries(points: int, long: bool) -> int:
-    """Of a warp: requests that wait, and those that come, of flights by their points, with `long` an event as well."""
-    return MOST_LEFT + 32 * (points + 1 if long else points)
+def _size(spec: TransportSpec, flights: bool, long: bool) -> tuple[int, int]:
+    """Entries of a warp, and vectors of each: requests that wait, and those that come, of flights by their points, with
+    `long` an event as well."""
+    vectors = 3 + _has_more(spec, flights) + (1 if spec.polarised else -(-len(spec.derivatives) // 4))
+    return MOST_LEFT + 32 * (spec.points + 1 if long else spec.points), vectors
 
 
 def long_queue_fits(spec: TransportSpec, in_tree: bool) -> bool:
@@ -93,14 +231,17 @@ def long_queue_fits(spec: TransportSpec, in_tree: bool) -> bool:
 
     Not in grids: with 72 registers the longer queues of all warps would leave 28 kB of cache, in place of 92 kB.
     """
-    vectors = _vectors(True, len(spec.derivatives), spec.polarised) * queue_entries(spec.points, True)
-    return spec.grid is None and fits_in_block(vectors, _KIB_IN_TREE if in_tree else 48)
+    entries, vectors = _size(spec, True, True)
+    kib = _KIB_IN_TREE if in_tree else 48
+    return spec.grid is None and 16 * (_QUEUE + vectors * entries) * BLOCK_SIZE // 32 <= kib * 1024
 
 
-@memoised
-def _make_words(confocal: bool, short: bool, begin: int) -> tuple[wp.Function, wp.Function]:
+def _make_words(spec: TransportSpec, more: bool, begin: int) -> tuple[wp.Function, wp.Function]:
     """Two Warp functions that write, ``(memory, entry, request)``, and read, ``(memory, entry, request) -> Request``,
-    what a request has beside x, u, weight and path; `confocal`, `short`: see `make_queue`, `begin`: where it is."""
+    what a request has beside x, u, weight and path: a vector from `begin` on, or a pair where requests are of
+    scatterings in water alone, which need one random word beside that of the tally. `more`: see `_has_more`."""
+    confocal = spec.confocal
+    short = not (spec.mesh or more or spec.derivatives or spec.polarised or spec.grid)
 
     @wp.func
     def write_pair(memory: int, entry: int, request: Request):
@@ -149,66 +290,53 @@ def _make_words(confocal: bool, short: bool, begin: int) -> tuple[wp.Function, w
 
 @memoised
 def make_queue(
-    flights: bool,
-    used: bool,
-    long: bool,
-    traces: bool,
-    confocal: bool,
-    derivatives: int = 0,
-    polarised: bool = False,
-    points: int = 1,
-    short: bool = False,
+    spec: TransportSpec, flights: bool, used: bool, long: bool, traces: bool
 ) -> tuple[wp.Function, wp.Function, wp.Function]:
-    """Three Warp functions: ``warp_memory()``, see `make_warp_memory`; ``push(memory, request)`` adds what is wanted;
-    ``pop(memory, lane, takes, size, count) -> Request``, the last ones for the so many lanes that take one.
+    """Three Warp functions: ``memory() -> int``, see `_make_memory`; ``push(s, request, world, sink, memory)`` adds
+    what is wanted; ``pop(memory, lane, takes, size, count) -> Request``, the last ones for the so many lanes that take
+    one.
 
     Args:
+        spec: Of the requests.
         flights: Whether requests have an interval and a point of the lens.
         used: Whether there is a queue at all; else `push` does nothing.
         long: Whether a lane may add two requests, a flight and an event, before the queue is read.
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
-        confocal: Whether they have a target.
-        derivatives: How many log derivatives requests carry.
-        polarised: Whether they have a Stokes vector.
-        points: Requests that a flight adds, one for each of its points.
-        short: Whether requests are of scatterings in water alone, and need one random word beside that of the tally.
     """
-    more, rank_of = flights or confocal, _among_takers if traces else _lane
-    derivative_vectors = -(-derivatives // 4)
-    first_carried = 4 if more else 3
-    entries = queue_entries(points, long)
-    write_words, read_words = _make_words(confocal, short, 2 * entries)
-    warp_memory = make_warp_memory(
-        _vectors(more, derivatives, polarised) * entries if used else 0, flights and long and not traces
-    )
+    confocal, polarised, more = spec.confocal, spec.polarised, _has_more(spec, flights)
+    rank_of = _among_takers if traces else _lane
+    derivative_vectors = -(-len(spec.derivatives) // 4)
+    carried = 3 + more
+    entries, vectors = _size(spec, flights, long)
+    write_words, read_words = _make_words(spec, more, 2 * entries)
+    warp_memory = _make_memory(vectors * entries * used, flights and long and not traces)
+
+    @wp.func
+    def put(memory: int, entry: int, number: int, value: wp.vec4):
+        queue_vector(memory, True, entry + number * wp.static(entries), value)
+
+    @wp.func
+    def get(memory: int, entry: int, number: int) -> wp.vec4:
+        return queue_vector(memory, False, entry + number * wp.static(entries), wp.vec4())
 
     @wp.func
     def write(memory: int, entry: int, request: Request):
-        queue_vector(memory, True, entry, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
-        queue_vector(
-            memory, True, entry + wp.static(entries), wp.vec4(request.u[0], request.u[1], request.u[2], request.path)
-        )
+        put(memory, entry, 0, wp.vec4(request.x[0], request.x[1], request.x[2], request.weight))
+        put(memory, entry, 1, wp.vec4(request.u[0], request.u[1], request.u[2], request.path))
         write_words(memory, entry, request)
         if wp.static(more):
             lens = wp.vec2(request.lens[0], request.lens[1])
             if request.interval[0] >= request.interval[1]:
                 lens[0] = from_bits(request.slot)  # an event has no point of the lens yet
-            queue_vector(
-                memory,
-                True,
-                entry + 3 * wp.static(entries),
-                wp.vec4(request.interval[0], request.interval[1], lens[0], lens[1]),
-            )
+            put(memory, entry, 3, wp.vec4(request.interval[0], request.interval[1], lens[0], lens[1]))
         for i in range(wp.static(derivative_vectors)):
             a = request.carried.log_derivatives
-            part = wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3])
-            queue_vector(memory, True, entry + (wp.static(first_carried) + i) * wp.static(entries), part)
+            put(memory, entry, wp.static(carried) + i, wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3]))
         if wp.static(polarised):
-            # Which cannot be combined with derivatives.
-            queue_vector(memory, True, entry + wp.static(first_carried) * wp.static(entries), request.carried.stokes)
+            put(memory, entry, wp.static(carried), request.carried.stokes)  # which cannot be combined with derivatives
 
     @wp.func
-    def push(memory: int, request: Request):
+    def push(s: PhotonRef, request: Request, world: WorldRef, sink: SinkRef, memory: int):
         if wp.static(used):
             if request.wanted:
                 write(memory, queue_size(memory, ADD_ENTRY, 0), request)
@@ -219,27 +347,25 @@ def make_queue(
         index = wp.max(size - count, 0) + rank_of(lane, takes)
         request.wanted = takes and index < size
         entry = wp.min(index, size - 1)
-        a = queue_vector(memory, False, entry, wp.vec4())
-        b = queue_vector(memory, False, entry + wp.static(entries), wp.vec4())
+        a = get(memory, entry, 0)
+        b = get(memory, entry, 1)
         request.x = wp.vec3(a[0], a[1], a[2])
         request.weight = a[3]
         request.u = wp.vec3(b[0], b[1], b[2])
         request.path = b[3]
         request = read_words(memory, entry, request)
         if wp.static(more):
-            d = queue_vector(memory, False, entry + 3 * wp.static(entries), wp.vec4())
+            d = get(memory, entry, 3)
             request.interval = wp.vec2(d[0], d[1])
             request.lens = wp.vec3(d[2], d[3], 0.0)
         if wp.static(confocal):
             request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
         for i in range(wp.static(derivative_vectors)):
-            part = queue_vector(memory, False, entry + (wp.static(first_carried) + i) * wp.static(entries), wp.vec4())
+            part = get(memory, entry, wp.static(carried) + i)
             for k in range(4):
                 request.carried.log_derivatives[4 * i + k] = part[k]
         if wp.static(polarised):
-            request.carried.stokes = queue_vector(
-                memory, False, entry + wp.static(first_carried) * wp.static(entries), wp.vec4()
-            )
+            request.carried.stokes = get(memory, entry, wp.static(carried))
         return request
 
     return warp_memory, push, pop

@@ -1,15 +1,20 @@
 """What a transport kernel is compiled for."""
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple, get_origin
+
+import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer
 from spadwarp_kernels.optics.camera import PLAIN, Lens
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
 from spadwarp_kernels.optics.port import PortKind
-from spadwarp_kernels.tally.blocks import BLOCK_DERIVATIVES
-from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES
+from spadwarp_kernels.optics.visibility import port_view
+from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
 from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
+
+from .derivatives import BLOCK_DERIVATIVES, DERIVATIVES, MOST_DERIVATIVES
 
 __all__ = ["TransportSpec"]
 
@@ -102,6 +107,31 @@ class TransportSpec(NamedTuple):
         return self.layered or self.grid is not None
 
     @property
+    def local_albedo(self) -> bool:
+        """Whether the albedo at an event is that of the water there."""
+        return self.varies and not self.random_albedo
+
+    @property
+    def reflectance_at(self) -> wp.Function:
+        """The Warp function ``(surfaces, face, x) -> float``."""
+        return pattern_reflectance if self.pattern else face_reflectance
+
+    @property
+    def tries_faces(self) -> bool:
+        """Whether a GPU tries every face."""
+        return self.brute_force and not self.use_warp_bvh
+
+    @property
+    def image_of(self) -> wp.Function:
+        """The pixel of a point, see `Lens.project`."""
+        return self.lens.project
+
+    @property
+    def in_view(self) -> wp.Function:
+        """The Warp function ``(camera, view, x) -> bool``: whether the camera may see a point."""
+        return self.lens.shows if self.port is None else port_view(self.port).shows
+
+    @property
     def scores_collisions(self) -> bool:
         """Whether `guided` scores half the points of flights where the photon collides: where that is by chance."""
         return self.water.profile is not None and self.water.profile.draw is None
@@ -111,33 +141,28 @@ def check_spec(spec: Any) -> None:
     """A `TransportSpec` whose choices exist and can be combined; raises `ArgumentError`."""
     if not isinstance(spec, TransportSpec):
         raise ArgumentError(f"spec = {spec!r} is not a TransportSpec")
-    kinds = {"phase": PhaseFunction, "lens": Lens, "port": PortKind | None, "laser_port": PortKind | None}
-    kinds |= {"grid": Water | None, "derivatives": tuple, "blocks": tuple}
-    kinds |= {name: bool for name, kind in TransportSpec.__annotations__.items() if kind is bool}
-    for name, kind in kinds.items():
-        if not isinstance(getattr(spec, name), kind):
-            needed = getattr(kind, "__name__", None) or "PortKind or None"
-            needed = {"grid": "REGULAR_TRACKING, DELTA_TRACKING or None", "bool": "True or False"}.get(
-                name if name == "grid" else needed, f"a {needed}"
-            )
-            raise ArgumentError(f"spec.{name} = {getattr(spec, name)!r} is not {needed}")
-    for name, choices, most in (
-        ("derivatives", DERIVATIVES, MOST_DERIVATIVES),
-        ("blocks", BLOCK_DERIVATIVES, len(BLOCK_DERIVATIVES)),
-    ):
+    words = {bool: "True or False", PortKind | None: "a PortKind or None"}
+    words[Water | None] = "REGULAR_TRACKING, DELTA_TRACKING or None"
+    for name, kind in TransportSpec.__annotations__.items():
+        value, kind = getattr(spec, name), tuple if get_origin(kind) is tuple else kind
+        if kind not in (str, int) and not isinstance(value, kind):  # those are checked by value
+            raise ArgumentError(f"spec.{name} = {value!r} is not {words.get(kind) or f'a {kind.__name__}'}")
+    choices: dict[str, tuple[Iterable[str], int]] = {
+        "derivatives": (DERIVATIVES, MOST_DERIVATIVES),
+        "blocks": (BLOCK_DERIVATIVES, len(BLOCK_DERIVATIVES)),
+    }
+    for name, (allowed, most) in choices.items():
         check_integer(f"length of spec.{name}", len(getattr(spec, name)), 0, most)
         for index, kind in enumerate(getattr(spec, name)):
-            check_choice(f"spec.{name}[{index}]", kind, choices)
+            check_choice(f"spec.{name}[{index}]", kind, allowed)
     # A block has 48 KiB of shared memory for queues.
     check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
     check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
-    alone = spec.estimator == "guided" and not (spec.reflecting or spec.blocks or spec.scores_collisions)
-    one_water = not {*spec.derivatives} - {"reflectance"}
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
         (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
         (
-            spec.grid is not None and (spec.layered or spec.random_albedo),
+            spec.grid and (spec.layered or spec.random_albedo),
             "grid cannot be combined with spec.layered and spec.random_albedo",
         ),
         (
@@ -147,7 +172,7 @@ def check_spec(spec: Any) -> None:
         ),
         (len(set(spec.blocks)) < len(spec.blocks), f"blocks = {spec.blocks!r} names one twice"),
         (
-            spec.blocks and (spec.grid is None or spec.reflecting or spec.merged),
+            spec.blocks and (not spec.grid or spec.reflecting or spec.merged),
             "blocks need spec.grid, and cannot be combined with spec.reflecting and spec.merged",
         ),
         (
@@ -155,7 +180,7 @@ def check_spec(spec: Any) -> None:
             "derivatives cannot be combined with spec.random_albedo, which has no scattering coefficient",
         ),
         (
-            spec.grid is not None and not one_water,
+            spec.grid and {*spec.derivatives} - {"reflectance"},
             "derivatives: with spec.grid, whose water has no one value, they are of reflectance",
         ),
         (
@@ -164,7 +189,8 @@ def check_spec(spec: Any) -> None:
         ),
         ("reflectance" in spec.derivatives and not spec.mesh, "derivatives: reflectance needs spec.mesh = True"),
         (
-            spec.points > 1 and not alone,
+            spec.points > 1
+            and (spec.estimator != "guided" or spec.reflecting or spec.blocks or spec.scores_collisions),
             f"points = {spec.points}: more than 1 needs spec.estimator = 'guided', and cannot be combined with "
             "spec.reflecting, spec.blocks and DELTA_TRACKING",
         ),

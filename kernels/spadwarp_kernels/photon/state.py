@@ -1,199 +1,47 @@
-"""The state of a photon and of the thread that carries it."""
+"""What a launch reads (World) and adds to (Sink), and the state of a photon and of the thread that carries it."""
+
+from typing import TypeAlias
 
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_device, check_integer
+from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.philox import RoundKeys
+from spadwarp_kernels.optics.camera import BEFORE, Camera, Gate, gate_bin
+from spadwarp_kernels.optics.laser import Laser, Scan
+from spadwarp_kernels.optics.polarisation import Polarisation
 from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
+from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
-from spadwarp_kernels.tally.tally import Contribution, LogDerivatives
+from spadwarp_kernels.tally import ledger
+from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
+from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64
+from spadwarp_kernels.water.limits import Limits
+from spadwarp_kernels.water.medium import Layers, Medium
+from spadwarp_kernels.water.phase_functions import Guiding
 
-from .sink import Account, Weight
-from .world import World
+from .derivatives import Derivatives, LogDerivatives, met_count, met_entry, score_entry
 
 __all__ = ["Records", "make_records"]
 
-# What a thread does next: a flight, the ray that looks for a surface along it, the event at its end, the scattering
-# there, a photon of its own, the end of one; or no photons are left.
-FLIGHT, RAY, EVENT, SCATTER, START, END, DONE = (wp.constant(i) for i in range(7))
-
-# The ray that a thread traces.
-NO_RAY, SURFACE_RAY, SHADOW_RAY = (wp.constant(i) for i in range(3))
-
 
 @wp.struct
-class Carried:
-    """What rides along with light beside its weight, see `riders`.
+class World:
+    """The fields of a `Model`, and the seed with the keys that Philox makes of it. No stage writes to it."""
 
-    Attributes:
-        log_derivatives: Of what the light has met, by the parameters of the spec; 0 without them.
-        stokes: Of the light, of weight 1 when it was emitted, with respect to `orthonormal_basis` of its direction.
-        half: Of `Blocks.memory`: 0 for the history of a photon, 1 for a contribution.
-    """
-
-    log_derivatives: LogDerivatives
-    stokes: wp.vec4
-    half: int
-
-
-@wp.struct
-class Flight:
-    """The flight to the next event.
-
-    Attributes:
-        block: Random words of that event.
-        sample_block: Random words of the estimator's sample of the flight.
-        distance: To the event [m].
-        reach: How far to look for surfaces [m].
-        interval: The part that an estimator wants to score [m]; empty for none.
-        lens: The point of the lens by which the flight is scored [m].
-        lens_weight: Its density if it were uniform, over that of the draw.
-    """
-
-    block: wp.vec4ui
-    sample_block: wp.vec4ui
-    distance: float
-    reach: float
-    interval: wp.vec2
-    lens: wp.vec3
-    lens_weight: float
-
-
-@wp.func
-def is_planned(flight: Flight) -> bool:
-    """Whether an estimator wants to score a part of the flight."""
-    return flight.interval[0] < flight.interval[1]
-
-
-@wp.func
-def shorten(flight: wp.ref[Flight], distance: float):
-    """Ends the flight at a surface at a distance [m]."""
-    flight.distance = wp.min(flight.distance, distance)
-    flight.interval = wp.vec2(flight.interval[0], wp.min(flight.interval[1], distance))
-
-
-@wp.struct
-class Bounces:
-    """Reflections of a photon by faces of the domain, and the account of the thread.
-
-    Attributes:
-        face: That the photon has come to, see EXIT_FACES; 0 at any other event.
-        count: Reflections of the photon.
-        leg: Those since the last other event.
-        total: Reflections of all photons that have ended.
-        dropped: Photons that came to the lens by too long a leg.
-    """
-
-    face: int
-    count: int
-    leg: int
-    total: int
-    dropped: int
-
-
-@wp.func
-def next_bounce(b: wp.ref[Bounces], face: int):
-    """After the photon has come to a face, or to another event (0)."""
-    b.face = face
-    b.leg = wp.where(face > 0, b.leg + 1, 0)
-    b.count += wp.where(face > 0, 1, 0)
-
-
-@wp.func
-def sum_bounces(b: wp.ref[Bounces]):
-    """After the photon has ended, for the next."""
-    b.total += b.count
-    b.count = 0
-    b.leg = 0
-
-
-@wp.struct
-class PhotonState:
-    """State of a thread between the stages.
-
-    A struct and not local variables: Warp merges a local that is set under a condition with a select, which keeps the
-    values of both branches alive around the loop and doubles the registers; attributes are assigned in place.
-
-    Attributes:
-        stage: FLIGHT ... DONE.
-        first: Number of the first of the warp's 32 new photons within the launch.
-        taken: How many of them have been taken.
-        photon: Number of the photon within the launch.
-        x, u: Position [m] and unit direction.
-        weight, analog_weight: Weight; the product of albedos and reflectances alone, at which histories end.
-        path: Geometric path [m].
-        collisions, surface_count: Events so far, and those at surfaces.
-        reason: Ledger entry of the history's end; -1 after an event that is not the last.
-        bounces: Reflections by faces of the domain, which `collisions` counts too.
-        carried: What rides along.
-        target: Pixel that a scan scores the photon in, else -1.
-        view: Tangents (left, top, right, bottom) of what it may be seen in.
-        flight: To the next event.
-        hit: The surface there; face -1 in the water.
-        albedo: Of the water there.
-        ray: NO_RAY, SURFACE_RAY or SHADOW_RAY.
-        walk: Of the ray down the tree.
-        hidden: Whether a contribution, of any photon, waits for its shadow ray.
-        pending, origin, lens: That contribution, the scored point, and the point to which the ray leads [m].
-        account: Of the thread.
-        absorbed_surface, directed: Sums for the ledger, in its units.
-        water_collisions, surface_events, surface_queries, shadow_queries, contributions: Counters.
-    """
-
-    stage: int
-    first: int
-    taken: int
-    # The photon:
-    photon: int
-    x: wp.vec3
-    u: wp.vec3
-    weight: Weight
-    analog_weight: float
-    path: float
-    collisions: int
-    surface_count: int
-    reason: int
-    bounces: Bounces
-    carried: Carried
-    target: int
-    view: wp.vec4
-    # Its next event:
-    flight: Flight
-    hit: SurfaceHit
-    albedo: float
-    # The ray that is traced, and the contribution that waits for one:
-    ray: int
-    walk: TreeWalk
-    hidden: bool
-    pending: Contribution
-    origin: wp.vec3
-    lens: wp.vec3
-    # Sums for the ledger, and counters:
-    account: Account
-    absorbed_surface: wp.int64
-    directed: wp.int64
-    water_collisions: int
-    surface_events: int
-    surface_queries: int
-    shadow_queries: int
-    contributions: int
-
-
-@wp.func
-def first_state(world: wp.ref[World], slot: int) -> PhotonState:
-    """A thread before its first photon."""
-    s = PhotonState()
-    s.stage = START
-    s.account.slot = slot
-    s.first = -1
-    s.taken = 32
-    s.albedo = world.medium.albedo
-    s.view = world.camera.view
-    s.target = -1
-    s.walk.node = NO_NODE
-    return s
-
-
-# ---- Terminal states of photons.
+    medium: Medium
+    layers: Layers
+    laser: Laser
+    camera: Camera
+    gate: Gate
+    limits: Limits
+    guiding: Guiding
+    surfaces: Surfaces
+    scan: Scan
+    derivatives: Derivatives
+    polarisation: Polarisation
+    seed: wp.uint64
+    keys: RoundKeys
 
 
 @wp.struct
@@ -223,13 +71,315 @@ def make_records(count: int, *, device: wp.DeviceLike = None, derivatives: int =
     """Room for the terminal states of `count` photons, with so many derivatives; raises `ArgumentError` for negative
     numbers."""
     count, derivatives = check_integer("count", count, 0), check_integer("derivatives", derivatives, 0)
-    device = check_device("device", device)
-    records = Records()
-    records.position = wp.zeros(count, dtype=wp.vec3, device=device)
-    records.direction = wp.zeros(count, dtype=wp.vec3, device=device)
-    records.weight = wp.zeros(count, dtype=float, device=device)
-    records.path = wp.zeros(count, dtype=float, device=device)
-    records.collisions = wp.zeros(count, dtype=int, device=device)
-    records.reason = wp.zeros(count, dtype=int, device=device)
-    records.log_derivatives = wp.zeros((count, derivatives), dtype=float, device=device)
+    device, records = check_device("device", device), Records()
+    for name, var in Records.vars.items():
+        shape = (count, derivatives) if name == "log_derivatives" else count
+        setattr(records, name, wp.zeros(shape, dtype=var.type.dtype, device=device))
     return records
+
+
+@wp.struct
+class Sink:
+    """What photons add to; no stage writes to the struct itself, so that CUDA reads it where launches have put it."""
+
+    tally: wp.array[wp.int64]  # histograms [component, pixel, bin], fixed point
+    low: wp.array[wp.uint32]  # their low words, where those are apart, see `tally.splitting_pays`
+    gradients: wp.array[wp.int64]  # the tallies that have signs [voxel, parameter]
+    ledger: wp.array[wp.int64]  # the energy balance and counters, see `add_to_ledger`
+    records: Records
+    scale: float  # tally units per emitted photon
+
+
+@wp.struct
+class Launch:
+    """The photons of a launch."""
+
+    first_id: wp.uint64
+    photon_count: int
+    threads: int
+    cursor: wp.array[int]  # how many photons have been handed out to warps
+    offset: wp.array[wp.uint64]  # added to the ids of a stepped spec
+
+
+@wp.struct
+class Draws:
+    """The random numbers of a thread."""
+
+    base: wp.uint64  # id of the launch's first photon
+    keys: RoundKeys  # those of the world, held in registers on CUDA
+
+
+@wp.struct
+class Account:
+    """What a thread needs to add to a sink."""
+
+    slot: int  # of the ledger, see `add_to_ledger`
+    pending: wp.vec2l  # on a CPU the voxel and value that are still to be added, see `add_pending`
+
+
+@wp.struct
+class Weight:
+    """The weight of a photon, and its account.
+
+    `absorbed_water` is what photons had, less what was left and what was booked. It is what water took once the
+    thread's other sums for the ledger are subtracted, at its end.
+    """
+
+    value: float  # fraction of the photon that is left
+    taken: wp.int64  # by which the last change lowered it, in ledger units
+    absorbed_water: wp.int64  # sum over the thread's photons, in ledger units
+
+
+# ---- The photon. Its structs are of attributes that are assigned in place: Warp merges a local that is set under a
+# condition with a select, which keeps the values of both branches alive around the loop and doubles the registers.
+
+
+# What a thread does next: a flight, the ray that looks for a surface along it, the event at its end, the scattering
+# there, a photon of its own, the end of one; or no photons are left.
+FLIGHT, RAY, EVENT, SCATTER, START, END, DONE = (wp.constant(i) for i in range(7))
+
+# The ray that a thread traces.
+NO_RAY, SURFACE_RAY, SHADOW_RAY = (wp.constant(i) for i in range(3))
+
+
+@wp.struct
+class Contribution:
+    """What a photon adds to the tally."""
+
+    value: float  # fraction of the emitted light; 0 for nothing
+    index: int  # of the voxel, see `tally_index`
+    rounding_sample: float  # uniform in [0, 1), see `to_fixed_point`
+    factors: LogDerivatives  # of the value for the tallies that have signs: log derivatives, or channels over I
+
+
+@wp.struct
+class Carried:
+    """What rides along with light beside its weight, see `riders`."""
+
+    log_derivatives: LogDerivatives  # of what the light has met, by the parameters of the spec; 0 without them
+    stokes: wp.vec4  # of weight 1 when emitted, with respect to `orthonormal_basis` of the light's direction
+    half: int  # of `Blocks.memory`: 0 for the history of a photon, 1 for a contribution
+
+
+@wp.struct
+class Flight:
+    """The flight to the next event."""
+
+    block: wp.vec4ui  # random words of that event
+    sample_block: wp.vec4ui  # random words of the estimator's sample of the flight
+    distance: float  # to the event [m]
+    reach: float  # how far to look for surfaces [m]
+    interval: wp.vec2  # the part that an estimator wants to score [m]; empty for none
+    lens: wp.vec3  # the point of the lens by which the flight is scored [m]
+    lens_weight: float  # its density if it were uniform, over that of the draw
+
+
+@wp.struct
+class Bounces:
+    """Reflections of a photon by faces of the domain, and the account of the thread."""
+
+    face: int  # that the photon has come to, see EXIT_FACES; 0 at any other event
+    count: int  # reflections of the photon
+    leg: int  # those since the last other event
+    total: int  # reflections of all photons that have ended
+    dropped: int  # photons that came to the lens by too long a leg
+
+
+@wp.struct
+class PhotonState:
+    """State of a thread between the stages."""
+
+    stage: int  # FLIGHT ... DONE
+    first: int  # number of the first of the warp's 32 new photons within the launch
+    taken: int  # how many of them have been taken
+    # The photon:
+    photon: int  # number within the launch
+    x: wp.vec3  # position [m]
+    u: wp.vec3  # unit direction
+    weight: Weight
+    analog_weight: float  # the product of albedos and reflectances alone, at which histories end
+    path: float  # geometric path [m]
+    collisions: int  # events so far, reflections included
+    surface_count: int  # those at surfaces
+    reason: int  # ledger entry of the history's end; -1 after an event that is not the last
+    bounces: Bounces
+    carried: Carried
+    target: int  # pixel that a scan scores the photon in, else -1
+    view: wp.vec4  # tangents (left, top, right, bottom) of what it may be seen in
+    # Its next event:
+    flight: Flight
+    hit: SurfaceHit  # face -1 in the water
+    albedo: float  # of the water there
+    # The ray that is traced, and the contribution, of any photon, that waits for one:
+    ray: int  # NO_RAY, SURFACE_RAY or SHADOW_RAY
+    walk: TreeWalk  # down the tree
+    hidden: bool  # whether a contribution waits
+    pending: Contribution
+    origin: wp.vec3  # the scored point [m]
+    lens: wp.vec3  # the point to which the shadow ray leads [m]
+    # Sums for the ledger, in its units, and counters:
+    account: Account
+    absorbed_surface: wp.int64
+    directed: wp.int64
+    water_collisions: int
+    surface_events: int
+    surface_queries: int
+    shadow_queries: int
+    contributions: int
+
+
+# Arguments by reference: they cost nothing, and may be changed in place.
+WorldRef: TypeAlias = wp.ref[World]
+SinkRef: TypeAlias = wp.ref[Sink]
+AccountRef: TypeAlias = wp.ref[Account]
+CarriedRef: TypeAlias = wp.ref[Carried]
+PhotonRef: TypeAlias = wp.ref[PhotonState]
+
+
+@wp.func
+def first_state(world: WorldRef, slot: int) -> PhotonState:
+    """A thread before its first photon."""
+    s = PhotonState()
+    s.stage = START
+    s.account.slot = slot
+    s.first = -1
+    s.taken = 32
+    s.albedo = world.medium.albedo
+    s.view = world.camera.view
+    s.target = -1
+    s.walk.node = NO_NODE
+    return s
+
+
+@wp.func
+def is_planned(flight: Flight) -> bool:
+    """Whether an estimator wants to score a part of the flight."""
+    return flight.interval[0] < flight.interval[1]
+
+
+@wp.func
+def shorten(flight: wp.ref[Flight], distance: float):
+    """Ends the flight at a surface at a distance [m]."""
+    flight.distance = wp.min(flight.distance, distance)
+    flight.interval = wp.vec2(flight.interval[0], wp.min(flight.interval[1], distance))
+
+
+# ---- The weight of a photon, and where it goes.
+
+
+@wp.func
+def reweigh(w: wp.ref[Weight], factor: float):
+    """Multiplies the weight by a factor.
+
+    The ledger is written where weight changes hands; water takes what is missing there. What is taken is to be added to
+    one of the thread's sums for the ledger, or to be booked by `book_weight`.
+    """
+    before = to_ledger(w.value)
+    w.value *= factor
+    w.taken = before - to_ledger(w.value)
+
+
+@wp.func
+def book_weight(w: wp.ref[Weight], account: AccountRef, sink: SinkRef, entry: int):
+    """What the last change has taken goes to an entry of the ledger."""
+    book(account, sink, entry, w.taken)
+    w.absorbed_water -= w.taken
+
+
+@wp.func
+def book(account: AccountRef, sink: SinkRef, entry: int, value: wp.int64):
+    """Adds to an entry of the ledger."""
+    add_to_ledger(sink.ledger, account.slot, entry, value)
+
+
+# ---- Contributions to the tally.
+
+
+# Index of light that has come to the lens by more reflections than count.
+TOO_LONG = wp.constant(-4)
+
+# Largest single contribution, in tally units, 2^58: what is above it is clipped and counted.
+DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
+
+
+@wp.func
+def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
+    """Index into the tally [component, pixel, bin], or BEFORE or AFTER the gate."""
+    k = gate_bin(gate, path)
+    if k < 0:
+        return k
+    return (component * camera.width * camera.height + pixel) * gate.bins + k
+
+
+@wp.func
+def to_fixed_point(units: float, rounding_sample: float) -> wp.int64:
+    """units >= 0, rounded up with probability equal to its fraction, for rounding_sample uniform in [0, 1).
+
+    For samples on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more.
+    """
+    return wp.int64(units + rounding_sample)
+
+
+@wp.func
+def _deposit(account: AccountRef, sink: SinkRef, c: Contribution):
+    """Adds a contribution to its voxel of the tally; the ledger counts BEFORE and AFTER, and what is below one unit."""
+    exact = c.value * sink.scale
+    units = to_fixed_point(exact, c.rounding_sample)
+    if not exact <= DEPOSIT_LIMIT:
+        book(account, sink, wp.where(exact > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
+    elif c.index >= 0:
+        if exact >= 1.0:
+            account.pending = add_pending(sink.tally, account.pending, c.index, units)
+        else:
+            if units > wp.int64(0):
+                account.pending = add_pending(sink.tally, account.pending, c.index, units)
+            voxels = sink.tally.shape[0] // wp.static(len(COMPONENTS))
+            component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
+            book(account, sink, ledger.BELOW_UNIT + component, wp.int64(1))
+    else:
+        # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
+        entry = wp.where(c.index == BEFORE, ledger.BEFORE_GATE, ledger.AFTER_GATE)
+        book(account, sink, entry, (units + wp.int64(128)) >> ledger.OUTSIDE_SHIFT)
+
+
+@wp.func
+def _deposit_signed(account: AccountRef, sink: SinkRef, index: int, units: float, rounding_sample: float):
+    """Adds to a tally that has signs; rounded down after the rounding sample is added, so that the mean is kept."""
+    if wp.abs(units) <= DEPOSIT_LIMIT:
+        whole = wp.int64(wp.floor(units + rounding_sample))
+        if whole != wp.int64(0):
+            atomic_add_int64(sink.gradients, index, whole)
+    else:
+        book(account, sink, wp.where(wp.abs(units) > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
+
+
+@memoised
+def make_deposit(signed: int, kinds: int, split: bool) -> wp.Function:
+    """The Warp function ``(account, sink, world, contribution)`` that adds a contribution to the tally, with so many
+    parameters or channels that have signs and so many kinds of derivatives by block; `split`: the low words of the
+    tally are apart."""
+
+    @wp.func
+    def deposit(account: AccountRef, sink: SinkRef, world: WorldRef, c: Contribution):
+        if wp.static(signed + kinds > 0):
+            if c.index >= 0:
+                blocks = world.derivatives.blocks
+                width = wp.static(signed) + wp.static(kinds) * blocks.count
+                for p in range(wp.static(signed)):
+                    units = c.value * c.factors[p] * world.derivatives.scale[p]
+                    _deposit_signed(account, sink, c.index * width + p, units, c.rounding_sample)
+                if wp.static(kinds > 0):
+                    for i in range(met_count(blocks, 1)):
+                        k = int(blocks.memory[met_entry(blocks, 1, i)])
+                        for q in range(wp.static(kinds)):
+                            units = c.value * blocks.memory[score_entry(blocks, 1, q, k)] * blocks.scale[q]
+                            p = wp.static(signed) + q * blocks.count + k
+                            _deposit_signed(account, sink, c.index * width + p, units, c.rounding_sample)
+        if wp.static(split):
+            units = c.value * sink.scale
+            if c.index >= 0 and units >= 1.0 and units <= DEPOSIT_LIMIT:
+                add_to_words(sink.tally, sink.low, c.index, to_fixed_point(units, c.rounding_sample))
+                return
+        _deposit(account, sink, c)
+
+    return deposit

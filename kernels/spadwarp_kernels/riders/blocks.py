@@ -13,13 +13,12 @@ that the thread keeps a list of them.
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.photon.derivatives import NOT_MET, Blocks, met_count, met_entry, score_entry
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.tally.blocks import NOT_MET, Blocks, met_count, met_entry, score_entry
+from spadwarp_kernels.photon.state import CarriedRef, WorldRef
 from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
 
-from .rider import NOTHING, Rider
+from .rider import Rider
 
 
 @wp.func
@@ -46,20 +45,19 @@ def _make_meet(kinds: int) -> wp.Function:
     return meet
 
 
-@memoised
-def make_blocks_rider(spec: TransportSpec) -> Rider:
-    """Of the blocks of a spec."""
+def make_blocks_rider(spec: TransportSpec, beside: Rider) -> Rider:
+    """Of the blocks of a spec, after what rides beside them."""
     kinds = len(spec.blocks)
 
     @wp.func
-    def begin(
-        c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3
-    ):
+    def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+        beside.begin(c, world, target, emitted, x, u)
         c.half = 0
         _forget(world.derivatives.blocks, 0)
 
     @wp.func
-    def fork(c: wp.ref[Carried], world: wp.ref[World]):
+    def fork(c: CarriedRef, world: WorldRef):
+        beside.fork(c, world)
         blocks = world.derivatives.blocks
         _forget(blocks, 1)
         count = met_count(blocks, 0)
@@ -72,10 +70,10 @@ def make_blocks_rider(spec: TransportSpec) -> Rider:
         blocks.memory[met_entry(blocks, 1, blocks.count)] = float(count)
         c.half = 1
 
-    return NOTHING._replace(begin=begin, fork=fork, fly=_make_fly(kinds), event=_make_event(spec))
+    return beside._replace(begin=begin, fork=fork, fly=_make_fly(kinds, beside), event=_make_event(spec, beside))
 
 
-def _make_fly(kinds: int) -> wp.Function:
+def _make_fly(kinds: int, beside: Rider) -> wp.Function:
     meet = _make_meet(kinds)
 
     @wp.func
@@ -86,7 +84,8 @@ def _make_fly(kinds: int) -> wp.Function:
             blocks.memory[entry] = blocks.memory[entry] + value
 
     @wp.func
-    def fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
+        beside.fly(c, world, x, u, length)
         blocks = world.derivatives.blocks
         line = grid_line(blocks.grid, x, u, length)
         if line.begin < line.end:
@@ -99,7 +98,7 @@ def _make_fly(kinds: int) -> wp.Function:
     return fly
 
 
-def _make_event(spec: TransportSpec) -> wp.Function:
+def _make_event(spec: TransportSpec, beside: Rider) -> wp.Function:
     kinds, water_at, meet = len(spec.blocks), spec.water.at, _make_meet(len(spec.blocks))
     # Bits, since a `wp.static` that reads the index of a loop does not enter the hash of Warp's kernel cache.
     by_scattering, by_extinction = (
@@ -107,7 +106,8 @@ def _make_event(spec: TransportSpec) -> wp.Function:
     )
 
     @wp.func
-    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+        beside.event(c, world, slot, x, u, v)
         blocks = world.derivatives.blocks
         block = grid_cell(blocks.grid, x)
         if slot < 0 and block >= 0:

@@ -6,14 +6,12 @@ the Lambertian reflectance.
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
+from spadwarp_kernels.photon.derivatives import LogDerivatives
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
+from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
+from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
 from spadwarp_kernels.surface.triangle import face_in, face_normal
-from spadwarp_kernels.tally.tally import Contribution, LogDerivatives
 from spadwarp_kernels.water.medium import boundary_ahead, layer_index
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
 
@@ -28,19 +26,18 @@ def parameters_of(spec: TransportSpec, *kinds: str) -> int:
     return sum(1 << p for p, kind in enumerate(spec.derivatives) if kind in kinds)
 
 
-@memoised
 def make_derivatives_rider(spec: TransportSpec) -> Rider:
     """Of the parameters of a spec."""
     return NOTHING._replace(begin=_begin, fly=_make_fly(spec), event=_make_event(spec), deliver=_deliver)
 
 
 @wp.func
-def _begin(c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+def _begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
     c.log_derivatives = LogDerivatives()
 
 
 @wp.func
-def _deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
     k.factors = c.log_derivatives
 
 
@@ -56,7 +53,7 @@ def _make_fly(spec: TransportSpec) -> wp.Function:
         return d
 
     @wp.func
-    def fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
         if wp.static(not layered):
             c.log_derivatives = shorter(c.log_derivatives, wp.static(on_path), length)
         else:
@@ -83,10 +80,10 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         parameters_of(spec, kind) for kind in ("scattering", "anisotropy", "reflectance")
     )
     in_water = by_scattering | by_anisotropy
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+    reflectance_at = spec.reflectance_at
 
     @wp.func
-    def in_the_water(d: LogDerivatives, world: wp.ref[World], x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
+    def in_the_water(d: LogDerivatives, world: WorldRef, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
         here = int(wp.static(in_water))
         if wp.static(layered):
             here = here & world.derivatives.waters[layer_index(world.layers, wp.dot(world.layers.axis, x))]
@@ -100,9 +97,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         return d
 
     @wp.func
-    def on_a_face(
-        d: LogDerivatives, world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3
-    ) -> LogDerivatives:
+    def on_a_face(d: LogDerivatives, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
         # The Lambertian part of the light that is reflected.
         part = float(1.0)
         face = face_in(world.surfaces.order, slot)
@@ -118,7 +113,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         return d
 
     @wp.func
-    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
         if wp.static(has_mesh):
             if slot >= 0:
                 if wp.static(by_reflectance > 0):

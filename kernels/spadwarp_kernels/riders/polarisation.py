@@ -14,11 +14,9 @@ from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis,
 from spadwarp_kernels.optics.laser import beam_frame
 from spadwarp_kernels.optics.port import Port, PortKind
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.surface.reflectance import face_reflectance, ggx_brdf, lambert_brdf, pattern_reflectance
+from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
+from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
 from spadwarp_kernels.surface.triangle import face_in, face_normal
-from spadwarp_kernels.tally.tally import Contribution
 
 from .rider import NOTHING, Rider
 
@@ -184,7 +182,6 @@ def make_port_elements(port: PortKind | None) -> wp.Function | None:
 # ---- The light of a photon, from the laser to the receiver.
 
 
-@memoised
 def make_polarisation_rider(spec: TransportSpec) -> Rider:
     """The Stokes vector of a polarised spec."""
     return NOTHING._replace(
@@ -198,9 +195,7 @@ def _make_begin(spec: TransportSpec) -> wp.Function:
     elements = make_port_elements(spec.laser_port)
 
     @wp.func
-    def begin(
-        c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3
-    ):
+    def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
         axis = world.laser.axis
         if wp.static(confocal):
             axis = world.scan.axis[target]
@@ -220,10 +215,10 @@ def _make_event(spec: TransportSpec) -> wp.Function:
     """Water multiplies by L M L/m11. A Lambertian surface depolarises; a specular lobe has Fresnel's matrix of the
     facet between u and v, over its m11; both in proportion to what they send to v."""
     has_mesh, specular = spec.mesh, spec.specular
-    reflectance_at = pattern_reflectance if spec.pattern else face_reflectance
+    reflectance_at = spec.reflectance_at
 
     @wp.func
-    def on_a_face(stokes: wp.vec4, world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec4:
+    def on_a_face(stokes: wp.vec4, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec4:
         left = wp.vec4(stokes[0], 0.0, 0.0, 0.0)
         if wp.static(specular):
             face = face_in(world.surfaces.order, slot)
@@ -235,7 +230,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         return left
 
     @wp.func
-    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
         before, after = set_apart(u), set_apart(v)
         if wp.static(has_mesh):
             if slot >= 0:
@@ -248,7 +243,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
 
 
 @wp.func
-def _mirror(c: wp.ref[Carried], u: wp.vec3, v: wp.vec3, index: float):
+def _mirror(c: CarriedRef, u: wp.vec3, v: wp.vec3, index: float):
     before, after = set_apart(u), set_apart(v)
     cosine = wp.sqrt(0.5 * wp.max(1.0 - wp.dot(before, after), 0.0))
     c.stokes = turn_stokes(c.stokes, before, after, fresnel_elements(wp.min(cosine, 1.0), index))
@@ -260,7 +255,7 @@ def _make_deliver(spec: TransportSpec) -> wp.Function:
     channels, has_port, elements = spec.channels, spec.port is not None, make_port_elements(spec.port)
 
     @wp.func
-    def deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+    def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
         stokes = c.stokes
         if wp.static(has_port):
             before = set_apart(u)

@@ -8,39 +8,36 @@ from typing import NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import memoised
-from spadwarp_kernels.photon.state import Carried
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.tally.tally import Contribution
+from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
 
 
 @wp.func
-def _begin(c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+def _begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
     pass
 
 
 @wp.func
-def _fork(c: wp.ref[Carried], world: wp.ref[World]):
+def _fork(c: CarriedRef, world: WorldRef):
     pass
 
 
 @wp.func
-def _fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
+def _fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
     pass
 
 
 @wp.func
-def _event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+def _event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
     pass
 
 
 @wp.func
-def _mirror(c: wp.ref[Carried], u: wp.vec3, v: wp.vec3, index: float):
+def _mirror(c: CarriedRef, u: wp.vec3, v: wp.vec3, index: float):
     pass
 
 
 @wp.func
-def _deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
     pass
 
 
@@ -69,44 +66,3 @@ class Rider(NamedTuple):
 
 
 NOTHING = Rider()
-
-
-@memoised
-def join(first: Rider, second: Rider) -> Rider:
-    """Both, one after the other."""
-    begin_first, fork_first, fly_first, event_first, mirror_first, deliver_first = first
-    begin_second, fork_second, fly_second, event_second, mirror_second, deliver_second = second
-
-    @wp.func
-    def begin(
-        c: wp.ref[Carried], world: wp.ref[World], target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3
-    ):
-        begin_first(c, world, target, emitted, x, u)
-        begin_second(c, world, target, emitted, x, u)
-
-    @wp.func
-    def fork(c: wp.ref[Carried], world: wp.ref[World]):
-        fork_first(c, world)
-        fork_second(c, world)
-
-    @wp.func
-    def fly(c: wp.ref[Carried], world: wp.ref[World], x: wp.vec3, u: wp.vec3, length: float):
-        fly_first(c, world, x, u, length)
-        fly_second(c, world, x, u, length)
-
-    @wp.func
-    def event(c: wp.ref[Carried], world: wp.ref[World], slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
-        event_first(c, world, slot, x, u, v)
-        event_second(c, world, slot, x, u, v)
-
-    @wp.func
-    def mirror(c: wp.ref[Carried], u: wp.vec3, v: wp.vec3, index: float):
-        mirror_first(c, u, v, index)
-        mirror_second(c, u, v, index)
-
-    @wp.func
-    def deliver(k: wp.ref[Contribution], c: Carried, world: wp.ref[World], end: wp.vec3, u: wp.vec3, inside: wp.vec3):
-        deliver_first(k, c, world, end, u, inside)
-        deliver_second(k, c, world, end, u, inside)
-
-    return Rider(begin, fork, fly, event, mirror, deliver)

@@ -3,31 +3,33 @@ a CPU.
 
 `wp.mesh_query_ray` walks a tree from its root to the end of the ray, so that a warp waits for its longest walk, some of
 its lanes in the tree's nodes and others at its leaves. Here a walk is a state (node, stack, nearest face so far) that
-a kernel moves on by a step, `step_node` or `step_leaf`: all lanes that are in nodes together, or all that are at
-leaves, and new rays join while old ones still walk (Aila & Laine, High-Performance Graphics 2009, on what the order of
-steps is worth). `intersect_surfaces` walks a tree with the same steps from its root to the end.
+a kernel moves on by `step_node` or `step_leaf`: all lanes that are in nodes together, or all that are at leaves, and
+new rays join while old ones still walk (Aila & Laine, High-Performance Graphics 2009).
 
-A node has four children, made of Warp's pairs, of which the one with the largest surface is opened twice; their boxes
-are in bytes (Ylitie, Karras & Laine, High Performance Graphics 2017). It is four vec4, half a line of a GPU's cache:
+A node has four children: the binary tree's, of which the one with the largest surface is opened twice; their boxes are
+in bytes (Ylitie, Karras & Laine, High Performance Graphics 2017). It is four vec4, half a line of a GPU's cache:
 
 - origin x, y, z, scale x; scale y, z, lower x, y; lower z, upper x, y, z: of the boxes a byte k for each child, the
   first in the lowest, that stands for origin + scale (1 + k / 32768), rounded outwards;
 - the bits of the children: the index of a node, NO_NODE, or below it a leaf, see `leaf_at`.
 
 Faces are three vec4 each, see `meet_planes`, in the order of the leaves; two that make a parallelogram may be tried as
-one, see `join_leaves`.
+one, see `join_faces`.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.native import bits_of, from_bits
 
-from .patches import SAME, shared_corner
-from .triangle import box_padding, face_in, meet_face, number_in, pack_faces, set_faces, set_row
+from .patches import SAME, join_faces, shared_corner
+from .triangle import box_padding, face_in, meet_face, number_in, set_rows
 
 
 @wp.func_native("""
+#if defined(__CUDA_ARCH__)
     float in[3], out[3];
     for (int i = 0; i < 3; ++i) {
         // Infinite for a segment parallel to these two sides: in and out are then infinite as well, and their signs
@@ -36,28 +38,16 @@ from .triangle import box_padding, face_in, meet_face, number_in, pack_faces, se
         in[i] = wp::min(a, b);
         out[i] = wp::max(a, b);
     }
-#if defined(__CUDA_ARCH__)
     // As integers, of which Hopper takes three at a time; the order of positive floats is the same, and what is
     // negative counts only as that.
     const auto bits = [](float number) { return __float_as_int(number); };
     const int enters = __vimax3_s32_relu(bits(in[0]), bits(in[1]), bits(in[2]));
     return enters <= min(__vimin3_s32(bits(out[0]), bits(out[1]), bits(out[2])), bits(length));
 #else
-    const float enters = wp::max(wp::max(in[0], in[1]), wp::max(in[2], 0.0f));
-    return enters <= wp::min(wp::min(out[0], out[1]), wp::min(out[2], length));
-#endif
-""")
-def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
-    """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
-    ...
-
-
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
+    // The three axes in one vector register; the fourth lane is the segment itself, from 0 to its length.
     typedef float row __attribute__((vector_size(16)));
     const auto least = [](row p, row q) { return p < q ? p : q; };
     const auto most = [](row p, row q) { return p > q ? p : q; };
-    // The fourth lane is the segment itself, from 0 to its length.
     const row start = {x[0], x[1], x[2], 0.0f}, low = {lower[0], lower[1], lower[2], 0.0f};
     const row high = {upper[0], upper[1], upper[2], length}, heading = {u[0], u[1], u[2], 1.0f};
     const row tiny = row{} + 1.0e-12f;
@@ -69,12 +59,10 @@ def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upp
     near = most(near, __builtin_shufflevector(near, near, 1, 0, 3, 2));
     far = least(far, __builtin_shufflevector(far, far, 1, 0, 3, 2));
     return near[0] <= far[0];
-#else
-    return true;
 #endif
 """)
-def segment_meets_box_on_cpu(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
-    """`segment_meets_box`, its three axes in one vector register; CPU alone."""
+def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upper: wp.vec3) -> bool:
+    """False only if the segment x + s u, 0 <= s <= length, misses the box; the box must be padded against rounding."""
     ...
 
 
@@ -104,196 +92,112 @@ DEEPEST = 32
 
 @wp.func_native("""
     const wp::Mesh m = wp::mesh_get(mesh);
-    const wp::BVHPackedNodeHalf half = upper ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
-    union { float number; int bits; } both;
-    both.bits = static_cast<int32_t>(half.i);
-    return wp::vec4(half.x, half.y, half.z, both.number);
-""")
-def _tree_node(mesh: wp.uint64, node: int, upper: bool) -> wp.vec4:
-    """A corner of a node's box and the bits of its child, or of the first and last face of a leaf."""
-    ...
-
-
-@wp.func_native("""
-    const wp::Mesh m = wp::mesh_get(mesh);
     // The linear builder fills all nodes that there are room for, the others count theirs.
     const bool linear = m.bvh.constructor_type == BVH_CONSTRUCTOR_LBVH;
-    if (node >= (linear ? m.bvh.max_nodes : m.bvh.num_nodes)) return -1;
-    return m.bvh.node_lowers[node].b ? 1 : 0;
+    const bool there = node < (linear ? m.bvh.max_nodes : m.bvh.num_nodes);
+    leaf.data[node] = there ? static_cast<int>(m.bvh.node_lowers[node].b) : -1;
+    for (int k = 0; there && k < 2; ++k) {
+        const wp::BVHPackedNodeHalf half = k ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
+        boxes.data[2 * node + k] = wp::vec3(half.x, half.y, half.z);
+        children.data[2 * node + k] = static_cast<int32_t>(half.i);
+    }
+    if (node < faces.shape[0]) faces.data[node] = m.bvh.primitive_indices[node];
+    if (node == 0) root.data[0] = *m.bvh.root;
 """)
-def _tree_kind(mesh: wp.uint64, node: int) -> int:
-    """0 for a node with children, 1 for a leaf, -1 beyond the tree."""
+def _read_node(
+    mesh: wp.uint64,
+    node: int,
+    leaf: wp.array[int],
+    boxes: wp.array2d[wp.vec3],
+    children: wp.array2d[int],
+    faces: wp.array[int],
+    root: wp.array[int],
+):
+    """Whether a node is a leaf, -1 beyond the tree; the corners of its box; its children, or of a leaf the first face
+    and the one after the last."""
     ...
 
 
-@wp.func_native("return *wp::mesh_get(mesh).bvh.root;")
-def _tree_root(mesh: wp.uint64) -> int: ...
-
-
-@wp.func_native("return wp::mesh_get(mesh).bvh.primitive_indices[slot];")
-def _tree_face(mesh: wp.uint64, slot: int) -> int: ...
-
-
-@wp.func
-def _with_bits(corner: wp.vec3, bits: int) -> wp.vec4:
-    return wp.vec4(corner[0], corner[1], corner[2], from_bits(bits))
-
-
 @wp.kernel(enable_backward=False)
-def _count_kernel(mesh: wp.uint64, has_children: wp.array[int]):
-    """Launch: nodes that the tree may have."""
-    node = wp.tid()
-    has_children[node] = wp.where(_tree_kind(mesh, node) == 0, 1, 0)
-
-
-@wp.func
-def _order_leaf(mesh: wp.uint64, start: int, stop: int, order: wp.array[int]):
-    for slot in range(start, stop):
-        face = _tree_face(mesh, slot)
-        order[slot] = wp.where(slot + 1 < stop, ~face, face)
-
-
-@wp.kernel(enable_backward=False)
-def _pack_kernel(
-    mesh: wp.uint64, padding: float, before: wp.array[int], nodes: wp.array[wp.vec4], order: wp.array[int]
+def _read_kernel(
+    mesh: wp.uint64,
+    leaf: wp.array[int],
+    boxes: wp.array2d[wp.vec3],
+    children: wp.array2d[int],
+    faces: wp.array[int],
+    root: wp.array[int],
 ):
-    """Launch: nodes that the tree may have. The root's pair is the first; the others stand in the tree's order."""
-    node = wp.tid()
-    kind = _tree_kind(mesh, node)
-    root = _tree_root(mesh)
-    pad = wp.vec3(padding)
-    if kind == 1 and node == root:  # a tree of one leaf
-        lower = _tree_node(mesh, node, False)
-        upper = _tree_node(mesh, node, True)
-        _order_leaf(mesh, bits_of(lower[3]), bits_of(upper[3]), order)
-        nodes[0] = _with_bits(wp.vec3(lower[0], lower[1], lower[2]) - pad, -2 - bits_of(lower[3]))
-        nodes[1] = _with_bits(wp.vec3(upper[0], upper[1], upper[2]) + pad, 0)
-        nodes[2] = _with_bits(wp.vec3(NOWHERE), NO_NODE)
-        nodes[3] = _with_bits(wp.vec3(NOWHERE), NO_NODE)
-    if kind == 0:
-        # Leaves are written by their parents: a tree may hold more, within leaves that it has merged.
-        pair = wp.where(node == root, 0, before[node] + 1)
-        for k in range(2):
-            child = bits_of(_tree_node(mesh, node, k == 1)[3])
-            low = _tree_node(mesh, child, False)
-            high = _tree_node(mesh, child, True)
-            entry = before[child] + 1
-            if _tree_kind(mesh, child) == 1:
-                entry = -2 - bits_of(low[3])
-                _order_leaf(mesh, bits_of(low[3]), bits_of(high[3]), order)
-            nodes[4 * pair + 2 * k] = _with_bits(wp.vec3(low[0], low[1], low[2]) - pad, entry)
-            nodes[4 * pair + 2 * k + 1] = _with_bits(wp.vec3(high[0], high[1], high[2]) + pad, 0)
+    """Launch: nodes that the tree may have."""
+    _read_node(mesh, wp.tid(), leaf, boxes, children, faces, root)
 
 
-def read_tree(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array]:
-    """Pairs of nodes and order of a mesh's tree.
+class Tree(NamedTuple):
+    """The binary tree of a mesh on the host, in which nothing leads to some of the nodes: these have no faces."""
 
-    Args:
-        mesh: Any `wp.Mesh`.
-        extent: Its largest coordinate [m], for the padding of the boxes.
+    root: int
+    children: np.ndarray  # [nodes, 2]; -1 for a leaf
+    lower: np.ndarray  # corners of the boxes [m], float32 [nodes, 3], padded against rounding
+    upper: np.ndarray
+    start: np.ndarray  # where the faces below a node stand in `faces`, [nodes]
+    stop: np.ndarray
+    faces: np.ndarray  # from left to right, [faces]
+
+
+def read_tree(mesh: wp.Mesh, extent: float) -> Tree:
+    """The tree of any `wp.Mesh` with coordinates up to the extent [m]."""
+    count, device = mesh.indices.size // 3, mesh.device
+    most = 2 * count + 1
+    shapes = ((most, int), ((most, 2), wp.vec3), ((most, 2), int), (count, int), (1, int))
+    arrays = [wp.zeros(shape, dtype=kind, device=device) for shape, kind in shapes]
+    wp.launch(_read_kernel, most, [mesh.id], arrays, device=device)
+    kind, boxes, children, slots, root = (array.numpy() for array in arrays)
+    levels, leaves, here = [], [], root
+    while here.size:
+        leaves.append(here[kind[here] == 1])
+        levels.append(here[kind[here] == 0])
+        here = children[levels[-1]].ravel()
+    leaf = np.concatenate(leaves)
+    size, start = (np.zeros(most, np.int64) for _ in range(2))
+    size[leaf] = children[leaf, 1] - children[leaf, 0]
+    for nodes in reversed(levels):
+        size[nodes] = size[children[nodes]].sum(axis=1)
+    for nodes in levels:
+        left, right = children[nodes].T
+        start[left], start[right] = start[nodes], start[nodes] + size[left]
+    leaf = leaf[np.argsort(start[leaf], kind="stable")]
+    faces = slots[np.repeat(children[leaf, 0] - start[leaf], size[leaf]) + np.arange(count)]
+    inner = np.concatenate(levels)
+    below = np.full((most, 2), -1)
+    below[inner] = children[inner]
+    pad = np.float32(box_padding(extent))
+    return Tree(int(root[0]), below, boxes[:, 0] - pad, boxes[:, 1] + pad, start, start + size, faces)
+
+
+def open_tree(tree: Tree, closed: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes of `width` children, level by level: the child with the largest surface is opened until there are so many,
+    but none that is closed, a leaf.
 
     Returns:
-        nodes: vec4 [4 * pairs], see above; boxes are padded against rounding.
-        order: int32 [faces]: the face in each slot, or ~face where the next slot belongs to the same leaf.
+        The tree's node that each stands for; its children among those, [nodes, width], -1 for none; its level.
     """
-    count, device = mesh.indices.size // 3, mesh.device
-    has_children = wp.zeros(2 * count + 1, dtype=int, device=device)
-    before = wp.zeros_like(has_children)
-    nodes = wp.zeros(4 * (count + 1), dtype=wp.vec4, device=device)
-    order = wp.zeros(count, dtype=int, device=device)
-    wp.launch(_count_kernel, has_children.size, [mesh.id], outputs=[has_children], device=device)
-    wp.utils.array_scan(has_children, before, inclusive=False)
-    inputs = [mesh.id, box_padding(extent), before]
-    wp.launch(_pack_kernel, has_children.size, inputs, outputs=[nodes, order], device=device)
-    return nodes, order
-
-
-# ---- Leaves of the tree on CUDA: two faces that make a parallelogram are tried as one.
-
-
-# Leaves of more faces are left as they are: all pairs of a leaf's faces are compared.
-LARGEST_LEAF = wp.constant(8)
-
-
-@wp.func
-def _leaf(nodes: wp.array[wp.vec4], node: int) -> int:
-    """The slot of a leaf's first face, below 0 for other nodes."""
-    return -2 - bits_of(nodes[2 * node][3])
-
-
-@wp.kernel(enable_backward=False)
-def _siblings_kernel(
-    mesh: wp.uint64, same: float, nodes: wp.array[wp.vec4], order: wp.array[int], joined: wp.array[int]
-):
-    """Two leaves of a face each that make a parallelogram become a leaf of two, which is marked. Launch: pairs."""
-    pair = wp.tid()
-    first = _leaf(nodes, 2 * pair)
-    if pair == 0 or first < 0 or _leaf(nodes, 2 * pair + 1) != first + 1:
-        return
-    if order[first] < 0 or order[first + 1] < 0:
-        return
-    if shared_corner(mesh, order[first], order[first + 1], same) >= 0:
-        order[first] = ~order[first]
-        joined[pair] = 1
-
-
-@wp.kernel(enable_backward=False)
-def _parents_kernel(joined: wp.array[int], nodes: wp.array[wp.vec4]):
-    """In place of a pair that has become one leaf, that. Launch: nodes."""
-    node = wp.tid()
-    child = bits_of(nodes[2 * node][3])
-    if child > NO_NODE and joined[wp.max(child, 0)] > 0:
-        nodes[2 * node][3] = nodes[4 * child][3]
-
-
-@wp.kernel(enable_backward=False)
-def _leaves_kernel(mesh: wp.uint64, same: float, found: wp.array[int], order: wp.array[int], faces: wp.array[wp.vec4]):
-    """Writes the faces of each leaf anew: behind a face the one with which it makes a parallelogram, if there is one.
-    Launch: slots."""
-    start = wp.tid()
-    if start > 0 and found[wp.max(start - 1, 0)] < 0:
-        return
-    stop = start + 1
-    while found[stop - 1] < 0 and stop - start <= LARGEST_LEAF:
-        stop += 1
-    if stop - start > LARGEST_LEAF:
-        return
-    taken = int(0)
-    slot = int(start)
-    for i in range(start, stop):
-        if ((taken >> (i - start)) & 1) == 0:
-            first = face_in(found, i)
-            second = int(-1)
-            corner = int(-1)
-            for j in range(i + 1, stop):
-                if corner < 0 and ((taken >> (j - start)) & 1) == 0:
-                    second = face_in(found, j)
-                    corner = shared_corner(mesh, first, second, same)
-                    taken = wp.where(corner >= 0, taken | (1 << (j - start)), taken)
-            width = wp.where(corner >= 0, 2, 1)
-            more = slot + width < stop
-            order[slot] = wp.where(more, ~first, first)
-            set_row(mesh, first, wp.max(corner, 0), wp.where(corner >= 0, 0.0, 1.0), slot, faces)
-            if corner >= 0:
-                order[slot + 1] = wp.where(more, ~second, second)
-                set_row(mesh, second, 0, 1.0, slot + 1, faces)
-            slot += width
-
-
-def join_leaves(mesh: wp.Mesh, extent: float, nodes: wp.array, order: wp.array, faces: wp.array) -> None:
-    """Faces that are tried as one where two of a leaf, or of two leaves of a face each, make a parallelogram.
-
-    Args:
-        mesh: Whose points will not move.
-        extent: Its largest coordinate [m].
-        nodes, order: From `read_tree`; both change.
-        faces: The faces in their slots as CUDA takes them, see `pack_faces`; they change, too.
-    """
-    count, device, same = nodes.size // 4, mesh.device, SAME * extent
-    joined = wp.zeros(count, dtype=int, device=device)
-    wp.launch(_siblings_kernel, count, [mesh.id, same, nodes], [order, joined], device=device)
-    wp.launch(_parents_kernel, 2 * count, [joined], [nodes], device=device)
-    wp.launch(_leaves_kernel, order.size, [mesh.id, same, wp.clone(order)], [order, faces], device=device)
+    with np.errstate(over="ignore", invalid="ignore"):  # places that the tree does not use hold anything
+        size = tree.upper - tree.lower
+        area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
+    area = np.append(np.where(closed, -1.0, area), -1.0)  # the last is that of the child -1
+    nodes, children, here = [], [], np.array([tree.root])
+    while here.size:
+        held = np.full((here.size, width), -1)
+        held[:, 0] = here
+        for count in range(1, width):
+            best = area[held].argmax(axis=1)
+            rows = np.flatnonzero(area[held[np.arange(len(held)), best]] >= 0.0)
+            opened = tree.children[held[rows, best[rows]]]
+            held[rows, best[rows]], held[rows, count] = opened.T
+        nodes.append(here)
+        children.append(held)
+        here = held[area[held] >= 0.0]
+    levels = np.repeat(np.arange(len(nodes)), [len(level) for level in nodes])
+    return np.concatenate(nodes), np.concatenate(children), levels
 
 
 # ---- Nodes.
@@ -391,12 +295,6 @@ def box_of(nodes: wp.array[wp.vec4], node: int):
     return low, high
 
 
-def empty_nodes(device: wp.DeviceLike) -> wp.array:
-    """A root whose four children no ray meets."""
-    x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
-    return wp.array([[x, x, x, 0.0], [0.0, 0.0, bits, bits], [bits] * 4, [bits] * 4], dtype=wp.vec4, device=device)
-
-
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const float4* row = reinterpret_cast<const float4*>(nodes.data) + 4 * static_cast<int64_t>(node);
@@ -426,8 +324,7 @@ def empty_nodes(device: wp.DeviceLike) -> wp.array:
 #endif
 """)
 def box_entries(nodes: wp.array[wp.vec4], node: int, inverse: wp.vec3, shift: wp.vec3) -> wp.vec4ui:
-    """Bits of the distances at which a ray enters the boxes of four children; 2^31 more for those that it misses. CUDA
-    alone."""
+    """Bits of the distances at which a ray enters four children; 2^31 more for those that it misses. CUDA alone."""
     ...
 
 
@@ -447,126 +344,71 @@ def children_of(nodes: wp.array[wp.vec4], node: int) -> wp.vec4ui:
 # ---- The tree.
 
 
-# Nodes that a walk will return to: three a level, and NO_NODE.
+# Where a walk will return to: three a level, and NO_NODE.
 Stack = wp.types.vector(length=3 * DEEPEST + 2, dtype=int)
 
-
-@wp.func
-def _surface(nodes: wp.array[wp.vec4], node: int) -> float:
-    """Of the box of a node [m²]; -1 for a leaf, which cannot be opened."""
-    size = nodes[2 * node + 1] - nodes[2 * node]
-    area = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
-    return wp.where(bits_of(nodes[2 * node][3]) >= 0, area, -1.0)
+# Leaves of more faces are left as they are: all pairs of a leaf's faces are compared.
+LARGEST_LEAF = 8
 
 
 @wp.kernel(enable_backward=False)
-def _open_kernel(pairs: wp.array[wp.vec4], nodes: wp.array[wp.vec4]):
-    """A node of four children for each pair; the largest are opened first. Launch: pairs."""
-    pair = wp.tid()
-    held = wp.vec4i(2 * pair, 2 * pair + 1, -1, -1)
-    for count in range(2, 4):
-        best = int(-1)
-        most = float(0.0)
-        for k in range(count):
-            if held[k] >= 0:
-                area = _surface(pairs, held[k])
-                if area > most:
-                    most = area
-                    best = k
-        if best >= 0:
-            opened = bits_of(pairs[2 * held[best]][3])
-            held[best] = 2 * opened
-            held[count] = 2 * opened + 1
-    children = wp.vec4i(NO_NODE)
-    low = Corners()
-    high = Corners()
-    for k in range(4):
-        if held[k] >= 0:
-            corner = pairs[2 * held[k]]
-            other = pairs[2 * held[k] + 1]
-            children[k] = bits_of(corner[3])
-            for axis in range(3):
-                low[k, axis] = corner[axis]
-                high[k, axis] = other[axis]
-    set_node(nodes, pair, children, low, high)
-
-
-@wp.kernel(enable_backward=False)
-def _depth_kernel(nodes: wp.array[wp.vec4], level: int, depth: wp.array[int]):
-    """Launch: nodes."""
-    node = wp.tid()
-    if depth[node] == level:
-        for k in range(4):
-            child = child_of(nodes, node, k)
-            if child >= 0:
-                depth[child] = level + 1
-
-
-def node_depths(nodes: wp.array) -> wp.array:
-    """How deep in the tree each node of four stands, int32 [nodes], -1 where no other leads to it."""
-    depth = wp.full(nodes.size // 4, -1, dtype=int, device=nodes.device)
-    depth[:1].zero_()
-    for level in range(DEEPEST + 2):
-        wp.launch(_depth_kernel, depth.size, [nodes, level], outputs=[depth], device=nodes.device)
-    return depth
-
-
-@wp.kernel(enable_backward=False)
-def _flag_kernel(depth: wp.array[int], used: wp.array[int]):
-    """Launch: nodes."""
-    used[wp.tid()] = wp.where(depth[wp.tid()] >= 0, 1, 0)
-
-
-@wp.kernel(enable_backward=False)
-def _gather_kernel(
-    wide: wp.array[wp.vec4], order: wp.array[int], used: wp.array[int], place: wp.array[int], nodes: wp.array[wp.vec4]
+def _nodes_kernel(
+    children: wp.array[wp.vec4i], low: wp.array[Corners], high: wp.array[Corners], nodes: wp.array[wp.vec4]
 ):
-    """The nodes that are used, in their order. Launch: nodes."""
+    """Launch: nodes."""
     node = wp.tid()
-    if used[node] > 0:
-        for row in range(3):
-            nodes[4 * place[node] + row] = wide[4 * node + row]
-        for k in range(4):
-            child = child_of(wide, node, k)
-            if child >= 0:
-                child = place[child]
-            elif child != NO_NODE:
-                child = leaf_at(order, -2 - child)
-            nodes[4 * place[node] + 3][k] = from_bits(child)
+    set_node(nodes, node, children[node], low[node], high[node])
 
 
-def open_pairs(pairs: wp.array, order: wp.array) -> wp.array:
-    """Nodes of four children, as they are described above, from pairs."""
-    count, device = pairs.size // 4, pairs.device
-    wide = wp.zeros(pairs.size, dtype=wp.vec4, device=device)
-    wp.launch(_open_kernel, count, [pairs], [wide], device=device)
-    used, place = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
-    wp.launch(_flag_kernel, count, [node_depths(wide)], [used], device=device)
-    wp.utils.array_scan(used, place, inclusive=False)
-    kept = int(place[-1:].numpy()[0] + used[-1:].numpy()[0])
-    nodes = wp.zeros(4 * kept, dtype=wp.vec4, device=device)
-    wp.launch(_gather_kernel, count, [wide, order, used, place], [nodes], device=device)
-    return nodes
-
-
-def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of a mesh's tree, for `step_node` and `step_leaf`; see `refit_bvh` for moved points.
+def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+    """A mesh's tree for `step_node` and `step_leaf`; see `refit_bvh` for moved points.
 
     Args:
-        mesh: Any `wp.Mesh` on a GPU.
+        mesh: Any `wp.Mesh`.
         extent: Its largest coordinate [m], for the padding of the boxes.
-        join: Whether two faces may be tried as one, see `join_leaves`: not where the points will move.
+        join: Whether two faces that make a parallelogram are tried as one: not where the points will move.
 
     Returns:
-        nodes: vec4 [4 * nodes], see above; boxes are padded against rounding.
+        nodes: vec4 [4 * nodes], see above.
         faces: vec4 [3 * slots], see `meet_planes`.
         order: int32 [slots]: the face in each slot, or ~face where others of its leaf are tried after it.
+        levels: int32 [nodes]: how deep in the tree each stands.
     """
-    pairs, order = read_tree(mesh, extent)
-    faces = pack_faces(mesh, extent, order)
+    tree, device = read_tree(mesh, extent), mesh.device
+    faces, size, closed = tree.faces, tree.stop - tree.start, tree.children[:, 0] < 0
+    last = np.zeros(len(faces), bool)  # whether a slot is the last of its leaf
+    last[tree.stop[closed & (size > 0)] - 1] = True
+    corners = np.full(len(faces), -1)
     if join:
-        join_leaves(mesh, extent, pairs, order, faces)
-    return open_pairs(pairs, order), faces, order
+        same = SAME * extent
+        points = mesh.points.numpy()[mesh.indices.numpy().reshape(-1, 3)]
+        # Two leaves of a face each become one.
+        both = np.flatnonzero(size == 2)
+        slots = tree.start[both]
+        paired = last[slots] & (shared_corner(points[faces[slots]], points[faces[slots + 1]], same) >= 0)
+        closed[both[paired]] = True
+        last[slots[paired]] = False
+        stop = np.flatnonzero(last) + 1
+        start = np.append(0, stop[:-1])
+        few = stop - start <= LARGEST_LEAF
+        faces, corners = join_faces(points, faces, start[few], stop[few], same)
+    slots = np.arange(len(faces))
+    stop = np.flatnonzero(last)[np.cumsum(last) - last] + 1
+    order = np.where(slots + np.where(corners >= 0, 2, 1) < stop, ~faces, faces)
+
+    nodes, held, levels = open_tree(tree, closed, 4)
+    sort = np.argsort(np.where(nodes == tree.root, -1, nodes))  # the root, then as in Warp's tree
+    nodes, held, levels = nodes[sort], held[sort], levels[sort]
+    entry = -2 - 2 * tree.start - (order[tree.start] < 0)
+    entry[nodes[~closed[nodes]]] = np.flatnonzero(~closed[nodes])
+    children = np.where(held >= 0, entry[held], NO_NODE)
+    packed, rows = (wp.zeros(size, dtype=wp.vec4, device=device) for size in (4 * len(nodes), 3 * len(order)))
+    inputs = [(children.astype(np.int32), wp.vec4i), (tree.lower[held], Corners), (tree.upper[held], Corners)]
+    arrays = [wp.array(values, dtype=kind, device=device) for values, kind in inputs]
+    wp.launch(_nodes_kernel, len(nodes), arrays, [packed], device=device)
+    order, corners, levels = (wp.array(each, dtype=int, device=device) for each in (order, corners, levels))
+    set_rows(mesh, order, rows, corners)
+    return packed, rows, order, levels
 
 
 @wp.kernel(enable_backward=False)
@@ -608,17 +450,19 @@ def _refit_kernel(
 def refit_bvh(
     mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array, depth: wp.array, levels: int
 ) -> None:
-    """Boxes and faces of a packed tree for points that have moved: a launch a level, without an allocation or a look
-    at Warp's own tree. `depth` is that of `node_depths`, `levels` their number."""
+    """Boxes and faces for points that have moved, as many launches as levels; `depth`: that of each node."""
     for level in reversed(range(levels)):
         inputs = [mesh.id, box_padding(extent), level, depth, order]
         wp.launch(_refit_kernel, depth.size, inputs, outputs=[nodes], device=mesh.device)
-    set_faces(mesh, extent, order, faces)
+    set_rows(mesh, order, faces)
 
 
 def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
-    """What `pack_bvh` returns, for no faces at all."""
-    return empty_nodes(device), wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
+    """Nodes, faces and order of no faces at all: a root whose four children no ray meets."""
+    x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
+    rows = [[x, x, x, 0.0], [0.0, 0.0, bits, bits], [bits] * 4, [bits] * 4]
+    nodes = wp.array(rows, dtype=wp.vec4, device=device)
+    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
 
 
 @wp.struct
@@ -633,7 +477,7 @@ class TreeWalk:
 
 @wp.func_native("__builtin_assume(depth >= 0); return depth;")
 def place(depth: int) -> int:
-    """Index into a `Stack`: the compiler knows then that it does not count from the end."""
+    """An index of which the compiler then knows that it does not count from the end of an array."""
     ...
 
 
@@ -655,14 +499,8 @@ class NodeStep:
 
 @wp.func
 def step_node(nodes: wp.array[wp.vec4], walk: TreeWalk, inverse: wp.vec3, shift: wp.vec3) -> NodeStep:
-    """The children of a node that a ray meets.
-
-    Args:
-        nodes: From `pack_bvh`.
-        walk: Its node is >= 0; a walk begins with node 0. Below `NO_NODE` are leaves, see `leaf_at`.
-        inverse: `inverse_direction` of the ray.
-        shift: The ray's origin times `inverse`, by components.
-    """
+    """The children of the walk's node, >= 0, that a ray meets; `inverse_direction` of the ray and its origin times that
+    by components. A walk begins with node 0."""
     entry = box_entries(nodes, walk.node, inverse, shift)
     child = children_of(nodes, walk.node)
     a, b = _first(wp.vec2ui(entry[0], child[0]), wp.vec2ui(entry[1], child[1]))
@@ -687,13 +525,7 @@ class LeafStep:
 
 @wp.func
 def step_leaf(faces: wp.array[wp.vec4], order: wp.array[int], walk: TreeWalk, x: wp.vec3, u: wp.vec3) -> LeafStep:
-    """Tries the face that a walk has come to.
-
-    Args:
-        faces, order: From `pack_bvh`.
-        walk: Its node is below NO_NODE, see `step_node`.
-        x, u: Origin and unit direction of the ray.
-    """
+    """Tries the face that a walk has come to: its node is below NO_NODE; origin and unit direction of the ray."""
     step = LeafStep()
     slot = slot_of(walk.node)
     distance, met, last = meet_face(faces, slot, x, u)

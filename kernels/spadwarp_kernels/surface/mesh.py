@@ -10,6 +10,7 @@ from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_device,
+    check_fields,
     check_kind,
     check_number,
     check_numbers,
@@ -19,8 +20,8 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.visibility import near_depth_map, update_near_depth
 
-from .bvh import empty_bvh, node_depths, pack_bvh, refit_bvh
-from .patches import BRUTE_FORCE_FACES, PATCH_ROWS, empty_patches, pack_patches, set_patches
+from .bvh import empty_bvh, pack_bvh, refit_bvh
+from .patches import BRUTE_FORCE_FACES, PATCH_ROWS, pack_patches, set_patches
 from .triangle import LANES, face_vectors, pack_faces, set_faces
 from .wide import empty_wide, pack_wide, refit_wide
 
@@ -58,8 +59,8 @@ class Surfaces:
         textures: Images that multiply the corners' reflectance.
         specular: Reflectance of the facets of the specular lobe, of each face; empty if there is none.
         roughness: Their width parameter, see `microfacet`.
-        depth, levels: Of the tree of a moving mesh, see `node_depths`; empty for others, and on the CPU but for one
-            level.
+        depth, levels: Of the nodes of a moving mesh's tree on CUDA, and their number; else empty, and 1 for a moving
+            mesh on the CPU.
         extent: Largest coordinate that the tree is made for [m].
         patches, normals: Of a mesh of up to BRUTE_FORCE_FACES faces on CUDA, for rays that try them all.
     """
@@ -96,10 +97,9 @@ def make_surfaces(
     extent: float | None = None,
     use_warp_bvh: bool = False,
 ) -> Surfaces:
-    """The kernel's view of a mesh.
+    """The kernel's view of a mesh; `surface_choices` has the fields of `TransportSpec` that go with it.
 
-    Lambertian reflectance plus `specular` must not exceed 1 anywhere. `surface_choices` has the fields of
-    `TransportSpec` that go with what is returned.
+    Lambertian reflectance plus `specular` must not exceed 1 anywhere.
 
     Args:
         mesh: Any `wp.Mesh`; None for no surface at all. Where its points move, see `update_surfaces`, or make the
@@ -124,9 +124,6 @@ def make_surfaces(
     device = check_device("device", device) if mesh is None else _check_mesh(mesh)
     face_count = 0 if mesh is None else mesh.indices.size // 3
 
-    if textures is not None:
-        check_struct("textures", textures, Textures)
-
     def by_face(name: str, value: Any, dtype: type, interval: str = "[0, 1]") -> wp.array:
         if mesh is None or value is None:
             return wp.zeros(0, dtype=dtype, device=device)
@@ -139,9 +136,15 @@ def make_surfaces(
         return value
 
     surfaces.reflectance = by_face("reflectance", reflectance, float)
-    if textures is not None and corner_reflectance is None and mesh is not None:
-        rows = surfaces.reflectance.numpy()[:, None].repeat(3, axis=1)
-        corner_reflectance = wp.array(rows, dtype=wp.vec3, device=device)
+    if textures is not None:
+        check_struct("textures", textures, Textures)
+        if mesh is not None:
+            needs = {"region": (None,), "texels": (None,), "coordinates": (face_count, 3)}
+            check_fields("textures", textures, needs, device)
+            by_face("textures.face", textures.face, int, f"[-1, {textures.region.size - 1}]")
+            if corner_reflectance is None:
+                rows = surfaces.reflectance.numpy()[:, None].repeat(3, axis=1)
+                corner_reflectance = wp.array(rows, dtype=wp.vec3, device=device)
     surfaces.corner_reflectance = by_face("corner_reflectance", corner_reflectance, wp.vec3)
     surfaces.specular = by_face("specular", specular, float)
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float, "[0.01, 1]")
@@ -150,51 +153,42 @@ def make_surfaces(
     surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device) if device.is_cuda else empty_wide()
     surfaces.depth = wp.zeros(0, dtype=int, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
-    surfaces.patches, surfaces.normals = empty_patches(device)
-    if mesh is None:
-        return surfaces
-    if textures is not None:
-        check_array("textures.region", textures.region, wp.vec3i, (None,), device)
-        check_array("textures.texels", textures.texels, wp.float32, (None,), device)
-        by_face("textures.face", textures.face, int, f"[-1, {textures.region.size - 1}]")
-        check_array("textures.coordinates", textures.coordinates, wp.vec2, (face_count, 3), device)
-    points = mesh.points.numpy()
-    if not np.isfinite(points).all():
-        raise ArgumentError(f"mesh.points[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    if extent is not None:
-        upper = np.full(3, check_number("extent", extent, "(0, inf)"))
-        lower = -upper
-    surfaces.extent = float(abs(points).max()) if extent is None else float(extent)
-    padding = 1e-6 * surfaces.extent + 1e-6
-    surfaces.mesh = mesh.id
-    if use_warp_bvh:
-        slots = face_count if device.is_cuda else -(-face_count // LANES) * LANES
-        numbers = np.where(np.arange(slots) < face_count, np.arange(slots), -1)
-        surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
-        surfaces.order = wp.array(numbers, dtype=int, device=device)  # each face in the slot of its own number
-        surfaces.faces = pack_faces(mesh, surfaces.extent, surfaces.order)
-    elif device.is_cuda:
-        surfaces.nodes, surfaces.faces, surfaces.order = pack_bvh(mesh, surfaces.extent, join=extent is None)
-        if extent is not None:
-            surfaces.depth = node_depths(surfaces.nodes)
-            surfaces.levels = int(surfaces.depth.numpy().max()) + 1
-    else:
-        surfaces.nodes, surfaces.faces, surfaces.order = pack_wide(mesh, surfaces.extent)
-        surfaces.levels = 0 if extent is None else 1
-    surfaces.patches, surfaces.normals = _few_patches(mesh, surfaces.order, extent is None)
-    surfaces.lower = wp.vec3(*(lower - padding))
-    surfaces.upper = wp.vec3(*(upper + padding))
-    if camera is not None:
-        surfaces.near_depth = near_depth_map(mesh, camera)
+    surfaces.patches, surfaces.normals = (wp.zeros(0, dtype=wp.vec4, device=device) for _ in range(2))
+    if mesh is not None:
+        _set_tree(surfaces, mesh, extent, use_warp_bvh)
+        if camera is not None:
+            surfaces.near_depth = near_depth_map(mesh, camera)
     return surfaces
 
 
-def _few_patches(mesh: wp.Mesh, order: wp.array, pairs: bool) -> tuple[wp.array, wp.array]:
-    """Those of `Surfaces`."""
-    if not mesh.device.is_cuda or mesh.indices.size > 3 * BRUTE_FORCE_FACES:
-        return empty_patches(mesh.device)
-    return pack_patches(mesh, order.numpy(), pairs)
+def _set_tree(surfaces: Surfaces, mesh: wp.Mesh, extent: float | None, use_warp_bvh: bool) -> None:
+    """Box, tree and patches of a mesh; an extent for one that will move."""
+    points, device, face_count = mesh.points.numpy(), mesh.device, mesh.indices.size // 3
+    if not np.isfinite(points).all():
+        raise ArgumentError(f"mesh.points[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
+    lower, upper, still = points.min(axis=0), points.max(axis=0), extent is None
+    if not still:
+        upper = np.full(3, check_number("extent", extent, "(0, inf)"))
+        lower = -upper
+    surfaces.extent = float(abs(points).max() if still else upper[0])
+    padding = 1e-6 * surfaces.extent + 1e-6
+    surfaces.mesh = mesh.id
+    surfaces.lower, surfaces.upper = wp.vec3(*(lower - padding)), wp.vec3(*(upper + padding))
+    if use_warp_bvh:
+        slots = np.arange(face_count if device.is_cuda else -(-face_count // LANES) * LANES)
+        surfaces.nodes = wp.zeros(0, dtype=wp.vec4, device=device)
+        # Each face in the slot of its own number.
+        surfaces.order = wp.array(np.where(slots < face_count, slots, -1), dtype=int, device=device)
+        surfaces.faces = pack_faces(mesh, surfaces.extent, surfaces.order)
+    elif device.is_cuda:
+        surfaces.nodes, surfaces.faces, surfaces.order, depth = pack_bvh(mesh, surfaces.extent, join=still)
+        if not still:
+            surfaces.depth, surfaces.levels = depth, int(depth.numpy().max()) + 1
+    else:
+        surfaces.nodes, surfaces.faces, surfaces.order = pack_wide(mesh, surfaces.extent)
+        surfaces.levels = 0 if still else 1
+    if device.is_cuda and face_count <= BRUTE_FORCE_FACES:
+        surfaces.patches, surfaces.normals = pack_patches(mesh, surfaces.order.numpy(), still)
 
 
 def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" = None) -> None:
@@ -249,8 +243,8 @@ def check_faces(name: str, surfaces: Surfaces, faces: int, device: wp.Device) ->
 
 def check_patches(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:
     """Raises `ArgumentError` for patches of another number of faces, or of none."""
-    check_array(f"{name}.normals", surfaces.normals, wp.vec4, (faces,), device)
-    size = check_array(f"{name}.patches", surfaces.patches, wp.vec4, (None,), device).size
+    check_fields(name, surfaces, {"normals": (faces,), "patches": (None,)}, device)
+    size = surfaces.patches.size
     if size == 0 or size % PATCH_ROWS:
         raise ArgumentError(f"{name}.patches has {size} entries; make_surfaces fills it")
 
@@ -264,7 +258,7 @@ def _check_mesh(mesh: Any) -> wp.Device:
 
 
 def _check_sum(surfaces: Surfaces) -> None:
-    """What a face sends back is at most what it gets."""
+    """A face sends back at most what it gets."""
     if not surfaces.specular.size:
         return
     lambert = surfaces.reflectance.numpy()
@@ -279,14 +273,12 @@ def _check_sum(surfaces: Surfaces) -> None:
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
     """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `use_warp_bvh`."""
     check_struct("surfaces", surfaces, Surfaces)
-    for name in ("corner_reflectance", "specular", "nodes"):
-        if not isinstance(getattr(surfaces, name), wp.array):
+    arrays = {name: getattr(surfaces, name) for name in ("corner_reflectance", "specular", "nodes")}
+    for name, array in arrays.items():
+        if not isinstance(array, wp.array):
             raise ArgumentError(f"surfaces.{name} is missing; see make_surfaces")
-    return {
-        "pattern": surfaces.corner_reflectance.size > 0,
-        "specular": surfaces.specular.size > 0,
-        "use_warp_bvh": surfaces.nodes.size == 0,
-    }
+    pattern, specular, nodes = (array.size > 0 for array in arrays.values())
+    return {"pattern": pattern, "specular": specular, "use_warp_bvh": not nodes}
 
 
 def no_textures(device: wp.DeviceLike = None) -> Textures:
@@ -321,13 +313,13 @@ def make_textures(
     check_kind("images", images, Sequence)
     device = check_device("device", device)
     images = [check_numbers(f"images[{k}]", image, 2).astype(np.float32) for k, image in enumerate(images)]
+    if not images:
+        raise ArgumentError("images has no entries; one image or more is needed")
     for k, image in enumerate(images):
         if image.size == 0:
             raise ArgumentError(f"images[{k}] has shape {image.shape}; one texel or more is needed")
         if not (image.min() >= 0.0 and image.max() <= 1.0):
             raise ArgumentError(f"images[{k}] holds {image.min()} to {image.max()}, outside [0, 1]")
-    if not images:
-        raise ArgumentError("images has no entries; one image or more is needed")
     face, coordinates = np.asarray(face), check_numbers("coordinates", coordinates)
     if face.ndim != 1 or face.dtype.kind not in "iu" or coordinates.shape != (face.size, 3, 2):
         raise ArgumentError(

@@ -30,64 +30,48 @@ SAME = 5.0e-7
 LEAST_HEIGHT = 100.0
 
 
-@wp.func
-def _point(mesh: wp.uint64, face: int, corner: int) -> wp.vec3:
-    m = wp.mesh_get(mesh)
-    return m.points[m.indices[3 * face + corner % 3]]
-
-
-@wp.func
-def _apart(p: wp.vec3, q: wp.vec3) -> float:
-    return wp.max(wp.abs(p - q))
-
-
-@wp.func
-def shared_corner(mesh: wp.uint64, first: int, second: int, same: float) -> int:
-    """The corner (0 to 2) of a face that is not on the diagonal of the parallelogram that another one completes; -1 if
-    it does not, or is less high than LEAST_HEIGHT; points so far from each other [m] are taken for one."""
-    found = int(-1)
-    p = _point(mesh, first, 0)
-    q = _point(mesh, first, 1)
-    r = _point(mesh, first, 2)
-    longest = wp.max(wp.max(wp.length(q - p), wp.length(r - q)), wp.length(p - r))
-    if wp.length(wp.cross(q - p, r - p)) > wp.static(LEAST_HEIGHT) * same * longest:
-        for corner in range(3):
-            a = _point(mesh, first, corner + 1)
-            b = _point(mesh, first, corner + 2)
-            across = a + (b - _point(mesh, first, corner))
-            for turn in range(3):
-                apart = _apart(_point(mesh, second, turn), across)
-                apart = wp.max(apart, _apart(_point(mesh, second, turn + 1), b))
-                apart = wp.max(apart, _apart(_point(mesh, second, turn + 2), a))
-                if apart <= same and found < 0:
-                    found = corner
+def shared_corner(first: np.ndarray, second: np.ndarray, same: float) -> np.ndarray:
+    """The corner (0 to 2) of each face that is not on the diagonal of the parallelogram that another one completes; -1
+    for none, and for faces less high than LEAST_HEIGHT. Corners are float32 [faces, 3, 3]; points so far from each
+    other [m] are taken for one."""
+    found = np.full(len(first), -1)
+    edges = np.roll(first, -1, axis=1) - first
+    height = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    high = height > LEAST_HEIGHT * same * np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0)
+    for corner in (2, 1, 0):
+        a, b = first[:, (corner + 1) % 3], first[:, (corner + 2) % 3]
+        rest = np.stack([a + (b - first[:, corner]), b, a], axis=1)
+        for turn in range(3):
+            apart = np.abs(np.roll(second, -turn, axis=1) - rest).max(axis=(1, 2), initial=0.0)
+            found[high & (apart <= same)] = corner
     return found
 
 
-@wp.kernel(enable_backward=False)
-def _corners_kernel(mesh: wp.uint64, same: float, corners: wp.array2d[int]):
-    """Launch: (faces, faces)."""
-    first, second = wp.tid()
-    corners[first, second] = wp.where(first < second, shared_corner(mesh, first, second, same), -1)
-
-
-def pair_faces(mesh: wp.Mesh) -> list[tuple[int, int, int]]:
-    """A mesh's faces as (face, second face, corner) of patches: where two make a parallelogram, the lower index first
-    and the corner (0 to 2) of the first that is not on the diagonal; else (face, face, 0). Faces that turn opposite
-    ways are not paired."""
-    count = mesh.indices.size // 3
-    found = wp.empty((count, count), dtype=int, device=mesh.device)
-    same = SAME * float(np.abs(mesh.points.numpy()[mesh.indices.numpy()]).max(initial=0.0))
-    wp.launch(_corners_kernel, found.shape, [mesh.id, same], [found], device=mesh.device)
-    corners, patches = found.numpy(), []
-    taken: set[int] = set()
-    for first in range(count):
-        if first not in taken:
-            seconds = (k for k in range(first + 1, count) if k not in taken and corners[first, k] >= 0)
-            second = next(seconds, first)
-            taken.add(second)
-            patches.append((first, second, max(int(corners[first, second]), 0)))
-    return patches
+def join_faces(
+    points: np.ndarray, faces: np.ndarray, start: np.ndarray, stop: np.ndarray, same: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The faces in the slots of each leaf anew: behind a face the one with which it makes a parallelogram, where they
+    turn the same way. Also the `shared_corner` of each with the next one; -1 for a triangle and for a second face."""
+    order, corners = faces.copy(), np.full(len(faces), -1)
+    free, place = np.ones(len(faces), bool), start.copy()
+    most = int((stop - start).max(initial=0))
+    for i in range(most):
+        leaf = np.flatnonzero(start + i < stop)
+        leaf = leaf[free[start[leaf] + i]]
+        here, second = start[leaf] + i, np.full(leaf.size, -1)
+        for j in range(i + 1, most):
+            there = start[leaf] + j
+            rows = np.flatnonzero((second < 0) & (there < stop[leaf]))
+            rows = rows[free[there[rows]]]
+            found = shared_corner(points[faces[here[rows]]], points[faces[there[rows]]], same)
+            rows, found = rows[found >= 0], found[found >= 0]
+            second[rows], corners[place[leaf[rows]]] = there[rows], found
+        order[place[leaf]] = faces[here]
+        paired = np.flatnonzero(second >= 0)
+        order[place[leaf[paired]] + 1] = faces[second[paired]]
+        free[second[paired]] = False
+        place[leaf] += 1 + (second >= 0)
+    return order, corners
 
 
 @wp.kernel(enable_backward=False)
@@ -124,32 +108,25 @@ def set_patches(mesh: wp.Mesh, patches: wp.array, normals: wp.array) -> None:
 
 
 def pack_patches(mesh: wp.Mesh, order: np.ndarray, pairs: bool = True) -> tuple[wp.array, wp.array]:
-    """The patches of a mesh, vec4 [5 * patches]; vec4 [slots]: normals, see `normal_and_face`.
-
-    Args:
-        mesh: Of a few faces: each is compared with all others.
-        order: The face in each slot, or its complement, see `pack_bvh`.
-        pairs: Whether to look for parallelograms: not where the points will move.
-    """
-    faces = mesh.indices.numpy().reshape(-1, 3)
-    found = pair_faces(mesh) if pairs else [(face, face, 0) for face in range(len(faces))]
-    slots = np.zeros(len(faces), int)
-    slots[np.where(order < 0, ~order, order)] = np.arange(len(order))
-    rows = np.zeros((len(found), PATCH_ROWS, 4), np.float32)
+    """The patches of a mesh of a few faces, vec4 [5 * patches], and the unit normal of the face in each slot with the
+    bits of its index, vec4 [slots]; `order` is that of `pack_bvh`, `pairs` false where the points will move."""
+    faces = np.arange(len(order))
+    corners = np.full(len(order), -1)
+    if pairs:
+        points = mesh.points.numpy()[mesh.indices.numpy().reshape(-1, 3)]
+        faces, corners = join_faces(points, faces, np.array([0]), np.array([len(order)]), SAME * np.abs(points).max())
+    first = np.flatnonzero(np.append(True, corners[:-1] < 0))  # no second faces
+    second = faces[first + (corners[first] >= 0)]
+    slots = np.argsort(np.where(order < 0, ~order, order))
+    rows = np.zeros((len(first), PATCH_ROWS, 4), np.float32)
     bits = rows.view(np.int32)
-    for k, (first, second, corner) in enumerate(found):
-        rows[k, 3, 1] = float(first == second)
-        bits[k, 3, 3] = corner
-        bits[k, 4] = slots[first], first, slots[second], second
+    rows[:, 3, 1] = corners[first] < 0
+    bits[:, 3, 3] = np.maximum(corners[first], 0)
+    bits[:, 4] = np.stack([slots[faces[first]], faces[first], slots[second], second], axis=1)
     patches = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device=mesh.device)
     normals = wp.zeros(len(order), dtype=wp.vec4, device=mesh.device)
     set_patches(mesh, patches, normals)
     return patches, normals
-
-
-def empty_patches(device: wp.DeviceLike) -> tuple[wp.array, wp.array]:
-    """What `pack_patches` returns, for no faces at all."""
-    return wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=wp.vec4, device=device)
 
 
 @wp.func_native("""
@@ -189,12 +166,21 @@ def empty_patches(device: wp.DeviceLike) -> tuple[wp.array, wp.array]:
     return wp::vec4(nearest, rate_there, side, both.number);
 """)
 def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: float) -> wp.vec4:
-    """The nearest patch along a ray from x in the unit direction u.
+    """The nearest patch along a ray from x in the unit direction u: its distance [m], below `reach`, or that; the rate
+    at which the ray gains height over it; the sum of its coordinates there; bits of its first row, -1 for none."""
+    ...
 
-    Returns:
-        Its distance [m], below `reach`, or that; the rate at which the ray gains height over it along its normal; the
-        sum of its coordinates there; bits of its first row, -1 for none.
-    """
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(rows.data) + static_cast<int64_t>(row));
+    return wp::vec4(v.x, v.y, v.z, v.w);
+#else
+    return rows.data[row];
+#endif
+""")
+def load_row(rows: wp.array[wp.vec4], row: int) -> wp.vec4:
+    """An entry of a contiguous array that no kernel changes, in one load on CUDA."""
     ...
 
 
@@ -209,37 +195,4 @@ def nearest_patch(patches: wp.array[wp.vec4], x: wp.vec3, u: wp.vec3, reach: flo
 """)
 def patch_faces(patches: wp.array[wp.vec4], row: int, second: bool) -> wp.vec2i:
     """Slot and index of the first or the second face of the patch that begins at a row."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const float4 v = __ldg(reinterpret_cast<const float4*>(patches.data + static_cast<int64_t>(row)));
-    const float against = -copysignf(1.0f, rate);
-    return wp::vec3(against * v.x, against * v.y, against * v.z);
-#else
-    const wp::vec4& v = patches.data[row];
-    const float against = rate > 0.0f ? -1.0f : 1.0f;
-    return wp::vec3(against * v[0], against * v[1], against * v[2]);
-#endif
-""")
-def patch_normal(patches: wp.array[wp.vec4], row: int, rate: float) -> wp.vec3:
-    """The unit normal of the patch that begins at a row, against a ray with that rate, see `nearest_patch`."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const float4 v = __ldg(reinterpret_cast<const float4*>(normals.data) + slot);
-    const int face = __float_as_int(v.w);
-    __builtin_assume(face >= 0);
-    union { int bits; float number; } both;
-    both.bits = face;
-    return wp::vec4(v.x, v.y, v.z, both.number);
-#else
-    return normals.data[slot];
-#endif
-""")
-def normal_and_face(normals: wp.array[wp.vec4], slot: int) -> wp.vec4:
-    """The unit normal of the face in a slot, and bits of its index."""
     ...

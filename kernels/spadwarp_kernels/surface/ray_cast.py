@@ -7,9 +7,9 @@ from spadwarp_kernels.optics.camera import Camera, pixel_direction
 
 from .bvh import NO_NODE, Stack, TreeWalk, inverse_direction, place, step_leaf, step_node
 from .mesh import Surfaces
-from .patches import nearest_patch, normal_and_face, patch_faces, patch_normal
+from .patches import load_row, nearest_patch, patch_faces
 from .reflectance import reflectance_at
-from .triangle import face_in, face_normal
+from .triangle import face_in, face_normal, times_sign
 from .wide import walk_wide
 
 __all__ = ["SurfaceHit", "intersect_mesh", "intersect_surfaces", "offset_from_surface", "truth_kernel"]
@@ -34,7 +34,7 @@ class SurfaceHit:
 
 @wp.func
 def surface_hit(surfaces: Surfaces, walk: TreeWalk, u: wp.vec3) -> SurfaceHit:
-    """What a ray along u has found on its way down the tree."""
+    """The hit of a ray along u that has come down the tree."""
     hit = SurfaceHit()
     hit.distance = walk.nearest
     hit.slot = walk.found
@@ -64,12 +64,13 @@ def intersect_mesh(mesh: wp.uint64, x: wp.vec3, u: wp.vec3, max_distance: float)
 def patch_hit(surfaces: Surfaces, met: wp.vec4) -> SurfaceHit:
     """The hit on the patch that `nearest_patch` has found."""
     row = bits_of(met[3])
-    named = patch_faces(surfaces.patches, row, met[2] > 0.0)
+    faces = patch_faces(surfaces.patches, row, met[2] > 0.0)
+    normal = load_row(surfaces.patches, row)
     hit = SurfaceHit()
     hit.distance = met[0]
-    hit.normal = patch_normal(surfaces.patches, row, met[1])
-    hit.slot = named[0]
-    hit.face = named[1]
+    hit.normal = times_sign(-1.0, met[1]) * wp.vec3(normal[0], normal[1], normal[2])
+    hit.slot = faces[0]
+    hit.face = faces[1]
     return hit
 
 
@@ -102,9 +103,9 @@ def patch_face(surfaces: Surfaces, slot: int, u: wp.vec3):
     """`tree_face` for surfaces with patches."""
     if _on_cpu():
         return face_in(surfaces.order, slot), face_normal(surfaces.faces, slot, u)
-    row = normal_and_face(surfaces.normals, slot)
+    row = load_row(surfaces.normals, slot)
     normal = wp.vec3(row[0], row[1], row[2])
-    return bits_of(row[3]), wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
+    return place(bits_of(row[3])), wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
 
 
 @wp.func
@@ -157,11 +158,8 @@ def intersect_surfaces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance:
 
 @wp.func
 def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3:
-    """x moved off the surface along the normal by a bound of its float32 error, so that a new ray does not hit the
-    same face.
-
-    The error of x + s u grows with the coordinates and with s: a few units in the last place of either.
-    """
+    """x moved off the surface along the normal by a bound of its float32 error, a few units in the last place of its
+    coordinates and of the distance, so that a new ray does not hit the same face."""
     magnitude = wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
     return x + (5.0e-7 * (magnitude + distance)) * normal
 
@@ -184,9 +182,8 @@ def truth_kernel(
     """Depth z and range along the ray [m], normal on the camera's side, reflectance; NaN for a miss. Launch: (height,
     width).
 
-    Rays go from `origins` [m], from which the range counts, such as those behind a port; where there are none, from the
-    lens. They go along `directions` (unit vectors through the pixel centres); where there are none, the camera has
-    square pixels about its axis.
+    Rays go from `origins` [m], from which the range counts, such as those behind a port, else from the lens; along
+    `directions`, unit vectors through the pixel centres, else through square pixels about the camera's axis.
     """
     row, column = wp.tid()
     x = wp.vec3(0.0)

@@ -12,8 +12,7 @@ _INV_PI = wp.constant(0.3183098861837907)
 
 @wp.func
 def lambert_brdf(reflectance: float) -> float:
-    """Lambertian f = reflectance/pi [1/sr]; times cos(theta_out) it is the density per steradian of the reflected
-    weight."""
+    """f = reflectance/pi [1/sr]; times cos(theta_out) it is the density of the reflected weight."""
     return reflectance * _INV_PI
 
 
@@ -42,9 +41,7 @@ def ggx_slope_length(cosine: float, roughness: float) -> float:
 @wp.func
 def ggx_normals(h: wp.vec3, n: wp.vec3, roughness: float) -> float:
     """D(h), density of facet normals [1/sr]: the integral of D cos(theta_h) over the hemisphere is 1 (Walter eq 33).
-
-    The sine comes from a cross product, so that narrow lobes keep their shape in float32.
-    """
+    The sine comes from a cross product, so that narrow lobes keep their shape in float32."""
     cosine = wp.dot(h, n)
     if cosine <= 0.0:
         return 0.0

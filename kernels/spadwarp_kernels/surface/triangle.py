@@ -37,26 +37,12 @@ def load_plane(faces: wp.array[wp.vec4], slot: int, plane: int) -> wp.vec4:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return plane;
-#else
-    if (which < 2) return wp::vec4(2.0f * plane[0], 2.0f * plane[1], 2.0f * plane[2], 2.0f * plane[3] - 1.0f);
-    const float half = plane[3] < 0.0f ? -0.5f : 0.5f;
-    return wp::vec4(half * plane[0], half * plane[1], half * plane[2], fabsf(half * plane[3]));
-#endif
-""")
-def _from_middle(plane: wp.vec4, which: int) -> wp.vec4:
-    """Plane 0, 1 or 2 of a face as `meet_planes` takes it: on CUDA it is kept so."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
     return __uint_as_float(__float_as_uint(x) ^ (__float_as_uint(sign) & 0x80000000u));
 #else
     return __builtin_signbit(sign) ? -x : x;
 #endif
 """)
-def _times_sign(x: float, sign: float) -> float:
+def times_sign(x: float, sign: float) -> float:
     """x, negated where the sign bit is set, also of a zero."""
     ...
 
@@ -81,52 +67,55 @@ def face_in(order: wp.array[int], slot: int) -> int:
 
 
 @wp.func
+def _coordinates(e1: wp.vec3, e2: wp.vec3, triangle: float):
+    """Gradients of the two coordinates along the edges, the unit normal, one over the least height of the triangle, or
+    with `triangle` = 0 of the parallelogram. Without area nothing is finite or the normal is 0: no ray hits it."""
+    n = wp.cross(e1, e2)
+    inverse = 1.0 / wp.dot(n, n)
+    a = inverse * wp.cross(e2, n)
+    b = inverse * wp.cross(n, e1)
+    steepest = wp.max(wp.max(wp.length(a), wp.length(b)), triangle * wp.length(a + b))
+    return a, b, wp.normalize(n), steepest
+
+
+@wp.func
+def _plane(normal: wp.vec3, offset: float) -> wp.vec4:
+    return wp.vec4(normal[0], normal[1], normal[2], offset)
+
+
+@wp.func
 def _planes(mesh: wp.uint64, face: int):
     """Normals and offsets of the three planes of a face on the CPU."""
     m = wp.mesh_get(mesh)
     p = m.points[m.indices[3 * face]]
     e1 = m.points[m.indices[3 * face + 1]] - p
     e2 = m.points[m.indices[3 * face + 2]] - p
-    n = wp.cross(e1, e2)
-    inverse = 1.0 / wp.dot(n, n)  # infinite for a face without area, which no ray then hits
-    a = inverse * wp.cross(e2, n)
-    b = inverse * wp.cross(n, e1)
-    steepest = wp.max(wp.max(wp.length(a), wp.length(b)), wp.length(a + b))
-    n = wp.normalize(n) / steepest
-    return (
-        wp.vec4(a[0], a[1], a[2], -wp.dot(a, p)),
-        wp.vec4(b[0], b[1], b[2], -wp.dot(b, p)),
-        wp.vec4(n[0], n[1], n[2], wp.dot(n, p)),
-    )
+    a, b, n, steepest = _coordinates(e1, e2, 1.0)
+    n = n / steepest
+    return _plane(a, -wp.dot(a, p)), _plane(b, -wp.dot(b, p)), _plane(n, wp.dot(n, p))
 
 
 @wp.func
 def middle_planes(p: wp.vec3, e1: wp.vec3, e2: wp.vec3, triangle: float):
-    """Planes of a triangle with corner p and edges e1, e2 from it, or with `triangle` = 0 of the parallelogram.
-
-    Returns:
-        Two coordinates as normals and offsets, -1 to 1 from edge to edge of the parallelogram; the unit normal and the
-        offset of its plane; half its least height [m]. Without area nothing is finite or the normal is 0.
-    """
-    n = wp.cross(e1, e2)
-    inverse = 1.0 / wp.dot(n, n)
-    a = inverse * wp.cross(e2, n)
-    b = inverse * wp.cross(n, e1)
-    steepest = wp.max(wp.max(wp.length(a), wp.length(b)), triangle * wp.length(a + b))
+    """Planes of a triangle with corner p and edges e1, e2 from it, or with `triangle` = 0 of the parallelogram: two
+    coordinates as normals and offsets, -1 to 1 from edge to edge of the parallelogram; its unit normal and offset; half
+    its least height [m]."""
+    a, b, n, steepest = _coordinates(e1, e2, triangle)
     middle = p + 0.5 * (e1 + e2)
-    n = wp.normalize(n)
-    return (
-        2.0 * wp.vec4(a[0], a[1], a[2], -wp.dot(a, middle)),
-        2.0 * wp.vec4(b[0], b[1], b[2], -wp.dot(b, middle)),
-        wp.vec4(n[0], n[1], n[2], wp.dot(n, middle)),
-        0.5 / steepest,
-    )
+    a_plane = 2.0 * _plane(a, -wp.dot(a, middle))
+    return a_plane, 2.0 * _plane(b, -wp.dot(b, middle)), _plane(n, wp.dot(n, middle)), 0.5 / steepest
 
 
-@wp.func
-def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int, faces: wp.array[wp.vec4]):
-    """Writes a face, or the parallelogram that it is a half of: then `triangle` is 0, and the corner is the one that is
-    not on the diagonal."""
+@wp.kernel(enable_backward=False)
+def _rows_kernel(mesh: wp.uint64, order: wp.array[int], corners: wp.array[int], faces: wp.array[wp.vec4]):
+    """Faces as CUDA takes them, or the parallelograms that they are halves of. Launch: slots."""
+    slot = wp.tid()
+    face = face_in(order, slot)
+    corner = int(-1)
+    if corners.shape[0] > 0:
+        corner = corners[slot]
+    triangle = wp.where(corner < 0, 1.0, 0.0)
+    corner = wp.max(corner, 0)
     m = wp.mesh_get(mesh)
     p = m.points[m.indices[3 * face + corner]]
     q = m.points[m.indices[3 * face + (corner + 1) % 3]]
@@ -134,35 +123,23 @@ def set_row(mesh: wp.uint64, face: int, corner: int, triangle: float, slot: int,
     a, b, n, height = middle_planes(p, q - p, r - p, triangle)
     faces[3 * slot] = a
     faces[3 * slot + 1] = b
-    turned = _times_sign(height, n[3]) * wp.vec3(n[0], n[1], n[2])
+    turned = times_sign(height, n[3]) * wp.vec3(n[0], n[1], n[2])
     if triangle == 0.0:
         turned = -1.0 * turned
     offset = height * wp.abs(n[3])
-    faces[3 * slot + 2] = wp.vec4(turned[0], turned[1], turned[2], _times_sign(offset, triangle - 0.5))
+    faces[3 * slot + 2] = _plane(turned, times_sign(offset, triangle - 0.5))
 
 
-@wp.kernel(enable_backward=False)
-def _rows_kernel(mesh: wp.uint64, order: wp.array[int], faces: wp.array[wp.vec4]):
-    """Launch: slots."""
-    slot = wp.tid()
-    set_row(mesh, face_in(order, slot), 0, 1.0, slot, faces)
+def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array, corners: wp.array | None = None) -> None:
+    """Writes the faces in their slots as CUDA takes them; `corners` is that of `join_faces`, None for triangles."""
+    if corners is None:
+        corners = wp.empty(0, dtype=int, device=mesh.device)
+    wp.launch(_rows_kernel, order.size, [mesh.id, order, corners], [faces], device=mesh.device)
 
 
-def set_rows(mesh: wp.Mesh, order: wp.array, faces: wp.array) -> None:
-    """Writes the faces in their slots as CUDA takes them, each by itself."""
-    wp.launch(_rows_kernel, order.size, [mesh.id, order], [faces], device=mesh.device)
-
-
-@wp.func_native("return reinterpret_cast<const float*>(rows.data)[index];")
-def number_at(rows: wp.array[wp.vec4], index: int) -> float:
-    """A number of contiguous rows."""
-    ...
-
-
-@wp.func_native("reinterpret_cast<float*>(rows.data)[index] = value;")
-def set_number(rows: wp.array[wp.vec4], index: int, value: float):
-    """Writes a number of contiguous rows."""
-    ...
+def numbers_of(rows: wp.array) -> wp.array:
+    """The same memory as float32."""
+    return wp.array(ptr=rows.ptr, dtype=float, shape=4 * rows.size, device=rows.device)
 
 
 @wp.func
@@ -172,7 +149,7 @@ def face_number(slot: int, row: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces: wp.array[wp.vec4]):
+def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces: wp.array[float]):
     """Launch: slots; CPU. A slot without a face keeps planes of zeros and a box that no ray meets."""
     slot = wp.tid()
     face = order[slot]
@@ -181,17 +158,17 @@ def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces:
     if face >= 0:
         a, b, n = _planes(mesh, face)
         for i in range(4):
-            set_number(faces, face_number(slot, i), a[i])
-            set_number(faces, face_number(slot, 4 + i), b[i])
-            set_number(faces, face_number(slot, 8 + i), n[i])
+            faces[face_number(slot, i)] = a[i]
+            faces[face_number(slot, 4 + i)] = b[i]
+            faces[face_number(slot, 8 + i)] = n[i]
         m = wp.mesh_get(mesh)
         for corner in range(3):
             p = m.points[m.indices[3 * face + corner]]
             low = wp.min(low, p - wp.vec3(padding))
             high = wp.max(high, p + wp.vec3(padding))
     for axis in range(3):
-        set_number(faces, face_number(slot, 12 + axis), low[axis])
-        set_number(faces, face_number(slot, 15 + axis), high[axis])
+        faces[face_number(slot, 12 + axis)] = low[axis]
+        faces[face_number(slot, 15 + axis)] = high[axis]
 
 
 def box_padding(extent: float) -> float:
@@ -200,7 +177,7 @@ def box_padding(extent: float) -> float:
 
 
 def face_vectors(slots: int, device: wp.Device) -> int:
-    """How many vec4 the faces in so many slots take."""
+    """Number of vec4 of the faces in so many slots."""
     return 3 * slots if device.is_cuda else 36 * (slots // 8)
 
 
@@ -209,14 +186,12 @@ def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) ->
     if mesh.device.is_cuda:
         set_rows(mesh, order, faces)
     else:
-        wp.launch(_blocks_kernel, order.size, [mesh.id, box_padding(extent), order], [faces], device=mesh.device)
+        inputs = [mesh.id, box_padding(extent), order]
+        wp.launch(_blocks_kernel, order.size, inputs, [numbers_of(faces)], device=mesh.device)
 
 
 def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
-    """The faces of a mesh in the slots of an order, vec4 [3 * slots], on the CPU [36 * blocks].
-
-    Raises `ArgumentError` for more of them than a CPU's indices reach.
-    """
+    """The faces of a mesh in the slots of an order; raises `ArgumentError` for more than a CPU's indices reach."""
     if not mesh.device.is_cuda:
         check_integer("faces of the mesh, in slots,", order.size, 0, _MOST_SLOTS)
     faces = zeros(face_vectors(order.size, mesh.device), wp.vec4, mesh.device)
@@ -228,16 +203,13 @@ def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
 def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> wp.vec2:
     """A ray from x along the unit vector u against a triangle or a parallelogram, two triangles side by side.
 
-    Args:
-        a, b: Two coordinates in its plane as normals and offsets, -1 to 1 from edge to edge and 0 in the middle of the
-            parallelogram. The sum of a triangle's is not above 0.
-        n: Normal and offset of the plane; the normal is half as long as the least height. The sign of the offset, also
-            of a zero, says what it is: negative for a parallelogram.
+    Two coordinates in its plane are normals and offsets, -1 to 1 from edge to edge and 0 in the middle of the
+    parallelogram; the sum of a triangle's is not above 0. The normal of the plane is half as long as the least height;
+    the sign of its offset, also of a zero, is negative for a parallelogram.
 
-    Returns:
-        The distance, >= 0, or -1 for a miss; the sum of the coordinates there, which is above 0 in the second triangle
-        of a parallelogram. A ray may pass a hair outside, measured across the ray, so that none slips between two
-        faces; more than that beyond the short edges of a sliver, where its box ends it.
+    Returns the distance, >= 0, or -1 for a miss, and the sum of the coordinates there, which is above 0 in the second
+    triangle. A ray may pass a hair outside, measured across the ray, so that none slips between two faces; more than
+    that beyond the short edges of a sliver, where its box ends it.
     """
     rate = n[0] * u[0] + n[1] * u[1] + n[2] * u[2]
     height = n[3] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])
@@ -247,7 +219,7 @@ def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> w
     second = b[0] * y[0] + b[1] * y[1] + b[2] * y[2] + b[3]
     both = first + second
     # Of a parallelogram the last does not count: negated it is the largest only beyond a corner.
-    most = wp.max(wp.max(wp.abs(first), wp.abs(second)), _times_sign(both + 1.0, n[3]))
+    most = wp.max(wp.max(wp.abs(first), wp.abs(second)), times_sign(both + 1.0, n[3]))
     hair = WIDENING * (wp.abs(y[0]) + wp.abs(y[1]) + wp.abs(y[2]) + distance)
     if not ((1.0 - most) * wp.abs(rate) >= -hair and distance >= 0.0):
         distance = -1.0
@@ -256,26 +228,14 @@ def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> w
 
 @wp.func
 def meet_face(faces: wp.array[wp.vec4], slot: int, x: wp.vec3, u: wp.vec3):
-    """What is kept in a slot against a ray, see `meet_planes`.
-
-    Returns:
-        The distance; the slot of the triangle that the ray would hit; the last slot that belongs to it, the next one
-        for a parallelogram.
-    """
-    a = _from_middle(load_plane(faces, slot, 0), 0)
-    b = _from_middle(load_plane(faces, slot, 1), 1)
-    n = _from_middle(load_plane(faces, slot, 2), 2)
+    """A ray against the face or faces kept in a slot on CUDA, see `meet_planes`: the distance, the slot of the triangle
+    that it would hit, and the last slot that belongs to these, the next one for a parallelogram."""
+    a = load_plane(faces, slot, 0)
+    b = load_plane(faces, slot, 1)
+    n = load_plane(faces, slot, 2)
     met = meet_planes(a, b, n, x, u)
     last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
     return met[0], wp.where(met[1] > 0.0, last, slot), last
-
-
-@wp.func
-def face_distance(faces: wp.array[wp.vec4], slot: int, x: wp.vec3, u: wp.vec3) -> float:
-    """Distance from x along the unit vector u at which the ray meets the face in a slot, >= 0, or -1 for a miss; on
-    CUDA, in the first of two slots whose faces are kept as a parallelogram, that."""
-    distance, _, _ = meet_face(faces, slot, x, u)
-    return distance
 
 
 @wp.func

@@ -16,201 +16,77 @@ import warp as wp
 
 from spadwarp_kernels.base.native import bits_of
 
-from .bvh import NO_NODE, read_tree
-from .triangle import LANES, face_number, number_at, pack_faces, set_faces, set_number
+from .bvh import NO_NODE, Tree, open_tree, read_tree
+from .triangle import LANES, face_number, numbers_of, pack_faces, set_faces
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
-# Entries of the stack of `_faces_in_order_kernel`: three a level of Warp's trees, which are at most 32 deep.
-_Stack = wp.types.vector(length=104, dtype=int)
 
-
-@wp.struct
-class _Part:
-    """Faces that follow each other in the tree's order, from start to stop."""
-
-    pair: int  # of Warp's nodes below it, see `read_tree`; -1 for none: then they are parted in the middle
-    start: int
-    stop: int
-    area: float  # half the surface of their box [m²]
-
-
-@wp.kernel(enable_backward=False)
-def _faces_in_order_kernel(
-    nodes: wp.array[wp.vec4], order: wp.array[int], start: wp.array[int], stop: wp.array[int], sorted: wp.array[int]
-):
-    """The faces from left to right, and where those below each of Warp's nodes start and stop. Launch: 1."""
-    stack = _Stack()
-    stack[0] = 1  # the second node of the root's pair
-    depth = int(2)
-    count = int(0)
-    while depth > 0:
-        depth -= 1
-        node = stack[depth]
-        if node < 0:
-            stop[~node] = count
-        else:
-            start[node] = count
-            stack[depth] = ~node
-            depth += 1
-            child = bits_of(nodes[2 * node][3])
-            if child >= 0:
-                stack[depth] = 2 * child + 1
-                stack[depth + 1] = 2 * child
-                depth += 2
-            slot = -2 - child
-            more = child < NO_NODE
-            while more:
-                more = order[slot] < 0
-                sorted[count] = wp.where(more, ~order[slot], order[slot])
-                count += 1
-                slot += 1
-
-
-@wp.func
-def _half(nodes: wp.array[wp.vec4], start: wp.array[int], stop: wp.array[int], part: _Part, k: int):
-    half = _Part()
-    if part.pair >= 0:
-        node = 2 * part.pair + k
-        low = nodes[2 * node]
-        size = nodes[2 * node + 1] - low
-        half.pair = wp.max(bits_of(low[3]), -1)
-        half.start = start[node]
-        half.stop = stop[node]
-        half.area = size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
-    else:
-        middle = (part.start + part.stop) / 2
-        half.pair = -1
-        half.start = wp.where(k == 0, part.start, middle)
-        half.stop = wp.where(k == 0, middle, part.stop)
-        half.area = part.area
-    return half
-
-
-@wp.func
-def _largest(parts: wp.array[_Part], count: int) -> int:
-    """The part with the largest surface of those that are no leaves; -1 for none."""
-    found = int(-1)
-    for k in range(count):
-        if parts[k].stop - parts[k].start > LANES and (found < 0 or parts[k].area > parts[found].area):
-            found = k
-    return found
+def _split_leaves(tree: Tree) -> Tree:
+    """Leaves of more than LANES faces become nodes, parted in the middle."""
+    while (large := np.flatnonzero((tree.children[:, 0] < 0) & (tree.stop - tree.start > LANES))).size:
+        nodes = len(tree.start) + np.arange(2 * large.size)
+        tree.children[large] = nodes.reshape(2, -1).T
+        start, stop = tree.start[large], tree.stop[large]
+        middle, box = (start + stop) // 2, [np.tile(corner[large], (2, 1)) for corner in (tree.lower, tree.upper)]
+        new = (np.full((nodes.size, 2), -1), *box, np.append(start, middle), np.append(middle, stop))
+        tree = Tree(tree.root, *map(np.concatenate, zip(tree[1:6], new, strict=True)), tree.faces)
+    return tree
 
 
 @wp.kernel(enable_backward=False)
-def _open_kernel(
-    nodes: wp.array[wp.vec4],
-    start: wp.array[int],
-    stop: wp.array[int],
-    sorted: wp.array[int],
-    parts: wp.array[_Part],
-    waiting: wp.array[_Part],
-    children: wp.array[int],
-    order: wp.array[int],
-    counts: wp.array[int],
-):
-    """Children of all nodes, level after level, and the faces in their slots; `counts`: nodes, leaves. Launch: 1."""
-    root = _Part()
-    root.stop = sorted.shape[0]
-    waiting[0] = root
-    total = int(1)
-    leaves = int(0)
-    node = int(0)
-    while node < total:
-        parts[0] = waiting[node]
-        count = int(1)
-        opened = _largest(parts, count)
-        while opened >= 0 and count < LANES:
-            part = parts[opened]
-            parts[opened] = _half(nodes, start, stop, part, 0)
-            parts[count] = _half(nodes, start, stop, part, 1)
-            count += 1
-            opened = _largest(parts, count)
-        for k in range(LANES):
-            child = int(NO_NODE)
-            if k < count and parts[k].start < parts[k].stop:
-                if parts[k].stop - parts[k].start > LANES:
-                    waiting[total] = parts[k]
-                    child = total
-                    total += 1
-                else:
-                    child = -2 - LANES * leaves
-                    for i in range(parts[k].stop - parts[k].start):
-                        order[LANES * leaves + i] = sorted[parts[k].start + i]
-                    leaves += 1
-            children[LANES * node + k] = child
-        node += 1
-    counts[0] = total
-    counts[1] = leaves
-
-
-@wp.kernel(enable_backward=False)
-def _boxes_kernel(faces: wp.array[wp.vec4], nodes: wp.array[wp.vec4]):
+def _boxes_kernel(faces: wp.array[float], nodes: wp.array[float]):
     """Boxes of all children, from the last node to the first, which stand after their parents. Launch: 1."""
-    count = nodes.shape[0] / 14
+    count = nodes.shape[0] / 56
     for i in range(count):
         node = count - 1 - i
         for k in range(LANES):
-            child = bits_of(number_at(nodes, 56 * node + 48 + k))
+            child = bits_of(nodes[56 * node + 48 + k])
             for axis in range(3):
                 low = float(1.0e30)
                 high = float(-1.0e30)
                 if child != NO_NODE:
                     for lane in range(LANES):
                         if child >= 0:
-                            low = wp.min(low, number_at(nodes, 56 * child + 8 * axis + lane))
-                            high = wp.max(high, number_at(nodes, 56 * child + 24 + 8 * axis + lane))
+                            low = wp.min(low, nodes[56 * child + 8 * axis + lane])
+                            high = wp.max(high, nodes[56 * child + 24 + 8 * axis + lane])
                         else:
                             slot = -2 - child + lane
-                            low = wp.min(low, number_at(faces, face_number(slot, 12 + axis)))
-                            high = wp.max(high, number_at(faces, face_number(slot, 15 + axis)))
-                set_number(nodes, 56 * node + 8 * axis + k, low)
-                set_number(nodes, 56 * node + 24 + 8 * axis + k, high)
+                            low = wp.min(low, faces[face_number(slot, 12 + axis)])
+                            high = wp.max(high, faces[face_number(slot, 15 + axis)])
+                nodes[56 * node + 8 * axis + k] = low
+                nodes[56 * node + 24 + 8 * axis + k] = high
 
 
 def pack_wide(mesh: wp.Mesh, extent: float) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of a mesh's tree, for `walk_wide`; see `refit_wide` for moved points.
-
-    Args:
-        mesh: Any `wp.Mesh` on the CPU.
-        extent: Its largest coordinate [m], for the padding of the boxes.
-
-    Returns:
-        nodes: vec4 [14 * nodes], see above; boxes are padded against rounding.
-        faces: vec4 [36 * leaves], see `triangle`.
-        order: int32 [8 * leaves]: the face in each slot, -1 for none.
-    """
-    pairs, slots = read_tree(mesh, extent)
-    count = slots.size
-    # Nodes of fewer than eight children have more than eight faces, all in leaves of their own.
-    most = count // 7 + count // 9 + 1
-
-    def integers(size: int) -> wp.array:
-        return wp.empty(size, dtype=int, device="cpu")
-
-    start, stop, sorted_, children, counts = map(integers, (pairs.size // 2, pairs.size // 2, count, LANES * most, 2))
-    order = wp.full(LANES * count, -1, dtype=int, device="cpu")
-    parts, waiting = (wp.empty(size, dtype=_Part, device="cpu") for size in (LANES, most))
-    wp.launch(_faces_in_order_kernel, 1, [pairs, slots], [start, stop, sorted_], device="cpu")
-    wp.launch(_open_kernel, 1, [pairs, start, stop, sorted_, parts, waiting], [children, order, counts], device="cpu")
-    nodes, leaves = counts.numpy()
-    rows = np.zeros((nodes, 7, LANES), np.float32)
-    rows[:, 6] = children.numpy()[: LANES * nodes].reshape(nodes, LANES).view(np.float32)
-    tree = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu", copy=False)  # in large pages, see `zeros`
-    order = wp.clone(order[: LANES * leaves])
+    """A mesh's tree for `walk_wide`, for coordinates up to the extent [m]: nodes, vec4 [14 * nodes], see above; faces,
+    vec4 [36 * leaves], see `triangle`; and the face in each slot, int32 [8 * leaves], -1 for none."""
+    tree = _split_leaves(read_tree(mesh, extent))
+    leaf = tree.stop - tree.start <= LANES
+    nodes, held, _ = open_tree(tree, leaf, LANES)
+    leaves = held[(held >= 0) & leaf[held]]
+    blocks = tree.start[leaves][:, None] + np.arange(LANES)
+    slots = np.where(blocks < tree.stop[leaves][:, None], tree.faces[np.minimum(blocks, len(tree.faces) - 1)], -1)
+    entry = np.full(len(leaf), NO_NODE)
+    entry[leaves] = -2 - LANES * np.arange(len(leaves))
+    entry[nodes[~leaf[nodes]]] = np.flatnonzero(~leaf[nodes])
+    rows = np.zeros((len(nodes), 7, LANES), np.float32)
+    rows[:, 6] = np.where(held >= 0, entry[held], NO_NODE).astype(np.int32).view(np.float32)
+    boxes = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu", copy=False)  # in large pages, see `zeros`
+    order = wp.array(slots.ravel(), dtype=int, device="cpu")
     faces = pack_faces(mesh, extent, order)
-    wp.launch(_boxes_kernel, 1, [faces], [tree], device="cpu")
-    return tree, faces, order
+    wp.launch(_boxes_kernel, 1, [numbers_of(faces)], [numbers_of(boxes)], device="cpu")
+    return boxes, faces, order
 
 
 def refit_wide(mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, order: wp.array) -> None:
     """Boxes and faces of a packed tree for points that have moved."""
     set_faces(mesh, extent, order, faces)
-    wp.launch(_boxes_kernel, 1, [faces], [nodes], device="cpu")
+    wp.launch(_boxes_kernel, 1, [numbers_of(faces)], [numbers_of(nodes)], device="cpu")
 
 
 def empty_wide() -> tuple[wp.array, wp.array, wp.array]:
-    """What `pack_wide` returns, for no faces at all."""
+    """The tree of no faces at all, see `pack_wide`."""
     rows = np.zeros((7, LANES), np.float32)
     rows[:3], rows[3:6], rows[6] = 1.0e30, -1.0e30, np.array(-1, np.int32).view(np.float32)
     nodes = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu")
@@ -309,13 +185,7 @@ def walk_wide(
     reach: float,
     any_hit: bool,
 ) -> wp.vec2:
-    """Distance of the nearest face along a ray and the bits of its slot; CPU alone.
-
-    Args:
-        nodes, faces, order: From `pack_wide`.
-        x, u: Origin and unit direction.
-        inverse, shift: `inverse_direction` of the ray, and its origin times that, by components.
-        reach: Length of the ray [m], which is returned with slot -1 where it meets no face.
-        any_hit: Whether the first leaf with a face that it meets is enough.
-    """
+    """Distance of the nearest face along a ray of length `reach`, or that, and the bits of its slot, -1 for none; CPU
+    alone. `inverse` is `inverse_direction`, `shift` the origin times that, by components; with `any_hit` the first leaf
+    with a face that it meets is enough."""
     ...

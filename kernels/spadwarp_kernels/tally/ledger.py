@@ -2,8 +2,7 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import memoised
-from spadwarp_kernels.water.limits import EXIT_FACES
+from .tally import atomic_add_int64
 
 __all__ = ["LEDGER_ENTRIES", "LEDGER_UNIT"]
 
@@ -16,6 +15,9 @@ LEDGER_SLOTS = 4096
 
 # Light outside the gate is counted in 2^8 tally units.
 OUTSIDE_SHIFT = wp.constant(wp.int64(8))
+
+# Where a history may leave the domain, in the order of `water.limits.exit_face`.
+EXIT_FACES = ("lateral_limit", "exit_x_low", "exit_x_high", "exit_y_low", "exit_y_high", "exit_z_low", "exit_z_high")
 
 LEDGER_ENTRIES = (
     "absorbed_water",
@@ -65,20 +67,6 @@ ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT,
 ) = (wp.constant(len(LEDGER_ENTRIES) + i) for i in range(len(COUNTERS) - 2))
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
-#else
-    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, static_cast<long long>(value),
-    __ATOMIC_RELAXED);
-#endif
-""")
-def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
-    """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the
-    CPU)."""
-    ...
-
-
 @wp.func
 def to_ledger(weight: float) -> wp.int64:
     """A weight >= 0 in ledger units, rounded to nearest."""
@@ -95,16 +83,3 @@ def add_to_ledger(ledger: wp.array[wp.int64], thread: int, entry: int, value: wp
 def slot_of_core(first_id: wp.uint64) -> int:
     """A thread's number on the CPU: launches on several cores write to cache lines of their own."""
     return 8 * int((first_id >> wp.uint64(10)) & wp.uint64(511))
-
-
-@memoised
-def make_ledger_slot(cuda: bool) -> wp.Function:
-    """The Warp function ``(thread, first_id) -> int``: what `add_to_ledger` takes as its thread."""
-
-    @wp.func
-    def ledger_slot(thread: int, first_id: wp.uint64) -> int:
-        if wp.static(cuda):
-            return thread
-        return slot_of_core(first_id)
-
-    return ledger_slot

@@ -1,46 +1,39 @@
-"""Tallies: 64-bit fixed point, so that a sum does not depend on the order of its terms."""
+"""Tallies in 64-bit fixed point, whose sums do not depend on the order of their terms, and the batches of a run."""
 
+import math
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_kind
 from spadwarp_kernels.base.kernels import launch_pixels
-from spadwarp_kernels.optics.camera import Camera, Gate, gate_bin
 
-__all__ = ["COMPONENTS", "add_tallies", "has_overflowed", "tally_rates"]
+__all__ = ["COMPONENTS", "Batches", "add_tallies", "has_overflowed", "tally_rates"]
+
+wp.set_module_options({"enable_backward": False})
 
 # What a history's events make of its light: the first axis of the tally.
 COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
 BALLISTIC, FORWARD_SCATTERED, BACKSCATTER = (wp.constant(i) for i in range(3))
 
-
-LogDerivatives = wp.types.vector(length=8, dtype=float)
-"""Derivatives of the logarithm of a photon's light with respect to the parameters of a spec, in its order."""
-
-
-@wp.struct
-class Contribution:
-    """What a photon adds to the tally.
-
-    Attributes:
-        value: Fraction of the emitted light; 0 for nothing.
-        index: Of the voxel, see `tally_index`.
-        rounding_sample: Uniform in [0, 1), see `to_fixed_point`.
-        factors: By which the value is multiplied for the tallies that have signs: log derivatives, or channels over I.
-    """
-
-    value: float
-    index: int
-    rounding_sample: float
-    factors: LogDerivatives
+# A voxel's sum beyond this has used up its 64 bits, or soon will.
+VOXEL_LIMIT = wp.constant(wp.int64(1 << 62))
 
 
-# Index of light that has come to the lens by more reflections than count.
-TOO_LONG = wp.constant(-4)
-
-# Largest single contribution, in tally units, 2^58: what is above it is clipped and counted.
-DEPOSIT_LIMIT = wp.constant(2.8823037615171174e17)
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, static_cast<unsigned long long>(value));
+#else
+    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, static_cast<long long>(value),
+    __ATOMIC_RELAXED);
+#endif
+""")
+def atomic_add_int64(tally: wp.array[wp.int64], index: int, value: wp.int64):
+    """Adds to a contiguous int64 array; atomic on CUDA and between CPU threads (Warp's own is a plain add on the
+    CPU)."""
+    ...
 
 
 @wp.func_native("""
@@ -60,26 +53,7 @@ def add_pending(tally: wp.array[wp.int64], pending: wp.vec2l, index: int, value:
     ...
 
 
-@wp.func
-def to_fixed_point(value: float, scale: float, rounding_sample: float) -> wp.int64:
-    """value * scale >= 0, rounded up with probability equal to its fraction, for rounding_sample uniform in [0, 1).
-
-    For samples on the grid k / 2^24 the mean is kept to 2^-25 unit, or 2^-24 of the value where that is more. Returns
-    -1 for what is clipped and -2 for what is not a number.
-    """
-    units = value * scale
-    if units <= DEPOSIT_LIMIT:
-        return wp.int64(units + rounding_sample)
-    if units > DEPOSIT_LIMIT:
-        return wp.int64(-1)
-    return wp.int64(-2)
-
-
-# A voxel's sum beyond this has used up its 64 bits, or soon will.
-VOXEL_LIMIT = wp.constant(wp.int64(1 << 62))
-
-
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def find_overflow_kernel(tally: wp.array[wp.int64], least: wp.int64, found: wp.array[int]):
     """Launch: voxels."""
     voxel = wp.tid()
@@ -90,10 +64,8 @@ def find_overflow_kernel(tally: wp.array[wp.int64], least: wp.int64, found: wp.a
 def has_overflowed(tally: wp.array, *, signed: bool = False) -> bool:
     """Whether a voxel has left [0, 2^62), or with `signed` (-2^62, 2^62); waits for the device.
 
-    Asked often enough, before a voxel can go round, this leaves no overflow unnoticed.
-
-    Raises:
-        ArgumentError: `tally` is not an array of int64 with one axis.
+    Asked often enough, before a voxel can go round, this leaves no overflow unnoticed. Raises `ArgumentError` unless
+    `tally` is an array of int64 with one axis.
     """
     check_array("tally", tally, wp.int64, (None,))
     found = wp.zeros(1, dtype=int, device=tally.device)
@@ -106,12 +78,11 @@ def has_overflowed(tally: wp.array, *, signed: bool = False) -> bool:
 _PIECE = 1 << 22
 
 
-def pieces(size: int) -> list[slice]:
-    """Of so many integers, those that `_PIECE` allows at a time."""
+def _pieces(size: int) -> list[slice]:
     return [slice(first, min(first + _PIECE, size)) for first in range(0, size, _PIECE)]
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def add_kernel(more: wp.array[wp.int64], total: wp.array[wp.int64]):
     """Launch: integers."""
     i = wp.tid()
@@ -121,23 +92,19 @@ def add_kernel(more: wp.array[wp.int64], total: wp.array[wp.int64]):
 def add_tallies(total: wp.array, more: wp.array) -> None:
     """Adds one tally to another, which may be on another device; no launch that writes `more` may be under way.
 
-    Raises:
-        ArgumentError: They are not contiguous arrays of int64 with one axis and equally long.
+    Raises `ArgumentError` unless they are contiguous arrays of int64 with one axis and equally long.
     """
     check_array("total", total, wp.int64, (None,), contiguous=True)
     check_array("more", more, wp.int64, tuple(total.shape), contiguous=True)
-    for piece in pieces(total.size):
+    for piece in _pieces(total.size):
         part = more[piece].to(total.device)
         wp.launch(add_kernel, dim=part.size, inputs=[part], outputs=[total[piece]], device=total.device)
 
 
-@wp.func
-def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
-    """Index into the tally [component, pixel, bin], or BEFORE or AFTER the gate."""
-    k = gate_bin(gate, path)
-    if k < 0:
-        return k
-    return (component * camera.width * camera.height + pixel) * gate.bins + k
+def exact_sums(slots: NDArray[np.int64]) -> list[int]:
+    """Sums over the second axis, by halves, since they may exceed 64 bits."""
+    high, low = (slots >> 32).sum(axis=1).tolist(), (slots & 0xFFFFFFFF).sum(axis=1).tolist()
+    return [(upper << 32) + lower for upper, lower in zip(high, low, strict=True)]
 
 
 # ---- Low words: in a large launch on CUDA the low 32 bits of a tally's voxels are added up in an array of their own.
@@ -171,7 +138,7 @@ def add_to_words(tally: wp.array[wp.int64], split_accumulators: wp.array[wp.uint
     ...
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def fold_kernel(split_accumulators: wp.array[wp.uint32], tally: wp.array[wp.int64]):
     """Launch: voxels of all components. Takes the low words and adds them to the tally; other launches may add to both
     meanwhile."""
@@ -185,31 +152,194 @@ def fold_accumulators(split_accumulators: wp.array, tally: wp.array) -> None:
     wp.launch(fold_kernel, dim=tally.size, inputs=[split_accumulators, tally], device=tally.device)
 
 
+# ---- Batch means: exact sums and sums of squares over equal batches of photons, for the error of every bin.
+
+
+# Copies of a component's sum, so that threads seldom add to one address at the same time.
+_SLOTS = wp.constant(4096)
+
+_LOW32 = wp.constant(wp.uint64(0xFFFFFFFF))
+
+
+# Voxels that one thread of a CPU closes: most of a large histogram has no light in one batch, and goes by in vectors.
+_RUN = 32
+
+
+@wp.func_native("""
+    const int64_t* values = batch.data + first;
+    int64_t any = 0;
+    for (int i = 0; i < count; ++i)
+        any |= values[i];
+    return any != 0;
+""")
+def _has_light(batch: wp.array[wp.int64], first: int, count: int) -> bool:
+    """Whether one of `count` neighbours in a contiguous array is not zero."""
+    ...
+
+
+@wp.func
+def _add_wide(low: wp.array[wp.uint64], high: wp.array[wp.uint64], i: int, more_low: wp.uint64, more_high: wp.uint64):
+    """Adds to a 128-bit integer."""
+    total = low[i] + more_low
+    high[i] = high[i] + more_high + wp.where(total < more_low, wp.uint64(1), wp.uint64(0))
+    low[i] = total
+
+
+@wp.kernel
+def close_batch_kernel(
+    first: int,
+    component_count: int,
+    least: wp.int64,
+    run: int,
+    batch: wp.array[wp.int64],
+    # Out:
+    total: wp.array[wp.int64],
+    squares_low: wp.array[wp.uint64],
+    squares_high: wp.array[wp.uint64],
+    sums: wp.array[wp.int64],
+    overflow: wp.array[int],
+):
+    """Adds a batch to the total and the square of its sum over components to a 128-bit sum, and empties it.
+
+    `sums` takes its components, over voxels; `overflow` is set where a total leaves [least, 2^62).
+
+    Integers, so that the sums depend neither on the order of the batches nor on how they were merged.
+    Launch: runs of `run` voxels from the `first` on.
+    """
+    voxels = squares_low.shape[0]
+    begin = (first + wp.tid()) * run
+    end = wp.min(begin + run, voxels)
+    lit = bool(False)
+    for component in range(component_count):
+        lit = lit or _has_light(batch, component * voxels + begin, end - begin)
+    if not lit:
+        return
+    for voxel in range(begin, end):
+        t = wp.int64(0)
+        for component in range(component_count):
+            index = component * voxels + voxel
+            value = batch[index]
+            if value != wp.int64(0):
+                t += value
+                atomic_add_int64(sums, component * _SLOTS + voxel % _SLOTS, value)
+                new = total[index] + value
+                total[index] = new
+                batch[index] = wp.int64(0)
+                if new < least or new >= VOXEL_LIMIT:
+                    overflow[0] = 1
+        if t != wp.int64(0):
+            # Derivatives have signs. t^2 = high^2 2^64 + 2 low high 2^32 + low^2, with |t| < 2^63.
+            t = wp.abs(t)
+            low = wp.uint64(t) & _LOW32
+            high = wp.uint64(t) >> wp.uint64(32)
+            middle = wp.uint64(2) * low * high
+            _add_wide(squares_low, squares_high, voxel, low * low, high * high)
+            _add_wide(squares_low, squares_high, voxel, middle << wp.uint64(32), middle >> wp.uint64(32))
+
+
+@wp.kernel
+def add_squares_kernel(
+    more_low: wp.array[wp.uint64],
+    more_high: wp.array[wp.uint64],
+    squares_low: wp.array[wp.uint64],
+    squares_high: wp.array[wp.uint64],
+):
+    """Adds 128-bit integers. Launch: voxels."""
+    voxel = wp.tid()
+    _add_wide(squares_low, squares_high, voxel, more_low[voxel], more_high[voxel])
+
+
+class Batches:
+    """Totals and squares on the device of a tally; `total` may be the caller's own array of zeros.
+
+    `signed`: whether values may be negative, as those of derivatives.
+
+    Raises `ArgumentError` for arrays that do not fit each other.
+
+    Attributes:
+        total: int64, as the tally.
+        second_moment: Low and high halves of the sums of squares over batches, uint64 [voxels of one component] each.
+        count: Batches closed.
+    """
+
+    def __init__(
+        self, tally: wp.array, component_count: int, *, total: wp.array | None = None, signed: bool = False
+    ) -> None:
+        check_array("tally", tally, wp.int64, (None,), contiguous=True)
+        self._component_count = check_integer("component_count", component_count, 1, max(tally.size, 1))
+        if tally.size % component_count:
+            raise ArgumentError(
+                f"tally has {tally.size} entries, which {component_count} components do not share evenly"
+            )
+        if total is not None:
+            check_array("total", total, wp.int64, tuple(tally.shape), tally.device, contiguous=True)
+        self._signed, self._least = signed, wp.int64(1 - (1 << 62) if signed else 0)
+        with wp.ScopedDevice(tally.device):
+            self._sums = wp.zeros(component_count * _SLOTS, dtype=wp.int64)
+            self._overflow = wp.zeros(1, dtype=int)
+            self.total = wp.zeros(tally.size, dtype=wp.int64) if total is None else total
+            self.second_moment = tuple(wp.zeros(tally.size // component_count, dtype=wp.uint64) for _ in range(2))
+        self.count = 0
+
+    def close(self, tally: wp.array, *, threads: int = 1) -> None:
+        """Takes the tally over as one batch and sets it to zero; on a CPU with so many threads."""
+        check_array("tally", tally, wp.int64, tuple(self.total.shape), self.total.device, contiguous=True)
+        threads = 1 if tally.device.is_cuda else check_integer("threads", threads, 1, 4096)
+        run = 1 if tally.device.is_cuda else _RUN
+        inputs = [self._component_count, self._least, run, tally, self.total, *self.second_moment]
+        inputs += [self._sums, self._overflow]
+        runs = -(-self.second_moment[0].size // run)
+        launch_pixels(close_batch_kernel, runs, inputs, device=tally.device, threads=threads)
+        self.count += 1
+
+    def add(self, other: "Batches") -> None:
+        """Adds the batches of another tally of the same components, which may be on another device and must rest.
+
+        Raises `ArgumentError` for another size or number of components.
+        """
+        check_kind("other", other, Batches)
+        if other.second_moment[0].size != self.second_moment[0].size:
+            raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
+        device = self.total.device
+        add_tallies(self.total, other.total)
+        for piece in _pieces(self.second_moment[0].size):
+            more = [half[piece].to(device) for half in other.second_moment]
+            outputs = [half[piece] for half in self.second_moment]
+            wp.launch(add_squares_kernel, dim=more[0].size, inputs=more, outputs=outputs, device=device)
+        if has_overflowed(self.total, signed=self._signed):
+            self._overflow.fill_(1)
+        self.count += other.count
+
+    def has_overflowed(self) -> bool:
+        """Whether a voxel of the total has left the range that `has_overflowed` allows; waits for the device."""
+        return bool(self._overflow.numpy()[0])
+
+    def take_sums(self) -> list[int]:
+        """Each component of the batches closed since the last call, summed over voxels; waits for the device."""
+        sums = exact_sums(self._sums.numpy().reshape(self._component_count, _SLOTS))
+        self._sums.zero_()
+        return sums
+
+
 # ---- Tallies as rates on their device: sums over components in single precision.
 
 
-wp.set_module_options({"enable_backward": False})
-
-
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _rates_kernel(
     first_pixel: int,
-    tally: wp.array[wp.int64],
+    tally: wp.array4d[wp.int64],
     scale: wp.array[wp.float64],
     component: int,
     stop_component: int,
-    parameters: int,
     parameter: int,
     # Out:
     rates: wp.array2d[float],
 ):
     pixel = first_pixel + wp.tid()
-    bins = rates.shape[1]
-    for k in range(bins):
+    for k in range(rates.shape[1]):
         total = wp.int64(0)
         for c in range(component, stop_component):
-            voxel = (wp.int64(c) * wp.int64(rates.shape[0]) + wp.int64(pixel)) * wp.int64(bins) + wp.int64(k)
-            total += tally[int(voxel) * parameters + parameter]
+            total += tally[c, pixel, k, parameter]
         rates[pixel, k] = float(wp.float64(total) * scale[pixel])
 
 
@@ -235,19 +365,16 @@ def tally_rates(
     Raises:
         ArgumentError: Arrays or numbers that do not fit each other.
     """
-    check_array("tally", tally, wp.int64, (None,))
-    check_array("scale", scale, wp.float64, (None,), tally.device)
+    check_array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
     bins, parameters = check_integer("bins", bins, 1), check_integer("parameters", parameters, 1)
     if not (isinstance(components, tuple | list) and len(components) == 2):
         raise ArgumentError("components is not a pair such as (0, 3)")
-    first, stop = (check_integer("components", one, 0) for one in components)
-    parameter = check_integer("parameter", parameter, 0)
-    pixels = scale.shape[0]
-    if tally.size != 3 * pixels * bins * parameters:
-        raise ArgumentError(f"tally has {tally.size} values; {3 * pixels * bins * parameters} are needed")
-    if not (first < stop <= 3) or parameter >= parameters or tally.size >= 2**31:
-        raise ArgumentError(f"components {first} to {stop} or parameter {parameter} is outside the tally")
-    rates: Any = wp.empty((pixels, bins), dtype=float, device=tally.device)
-    inputs = [tally, scale, first, stop, parameters, parameter, rates]
-    launch_pixels(_rates_kernel, pixels, inputs, device=tally.device)
+    stop = check_integer("components[1]", components[1], 1, len(COMPONENTS))
+    first = check_integer("components[0]", components[0], 0, stop - 1)
+    parameter = check_integer("parameter", parameter, 0, parameters - 1)
+    shape = (len(COMPONENTS), scale.shape[0], bins, parameters)
+    check_array("tally", tally, wp.int64, (check_integer("values of tally", math.prod(shape), 0),), contiguous=True)
+    rates: Any = wp.empty(shape[1:3], dtype=float, device=tally.device)
+    inputs = [tally.reshape(shape), scale, first, stop, parameter, rates]
+    launch_pixels(_rates_kernel, shape[1], inputs, device=tally.device)
     return rates

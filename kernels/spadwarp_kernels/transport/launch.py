@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from operator import attrgetter
 
 import warp as wp
 
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
+    Need,
     check_array,
-    check_attributes,
     check_device,
     check_fields,
     check_integer,
@@ -19,29 +20,28 @@ from spadwarp_kernels.base.arguments import (
     check_number,
     check_seed,
     check_struct,
-    check_vector,
 )
 from spadwarp_kernels.base.native import zeros
 from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.base.tables import TABLE_CELLS
-from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.optics.camera import PLAIN, Camera, Gate, check_camera, ready_camera
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
 from spadwarp_kernels.optics.polarisation import MATRIX_POINTS, Polarisation
 from spadwarp_kernels.optics.port import check_port
-from spadwarp_kernels.photon.lanes import BLOCK_SIZE
-from spadwarp_kernels.photon.sink import Sink
-from spadwarp_kernels.photon.spec import TransportSpec, check_spec
-from spadwarp_kernels.photon.state import Records, make_records
-from spadwarp_kernels.photon.world import World
-from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, surface_choices
-from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
-from spadwarp_kernels.tally.blocks import (
+from spadwarp_kernels.photon.derivatives import (
+    DERIVATIVES,
     MOST_BLOCK_DERIVATIVES,
+    MOST_DERIVATIVES,
+    Derivatives,
     ready_blocks,
     threads_of_blocks,
 )
+from spadwarp_kernels.photon.queue import BLOCK_SIZE
+from spadwarp_kernels.photon.spec import TransportSpec, check_spec
+from spadwarp_kernels.photon.state import Launch, Records, Sink, World, make_records
+from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, surface_choices
+from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
 from spadwarp_kernels.tally.ledger import (
     BOUNDARY_COUNTERS,
     COUNTERS,
@@ -51,15 +51,13 @@ from spadwarp_kernels.tally.ledger import (
     OUTSIDE_SHIFT,
     PORT_ENTRY,
 )
-from spadwarp_kernels.tally.scores import DERIVATIVES, MOST_DERIVATIVES, Derivatives
 from spadwarp_kernels.tally.tally import (
     COMPONENTS,
+    exact_sums,
     find_overflow_kernel,
     fold_accumulators,
-    fold_kernel,
     splitting_pays,
 )
-from spadwarp_kernels.water.grid import Grid
 from spadwarp_kernels.water.limits import Limits, ready_limits
 from spadwarp_kernels.water.medium import Layers, Medium, ready_medium
 from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
@@ -67,6 +65,9 @@ from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
 from .loops import make_transport_kernel
 
 __all__ = ["Data", "Model", "launch_transport", "load_transport_kernel", "make_data", "read_ledger"]
+
+# The structs of a model, by name.
+_STRUCTS = {name: var.type for name, var in World.vars.items() if name not in ("seed", "keys")}
 
 
 @dataclass(frozen=True)
@@ -107,8 +108,12 @@ class Model:
     split_accumulators: bool = False
 
     def __post_init__(self) -> None:
-        check_model(self)
-        object.__setattr__(self, "device", wp.get_device(self.device))
+        object.__setattr__(self, "device", check_device("model.device", self.device))
+        for name, struct in _STRUCTS.items():
+            check_struct(f"model.{name}", getattr(self, name), struct)
+        if self.mesh is not None and not isinstance(self.mesh, wp.Mesh):
+            raise ArgumentError(f"model.mesh is {type(self.mesh).__name__}; a wp.Mesh or None is needed")
+        check_number("model.scale", self.scale, "(0, inf)")
 
     @property
     def tally_size(self) -> int:
@@ -179,147 +184,94 @@ def make_data(
 # ---- What a launch checks before it: a kernel trusts what it is given.
 
 
-_STRUCTS = {
-    "medium": Medium,
-    "laser": Laser,
-    "camera": Camera,
-    "gate": Gate,
-    "limits": Limits,
-    "guiding": Guiding,
-    "surfaces": Surfaces,
-    "layers": Layers,
-    "scan": Scan,
-    "derivatives": Derivatives,
-    "polarisation": Polarisation,
-}
-_MEDIUM = {"extinction": "[0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)", "axis_threshold": "(0, 1]"}
-_GUIDING = {
-    "probability": "[0, 1)",
-    "surface_probability": "[0, 1)",
-    "anisotropy": "(-1, 1)",
-    "return_probability": "[0, 1)",
-    "return_anisotropy": "(-1, 1)",
-}
+# Fields of a part of the model, by its path, and what each must be, see `check_fields`.
+Needs = Iterator[tuple[str, Mapping[str, Need]]]
+
 # What each laser profile reads.
 _BEAM = ({"spread": "[0, 2]"}, {"tan2": "[0, inf)"}, {"radius": "[0, inf)"})
-
-
-def check_model(model: Any) -> None:
-    """Kinds of what a model holds, and a device that exists."""
-    check_device("model.device", model.device)
-    for name, struct in _STRUCTS.items():
-        check_struct(f"model.{name}", getattr(model, name), struct)
-    if model.mesh is not None and not isinstance(model.mesh, wp.Mesh):
-        raise ArgumentError(f"model.mesh is {type(model.mesh).__name__}; a wp.Mesh or None is needed")
-    check_number("model.scale", model.scale, "(0, inf)")
 
 
 def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> None:
     """Everything that the kernel of a spec reads and writes: numbers in range, arrays long enough and on the device."""
     check_spec(spec)
-    estimator = make_estimator(spec)
-    if spec.mesh:
-        _check_surfaces(spec, model)
-    _check_water(spec, model)
-    _check_laser(spec, model)
-    _check_limits(spec, model)
-    if estimator.scores:
-        check_camera("model.camera", model.camera, calibrated=spec.lens.name != PLAIN.name)
-        check_integer("model.gate.bins", model.gate.bins, 1)
-        check_fields("model.gate", model.gate, {"start": "(-inf, inf)", "bins_per_metre": "(0, inf)"})
-        check_number("model.gate.stop", model.gate.stop, f"({float(model.gate.start)}, inf)")
-        if spec.port is not None:
-            check_port("model.camera.port", model.camera.port, spec.port)
-    if spec.laser_port is not None:
-        check_port("model.laser.port", model.laser.port, spec.laser_port)
-    if estimator.cross is not None:
-        check_fields("model.camera", model.camera, {"aperture_radius": "(0, inf)"})
-    if estimator.direct is not None:
-        check_fields("model.guiding", model.guiding, _GUIDING)
-    if spec.confocal:
-        _check_scan(model, estimator)
-    if spec.derivatives or spec.blocks:
-        _check_derivatives(spec, model)
-    if spec.polarised:
-        _check_polarisation(spec, model)
-    _check_data(spec, model, data, estimator, photon_count)
+    for needs in (_surface_needs, _water_needs, _light_needs, _limit_needs, _rider_needs):
+        for path, fields in needs(spec, model):
+            check_fields(f"model.{path}", attrgetter(path)(model), fields, model.device)
+    _check_data(spec, model, data, photon_count)
 
 
-def _check_water(spec: TransportSpec, model: Model) -> None:
-    medium, device = model.medium, model.device
-    check_fields("model.medium", medium, _MEDIUM)
+def _water_needs(spec: TransportSpec, model: Model) -> Needs:
+    layers, grid = model.layers, model.layers.grid
+    yield "medium", {"extinction": "[0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)", "axis_threshold": "(0, 1]"}
     if spec.phase.name == TABULATED.name:
-        check_attributes("model.medium.phase", medium.phase, device, cells=(3, TABLE_CELLS), guide=(3, TABLE_CELLS))
+        yield "medium.phase", {"cells": (3, TABLE_CELLS), "guide": (3, TABLE_CELLS)}
     if spec.layered:
-        layers = model.layers
-        check_attributes("model.layers", layers, device, start=(None,))
+        yield "layers", {"start": (None,), "axis": "unit"}
         check_integer("number of model.layers", layers.start.size, 1)
-        check_vector("model.layers.axis", layers.axis, unit=True)
-        shape = layers.start.shape
-        check_attributes("model.layers", layers, device, extinction=shape, albedo=shape, anisotropy=shape)
+        yield "layers", dict.fromkeys(("extinction", "albedo", "anisotropy"), layers.start.shape)
     if spec.grid is not None:
-        _check_grid(model.layers.grid, device)
+        yield "layers.grid", dict.fromkeys(("size", "block_size", "block_edge"), "[1, inf)")
+        cells, blocks, edge = math.prod(grid.size), math.prod(grid.block_size), grid.block_edge
+        if [*grid.block_size] != [-(-count // edge) for count in grid.size]:
+            raise ArgumentError(f"model.layers.grid: {[*grid.block_size]} blocks of {edge} cells; see make_grid")
+        yield "layers.grid", dict.fromkeys(("extinction", "albedo", "residual"), (cells,))
+        yield "layers.grid", dict.fromkeys(("block_majorant", "block_control"), (blocks,))
+        yield "layers.grid", {"anisotropy": (None,)}
+        if grid.anisotropy.size:
+            yield "layers.grid", {"anisotropy": (cells,)}
 
 
-def _check_grid(grid: Grid, device: wp.Device) -> None:
-    sizes = {"size": list(grid.size), "block_size": list(grid.block_size)}
-    for name, size in sizes.items():
-        for count in size:
-            check_integer(f"model.layers.grid.{name}", count, 1)
-    cells, blocks = (math.prod(size) for size in sizes.values())
-    check_attributes("model.layers.grid", grid, device, extinction=(cells,), albedo=(cells,), residual=(cells,))
-    check_attributes("model.layers.grid", grid, device, anisotropy=(None,))
-    if grid.anisotropy.size:
-        check_attributes("model.layers.grid", grid, device, anisotropy=(cells,))
-    edge = check_integer("model.layers.grid.block_edge", grid.block_edge, 1)
-    if sizes["block_size"] != [-(-count // edge) for count in sizes["size"]]:
-        raise ArgumentError(f"model.layers.grid: {sizes['block_size']} blocks of {edge} cells; see make_grid")
-    check_attributes("model.layers.grid", grid, device, block_majorant=(blocks,), block_control=(blocks,))
-
-
-def _check_laser(spec: TransportSpec, model: Model) -> None:
-    laser, device = model.laser, model.device
-    check_vector("model.laser.position", laser.position)
-    if not spec.confocal:
-        check_vector("model.laser.axis", laser.axis, unit=True)
+def _light_needs(spec: TransportSpec, model: Model) -> Needs:
+    laser, camera, estimator = model.laser, model.camera, make_estimator(spec)
+    yield "laser", {"position": "(-inf, inf)"}
     if spec.measured_beam:
-        check_attributes("model.laser", laser, device, rows=(None,))
+        yield "laser", {"rows": (None,), "extent": "(0, inf)"}
         check_integer("rows of the laser's profile", laser.rows.size, 1)
-        check_attributes("model.laser", laser, device, columns=(laser.rows.size, None))
+        yield "laser", {"columns": (laser.rows.size, None)}
         check_integer("columns of the laser's profile", laser.columns.shape[1], 1)
-        for extent in laser.extent:
-            check_number("model.laser.extent", extent, "(0, inf)")
     else:
-        profile = check_integer("model.laser.profile", laser.profile, 0, len(LASER_PROFILES) - 1)
-        check_fields("model.laser", laser, _BEAM[profile])
+        yield "laser", _BEAM[check_integer("model.laser.profile", laser.profile, 0, len(LASER_PROFILES) - 1)]
+    if spec.laser_port is not None:
+        check_port("model.laser.port", laser.port, spec.laser_port)
+    if spec.confocal:
+        most = camera.width * camera.height if estimator.scores else 2**31 - 1
+        count = check_integer("model.scan.count", model.scan.count, 1, most)
+        yield "scan", {"axis": (None,), "view": (None,)}
+        for name in ("axis", "view"):
+            check_integer(f"entries of model.scan.{name}", getattr(model.scan, name).size, count)
+    else:
+        yield "laser", {"axis": "unit"}
+    if estimator.scores:
+        check_camera("model.camera", camera, calibrated=spec.lens.name != PLAIN.name)
+        yield "gate", {"bins": "[1, inf)", "start": "(-inf, inf)", "bins_per_metre": "(0, inf)"}
+        yield "gate", {"stop": f"({float(model.gate.start)}, inf)"}
+        if spec.port is not None:
+            check_port("model.camera.port", camera.port, spec.port)
+    if estimator.cross is not None:
+        yield "camera", {"aperture_radius": "(0, inf)"}
+    if estimator.direct is not None:
+        yield "guiding", dict.fromkeys(("probability", "surface_probability", "return_probability"), "[0, 1)")
+        yield "guiding", dict.fromkeys(("anisotropy", "return_anisotropy"), "(-1, 1)")
 
 
-def _check_limits(spec: TransportSpec, model: Model) -> None:
-    limits = model.limits
-    check_fields("model.limits", limits, {"max_path": "(0, inf)", "weight_cutoff": "[0, 1)"})
-    check_integer("model.limits.max_collisions", limits.max_collisions, 0)
+def _limit_needs(spec: TransportSpec, model: Model) -> Needs:
+    yield "limits", {"max_path": "(0, inf)", "weight_cutoff": "[0, 1)", "max_collisions": "[0, inf)"}
     if spec.bounded:
-        check_number("model.limits.lateral", limits.lateral, "(0, inf)")
-        for low, high in zip(limits.lower, limits.upper, strict=True):
-            check_number("model.limits.lower", low)
-            check_number("model.limits.upper", high, f"({float(low)}, inf)")
+        yield "limits", {"lateral": "(0, inf)", "lower": "(-inf, inf)", "upper": "(-inf, inf)"}
+        for axis, (low, high) in enumerate(zip(model.limits.lower, model.limits.upper, strict=True)):
+            check_number(f"model.limits.upper[{axis}]", high, f"({float(low)}, inf)")
     if spec.reflecting:
-        boundary = limits.boundary
-        for name, indices in (("low", boundary.low), ("high", boundary.high)):
-            for axis in range(3):
-                check_number(f"model.limits.boundary.{name}[{axis}]", indices[axis], "[0, 1e9]")
-        check_integer("model.limits.boundary.max_reflections", boundary.max_reflections, 0)
-        check_attributes("model.limits.boundary", boundary, model.device, images=(None,))
+        yield "limits.boundary", {"low": "[0, 1e9]", "high": "[0, 1e9]", "max_reflections": "[0, inf)"}
+        yield "limits.boundary", {"images": (None,)}
     if spec.rotated_domain:
-        check_vector("model.limits.origin", limits.origin)
-        rows = [[limits.rotation[i, j] for j in range(3)] for i in range(3)]
-        for row in rows:
-            check_vector("model.limits.rotation, a row", row, unit=True)
+        yield "limits", {"origin": "(-inf, inf)", "rotation": "unit"}
 
 
-def _check_surfaces(spec: TransportSpec, model: Model) -> None:
-    surfaces, device = model.surfaces, model.device
-    check_attributes("model.surfaces", surfaces, device, reflectance=(None,), nodes=(None,), near_depth=(None, None))
+def _surface_needs(spec: TransportSpec, model: Model) -> Needs:
+    if not spec.mesh:
+        return
+    surfaces = model.surfaces
+    yield "surfaces", {"reflectance": (None,), "nodes": (None,), "near_depth": (None, None)}
     faces = surfaces.reflectance.size
     if faces == 0:
         raise ArgumentError("spec.mesh = True needs surfaces of a mesh, see make_surfaces; model.surfaces has no faces")
@@ -332,28 +284,28 @@ def _check_surfaces(spec: TransportSpec, model: Model) -> None:
             raise ArgumentError(
                 f"spec.{name} = {getattr(spec, name)} does not go with the model's surfaces, see surface_choices"
             )
-    check_faces("model.surfaces", surfaces, faces, device)
+    check_faces("model.surfaces", surfaces, faces, model.device)
     if spec.use_warp_bvh and (model.mesh is None or model.mesh.id != surfaces.mesh):
         raise ArgumentError(
             "spec.use_warp_bvh = True reads the mesh that the surfaces were made of, which has to be model.mesh: the "
             "model keeps it"
         )
-    if spec.brute_force and device.is_cuda:
-        check_patches("model.surfaces", surfaces, faces, device)
+    if spec.brute_force and model.device.is_cuda:
+        check_patches("model.surfaces", surfaces, faces, model.device)
     if spec.pattern:
-        textures = surfaces.textures
-        check_attributes("model.surfaces", surfaces, device, corner_reflectance=(faces,))
-        check_attributes("model.surfaces.textures", textures, device, face=(None,))
-        if textures.face.size:
-            check_attributes("model.surfaces.textures", textures, device, face=(faces,), coordinates=(faces, 3))
+        yield "surfaces", {"corner_reflectance": (faces,)}
+        yield "surfaces.textures", {"face": (None,)}
+        if surfaces.textures.face.size:
+            yield "surfaces.textures", {"face": (faces,), "coordinates": (faces, 3)}
     if spec.specular:
-        check_attributes("model.surfaces", surfaces, device, specular=(faces,), roughness=(faces,))
+        yield "surfaces", {"specular": (faces,), "roughness": (faces,)}
 
 
-def _check_derivatives(spec: TransportSpec, model: Model) -> None:
-    derivatives, device = model.derivatives, model.device
+def _rider_needs(spec: TransportSpec, model: Model) -> Needs:
+    derivatives, faces = model.derivatives, (model.surfaces.reflectance.size,) if spec.mesh else ()
     for p, kind in enumerate(spec.derivatives):
         check_number(f"model.derivatives.value[{p}]", derivatives.value[p], DERIVATIVES[kind])
+    for p in range(spec.signed):
         check_number(f"model.derivatives.scale[{p}]", derivatives.scale[p], "(0, inf)")
     if spec.blocks:
         blocks = derivatives.blocks
@@ -364,65 +316,49 @@ def _check_derivatives(spec: TransportSpec, model: Model) -> None:
             raise ArgumentError(f"model.derivatives.blocks.count = {count}; see make_blocks")
         for q in range(len(spec.blocks)):
             check_number(f"model.derivatives.blocks.scale[{q}]", blocks.scale[q], "(0, inf)")
-    if spec.layered:
-        check_attributes("model.derivatives", derivatives, device, waters=(model.layers.start.size,))
+    if spec.derivatives and spec.layered:
+        yield "derivatives", {"waters": (model.layers.start.size,)}
     if "reflectance" in spec.derivatives:
-        check_attributes("model.derivatives", derivatives, device, faces=(model.surfaces.reflectance.size,))
+        yield "derivatives", {"faces": faces}
+    if spec.polarised:
+        if model.medium.axis_threshold < 1.0:
+            raise ArgumentError(
+                f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.polarised = True needs 1, without "
+                "the near-axis rule, which has no plane of scattering"
+            )
+        yield "polarisation", {"first": (MATRIX_POINTS,), "last": (MATRIX_POINTS,)}
+        if spec.specular and spec.mesh:
+            yield "polarisation", {"facet_index": faces}
 
 
-def _check_polarisation(spec: TransportSpec, model: Model) -> None:
-    polarisation, device = model.polarisation, model.device
-    if model.medium.axis_threshold < 1.0:
-        raise ArgumentError(
-            f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.polarised = True needs 1, without the "
-            "near-axis rule, which has no plane of scattering"
-        )
-    check_attributes("model.polarisation", polarisation, device, first=(MATRIX_POINTS,), last=(MATRIX_POINTS,))
-    for k in range(spec.channels):
-        check_number(f"model.derivatives.scale[{k}]", model.derivatives.scale[k], "(0, inf)")
-    if spec.specular:
-        check_attributes("model.polarisation", polarisation, device, facet_index=(model.surfaces.reflectance.size,))
+def _check_data(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> None:
+    device, scores = model.device, make_estimator(spec).scores
 
+    def check(name: str, dtype: type, size: int | None) -> None:
+        check_array(f"data.{name}", getattr(data, name), dtype, (size,), device, contiguous=True)
 
-def _check_scan(model: Model, estimator: Estimator) -> None:
-    scan, camera = model.scan, model.camera
-    most = camera.width * camera.height if estimator.scores else 2**31 - 1
-    count = check_integer("model.scan.count", scan.count, 1, most)
-    check_attributes("model.scan", scan, model.device, axis=(None,), view=(None,))
-    for name in ("axis", "view"):
-        check_integer(f"entries of model.scan.{name}", getattr(scan, name).size, count)
-
-
-def _check_data(spec: TransportSpec, model: Model, data: Data, estimator: Estimator, photon_count: int) -> None:
-    device = model.device
     bins = model.tally_size // len(COMPONENTS) if spec.merged else model.tally_size
-    size = check_integer("bins of the tally", bins, 1) if estimator.scores else None
-    check_array("data.tally", data.tally, wp.int64, (size,), device, contiguous=True)
-    signed = spec.signed + len(spec.blocks) * model.derivatives.blocks.count
-    if signed and size is not None:
-        size = check_integer("bins of data.gradients", size * signed, 1)
-        check_array("data.gradients", data.gradients, wp.int64, (size,), device, contiguous=True)
-    elif data.gradients is not None:
-        check_array("data.gradients", data.gradients, wp.int64, (None,), device)
+    check("tally", wp.int64, check_integer("bins of the tally", bins, 1) if scores else None)
+    signed = spec.signed + len(spec.blocks) * model.derivatives.blocks.count if scores else 0
+    if signed or data.gradients is not None:
+        check("gradients", wp.int64, check_integer("bins of data.gradients", bins * signed, 1) if signed else None)
     if data.split_accumulators is not None:
-        check_array(
-            "data.split_accumulators", data.split_accumulators, wp.uint32, (data.tally.size,), device, contiguous=True
-        )
-    check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,), device, contiguous=True)
-    check_array("data.cursor", data.cursor, wp.int32, (1,), device)
+        check("split_accumulators", wp.uint32, data.tally.size)
+    check("ledger", wp.int64, LEDGER_SLOTS * LEDGER_WIDTH)
+    check("cursor", wp.int32, 1)
     if spec.stepped or data.offset is not None:
-        check_array("data.offset", data.offset, wp.uint64, (1,), device)
+        check("offset", wp.uint64, 1)
     check_struct("data.records", data.records, Records)
     if spec.records:
-        for name, var in Records.vars.items():
-            if name == "log_derivatives" and not spec.derivatives:
-                continue
-            shape = (None, len(spec.derivatives)) if name == "log_derivatives" else (None,)
-            array = check_array(f"data.records.{name}", getattr(data.records, name), var.type.dtype, shape, device)
-            if array.shape[0] < photon_count:
+        shapes: dict[str, Need] = dict.fromkeys(Records.vars, (None,))
+        shapes["log_derivatives"] = (None, len(spec.derivatives))
+        for name in shapes if spec.derivatives else [*shapes][:-1]:
+            check_fields("data.records", data.records, {name: shapes[name]}, device)
+            room = getattr(data.records, name).shape[0]
+            if room < photon_count:
                 raise ArgumentError(
-                    f"data.records.{name} has room for {array.shape[0]} photons; spec.records = True needs "
-                    f"{photon_count}, see record_count of make_data"
+                    f"data.records.{name} has room for {room} photons; spec.records = True needs {photon_count}, see "
+                    "record_count of make_data"
                 )
 
 
@@ -453,8 +389,6 @@ def load_transport_kernel(
         split_accumulators = splits_accumulators(spec, model, photon_count)
     kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators)
     kernel.module.load(device, BLOCK_SIZE if device.is_cuda else 1)
-    if split_accumulators:
-        wp.load_module(fold_kernel.module, device=device)
     # Loaded here and not by a worker: each thread that compiles makes Warp prepare its headers anew, 1.5 s on a CPU.
     wp.load_module(find_overflow_kernel.module, device=device)
 
@@ -506,11 +440,16 @@ def launch_transport(
         threads = threads_of_blocks(threads, model.derivatives.blocks)
     data.cursor.zero_()
     split_accumulators = _split_accumulators(spec, model, data, photon_count)
-    world, sink = _make_world(spec, model, seed, threads), _make_sink(model, data, split_accumulators)
+    launch = Launch()
+    launch.first_id, launch.photon_count, launch.threads = first_id, photon_count, threads
+    launch.cursor, launch.offset = data.cursor, data.offset
+    sink = Sink()
+    sink.tally, sink.ledger, sink.scale, sink.records = data.tally, data.ledger, model.scale, data.records
+    sink.gradients, sink.low = data.gradients, split_accumulators
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda, split_accumulators is not None),
         dim=threads,
-        inputs=[world, sink, data.records, first_id, photon_count, threads, data.cursor, data.offset],
+        inputs=[_make_world(spec, model, seed, threads), sink, launch],
         device=model.device,
         block_dim=BLOCK_SIZE,
     )
@@ -548,16 +487,6 @@ def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> W
     return world
 
 
-def _make_sink(model: Model, data: Data, split_accumulators: wp.array | None) -> Sink:
-    sink = Sink()
-    sink.tally, sink.ledger, sink.scale = data.tally, data.ledger, model.scale
-    if data.gradients is not None:
-        sink.gradients = data.gradients
-    if split_accumulators is not None:
-        sink.low = split_accumulators
-    return sink
-
-
 def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device.
 
@@ -566,19 +495,10 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """
     check_kind("data", data, Data)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
-    slots = data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS)
-    # In halves: light outside the gate may exceed 64 bits in all.
-    high, low = (slots >> 32).sum(axis=1).tolist(), (slots & 0xFFFFFFFF).sum(axis=1).tolist()
-    values = {
-        name: (upper << 32) + lower
-        for name, upper, lower in zip(
-            LEDGER_ENTRIES + COUNTERS + (PORT_ENTRY,) + BOUNDARY_COUNTERS, high, low, strict=True
-        )
-    }
+    sums = exact_sums(data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS))
+    values = dict(zip(LEDGER_ENTRIES + COUNTERS + (PORT_ENTRY,) + BOUNDARY_COUNTERS, sums, strict=True))
     for name in ("before_gate", "after_gate"):
         values[name] <<= int(OUTSIDE_SHIFT)
-    entries = {n: values[n] for n in LEDGER_ENTRIES}
-    if values[PORT_ENTRY]:
-        entries[PORT_ENTRY] = values[PORT_ENTRY]
+    entries = (*LEDGER_ENTRIES, PORT_ENTRY) if values[PORT_ENTRY] else LEDGER_ENTRIES
     counters = COUNTERS + BOUNDARY_COUNTERS if data.reflecting else COUNTERS
-    return entries, {n: values[n] for n in counters}
+    return {name: values[name] for name in entries}, {name: values[name] for name in counters}

@@ -6,7 +6,6 @@ from .grid import *
 from .limits import *
 from .medium import *
 from .phase_functions import *
-from .tracking import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = grid.__all__ + limits.__all__ + medium.__all__ + phase_functions.__all__ + tracking.__all__
+    __all__ = grid.__all__ + limits.__all__ + medium.__all__ + phase_functions.__all__

@@ -10,11 +10,12 @@ which it meets the faces, and crosses each on the face.
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_integer, check_items, check_number
+from spadwarp_kernels.base.kernels import memoised
 
 __all__ = ["Boundary", "Limits", "make_boundary"]
 
@@ -70,34 +71,28 @@ def flipped(u: wp.vec3, axis: int) -> wp.vec3:
 
 
 @wp.func
-def _image_coordinate(x: float, low: float, high: float, number: int) -> float:
-    """A coordinate as it is in the cell of a number; a face without its opposite is met once."""
-    if number % 2 == 0:
-        return x + float(number) * (high - low)
-    if number > 0:
-        return 2.0 * high - x + float(number - 1) * (high - low)
-    return 2.0 * low - x + float(number + 1) * (high - low)
-
-
-@wp.func
 def image_point(lower: wp.vec3, upper: wp.vec3, image: wp.vec3i, x: wp.vec3) -> wp.vec3:
     """Where a point of the domain [m] is seen after the reflections of an image."""
-    return wp.vec3(
-        _image_coordinate(x[0], lower[0], upper[0], image[0]),
-        _image_coordinate(x[1], lower[1], upper[1], image[1]),
-        _image_coordinate(x[2], lower[2], upper[2], image[2]),
-    )
-
-
-@wp.func
-def _turned(u: float, number: int) -> float:
-    return wp.where(number % 2 == 0, u, -u)
+    seen = wp.vec3()
+    for i in range(3):
+        number = image[i]
+        size = upper[i] - lower[i]
+        if number % 2 == 0:
+            seen[i] = x[i] + float(number) * size
+        elif number > 0:
+            seen[i] = 2.0 * upper[i] - x[i] + float(number - 1) * size
+        else:  # a face without its opposite is met once
+            seen[i] = 2.0 * lower[i] - x[i] + float(number + 1) * size
+    return seen
 
 
 @wp.func
 def image_direction(image: wp.vec3i, u: wp.vec3) -> wp.vec3:
     """A direction at the point as it is at its image, and the other way round."""
-    return wp.vec3(_turned(u[0], image[0]), _turned(u[1], image[1]), _turned(u[2], image[2]))
+    v = wp.vec3()
+    for i in range(3):
+        v[i] = wp.where(image[i] % 2 == 0, u[i], -u[i])
+    return v
 
 
 @wp.func
@@ -131,41 +126,6 @@ def image_reflectance(boundary: Boundary, image: wp.vec3i, u: wp.vec3) -> float:
     return product
 
 
-def _checked_faces(low: Any, high: Any, max_reflections: Any) -> tuple[list[float], list[float], int]:
-    found = {}
-    for name, indices in (("low", low), ("high", high)):
-        items = check_items(name, indices)
-        if len(items) != 3:
-            raise ArgumentError(f"{name} = {indices!r} is not three numbers")
-        found[name] = [
-            check_number(f"{name}, {axis},", one, "[0, 1e9]") for axis, one in zip("xyz", items, strict=True)
-        ]
-    return found["low"], found["high"], check_integer("max_reflections", max_reflections, 0, 8)
-
-
-def reflection_images(low: Sequence[float], high: Sequence[float], max_reflections: int) -> list[tuple[int, int, int]]:
-    """All chains of at most so many reflections as the numbers of `Boundary.images`, those of few reflections first.
-
-    Args:
-        low, high: See `Boundary`.
-        max_reflections: 0 ... 8.
-
-    Raises:
-        ArgumentError: A number out of range.
-    """
-    low, high, max_reflections = _checked_faces(low, high, max_reflections)
-    numbers = [
-        [
-            k
-            for k in range(-max_reflections, max_reflections + 1)
-            if k == 0 or (abs(k) == 1 and (a, b)[k > 0] > 0) or (abs(k) > 1 and a > 0 and b > 0)
-        ]
-        for a, b in zip(low, high, strict=True)
-    ]
-    found = [(x, y, z) for x, y, z in itertools.product(*numbers) if 0 < abs(x) + abs(y) + abs(z) <= max_reflections]
-    return sorted(found, key=lambda image: (sum(map(abs, image)), image))
-
-
 def make_boundary(
     low: Sequence[float], high: Sequence[float], *, max_reflections: int = 2, device: wp.DeviceLike = None
 ) -> Boundary:
@@ -180,22 +140,29 @@ def make_boundary(
     Raises:
         ArgumentError: A number out of range, or all faces let light out.
     """
-    low, high, max_reflections = _checked_faces(low, high, max_reflections)
-    if not any((*low, *high)):
+    sides: dict[str, list[Any]] = {"low": check_items("low", low), "high": check_items("high", high)}
+    for name, indices in sides.items():
+        if len(indices) != 3:
+            raise ArgumentError(f"{name} = {indices!r} is not three numbers")
+        sides[name] = [check_number(f"{name}, {axis},", indices[k], "[0, 1e9]") for k, axis in enumerate("xyz")]
+    most = check_integer("max_reflections", max_reflections, 0, 8)
+    if not any((*sides["low"], *sides["high"])):
         raise ArgumentError("low and high: all faces let all light out; such a spec is not `reflecting`")
+    # A face without its opposite is met once. Ways of few reflections come first.
+    numbers = [
+        [k for k in range(-most, most + 1) if k == 0 or (pair[k > 0] > 0 and (abs(k) == 1 or min(pair) > 0))]
+        for pair in zip(*sides.values(), strict=True)
+    ]
+    chains = [chain for chain in itertools.product(*numbers) if 0 < sum(map(abs, chain)) <= most]
+    images = sorted(chains, key=lambda chain: (sum(map(abs, chain)), chain))
     boundary = Boundary()
-    boundary.low, boundary.high = wp.vec3(*low), wp.vec3(*high)
-    images = reflection_images(low, high, max_reflections)
+    boundary.low, boundary.high = (wp.vec3(*indices) for indices in sides.values())
     boundary.images = wp.array(images, dtype=wp.vec3i, device=check_device("device", device), shape=len(images))
-    boundary.max_reflections = max_reflections
+    boundary.max_reflections = most
     return boundary
 
 
 # ---- The box and the limits.
-
-
-# Where a history may leave, in the order of `exit_face`.
-EXIT_FACES = ("lateral_limit", "exit_x_low", "exit_x_high", "exit_y_low", "exit_y_high", "exit_z_low", "exit_z_high")
 
 
 @wp.struct
@@ -204,8 +171,8 @@ class Limits:
 
     Attributes:
         lower, upper: The domain [m]; a flight that reaches a face leaves and is tallied by face, or is reflected.
-        rotation, origin: The domain's own axes: x lies at rotation x + origin in them. Read by `..._rotated` alone, the
-            others take lower and upper as they stand in the frame of the flight.
+        rotation, origin: The domain's own axes: x lies at rotation x + origin in them. Read with `rotated_domain`
+            alone, else lower and upper stand in the frame of the flight.
         lateral: A history ends where |x| or |y| reaches this [m].
         max_path: Geometric path [m].
         weight_cutoff: A history ends after an event that leaves its analog weight below this.
@@ -242,22 +209,12 @@ def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
 
 
 @wp.func
-def _to_sides(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-    return wp.min(
-        _to_plane(x[0], u[0], -limits.lateral, limits.lateral), _to_plane(x[1], u[1], -limits.lateral, limits.lateral)
-    )
-
-
-@wp.func
 def to_next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
     """Distance [m] from x along u to a face of the domain; both in its own axes."""
-    return wp.min(
-        _to_plane(x[0], u[0], limits.lower[0], limits.upper[0]),
-        wp.min(
-            _to_plane(x[1], u[1], limits.lower[1], limits.upper[1]),
-            _to_plane(x[2], u[2], limits.lower[2], limits.upper[2]),
-        ),
-    )
+    distance = float(1.0e30)
+    for i in range(3):
+        distance = wp.min(distance, _to_plane(x[i], u[i], limits.lower[i], limits.upper[i]))
+    return distance
 
 
 @wp.struct
@@ -269,7 +226,8 @@ class Exit:
 
 
 @wp.func
-def _first_exit(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> Exit:
+def next_face(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> Exit:
+    """The face that a ray meets, in the domain's own axes; face 0 where it comes to the distance `to_sides` before."""
     first = Exit()
     best = float(to_sides)
     face = int(0)
@@ -283,68 +241,62 @@ def _first_exit(limits: Limits, to_sides: float, x: wp.vec3, u: wp.vec3) -> Exit
     return first
 
 
-@wp.func
-def _outside_sides(limits: Limits, x: wp.vec3) -> bool:
-    return wp.abs(x[0]) > limits.lateral or wp.abs(x[1]) > limits.lateral
+class Domain(NamedTuple):
+    """The domain's axes and where a flight leaves it, as Warp functions; lateral limits keep to the frame of the
+    flight, as do points x and directions u."""
+
+    point: wp.Function  # ``(limits, x) -> vec3``, x in the domain's axes
+    point_back: wp.Function  # the inverse
+    turn: wp.Function  # ``(limits, u) -> vec3``, u in the domain's axes
+    turn_back: wp.Function  # the inverse
+    is_outside: wp.Function  # ``(limits, x) -> bool``, outside the domain or beyond the lateral limit
+    exit: wp.Function  # ``(limits, x, u) -> Exit``, of what a ray meets first
+    exit_distance: wp.Function  # ``(limits, x, u) -> float``, the distance of that [m]
 
 
-@wp.func
-def _outside_faces(limits: Limits, x: wp.vec3) -> bool:
-    low = x[0] < limits.lower[0] or x[1] < limits.lower[1] or x[2] < limits.lower[2]
-    return low or x[0] > limits.upper[0] or x[1] > limits.upper[1] or x[2] > limits.upper[2]
+@memoised
+def make_domain(rotated: bool) -> Domain:
+    """The domain of a spec; `rotated`: it has axes of its own."""
 
+    @wp.func
+    def point(limits: Limits, x: wp.vec3) -> wp.vec3:
+        return limits.rotation * x + limits.origin if wp.static(rotated) else x
 
-@wp.func
-def is_outside(limits: Limits, x: wp.vec3) -> bool:
-    """Whether x lies outside the domain or beyond the lateral limit."""
-    return _outside_sides(limits, x) or _outside_faces(limits, x)
+    @wp.func
+    def point_back(limits: Limits, x: wp.vec3) -> wp.vec3:
+        return wp.transpose(limits.rotation) * (x - limits.origin) if wp.static(rotated) else x
 
+    @wp.func
+    def turn(limits: Limits, u: wp.vec3) -> wp.vec3:
+        return limits.rotation * u if wp.static(rotated) else u
 
-@wp.func
-def is_outside_rotated(limits: Limits, x: wp.vec3) -> bool:
-    """As `is_outside`, for a domain with axes of its own."""
-    return _outside_sides(limits, x) or _outside_faces(limits, limits.rotation * x + limits.origin)
+    @wp.func
+    def turn_back(limits: Limits, u: wp.vec3) -> wp.vec3:
+        return wp.transpose(limits.rotation) * u if wp.static(rotated) else u
 
+    @wp.func
+    def outside_faces(limits: Limits, y: wp.vec3) -> bool:
+        outside = bool(False)
+        for i in range(3):
+            outside = outside or y[i] < limits.lower[i] or y[i] > limits.upper[i]
+        return outside
 
-@wp.func
-def next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
-    """Index into EXIT_FACES of the face of `to_next_face`; 0: there is none."""
-    return _first_exit(limits, 9.0e29, x, u).face
+    @wp.func
+    def is_outside(limits: Limits, x: wp.vec3) -> bool:
+        aside = wp.abs(x[0]) > limits.lateral or wp.abs(x[1]) > limits.lateral
+        return aside or outside_faces(limits, point(limits, x))
 
+    @wp.func
+    def to_sides(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+        aside = _to_plane(x[0], u[0], -limits.lateral, limits.lateral)
+        return wp.min(aside, _to_plane(x[1], u[1], -limits.lateral, limits.lateral))
 
-@wp.func
-def first_exit(limits: Limits, x: wp.vec3, u: wp.vec3) -> Exit:
-    """`exit_distance` and `exit_face` at once."""
-    return _first_exit(limits, _to_sides(limits, x, u), x, u)
+    @wp.func
+    def exit(limits: Limits, x: wp.vec3, u: wp.vec3) -> Exit:
+        return next_face(limits, to_sides(limits, x, u), point(limits, x), turn(limits, u))
 
+    @wp.func
+    def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
+        return wp.min(to_sides(limits, x, u), to_next_face(limits, point(limits, x), turn(limits, u)))
 
-@wp.func
-def first_exit_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> Exit:
-    """`exit_distance_rotated` and `exit_face_rotated` at once."""
-    return _first_exit(limits, _to_sides(limits, x, u), limits.rotation * x + limits.origin, limits.rotation * u)
-
-
-@wp.func
-def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-    """Distance [m] along u at which the ray leaves the domain or the lateral limit."""
-    return wp.min(_to_sides(limits, x, u), to_next_face(limits, x, u))
-
-
-@wp.func
-def exit_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
-    """Index into EXIT_FACES of what a ray from x along u meets first: a face of the domain, else the lateral limit."""
-    return first_exit(limits, x, u).face
-
-
-@wp.func
-def exit_distance_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-    """As `exit_distance`, for a domain with axes of its own; the lateral limit keeps to the frame of the flight."""
-    return wp.min(
-        _to_sides(limits, x, u), to_next_face(limits, limits.rotation * x + limits.origin, limits.rotation * u)
-    )
-
-
-@wp.func
-def exit_face_rotated(limits: Limits, x: wp.vec3, u: wp.vec3) -> int:
-    """As `exit_face`, for a domain with axes of its own; faces are named after them."""
-    return first_exit_rotated(limits, x, u).face
+    return Domain(point, point_back, turn, turn_back, is_outside, exit, exit_distance)

@@ -24,9 +24,7 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
-from .grid import Grid
-
-__all__ = ["Layers", "Medium", "free_path", "make_layers"]
+__all__ = ["Grid", "Layers", "Medium", "free_path", "make_layers"]
 
 
 @wp.struct
@@ -82,6 +80,36 @@ def ready_free_path(xi: float, medium: Medium) -> float:
 
 
 _RANGES = {"start": "(-inf, inf)", "extinction": "(0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)"}
+
+
+@wp.struct
+class Grid:
+    """Cells of water in a box, made by `make_grid`.
+
+    Attributes:
+        turn, shift: A point x [m] lies at turn x + shift in cells; the box has 0 ... size there.
+        size: Number of cells along the three edges.
+        extinction: c [1/m] by cell, the last edge fastest.
+        albedo: Single-scattering albedo in [0, 1].
+        anisotropy: g in (-1, 1), for phase functions that use the medium's; empty: the medium's everywhere.
+        block_edge: Cells along the edges of a block.
+        block_size: Number of blocks along the three edges of the box; the last may be incomplete.
+        block_majorant: Largest c in each block [1/m].
+        block_control: Mean c of each block, and the largest difference from it in the block [1/m].
+        residual: c less the block's, see `block_statistics` [1/m], by cell.
+    """
+
+    turn: wp.mat33
+    shift: wp.vec3
+    size: wp.vec3i
+    extinction: wp.array[float]
+    albedo: wp.array[float]
+    anisotropy: wp.array[float]
+    block_edge: int
+    block_size: wp.vec3i
+    block_majorant: wp.array[float]
+    block_control: wp.array[wp.vec2]
+    residual: wp.array[float]
 
 
 @wp.struct
@@ -255,9 +283,8 @@ def make_layers(
     check_vector("axis", axis, unit=True)
     for name, interval in _RANGES.items():
         for k, value in enumerate(columns[name]):
-            check_number(f"{name}[{k}]", value, interval)
-    for k in range(2, len(start)):
-        check_number(f"start[{k}]", start[k], f"[{float(start[k - 1])}, inf)")
+            above = name == "start" and k > 1
+            check_number(f"{name}[{k}]", value, f"[{float(start[k - 1])}, inf)" if above else interval)
     layers = Layers()
     layers.axis = wp.vec3(*axis)
     for name, column in columns.items():

@@ -2,19 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-from .closed_forms import *
-from .config import *
 from .shapes import *
 from .simulators import *
 from .spad_camera import *
 from .spad_tracer import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = (
-        closed_forms.__all__
-        + config.__all__
-        + shapes.__all__
-        + simulators.__all__
-        + spad_camera.__all__
-        + spad_tracer.__all__
-    )
+    __all__ = shapes.__all__ + simulators.__all__ + spad_camera.__all__ + spad_tracer.__all__

@@ -1,7 +1,10 @@
-"""What stands in the worlds: shapes on bodies, as the arrays that a simulator has on the device."""
+"""Shapes on bodies in many worlds, as the arrays that a simulator has on the device, and rays against them.
+
+Shapes other than meshes are met in closed form, in their own frame: centred at the origin, along z, as in Newton and
+MuJoCo. Surfaces have two sides.
+"""
 
 import gc
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,17 +19,24 @@ from spadwarp_kernels.base.arguments import (
     check_items,
     check_kind,
     check_struct,
+    check_values,
 )
 from spadwarp_kernels.surface.mesh import Textures, no_textures
 from spadwarp_kernels.surface.reflectance import texture_at
 
-from .closed_forms import MESH, SHAPE_KINDS, ShapeHit, intersect_shape
-
-__all__ = ["Shapes", "make_shapes"]
+__all__ = ["SHAPE_KINDS", "Shapes", "make_shapes"]
 
 wp.set_module_options({"enable_backward": False})
 
-_FAR = wp.constant(1.0e10)
+SHAPE_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "cone", "mesh")
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, CONE, MESH = (wp.constant(i) for i in range(len(SHAPE_KINDS)))
+
+# Components of a size that say something; those of a mesh may be negative, which mirrors it.
+_COMPONENTS = {"plane": 2, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "cone": 2, "mesh": 0}
+
+_FAR = wp.constant(1.0e30)
+# Farthest shape that counts [m].
+_REACH = wp.constant(1.0e10)
 
 
 @wp.struct
@@ -109,60 +119,33 @@ def make_shapes(
     """
     device = check_device("device", device)
     worlds = check_integer("worlds", worlds, 1, 1 << 24)
-    table = ShapeTable()
     if not isinstance(kind, wp.array):
         kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in check_items("kind", kind)])
         if kind.dtype.kind not in "iu" or kind.size == 0:
-            raise ArgumentError(
-                f"kind = {kind.tolist()} is not a list of {', '.join(SHAPE_KINDS)}, or of their indices"
-            )
+            names = ", ".join(SHAPE_KINDS)
+            raise ArgumentError(f"kind = {kind.tolist()} is not a list of {names}, or of their indices")
     count = kind.shape[0]
-
-    def on_device(name: str, value: Any, dtype: Any, default: Any) -> wp.array:
-        if value is None:
-            value = default
-        if isinstance(value, wp.array):
-            return check_array(name, value, dtype, (count,), device)
-        try:
-            width = wp.types.type_size(dtype)
-            shape = (count, width) if width > 1 else (count,)
-            rows = np.broadcast_to(np.asarray(value, np.uint64 if dtype == wp.uint64 else np.float64), shape)
-        except (TypeError, ValueError, OverflowError):
-            raise ArgumentError(f"{name} does not fit {count} shapes, [shapes] of {dtype.__name__}") from None
-        scalar = {wp.int32: np.int32, wp.uint64: np.uint64}.get(dtype, np.float32)
-        if not (np.isfinite(rows).all() and (np.abs(rows) <= np.finfo(np.float32).max).all()):
-            raise ArgumentError(f"{name} is not finite for some of {count} shapes")
-        if dtype == wp.int32 and not (rows == np.clip(np.rint(rows), -(2**31), 2**31 - 1)).all():
-            raise ArgumentError(f"{name} is not an integer of 32 bits for some of {count} shapes")
-        return wp.array(rows.astype(scalar), dtype=dtype, device=device)
-
     meshes: tuple[wp.Mesh, ...] = ()
     if mesh is not None and not isinstance(mesh, wp.array):
         mesh = check_items("mesh", mesh)
         meshes = tuple(one for one in mesh if isinstance(one, wp.Mesh))
         mesh = [one.id if isinstance(one, wp.Mesh) else check_integer("mesh", one or 0, 0, 2**64 - 1) for one in mesh]
-    table.kind = on_device("kind", kind, wp.int32, None)
-    table.size = on_device("size", size, wp.vec3, None)
-    table.body = on_device("body", body, wp.int32, -1)
-    table.local = on_device("local", local, wp.transform, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-    table.mesh = on_device("mesh", mesh, wp.uint64, 0)
-    table.reflectance = on_device("reflectance", reflectance, wp.float32, None)
-    table.first_face = on_device("first_face", first_face, wp.int32, -1)
+    table = ShapeTable()
+    defaults = {"body": -1, "local": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "mesh": 0, "first_face": -1}
+    columns = {"kind": kind, "size": size, "body": body, "local": local, "mesh": mesh, "reflectance": reflectance}
+    for name, value in (columns | {"first_face": first_face}).items():
+        setattr(table, name, _column(name, defaults.get(name) if value is None else value, count, device))
     if textures is not None:
         check_struct("textures", textures, Textures)
     table.textures = no_textures(device) if textures is None else textures
-    if world is None:
-        world = np.full(count, 0 if worlds == 1 else -1)
-    world = _plain_array("world", world)
+    world = _plain_array("world", np.full(count, 0 if worlds == 1 else -1) if world is None else world)
     if world.shape != (count,) or world.dtype.kind not in "iu" or world.min() < -1 or world.max() >= worlds:
         raise ArgumentError(f"world is not one of -1 to {worlds - 1} for each of {count} shapes")
-    seen = np.arange(count)
-    if visible is not None:
-        visible = _plain_array("visible", visible)
-        if visible.shape not in ((), (count,)) or visible.dtype.kind not in "biu":
-            kind_given = f"{visible.dtype} of shape {visible.shape}"
-            raise ArgumentError(f"visible is {kind_given}; true or false for each of {count} shapes is needed")
-        seen = np.flatnonzero(np.broadcast_to(visible, (count,)))
+    visible = _plain_array("visible", True if visible is None else visible)
+    if visible.shape not in ((), (count,)) or visible.dtype.kind not in "biu":
+        kind_given = f"{visible.dtype} of shape {visible.shape}"
+        raise ArgumentError(f"visible is {kind_given}; true or false for each of {count} shapes is needed")
+    seen = np.flatnonzero(np.broadcast_to(visible, (count,)))
     meshes = _check_shapes(table, seen, meshes)
     slot = np.where(world < 0, worlds, world)[seen]
     table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
@@ -171,23 +154,42 @@ def make_shapes(
     return Shapes(table, worlds, device, meshes, int(table.body.numpy().max()) + 1)
 
 
-# ---- What is read on the host, once: values that kernels trust, and would crash or hang on.
+def _column(name: str, value: Any, count: int, device: wp.Device) -> wp.array:
+    """An array of the table, of values on the host or on the device."""
+    dtype = ShapeTable.vars[name].type.dtype
+    if isinstance(value, wp.array):
+        return check_array(name, value, dtype, (count,), device)
+    width = wp.types.type_size(dtype)
+    try:
+        rows = np.asarray(value, np.uint64 if dtype == wp.uint64 else np.float64)
+        rows = np.broadcast_to(rows, (count, width) if width > 1 else (count,))
+    except (TypeError, ValueError, OverflowError):
+        raise ArgumentError(f"{name} does not fit {count} shapes, [shapes] of {dtype.__name__}") from None
+    if not (np.isfinite(rows).all() and (np.abs(rows) <= np.finfo(np.float32).max).all()):
+        raise ArgumentError(f"{name} is not finite for some of {count} shapes")
+    if dtype == wp.int32 and not (rows == np.clip(np.rint(rows), -(2**31), 2**31 - 1)).all():
+        raise ArgumentError(f"{name} is not an integer of 32 bits for some of {count} shapes")
+    scalar = {wp.int32: np.int32, wp.uint64: np.uint64}.get(dtype, np.float32)
+    return wp.array(rows.astype(scalar), dtype=dtype, device=device)
 
 
-# Components of a size that say something; those of a mesh may be negative, which mirrors it.
-_COMPONENTS = {"plane": 2, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "cone": 2, "mesh": 0}
+def _plain_array(name: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value.numpy() if isinstance(value, wp.array) else value)
+    except ValueError:
+        raise ArgumentError(f"{name} is not an array: its rows have different lengths") from None
+
+
+# ---- Values that are read on the host, once: kernels trust them, and would crash or hang on others.
 
 
 def check_poses(name: str, poses: wp.array, count: int | None = None) -> None:
     """Positions are finite and rotations unit quaternions; waits for the device. `count`: the first ones alone."""
-    rows = poses.numpy()[:count]
-    finite = np.isfinite(rows).all(axis=1)
-    if not finite.all():
-        k = int(finite.argmin())
-        raise ArgumentError(f"{name}[{k}] = {rows[k].tolist()} is not finite")
-    length = np.linalg.norm(rows[:, 3:].astype(np.float64), axis=1)
-    if (wrong := abs(length - 1.0) > 0.01).any():
-        k = int(wrong.argmax())
+    rows = poses.numpy()[:count].astype(np.float64)
+    length = np.linalg.norm(rows[:, 3:], axis=1)
+    for k in np.flatnonzero(~(abs(length - 1.0) <= 0.01) | ~np.isfinite(rows).all(axis=1))[:1]:
+        if not np.isfinite(rows[k]).all():
+            raise ArgumentError(f"{name}[{k}] = {rows[k].tolist()} is not finite")
         raise ArgumentError(
             f"{name}[{k}] has the quaternion {rows[k, 3:].tolist()} (x, y, z, w) of length {length[k]:.3g}; one of "
             "length 1 is needed"
@@ -196,70 +198,45 @@ def check_poses(name: str, poses: wp.array, count: int | None = None) -> None:
 
 def _check_shapes(table: ShapeTable, seen: np.ndarray, given: tuple[wp.Mesh, ...]) -> tuple[wp.Mesh, ...]:
     """Shapes that are in range; returns the meshes that they use, as far as they can be found by their ids."""
-    kind, mesh, size = table.kind.numpy(), table.mesh.numpy(), table.size.numpy()
-    if kind.min() < 0 or kind.max() >= len(SHAPE_KINDS):
-        raise ArgumentError(f"kind holds {kind.min()} to {kind.max()}, outside [0, {len(SHAPE_KINDS) - 1}]")
-    reflectance = table.reflectance.numpy()
-    if not ((reflectance >= 0.0) & (reflectance <= 1.0)).all():
-        raise ArgumentError(f"reflectance holds {reflectance.min()} to {reflectance.max()}, outside [0, 1]")
-    body = table.body.numpy()
-    if body.min() < -1:
-        raise ArgumentError(f"body[{body.argmin()}] = {body.min()} is outside [-1, 2147483647]")
+    for name, high in (("kind", len(SHAPE_KINDS) - 1), ("reflectance", 1)):
+        values = getattr(table, name).numpy()
+        if not ((values >= 0) & (values <= high)).all():
+            raise ArgumentError(f"{name} holds {values.min()} to {values.max()}, outside [0, {high}]")
+    check_values("body", table.body, "[-1, 2147483647]")
     check_poses("local", table.local)
+    kind, size = table.kind.numpy(), table.size.numpy()
     needed = np.array([_COMPONENTS[name] for name in SHAPE_KINDS])[kind]
     wrong = ~np.isfinite(size) | ((size < 0.0) & (np.arange(3) < needed[:, None]))
-    if (bad := seen[wrong[seen].any(axis=1)]).size:
-        k = int(bad[0])
+    for k in seen[wrong[seen].any(axis=1)][:1]:
         raise ArgumentError(
             f"size[{k}] = {size[k].tolist()} of a {SHAPE_KINDS[kind[k]]} is not finite and 0 or more [m]"
         )
     meshed = np.flatnonzero(kind == MESH)
-    without = meshed[mesh[meshed] == 0]
-    if without.size:
-        raise ArgumentError(f"kind[{without[0]}] is a mesh and mesh[{without[0]}] = 0 is none")
+    ids = table.mesh.numpy()[meshed].tolist()
     known = {one.id: one for one in given}
-    if not set(mesh[meshed].tolist()) <= set(known):
-        known |= _live_meshes()
-    for one in set(mesh[meshed].tolist()):
-        _check_mesh(int(meshed[mesh[meshed] == one][0]), known.get(one))
-    _check_faces(table, meshed, mesh, known)
-    return tuple(known[one] for one in dict.fromkeys(mesh[meshed].tolist()) if one in known)
+    if not set(ids) <= set(known):
+        # All meshes of this process: an id of none is a pointer to anything.
+        live = (one for one in gc.get_objects() if issubclass(type(one), wp.Mesh))
+        known |= {one.id: one for one in live if getattr(one, "id", None)}
+    faces = {mesh: _checked_faces(int(meshed[ids.index(mesh)]), mesh, known.get(mesh)) for mesh in dict.fromkeys(ids)}
+    first, rows = table.first_face.numpy(), table.textures.face.size
+    for k, mesh in zip(meshed, ids, strict=True):
+        if first[k] >= 0 and first[k] + faces[mesh] > rows:
+            reach = f"{faces[mesh]} faces of mesh[{k}] reach beyond the {rows} faces of textures"
+            raise ArgumentError(f"first_face[{k}] = {first[k]} and {reach}")
+    return tuple(known[mesh] for mesh in faces if mesh in known)
 
 
-def _live_meshes() -> dict[int, wp.Mesh]:
-    """All meshes of this process by id: an id of none is a pointer to anything."""
-    return {one.id: one for one in gc.get_objects() if issubclass(type(one), wp.Mesh) and getattr(one, "id", None)}
-
-
-def _check_mesh(k: int, mesh: wp.Mesh | None) -> None:
+def _checked_faces(k: int, id: int, mesh: wp.Mesh | None) -> int:
+    """Number of the faces of a shape's mesh, whose indices are in range; 1 where it is not found."""
+    if id == 0:
+        raise ArgumentError(f"kind[{k}] is a mesh and mesh[{k}] = 0 is none")
     if mesh is None:
         if gc.get_freeze_count():  # some objects are not listed
-            return
+            return 1
         raise ArgumentError(f"mesh[{k}] is not the id of a wp.Mesh that exists; keep the wp.Mesh, or give it instead")
-    indices = mesh.indices.numpy()
-    if indices.size and not (indices.min() >= 0 and indices.max() < mesh.points.size):
-        raise ArgumentError(
-            f"mesh[{k}] has indices {indices.min()} to {indices.max()}, outside [0, {mesh.points.size - 1}]"
-        )
-
-
-def _check_faces(table: ShapeTable, meshed: np.ndarray, mesh: np.ndarray, known: Mapping[int, wp.Mesh]) -> None:
-    """Textured meshes have a row of the textures for each face."""
-    first, rows = table.first_face.numpy(), table.textures.face.size
-    for k in meshed[first[meshed] >= 0]:
-        one = known.get(int(mesh[k]))
-        faces = 1 if one is None else one.indices.size // 3
-        if first[k] + faces > rows:
-            raise ArgumentError(
-                f"first_face[{k}] = {first[k]} and {faces} faces of mesh[{k}] reach beyond the {rows} faces of textures"
-            )
-
-
-def _plain_array(name: str, value: Any) -> np.ndarray:
-    try:
-        return np.asarray(value.numpy() if isinstance(value, wp.array) else value)
-    except ValueError:
-        raise ArgumentError(f"{name} is not an array: its rows have different lengths") from None
+    check_values(f"mesh[{k}].indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+    return mesh.indices.size // 3
 
 
 @wp.kernel(enable_backward=False)
@@ -292,6 +269,210 @@ def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
     wp.launch(_move_kernel, len(shapes), [shapes.table, body_q], device=shapes.device)
 
 
+# ---- Rays.
+
+
+@wp.struct
+class ShapeHit:
+    """Where a ray x + s u meets a shape, for s beyond a least one, which may be negative."""
+
+    distance: float  # along the ray [m]; -1 for a miss
+    normal: wp.vec3  # unit vector, either side, in the frame of the ray
+    face: int  # of a mesh; -1 for other shapes
+    corner: wp.vec2  # barycentric shares of the first two corners of the face
+
+
+@wp.func
+def _miss() -> ShapeHit:
+    hit = ShapeHit()
+    hit.distance = _FAR
+    hit.face = -1
+    return hit
+
+
+@wp.func
+def _nearer(hit: ShapeHit, least: float, distance: float, normal: wp.vec3) -> ShapeHit:
+    """The nearer of a hit and a point of the ray beyond `least`."""
+    if distance > least and distance < hit.distance:
+        hit.distance = distance
+        hit.normal = normal
+    return hit
+
+
+@wp.func
+def _roots(a: float, b: float, c: float) -> wp.vec2:
+    """Solutions of a s^2 + 2 b s + c = 0, without cancellation; far away twice if there are none."""
+    disc = b * b - a * c
+    if disc < 0.0 or a == 0.0:
+        return wp.vec2(_FAR, _FAR)
+    q = -(b + wp.where(b < 0.0, -1.0, 1.0) * wp.sqrt(disc))
+    if q == 0.0:
+        return wp.vec2(0.0, 0.0)
+    return wp.vec2(q / a, c / q)
+
+
+@wp.func
+def _intersect_plane(size: wp.vec3, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
+    """The plane z = 0."""
+    hit = _miss()
+    s = -x[2] / u[2]  # infinite or not a number for a ray along the plane, which fails below
+    y = x + s * u
+    inside = (size[0] <= 0.0 or wp.abs(y[0]) <= 0.5 * size[0]) and (size[1] <= 0.0 or wp.abs(y[1]) <= 0.5 * size[1])
+    if inside:
+        hit = _nearer(hit, least, s, wp.vec3(0.0, 0.0, 1.0))
+    return hit
+
+
+@wp.func
+def _intersect_ball(
+    hit: ShapeHit, z: float, radius: float, cut: float, x: wp.vec3, u: wp.vec3, least: float
+) -> ShapeHit:
+    """A sphere at a height z, of which counts what lies beyond |z| = cut on its side."""
+    centre = wp.vec3(0.0, 0.0, z)
+    y = x - centre
+    along = -wp.dot(y, u)
+    rest = y + along * u
+    half2 = radius * radius - wp.dot(rest, rest)
+    if half2 > 0.0:
+        for k in range(2):
+            s = along + (2.0 * float(k) - 1.0) * wp.sqrt(half2)
+            height = x[2] + s * u[2]
+            if cut <= 0.0 or (height * z >= 0.0 and wp.abs(height) >= cut):
+                hit = _nearer(hit, least, s, (y + s * u) / radius)
+    return hit
+
+
+@wp.func
+def _intersect_side(hit: ShapeHit, radius: float, half: float, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
+    """The side of a cylinder, |z| < half."""
+    roots = _roots(u[0] * u[0] + u[1] * u[1], x[0] * u[0] + x[1] * u[1], x[0] * x[0] + x[1] * x[1] - radius * radius)
+    for k in range(2):
+        y = x + roots[k] * u
+        if wp.abs(y[2]) < half:
+            hit = _nearer(hit, least, roots[k], wp.vec3(y[0], y[1], 0.0) / radius)
+    return hit
+
+
+@wp.func
+def _intersect_cap(hit: ShapeHit, radius: float, z: float, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
+    """A disc at a height z."""
+    s = (z - x[2]) / u[2]
+    y = x + s * u
+    if y[0] * y[0] + y[1] * y[1] <= radius * radius:
+        hit = _nearer(hit, least, s, wp.vec3(0.0, 0.0, 1.0))
+    return hit
+
+
+@wp.func
+def _intersect_ellipsoid(size: wp.vec3, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
+    stretched = wp.cw_div(u, size)
+    length = wp.length(stretched)
+    hit = _intersect_ball(_miss(), 0.0, 1.0, 0.0, wp.cw_div(x, size), stretched / length, least * length)
+    if hit.distance < _FAR:
+        hit.distance = hit.distance / length
+        hit.normal = wp.normalize(wp.cw_div(hit.normal, size))
+    return hit
+
+
+@wp.func
+def _intersect_box(size: wp.vec3, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
+    enter = -float(_FAR)
+    leave = float(_FAR)
+    enter_axis = int(0)
+    leave_axis = int(0)
+    for k in range(3):
+        low = (-size[k] - x[k]) / u[k]
+        high = (size[k] - x[k]) / u[k]
+        if u[k] == 0.0:
+            low = wp.where(wp.abs(x[k]) <= size[k], -_FAR, _FAR)
+            high = float(_FAR)
+        if wp.min(low, high) > enter:
+            enter = wp.min(low, high)
+            enter_axis = k
+        if wp.max(low, high) < leave:
+            leave = wp.max(low, high)
+            leave_axis = k
+    hit = _miss()
+    if enter <= leave:
+        normal = wp.vec3(0.0)
+        normal[enter_axis] = 1.0
+        hit = _nearer(hit, least, enter, normal)
+        normal = wp.vec3(0.0)
+        normal[leave_axis] = 1.0
+        hit = _nearer(hit, least, leave, normal)
+    return hit
+
+
+@wp.func
+def _intersect_cone(size: wp.vec3, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
+    """Its tip is up."""
+    half = size[1]
+    k2 = 0.25 * size[0] * size[0] / (half * half)
+    below = half - x[2]
+    a = u[0] * u[0] + u[1] * u[1] - k2 * u[2] * u[2]
+    b = x[0] * u[0] + x[1] * u[1] + k2 * below * u[2]
+    roots = _roots(a, b, x[0] * x[0] + x[1] * x[1] - k2 * below * below)
+    hit = _miss()
+    for k in range(2):
+        y = x + roots[k] * u
+        if wp.abs(y[2]) <= half:
+            hit = _nearer(hit, least, roots[k], wp.normalize(wp.vec3(y[0], y[1], k2 * (half - y[2]))))
+    return _intersect_cap(hit, size[0], -half, x, u, least)
+
+
+@wp.func
+def _intersect_scaled_mesh(mesh: wp.uint64, size: wp.vec3, x: wp.vec3, u: wp.vec3, reach: float) -> ShapeHit:
+    """A `wp.Mesh` whose points are multiplied by size."""
+    stretched = wp.cw_div(u, size)
+    length = wp.length(stretched)
+    hit = _miss()
+    query = wp.mesh_query_ray(mesh, wp.cw_div(x, size), stretched / length, reach * length)
+    if query.result:
+        hit.distance = query.t / length
+        hit.normal = wp.normalize(wp.cw_div(query.normal, size))
+        hit.face = query.face
+        hit.corner = wp.vec2(query.u, query.v)
+    return hit
+
+
+@wp.func
+def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp.vec3, reach: float) -> ShapeHit:
+    """The nearest point, up to `reach`, at which the ray x + s u meets a shape of `SHAPE_KINDS` in its own frame.
+
+    `size` is that of `ShapeTable`; a mesh is an id of a `wp.Mesh`.
+    """
+    # From the point of the ray that is nearest the centre: differences of squares would cancel far away.
+    start = -wp.dot(x, u)
+    y = x + start * u
+    least = -start
+    hit = _miss()
+    if kind == PLANE:
+        hit = _intersect_plane(size, y, u, least)
+    elif kind == SPHERE:
+        hit = _intersect_ball(hit, 0.0, size[0], 0.0, y, u, least)
+    elif kind == CAPSULE:
+        hit = _intersect_side(hit, size[0], size[1], y, u, least)
+        hit = _intersect_ball(hit, size[1], size[0], size[1], y, u, least)
+        hit = _intersect_ball(hit, -size[1], size[0], size[1], y, u, least)
+    elif kind == ELLIPSOID:
+        hit = _intersect_ellipsoid(size, y, u, least)
+    elif kind == CYLINDER:
+        hit = _intersect_side(hit, size[0], size[1], y, u, least)
+        hit = _intersect_cap(hit, size[0], size[1], y, u, least)
+        hit = _intersect_cap(hit, size[0], -size[1], y, u, least)
+    elif kind == BOX:
+        hit = _intersect_box(size, y, u, least)
+    elif kind == CONE:
+        hit = _intersect_cone(size, y, u, least)
+    elif kind == MESH:
+        start = float(0.0)
+        hit = _intersect_scaled_mesh(mesh, size, x, u, reach)
+    hit.distance += start
+    if not hit.distance <= reach:
+        hit.distance = -1.0
+    return hit
+
+
 @wp.struct
 class SceneHit:
     """The nearest shape along a ray."""
@@ -321,7 +502,7 @@ def _reflectance_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
 def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> SceneHit:
     """The nearest shape of a world along the ray x + s u; every shape of the world is tried."""
     nearest = ShapeHit()
-    nearest.distance = _FAR
+    nearest.distance = _REACH
     nearest.face = -1
     found = int(-1)
     worlds = table.first.shape[0] - 2

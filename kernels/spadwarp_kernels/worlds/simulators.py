@@ -11,8 +11,7 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
 
-from .closed_forms import SHAPE_KINDS
-from .shapes import Shapes, make_shapes
+from .shapes import SHAPE_KINDS, Shapes, make_shapes
 
 __all__ = ["mujoco_shapes", "newton_shapes", "write_poses"]
 
@@ -98,8 +97,9 @@ def mujoco_shapes(
     size = np.array(model.geom_size, np.float32)
     size[kind == 0] *= 2.0  # of a plane MuJoCo has half the width
     size[(kind == _MESH) | (kind == _HEIGHT_FIELD)] = 1.0
-    meshes = {key: _mujoco_mesh(model, *key, device) for key in _mujoco_mesh_keys(model)}
-    mesh = [meshes.get((int(k), int(one))) for k, one in zip(kind, model.geom_dataid, strict=True)]
+    data = list(zip(kind.tolist(), np.asarray(model.geom_dataid).tolist(), strict=True))
+    meshes = {key: _mujoco_mesh(model, *key, device) for key in set(data) if key[0] in (_MESH, _HEIGHT_FIELD)}
+    mesh = [meshes.get(key) for key in data]
     rgba, material = np.array(model.geom_rgba), np.asarray(model.geom_matid)
     rgba[material >= 0] = model.mat_rgba[material[material >= 0]]
     reflectance = np.broadcast_to(srgb_to_linear(rgba[:, GREEN]) if reflectance is None else reflectance, (count,))
@@ -117,12 +117,6 @@ def mujoco_shapes(
         visible=np.tile(np.isin(model.geom_group, list(groups)) & (rgba[:, 3] > 0.0), worlds),
         device=device,
     )
-
-
-def _mujoco_mesh_keys(model: Any) -> set[tuple[int, int]]:
-    """(type, index) of the meshes and height fields that geoms use."""
-    pairs = zip(model.geom_type, model.geom_dataid, strict=True)
-    return {(int(kind), int(one)) for kind, one in pairs if kind in (_MESH, _HEIGHT_FIELD)}
 
 
 def _mujoco_mesh(model: Any, kind: int, index: int, device: wp.DeviceLike) -> wp.Mesh:

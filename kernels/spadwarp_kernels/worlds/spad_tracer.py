@@ -18,10 +18,8 @@ from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
-from .closed_forms import BOX, CAPSULE, CONE, CYLINDER, ELLIPSOID, MESH, PLANE, SPHERE
-from .config import SpadConfig, check_config
-from .shapes import Shapes, ShapeTable
-from .spad_camera import WorldCameras, check_memory
+from .shapes import BOX, CAPSULE, CONE, CYLINDER, ELLIPSOID, MESH, PLANE, SPHERE, Shapes, ShapeTable
+from .spad_camera import SpadConfig, WorldCameras, check_config, check_memory
 
 __all__ = ["SpadTracer"]
 
@@ -158,48 +156,39 @@ def _reflectance_kernel(
 
 
 class CameraMeshes:
-    """A triangle mesh for each camera, of what stands in its world.
-
-    Attributes:
-        meshes: A `wp.Mesh` for each camera, made by the first `place`.
-        reflectance: Of each camera's faces.
-        faces: Number of faces of each camera.
-    """
+    """A triangle mesh for each camera, of what stands in its world, and the shape of each of its faces."""
 
     def __init__(self, shapes: Shapes, world: list[int], device: wp.Device) -> None:
         table = shapes.table
-        kind, first, member = table.kind.numpy(), table.first.numpy(), table.member.numpy()
-        ids = table.mesh.numpy()
+        kind, first, member = (array.numpy() for array in (table.kind, table.first, table.member))
+        own, ids = {one.id: one for one in shapes.meshes}, table.mesh.numpy().tolist()
+        parts = {}  # of shapes that are not meshes, and of meshes
+        for k in member.tolist():
+            key = ids[k] if kind[k] == MESH else -int(kind[k])
+            if key not in parts:
+                parts[key] = _mesh_triangles(k, own.get(key)) if kind[k] == MESH else _unit_triangles(int(kind[k]))
         self.shapes, self.device = shapes, device
-        own = {one.id: one for one in shapes.meshes}
-        parts: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
-        camera, shape, unit, source, self._indices, self.face_shape = [], [], [], [], [], []
+        self._indices, self.face_shape, self._ends = [], [], [0]
+        camera, shape, unit, source = [], [], [np.zeros((0, 4))], []
         for v, w in enumerate(world):
             seen = np.concatenate([member[first[w] : first[w + 1]], member[first[-2] : first[-1]]])
-            indices, owner, start = [], [], 0
-            for k in seen.tolist():
-                key = (int(kind[k]), int(ids[k]) if kind[k] == MESH else 0)
-                if key not in parts:
-                    parts[key] = _mesh_triangles(key[1], own, device) if kind[k] == MESH else _unit_triangles(key[0])
-                vertices, faces = parts[key]
-                count = len(vertices)
-                camera.append(np.full(count, v))
-                shape.append(np.full(count, k))
-                unit.append(vertices)
-                source.append(np.arange(count) if kind[k] == MESH else np.full(count, -1))
-                indices.append(faces + start)
-                owner.append(np.full(len(faces), k))
-                start += count
-            self._indices.append(np.concatenate(indices) if indices else np.zeros((0, 3), int))
-            self.face_shape.append(np.concatenate(owner) if owner else np.zeros(0, int))
-        self._ends = np.cumsum(
-            [0, *(int(np.count_nonzero(np.concatenate([[], *camera]) == v)) for v in range(len(world)))]
-        )
+            held = [parts[ids[k] if kind[k] == MESH else -int(kind[k])] for k in seen]
+            counts = np.array([len(vertices) for vertices, _ in held], int)
+            start = np.append(0, np.cumsum(counts))
+            faces = [faces + begin for (_, faces), begin in zip(held, start, strict=False)]
+            self._indices.append(np.concatenate([np.zeros((0, 3), int), *faces]))
+            self.face_shape.append(np.repeat(seen, np.array([len(each) for each in faces], int)))
+            self._ends.append(self._ends[-1] + int(start[-1]))
+            camera.append(np.full(start[-1], v))
+            shape.append(np.repeat(seen, counts))
+            unit += [vertices for vertices, _ in held]
+            own_index = np.arange(start[-1]) - np.repeat(start[:-1], counts)
+            source.append(np.where(np.repeat(kind[seen], counts) == MESH, own_index, -1))
         self.corners = Corners()
-        for name, rows, dtype in (("camera", camera, int), ("shape", shape, int), ("source", source, int)):
-            setattr(self.corners, name, wp.array(np.concatenate([[], *rows]), dtype=dtype, device=device))
-        self.corners.unit = wp.array(np.concatenate([np.zeros((0, 4)), *unit]), dtype=wp.vec4, device=device)
-        self.points = wp.zeros(int(self._ends[-1]), dtype=wp.vec3, device=device)
+        for name, rows in (("camera", camera), ("shape", shape), ("source", source)):
+            setattr(self.corners, name, wp.array(np.concatenate(rows), dtype=int, device=device))
+        self.corners.unit = wp.array(np.concatenate(unit), dtype=wp.vec4, device=device)
+        self.points = wp.zeros(self._ends[-1], dtype=wp.vec3, device=device)
 
     def place(self, camera_q: wp.array, optical: wp.transform, reach: float) -> None:
         """Writes all points for the poses of shapes and cameras."""
@@ -208,40 +197,19 @@ class CameraMeshes:
 
     def build(self) -> list[wp.Mesh]:
         """Meshes, whose trees are built for where the points are now."""
-        meshes = []
-        for v, indices in enumerate(self._indices):
-            points = self.points[int(self._ends[v]) : int(self._ends[v + 1])]
-            indices = wp.array(indices.ravel(), dtype=int, device=self.device)
-            # The fastest to walk, by measurement.
-            kind: dict[str, Any] = {"bvh_constructor": "cubql", "bvh_leaf_size": 1} if self.device.is_cuda else {}
-            meshes.append(wp.Mesh(points, indices, **kind))
-        return meshes
+        # The fastest to walk, by measurement.
+        kind: dict[str, Any] = {"bvh_constructor": "cubql", "bvh_leaf_size": 1} if self.device.is_cuda else {}
+        return [
+            wp.Mesh(self.points[start:stop], wp.array(indices.ravel(), dtype=int, device=self.device), **kind)
+            for indices, start, stop in zip(self._indices, self._ends, self._ends[1:], strict=False)
+        ]
 
 
-def _mesh_triangles(mesh_id: int, own: dict[int, wp.Mesh], device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
-    """Stand-in vertices and the faces of a mesh that is known by its id."""
-    if mesh_id in own:
-        mesh = own[mesh_id]
-        return np.zeros((mesh.points.size, 4)), mesh.indices.numpy().reshape(-1, 3)
-    sizes = wp.zeros(2, dtype=int, device=device)
-    wp.launch(_mesh_size_kernel, 1, [wp.uint64(mesh_id)], [sizes], device=device)
-    points, count = sizes.numpy().tolist()
-    indices = wp.zeros(count, dtype=int, device=device)
-    wp.launch(_mesh_indices_kernel, count, [wp.uint64(mesh_id)], [indices], device=device)
-    return np.zeros((points, 4)), indices.numpy().reshape(-1, 3)
-
-
-@wp.kernel(enable_backward=False)
-def _mesh_size_kernel(mesh: wp.uint64, sizes: wp.array[int]):
-    m = wp.mesh_get(mesh)
-    sizes[0] = m.points.shape[0]
-    sizes[1] = m.indices.shape[0]
-
-
-@wp.kernel(enable_backward=False)
-def _mesh_indices_kernel(mesh: wp.uint64, indices: wp.array[int]):
-    i = wp.tid()
-    indices[i] = wp.mesh_get(mesh).indices[i]
+def _mesh_triangles(k: int, mesh: wp.Mesh | None) -> tuple[np.ndarray, np.ndarray]:
+    """Stand-in vertices and the faces of the mesh of a shape."""
+    if mesh is None:
+        raise ArgumentError(f"the wp.Mesh with the id mesh[{k}] is not found; give it instead")
+    return np.zeros((mesh.points.size, 4)), mesh.indices.numpy().reshape(-1, 3)
 
 
 # ---- The camera.
@@ -293,7 +261,7 @@ def _advance_kernel(offset: wp.array[wp.uint64], count: wp.uint64):
 
 @dataclasses.dataclass(frozen=True)
 class _Lane:
-    """What cameras that are traced one after the other share; lanes run side by side on a GPU."""
+    """Memory that cameras share which are traced one after the other; lanes run side by side on a GPU."""
 
     stream: wp.Stream | None  # none for the device's current one
     data: Data  # its tally and cursor; the ledger and the offset are those of all lanes
@@ -395,14 +363,9 @@ class SpadTracer(WorldCameras):
         wp.launch(_reflectance_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
         update_surfaces(surfaces, model.mesh, model.camera)
         lane.data.tally.zero_()
+        threads = CUDA_THREADS // len(self._lanes)
         launch_transport(
-            self._spec,
-            model,
-            lane.data,
-            seed=config.seed,
-            first_id=v * photons,
-            photon_count=photons,
-            threads=CUDA_THREADS // len(self._lanes),
+            self._spec, model, lane.data, seed=config.seed, first_id=v * photons, photon_count=photons, threads=threads
         )
         pixels = config.height * config.width
         factor = config.photons * config.pde / (model.scale * photons)
@@ -440,21 +403,14 @@ class SpadTracer(WorldCameras):
         # 2^62 units hold the thousandth part of all photons in one bin; 2^58 units are the largest contribution.
         scale = min(2.0**72 / self.photons, 2.0**58)
         extent = gate.stop + math.hypot(*config.laser_position)  # no photon that counts comes further
+        moving: dict[str, Any] = {"camera": camera, "extent": extent, "use_warp_bvh": self._use_warp_bvh}
         self._face_shape, models = [], []
         for mesh, owner in zip(self._meshes.build(), self._meshes.face_shape, strict=True):
             self._face_shape.append(wp.array(owner, dtype=int, device=self.device))
             reflectance = wp.zeros(len(owner), dtype=float, device=self.device)
             textures = self._textures(owner)
             corners = None if textures is None else wp.zeros(len(owner), dtype=wp.vec3, device=self.device)
-            surfaces = make_surfaces(
-                mesh,
-                reflectance,
-                corner_reflectance=corners,
-                textures=textures,
-                camera=camera,
-                extent=extent,
-                use_warp_bvh=self._use_warp_bvh,
-            )
+            surfaces = make_surfaces(mesh, reflectance, corner_reflectance=corners, textures=textures, **moving)
             models.append(Model(self.device, medium, laser, camera, gate, limits, guiding, mesh, surfaces, scale))
         self._models = models
         choices = surface_choices(models[0].surfaces)
@@ -476,10 +432,8 @@ class SpadTracer(WorldCameras):
         if not table.textures.face.size:
             return None
         first = table.first_face.numpy()[owner]
-        _, start, count = np.unique(owner, return_index=True, return_counts=True)
-        number = np.zeros(len(owner), int)  # of the face in its own mesh
-        for begin, faces in zip(start, count, strict=True):
-            number[begin : begin + faces] = np.arange(faces)
+        _, start, each = np.unique(owner, return_index=True, return_inverse=True)
+        number = np.arange(len(owner)) - start[each]  # of the face in its own mesh
         row = np.where(first >= 0, first + number, 0)
         textures = Textures()
         face = np.where(first >= 0, table.textures.face.numpy()[row], -1)

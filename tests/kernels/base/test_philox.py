@@ -12,7 +12,6 @@ from spadwarp_kernels.base.philox import (
     begin_sequence,
     join_words,
     make_prefetch,
-    philox4x32,
     prefetched_block,
     random_block_keyed,
     round_keys,
@@ -24,7 +23,8 @@ from spadwarp_kernels.base.philox import (
 
 @wp.kernel(enable_backward=False)
 def _philox(words: wp.array(dtype=wp.uint32), out: wp.array(dtype=wp.vec4ui)):
-    out[0] = philox4x32(words[0], words[1], words[2], words[3], words[4], words[5])
+    """The words of a counter, id, event and stream, and of a key, the seed."""
+    out[0] = random_block(join_words(words[5], words[4]), join_words(words[1], words[0]), words[2], words[3])
 
 
 @wp.kernel(enable_backward=False)

@@ -8,8 +8,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from spadwarp_kernels.estimators.registry import make_next_event
 from spadwarp_kernels.photon.queue import Request
-from spadwarp_kernels.photon.state import PhotonState
-from spadwarp_kernels.photon.world import World
+from spadwarp_kernels.photon.state import PhotonState, World
 
 
 def make_half(spec: sk.TransportSpec) -> sk.Estimator:

@@ -7,7 +7,7 @@ import warp as wp
 from helpers.launch import Vectors, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import Camera, Gate, random_block, u01
-from spadwarp_kernels.optics.camera import clip_to_gate, clip_to_view, field, in_view, lens_point, project
+from spadwarp_kernels.optics.camera import clip_to_gate, clip_to_view, field, in_view, lens_point, project, ready_camera
 
 _LENS_POINT = wp.constant(wp.vec2(0.1, -0.25))
 
@@ -30,7 +30,7 @@ def _clips(camera: Camera, gate: Gate, x: Vectors, u: Vectors, path: float, out:
 @wp.kernel(enable_backward=False)
 def _images(camera: Camera, x: Vectors, o: Vectors, pixel: wp.array(dtype=int), visible: wp.array(dtype=int)):
     i = wp.tid()
-    pixel[i] = project(camera, x[i], o[i])
+    pixel[i] = project(camera, camera.view, -1, x[i], o[i])
     visible[i] = int(in_view(camera, field(camera), x[i]))
 
 
@@ -85,6 +85,7 @@ def test_the_lens_images_through_the_focus_plane_and_overlooks_nothing(radius, i
     camera = Camera()
     camera.width, camera.height, camera.pixel_tangent = 20, 12, 0.05
     camera.aperture_radius, camera.inverse_focus = radius, inverse_focus
+    ready_camera(camera, camera)
     rng = np.random.default_rng(7)
     points, lenses = 2000, 200
     x = rng.uniform([-3, -3, -1], [3, 3, 6], size=(points, 3)).astype(np.float32)

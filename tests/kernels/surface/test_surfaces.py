@@ -9,6 +9,7 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
+from helpers.launch import Floats, Integers, Vectors, launched, on_device
 from helpers.meshes import mesh_and_surfaces
 from spadwarp_kernels.optics.visibility import near_depth_map
 from spadwarp_kernels.surface.bvh import read_tree
@@ -16,7 +17,7 @@ from spadwarp_kernels.surface.bvh import read_tree
 PRIVATE_LAYOUT = (
     f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/surface/bvh.py reads "
     "(members of wp::Mesh::bvh: node_lowers, node_uppers, root, primitive_indices, num_nodes, max_nodes). Mend "
-    "`_tree_node`, `_tree_kind`, `_tree_root` and `_tree_face` there; until then make_surfaces(..., use_warp_bvh=True) "
+    "`_read_node` there; until then make_surfaces(..., use_warp_bvh=True) "
     "takes wp.mesh_query_ray."
 )
 
@@ -29,25 +30,19 @@ def ball(device, count=24):
     first = (np.arange(2 * count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     faces = np.stack([first, first + count, first + 1, first + 1, first + count, first + count + 1], axis=1)
     points = points.reshape(-1, 3).astype(np.float32)
-    mesh = wp.Mesh(wp.array(points, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=int, device=device))
+    mesh = wp.Mesh(on_device(points, device), on_device(faces.ravel(), device, int))
     return mesh, points
 
 
 @wp.kernel(enable_backward=False)
-def cast(
-    surfaces: sk.Surfaces,
-    x: wp.array(dtype=wp.vec3),
-    u: wp.array(dtype=wp.vec3),
-    mine: wp.array(dtype=float),
-    hers: wp.array(dtype=float),
-):
+def cast(surfaces: sk.Surfaces, x: Vectors, u: Vectors, mine: Floats, hers: Floats):
     i = wp.tid()
     mine[i] = sk.intersect_surfaces(surfaces, x[i], u[i], 100.0, False).distance
     hers[i] = sk.intersect_mesh(surfaces.mesh, x[i], u[i], 100.0).distance
 
 
 @wp.kernel(enable_backward=False)
-def meets(surfaces: sk.Surfaces, x: wp.array(dtype=wp.vec3), way: wp.array(dtype=wp.vec3), met: wp.array(dtype=int)):
+def meets(surfaces: sk.Surfaces, x: Vectors, way: Vectors, met: Integers):
     i = wp.tid()
     hit = sk.intersect_surfaces(surfaces, x[i], wp.normalize(way[i]), wp.length(way[i]), True)
     met[i] = wp.where(hit.slot >= 0, 1, 0)
@@ -58,10 +53,7 @@ def distances(surfaces, device, count=20_000):
     u = rng.normal(size=(count, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     x = rng.uniform(-2, 2, (count, 3)) - 5.0 * u
-    mine, hers = (wp.empty(count, dtype=float, device=device) for _ in range(2))
-    rays = [wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (x, u)]
-    wp.launch(cast, count, [surfaces, *rays], [mine, hers], device=device)
-    return mine.numpy(), hers.numpy()
+    return launched(cast, [surfaces, x, u], (float, float), device, count)
 
 
 def test_the_tree_is_read_as_warp_writes_it(device):
@@ -70,33 +62,23 @@ def test_the_tree_is_read_as_warp_writes_it(device):
         mesh, points = ball(device)
         mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor, bvh_leaf_size=1)
         try:
-            nodes, order = (one.numpy() for one in read_tree(mesh, 1.2))
+            tree = read_tree(mesh, 1.2)
         except Exception as error:
             pytest.fail(f"{PRIVATE_LAYOUT} ({error})")
-        faces = np.where(order < 0, ~order, order)
-        corners = points[mesh.indices.numpy().reshape(-1, 3)]
-        pairs, seen, stack = nodes.reshape(-1, 2, 2, 4), [], [(0, np.full(3, -np.inf), np.full(3, np.inf))]
-        while stack and len(seen) <= len(faces):
-            pair, low, high = stack.pop()
-            for child in range(2):
-                lower, upper = pairs[pair, child, 0, :3], pairs[pair, child, 1, :3]
-                entry = int(pairs[pair, child, 0, 3].view(np.int32))
-                if entry == -1:
-                    continue
-                inside = (lower >= low - 1e-5).all() and (upper <= high + 1e-5).all()
-                assert inside, f"{PRIVATE_LAYOUT} (a child leaves its parent's box, {constructor})"
-                if entry >= 0:
-                    stack.append((entry, lower, upper))
-                    continue
-                slot = -2 - entry
-                while True:
-                    held = (corners[faces[slot]] >= lower).all() and (corners[faces[slot]] <= upper).all()
-                    assert held, f"{PRIVATE_LAYOUT} (a face leaves its box, {constructor})"
-                    seen.append(faces[slot])
-                    if order[slot] >= 0:
-                        break
-                    slot += 1
-        assert sorted(seen) == list(range(len(faces))), f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
+        assert sorted(tree.faces) == list(range(len(tree.faces))), (
+            f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
+        )
+        corners, stack, seen = points[mesh.indices.numpy().reshape(-1, 3)[tree.faces]], [tree.root], 0
+        while stack:
+            node = stack.pop()
+            held = corners[tree.start[node] : tree.stop[node]]
+            inside = (held >= tree.lower[node]).all() and (held <= tree.upper[node]).all()
+            assert inside, f"{PRIVATE_LAYOUT} (a face leaves a box, {constructor})"
+            if tree.children[node, 0] >= 0:
+                stack += tree.children[node].tolist()
+            else:
+                seen += len(held)
+        assert seen == len(tree.faces), f"{PRIVATE_LAYOUT} (faces are in no leaf, {constructor})"
 
 
 @pytest.mark.parametrize("use_warp_bvh", [False, True])
@@ -110,7 +92,7 @@ def test_surfaces_follow_moving_points(use_warp_bvh, device):
     sk.update_surfaces(surfaces, mesh)
     mesh.refit()
     mine, hers = distances(surfaces, device)
-    new = wp.Mesh(wp.array(moved.astype(np.float32), dtype=wp.vec3, device=device), mesh.indices)
+    new = wp.Mesh(on_device(moved.astype(np.float32), device), mesh.indices)
     fresh = distances(sk.make_surfaces(new), device)[0]
     assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
     assert (np.abs(mine - before) > 1e-3).mean() > 0.1
@@ -175,8 +157,7 @@ def test_nothing_hides_what_lies_before_the_map(device):
     ]
     corners = np.concatenate(parts).astype(np.float32)
     faces = (np.array([0, 1, 2, 0, 2, 3]) + 4 * np.arange(4)[:, None]).ravel()
-    points = wp.array(corners, dtype=wp.vec3, device=device)
-    mesh = wp.Mesh(points, wp.array(faces, dtype=int, device=device))
+    mesh = wp.Mesh(on_device(corners, device), on_device(faces, device, int))
     camera = wide_camera()
     near = near_depth_map(mesh, camera).numpy().astype(float)
     assert near[100, 64] == pytest.approx(0.4 / (0.8 * 73.0 / 128), rel=0.05)  # of the floor, less the lens's radius
@@ -189,10 +170,8 @@ def test_nothing_hides_what_lies_before_the_map(device):
     start = np.concatenate([tangent, np.ones((count, 1))], axis=1) * depth[:, None]
     turn = rng.uniform(0, 2 * np.pi, count)
     lens = camera.aperture_radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
-    x, way = (wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (start, lens - start))
-    met = wp.zeros(count, dtype=int, device=device)
-    wp.launch(meets, count, [sk.make_surfaces(mesh), x, way], [met], device=device)
-    assert not met.numpy().any()
+    (met,) = launched(meets, [sk.make_surfaces(mesh), start, lens - start], [int], device, count)
+    assert not met.any()
 
 
 def small_model(mesh, surfaces):

@@ -4,21 +4,15 @@ import numpy as np
 import pytest
 import warp as wp
 
+from helpers.launch import Floats, Vectors, launched
 from spadwarp_kernels.worlds import SHAPE_KINDS
-from spadwarp_kernels.worlds.closed_forms import intersect_shape
+from spadwarp_kernels.worlds.shapes import intersect_shape
 
 SIZE = (0.4, 0.7, 0.3)
 
 
 @wp.kernel(enable_backward=False)
-def trace(
-    kind: int,
-    size: wp.vec3,
-    x: wp.array(dtype=wp.vec3),
-    u: wp.array(dtype=wp.vec3),
-    distance: wp.array(dtype=float),
-    normal: wp.array(dtype=wp.vec3),
-):
+def trace(kind: int, size: wp.vec3, x: Vectors, u: Vectors, distance: Floats, normal: Vectors):
     i = wp.tid()
     hit = intersect_shape(kind, size, wp.uint64(0), x[i], u[i], 1.0e10)
     distance[i] = hit.distance
@@ -57,13 +51,8 @@ def test_nearest_point_is_on_the_surface(kind, start, device):
     else:
         x = rng.uniform(-1, 1, (8 * count, 3)) * SIZE
         x = x[inside(kind, x) > 1e-3][:count]
-    count = len(x)
-    x, u = x.astype(np.float32), u[:count].astype(np.float32)
-    distance = wp.empty(count, dtype=float, device=device)
-    normal = wp.empty(count, dtype=wp.vec3, device=device)
-    rays = [wp.array(one, dtype=wp.vec3, device=device) for one in (x, u)]
-    wp.launch(trace, count, [SHAPE_KINDS.index(kind), wp.vec3(*SIZE), *rays], [distance, normal], device=device)
-    s, n = distance.numpy(), normal.numpy()
+    x, u = x.astype(np.float32), u[: len(x)].astype(np.float32)
+    s, n = launched(trace, [SHAPE_KINDS.index(kind), wp.vec3(*SIZE), x, u], (float, wp.vec3), device, len(x))
     hit = s > 0.0
     assert hit.mean() > 0.2 if start == "outside" else hit.all()
     assert np.abs(inside(kind, x[hit] + s[hit, None] * u[hit])).max() < 2e-5
@@ -80,13 +69,8 @@ def test_nearest_point_is_on_the_surface(kind, start, device):
 
 
 def test_plane_ends_at_its_width(device):
-    x = wp.array(
-        [(0.19, 0.34, 1.0), (0.21, 0.0, 1.0), (0.0, 0.36, 1.0), (0.0, 0.0, -1.0)], dtype=wp.vec3, device=device
-    )
-    u = wp.array([(0.0, 0.0, -1.0)] * 4, dtype=wp.vec3, device=device)
-    distance = wp.empty(4, dtype=float, device=device)
-    normal = wp.empty(4, dtype=wp.vec3, device=device)
-    wp.launch(trace, 4, [0, wp.vec3(*SIZE), x, u], [distance, normal], device=device)
-    assert distance.numpy().tolist() == [1.0, -1.0, -1.0, -1.0]
-    wp.launch(trace, 4, [0, wp.vec3(0.0), x, u], [distance, normal], device=device)
-    assert distance.numpy().tolist() == [1.0, 1.0, 1.0, -1.0]
+    x = np.array([(0.19, 0.34, 1.0), (0.21, 0.0, 1.0), (0.0, 0.36, 1.0), (0.0, 0.0, -1.0)])
+    u = np.array([(0.0, 0.0, -1.0)] * 4)
+    for size, expected in ((SIZE, [1.0, -1.0, -1.0, -1.0]), ((0.0, 0.0, 0.0), [1.0, 1.0, 1.0, -1.0])):
+        distance, _ = launched(trace, [0, wp.vec3(*size), x, u], (float, wp.vec3), device, 4)
+        assert distance.tolist() == expected

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import spadwarp_kernels as sk
-from helpers.worlds import SMALL, garden, transforms
+from helpers.worlds import SMALL, STILL, garden, transforms
 
 
 @pytest.mark.parametrize("use_warp_bvh", [False, True])
@@ -15,7 +15,7 @@ def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
     config = sk.SpadConfig(**SMALL, absorption=0.05, scattering=0.0, dark_rate=2e3)
     fine = dataclasses.replace(config, width=64, height=48, dark_rate=0.0)  # the camera's rays are at pixel centres
     shapes, bodies = garden(device)
-    poses = transforms([(0.1, 0, -0.2, 0, 0, 0, 1), (0, 0, 0, 0, 0, 0, 1)], device)
+    poses = transforms([(0.1, 0, -0.2, 0, 0, 0, 1), STILL], device)
     camera = sk.SpadCamera(fine, 2, device=device)
     camera.update(shapes, poses, bodies)
     dark = config.dark_rate * config.bin_path / config.speed
@@ -40,13 +40,6 @@ def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
     assert np.array_equal(tracer.true_depth.numpy(), camera.true_depth.numpy())
 
 
-def small_step(device, photons=20_000):
-    shapes, bodies = garden(device)
-    tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), 2, photons=photons)
-    poses = transforms([(0, 0, 0, 0, 0, 0, 1)] * 2, device)
-    return tracer, bodies, lambda: tracer.update(poses, bodies)
-
-
 def test_the_map_of_the_view_skips_rays_and_changes_no_bit(device, monkeypatch):
     """With bodies that have moved, and a floor that goes past the lens."""
     from spadwarp_kernels.worlds import spad_tracer
@@ -60,7 +53,7 @@ def test_the_map_of_the_view_skips_rays_and_changes_no_bit(device, monkeypatch):
             device=device,
         )
         tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), photons=20_000)
-        pose = transforms([(0, 0, 0, 0, 0, 0, 1)], device)
+        pose = transforms([STILL], device)
         for x in (-0.5, 0.5):
             tracer.update(pose, transforms([(x, 0.2, 2, 0, 0, 0, 1), (-x, 0, 3, 0, 0, 0, 1)], device))
         return tracer.rates.numpy(), sk.read_ledger(tracer.data)[1]
@@ -77,10 +70,11 @@ def test_the_map_of_the_view_skips_rays_and_changes_no_bit(device, monkeypatch):
 
 def test_steps_have_photons_of_their_own(device):
     """Their mean converges as that of independent runs does."""
-    tracer, _, step = small_step(device, photons=5_000)
+    shapes, bodies = garden(device)
+    tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), 2, photons=5_000)
     sums = []
     for _ in range(16):
-        step()
+        tracer.update(transforms([STILL] * 2, device), bodies)
         sums.append(tracer.rates.numpy()[1].astype(float).sum())
     assert np.unique(sums).size == 16
     one = np.std(sums[:8] + sums[8:]) / np.mean(sums)

@@ -82,7 +82,7 @@ def test_poses_of_a_first_step(kind, row, text):
         ({"worlds": 2**31 - 1}, r"worlds = 2147483647 is outside \[1, 16777216\]"),
         ({"visible": "yes"}, "visible is .*; true or false for each of 2 shapes is needed"),
         ({"kind": ["mesh"] * 2, "mesh": [12345] * 2}, r"mesh\[0\] is not the id of a wp.Mesh that exists"),
-        ({"kind": ["mesh"] * 2, "mesh": [triangle(9)] * 2}, r"mesh\[0\] has indices 0 to 9, outside \[0, 2\]"),
+        ({"kind": ["mesh"] * 2, "mesh": [triangle(9)] * 2}, r"mesh\[0\].indices\[2\] = 9 is outside \[0, 2\]"),
         ({"kind": ["mesh"] * 2, "mesh": [triangle()] * 2, "first_face": 99}, "reach beyond the 0 faces of textures"),
     ],
 )

@@ -1,0 +1,591 @@
+"""What becomes of a photon, from its emission to the end of its history: stages, made for a spec."""
+
+import warp as wp
+
+from spadwarp_kernels.base.philox import (
+    STREAM_FLIGHT_SAMPLE,
+    STREAM_ROULETTE,
+    STREAM_SURFACE,
+    STREAM_TRANSPORT,
+    hold_keys,
+    join_words,
+    make_prefetch,
+    prefetched_block,
+    random_block_keyed,
+    u01,
+    u01_fine,
+    u01_tail,
+)
+from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
+from spadwarp_kernels.estimators.estimator import Direction
+from spadwarp_kernels.optics.laser import emit_along, emit_measured
+from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import (
+    END,
+    EVENT,
+    FLIGHT,
+    RAY,
+    SCATTER,
+    TOO_LONG,
+    Draws,
+    Launch,
+    PhotonRef,
+    SinkRef,
+    Weight,
+    WorldRef,
+    book,
+    book_weight,
+    is_planned,
+    reweigh,
+    shorten,
+)
+from spadwarp_kernels.riders.rider import NOTHING
+from spadwarp_kernels.riders.riders import make_rider
+from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box
+from spadwarp_kernels.surface.patches import nearest_patch
+from spadwarp_kernels.surface.ray_cast import intersect_surfaces, offset_from_surface, patch_hit
+from spadwarp_kernels.surface.reflectance import (
+    sample_cosine_law,
+    sample_reflection,
+    unshadowed,
+)
+from spadwarp_kernels.tally import ledger
+from spadwarp_kernels.tally.ledger import slot_of_core, to_ledger
+from spadwarp_kernels.tally.tally import atomic_add_int64
+from spadwarp_kernels.water import limits
+
+# ---- The begin and the end of a history, and the account of a thread.
+
+
+def make_prepare(spec: TransportSpec, cuda: bool) -> wp.Function:
+    """The Warp function ``(draws, world, thread, launch) -> int``: readies the random numbers of a thread; its slot of
+    the ledger."""
+    stepped, in_blocks = spec.stepped, bool(spec.blocks)
+
+    @wp.func
+    def prepare(draws: wp.ref[Draws], world: WorldRef, thread: int, launch: Launch) -> int:
+        if wp.static(in_blocks):
+            world.derivatives.blocks.thread = thread
+        draws.base = launch.first_id
+        if wp.static(stepped):
+            draws.base += launch.offset[0]
+        draws.keys = hold_keys(world.keys)
+        if wp.static(cuda):
+            return thread
+        return slot_of_core(launch.first_id)
+
+    return prepare
+
+
+def make_emit(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(world, id) -> spatial_vector``: start position [m], then unit direction."""
+    confocal = spec.confocal
+    emit_from = emit_measured if spec.measured_beam else emit_along
+
+    @wp.func
+    def emit(world: WorldRef, id: wp.uint64) -> wp.spatial_vector:
+        axis = world.laser.axis
+        if wp.static(confocal):
+            axis = world.scan.axis[int(id % wp.uint64(world.scan.count))]
+        start, heading = emit_from(world.laser, axis, world.seed, id)
+        return wp.spatial_vector(start, heading)
+
+    return emit
+
+
+def make_begin(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
+    confocal, has_port, begin_carried = spec.confocal, spec.laser_port is not None, make_rider(spec).begin
+    enter = spec.laser_port.enter if spec.laser_port is not None else None
+
+    @wp.func
+    def begin(s: PhotonRef, world: WorldRef, sink: SinkRef, emitted: wp.spatial_vector, id: wp.uint64):
+        if wp.static(confocal):
+            s.target = int(id % wp.uint64(world.scan.count))
+            s.view = world.scan.view[s.target]
+        s.x = wp.spatial_top(emitted)
+        s.u = wp.spatial_bottom(emitted)
+        s.path = 0.0
+        s.weight.value = 1.0
+        s.weight.absorbed_water += to_ledger(1.0)
+        if wp.static(has_port):
+            passage = enter(world.laser.port, s.x, s.u)
+            reweigh(s.weight, passage.transmission)
+            if passage.transmission > 0.0:
+                s.x = passage.x
+                s.u = passage.u
+                s.path = passage.path
+            book_weight(s.weight, s.account, sink, ledger.LASER_PORT)
+        s.analog_weight = s.weight.value
+        s.collisions = 0
+        s.surface_count = 0
+        begin_carried(s.carried, world, s.target, emitted, s.x, s.u)
+        s.stage = FLIGHT
+
+    return begin
+
+
+def make_finish(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, sink)``: writes the photon's record, and the ledger entry that takes the rest of its
+    weight."""
+    records, derivatives = spec.records, len(spec.derivatives)
+
+    @wp.func
+    def finish(s: PhotonRef, sink: SinkRef):
+        if wp.static(records):
+            sink.records.position[s.photon] = s.x
+            sink.records.direction[s.photon] = s.u
+            sink.records.weight[s.photon] = s.weight.value
+            sink.records.path[s.photon] = s.path
+            sink.records.collisions[s.photon] = s.collisions
+            sink.records.reason[s.photon] = s.reason
+            for p in range(wp.static(derivatives)):
+                sink.records.log_derivatives[s.photon, p] = s.carried.log_derivatives[p]
+        rest = to_ledger(s.weight.value)
+        s.weight.absorbed_water -= rest
+        book(s.account, sink, s.reason, rest)
+        s.water_collisions += s.collisions - s.surface_count - s.bounces.count
+        s.bounces.total += s.bounces.count
+        s.bounces.count = 0
+        s.bounces.leg = 0
+        s.surface_events += s.surface_count
+
+    return finish
+
+
+def make_flush(adds: bool, reflecting: bool) -> wp.Function:
+    """The Warp function ``(s, sink)``: adds what a thread has summed up to the ledger, and with `adds` to the tally
+    what `add_pending` has left."""
+
+    @wp.func
+    def flush(s: PhotonRef, sink: SinkRef):
+        if wp.static(adds):
+            atomic_add_int64(sink.tally, int(s.account.pending[0]), s.account.pending[1])
+        book(s.account, sink, ledger.ABSORBED_WATER, s.weight.absorbed_water - s.absorbed_surface - s.directed)
+        book(s.account, sink, ledger.ABSORBED_SURFACE, s.absorbed_surface)
+        book(s.account, sink, ledger.DIRECTED, s.directed)
+        book(s.account, sink, ledger.WATER_COLLISIONS, wp.int64(s.water_collisions))
+        book(s.account, sink, ledger.SURFACE_EVENTS, wp.int64(s.surface_events))
+        book(s.account, sink, ledger.SURFACE_QUERIES, wp.int64(s.surface_queries))
+        book(s.account, sink, ledger.SHADOW_QUERIES, wp.int64(s.shadow_queries))
+        book(s.account, sink, ledger.CONTRIBUTIONS, wp.int64(s.contributions))
+        if wp.static(reflecting):
+            book(s.account, sink, ledger.REFLECTIONS, wp.int64(s.bounces.total))
+            book(s.account, sink, ledger.BEYOND_MAX_REFLECTIONS, wp.int64(s.bounces.dropped))
+
+    return flush
+
+
+# ---- Fly: how far the photon flies before it collides, and whether a surface stands before that.
+
+
+def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: bool, cuda: bool) -> wp.Function:
+    """The Warp function ``(s, world, draws, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
+    in its way, to RAY.
+
+    On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
+    several flights at once, so that it must be called for each flight of a photon in turn. `brute_force`: every face
+    is tried on the spot.
+    """
+    plans, random_albedo, water_free_path = plan_flight is not None, spec.random_albedo, spec.water.free_path
+    events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
+    last = events - 1
+    has_bvh = spec.mesh and not brute_force
+
+    @wp.func
+    def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
+        id = draws.base + wp.uint64(s.photon)
+        event = wp.uint32(s.collisions + 1)
+        if wp.static(cuda):
+            s.flight.block = random_block_keyed(draws.keys, id, event, STREAM_TRANSPORT)
+        else:
+            k = s.collisions & last
+            if k == 0:
+                prefetch(words, draws.keys, id, event)
+            s.flight.block = prefetched_block(words, k)
+        seed = join_words(s.flight.block[0], s.flight.block[2])
+        xi = u01_tail(s.flight.block[0], s.flight.block[2])
+        s.flight.distance = water_free_path(world.medium, world.layers, s.x, s.u, xi, seed)
+        s.flight.reach = wp.min(s.flight.distance, world.limits.max_path - s.path)
+        if wp.static(plans):
+            if wp.static(cuda):
+                s.flight.sample_block = random_block_keyed(draws.keys, id, event, STREAM_FLIGHT_SAMPLE)
+            else:
+                s.flight.sample_block = prefetched_block(words, events + k)
+            plan = plan_flight(s, s.flight.sample_block, world)
+            s.flight.lens = plan.lens
+            s.flight.lens_weight = plan.lens_weight
+            s.flight.interval = plan.interval
+            if is_planned(s.flight):
+                s.flight.reach = wp.max(s.flight.reach, s.flight.interval[1])
+        s.hit.face = -1
+        s.stage = EVENT
+        if wp.static(random_albedo):
+            s.albedo = world.medium.albedo * u01(random_block_keyed(draws.keys, id, event, STREAM_ROULETTE)[1])
+        if wp.static(has_bvh):
+            if segment_meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
+                s.stage = RAY
+        if wp.static(brute_force):
+            # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
+            met = nearest_patch(world.surfaces.patches, s.x, s.u, NOWHERE)
+            s.surface_queries += 1
+            if met[0] < wp.min(s.flight.distance, NOWHERE):  # in water as thin as vacuum a flight is longer than that
+                s.hit = patch_hit(world.surfaces, met)
+            shorten(s.flight, met[0])
+
+    return fly
+
+
+def make_trace(has_bvh: bool) -> wp.Function:
+    """The Warp function ``(s, world)``: the surface before a photon that waits for a ray, without other threads."""
+
+    @wp.func
+    def trace(s: PhotonRef, world: WorldRef):
+        if wp.static(has_bvh):
+            if s.stage == RAY:
+                s.surface_queries += 1
+                hit = intersect_surfaces(world.surfaces, s.x, s.u, s.flight.reach, False)
+                if hit.face >= 0:
+                    if hit.distance < s.flight.distance:
+                        s.hit = hit
+                    shorten(s.flight, hit.distance)
+                s.stage = EVENT
+
+    return trace
+
+
+# ---- Collide: the end of a flight, in the water, on a surface or at a limit.
+
+
+@wp.struct
+class Collision:
+    """The end of a flight."""
+
+    distance: float  # length of the flight [m]
+    reason: int  # ledger entry of the limit that ended the history, or of its last event; else -1
+    mirror: int  # face of the domain that reflects the photon there; else 0
+
+
+def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, world)``: takes a photon to the end of its flight, and on to SCATTER or to END.
+
+    `flies_on`: see `make_continues`.
+    """
+    has_mesh, reflecting, local_albedo = spec.mesh, spec.reflecting, spec.local_albedo
+    bounded = spec.bounded and not reflecting
+    water_at, fly_carried = spec.water.at, make_rider(spec).fly
+    domain = limits.make_domain(spec.rotated_domain)
+    outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
+
+    @wp.func
+    def end_of_flight(s: PhotonRef, world: WorldRef) -> Collision:
+        c = Collision()
+        c.distance = s.flight.distance
+        c.reason = -1
+        limit = world.limits.max_path - s.path
+        if s.flight.distance > limit:
+            c.reason = ledger.MAX_PATH
+            c.distance = limit
+        if wp.static(bounded):
+            if outside(world.limits, s.x + c.distance * s.u):
+                leaves = exit_of(world.limits, s.x, s.u)
+                c.reason = ledger.EXIT + leaves.face
+                c.distance = wp.min(c.distance, leaves.distance)
+        if wp.static(reflecting):
+            # By distance: a photon that has been reflected may be outside by a rounding error.
+            exit = to_exit(world.limits, s.x, s.u)
+            if exit < c.distance:
+                c.distance = exit
+                c.reason = -1
+                face = exit_of(world.limits, s.x, s.u).face
+                if limits.face_index(world.limits.boundary, face) > 0.0:
+                    c.mirror = face
+                else:
+                    c.reason = ledger.EXIT + face
+        if wp.static(flies_on):
+            if s.collisions > 0 and s.reason >= 0:
+                c.reason = s.reason
+                if wp.static(reflecting):
+                    # The light of the last event ends at the next, or with the longest leg that may be scored.
+                    c.mirror = wp.where(s.bounces.leg < world.limits.boundary.max_reflections, c.mirror, 0)
+        return c
+
+    @wp.func
+    def collide(s: PhotonRef, world: WorldRef):
+        c = end_of_flight(s, world)
+        fly_carried(s.carried, world, s.x, s.u, c.distance)
+        s.x = s.x + c.distance * s.u
+        s.path += c.distance
+        s.reason = c.reason
+        s.stage = END
+        if c.reason < 0:
+            if wp.static(local_albedo):
+                s.albedo = water_at(world.medium, world.layers, s.x).albedo
+            if wp.static(has_mesh):
+                if s.hit.face >= 0 and c.mirror == 0:
+                    s.x = offset_from_surface(s.x, s.hit.normal, c.distance)
+        if wp.static(reflecting):
+            s.bounces.face = c.mirror
+            s.bounces.leg = wp.where(c.mirror > 0, s.bounces.leg + 1, 0)
+            s.bounces.count += wp.where(c.mirror > 0, 1, 0)
+        if c.reason < 0 or c.mirror > 0:
+            s.stage = SCATTER
+
+    return collide
+
+
+def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Function) -> wp.Function:
+    """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
+    estimator says so, with what rides along."""
+    crosses, reflecting, has_port = cross is not None, spec.reflecting, spec.port is not None
+    leave = spec.port.leave if spec.port is not None else None
+    rider = make_rider(spec)
+    rides, (_begin, fork, fly, _event, _mirror, deliver) = rider is not NOTHING, rider
+
+    @wp.func
+    def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
+        if wp.static(crosses):
+            c = cross(s, world)
+            if wp.static(reflecting):
+                s.bounces.dropped += wp.where(c.index == TOO_LONG, 1, 0)
+            if wp.static(rides):
+                if c.value > 0.0:
+                    carried = s.carried
+                    to_lens = -s.x[2] / s.u[2]
+                    inside = s.u
+                    if wp.static(has_port):
+                        passage = leave(world.camera.port, s.x, s.u)
+                        to_lens = passage.water
+                        inside = passage.u
+                    fork(carried, world)
+                    fly(carried, world, s.x, s.u, to_lens)
+                    deliver(c, carried, world, s.x, s.u, inside)
+            if not c.value <= 0.0:
+                s.contributions += 1
+                deposit(s.account, sink, world, c)
+
+    return cross_aperture
+
+
+# ---- Scatter: the weight after an event, the end of the history, or the new direction.
+
+
+@wp.struct
+class Survival:
+    """What an event leaves of a photon: the part of its weight, and at a surface the part of that which is specular."""
+
+    part: float
+    lobe: float
+
+
+@wp.struct
+class Outcome:
+    """What an event makes of a photon: see `PhotonState`, which takes it over once nothing asks for the old weight."""
+
+    weight: Weight
+    analog_weight: float
+    reason: int
+
+
+def make_survive(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
+    has_mesh, specular, reflectance_at = spec.mesh, spec.specular, spec.reflectance_at
+
+    @wp.func
+    def survive(s: PhotonRef, world: WorldRef) -> Survival:
+        survival = Survival()
+        survival.part = s.albedo
+        if wp.static(has_mesh):
+            if s.hit.face >= 0:
+                survival.part = reflectance_at(world.surfaces, s.hit.face, s.x)
+                if wp.static(specular):
+                    specular_part = world.surfaces.specular[s.hit.face]
+                    survival.part += specular_part
+                    survival.lobe = specular_part / wp.max(survival.part, 1.0e-30)
+        return survival
+
+    return survive
+
+
+def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
+    """The Warp function ``(s, reflected, lobe, world, id) -> Direction``.
+
+    Directions follow the phase function and the surface's law, unless an estimator has a way of its own.
+    """
+    if direct is not None:
+        return direct
+    has_mesh, specular, phase_sample, water_at = spec.mesh, spec.specular, spec.phase.sample, spec.water.at
+
+    @wp.func
+    def sample_direction(s: PhotonRef, reflected: wp.vec3, lobe: float, world: WorldRef, id: wp.uint64) -> Direction:
+        new = Direction()
+        on_surface = False
+        if wp.static(has_mesh):
+            on_surface = s.hit.face >= 0
+        axis = snap_from(s.u, world.medium.axis_threshold)
+        t = phase_sample(u01_fine(s.flight.block[1]), water_at(world.medium, world.layers, s.x))
+        if on_surface:
+            axis = s.hit.normal
+            t = sample_cosine_law(u01(s.flight.block[1]))
+        new.u = rotate_by(axis, t, cos_sin_word(s.flight.block[2]))
+        if wp.static(specular):
+            if on_surface:
+                new.u = reflected
+        return new
+
+    return sample_direction
+
+
+def make_continues(flies_on: bool) -> wp.Function:
+    """The Warp function ``reason -> bool``: whether there is a flight after an event.
+
+    `flies_on`: the light of a history's last event is scored as it flies, to where the next event would be.
+    """
+
+    @wp.func
+    def continues(reason: int) -> bool:
+        return reason < 0 or (wp.static(flies_on) and reason != ledger.ROULETTE)
+
+    return continues
+
+
+def make_terminate(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(new, s, world, sink, id)``: the end of a history for its analog weight or its events."""
+    roulette = spec.roulette
+
+    @wp.func
+    def terminate(new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
+        if new.analog_weight < world.limits.weight_cutoff:
+            new.reason = ledger.WEIGHT_CUTOFF
+            if wp.static(roulette):
+                chance = u01(random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
+                new.reason = ledger.ROULETTE
+                if chance < 0.1 and new.analog_weight > 0.0:
+                    new.reason = -1
+                    reweigh(new.weight, 10.0)
+                    new.analog_weight *= 10.0
+                    book_weight(new.weight, s.account, sink, ledger.ROULETTE)
+        if new.reason < 0 and s.collisions >= world.limits.max_collisions:
+            new.reason = ledger.MAX_COLLISIONS
+
+    return terminate
+
+
+def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, world, sink, id)`` of a photon that a face of the domain reflects; what is not reflected
+    leaves by the face.
+
+    `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
+    """
+    rotated, terminate, continues = spec.rotated_domain, make_terminate(spec), make_continues(flies_on)
+    turn, turn_back = limits.make_domain(rotated).turn, limits.make_domain(rotated).turn_back
+    mirror_carried = make_rider(spec).mirror
+
+    @wp.func
+    def bounce(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
+        face = s.bounces.face
+        axis = (face - 1) // 2
+        index = limits.face_index(world.limits.boundary, face)
+        u = turn(world.limits, s.u)
+        part = limits.fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), index)
+        u = turn_back(world.limits, limits.flipped(u, axis))
+        if wp.static(rotated):
+            u = wp.normalize(u)
+        new = Outcome()
+        new.reason = s.reason
+        new.weight = s.weight
+        reweigh(new.weight, part)
+        mirror_carried(s.carried, s.u, u, index)
+        # The light of an event that was the last is accounted for by what has ended the history.
+        book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.EXIT + face, s.reason))
+        if s.reason < 0:
+            new.analog_weight = wp.where(wp.static(directed), s.analog_weight * part, new.weight.value)
+            terminate(new, s, world, sink, id)
+        if continues(new.reason):
+            s.u = u
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.reason = new.reason
+
+    return bounce
+
+
+def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, world, sink, draws)``: takes a photon from its event to FLIGHT, or to END.
+
+    `flies_on`: see `make_continues`.
+    """
+    has_mesh, specular, reflecting, directed = spec.mesh, spec.specular, spec.reflecting, direct is not None
+    survive, sample_direction = make_survive(spec), make_sample_direction(spec, direct)
+    terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
+    continues, turn_carried = make_continues(flies_on), make_rider(spec).event
+
+    @wp.func
+    def turn(
+        new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64, on_surface: bool, lobe: float
+    ):
+        reflected = s.u
+        if wp.static(specular):
+            if on_surface:
+                draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
+                roughness = world.surfaces.roughness[s.hit.face]
+                reflected = sample_reflection(s.u, s.hit.normal, roughness, lobe, draw)
+        heading = sample_direction(s, reflected, lobe, world, id)
+        turn_carried(s.carried, world, wp.where(on_surface, s.hit.slot, -1), s.x, s.u, heading.u)
+        if wp.static(directed):
+            reweigh(new.weight, heading.factor)
+            s.directed += new.weight.taken
+            if new.weight.value <= 0.0:
+                new.reason = ledger.DIRECTED
+        if wp.static(specular):
+            if on_surface:
+                # What one facet takes of another's light stays in the surface.
+                leaving = unshadowed(s.u, heading.u, s.hit.normal, world.surfaces.roughness[s.hit.face], lobe)
+                reweigh(new.weight, leaving)
+                new.analog_weight *= leaving
+                if new.reason < 0:
+                    s.absorbed_surface += new.weight.taken
+                else:
+                    book_weight(new.weight, s.account, sink, new.reason)
+                if new.weight.value <= 0.0 and new.reason < 0:
+                    new.reason = ledger.WEIGHT_CUTOFF
+        s.u = heading.u
+
+    @wp.func
+    def collision(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
+        new = Outcome()
+        new.reason = -1
+        new.weight = s.weight
+        on_surface = False
+        if wp.static(has_mesh):
+            on_surface = s.hit.face >= 0
+        survival = survive(s, world)
+        if on_surface:
+            reweigh(new.weight, survival.part)
+            s.absorbed_surface += new.weight.taken
+        else:
+            new.weight.value *= survival.part
+        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
+        terminate(new, s, world, sink, id)
+        if continues(new.reason):
+            turn(new, s, world, sink, id, on_surface, survival.lobe)
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.reason = new.reason
+        s.surface_count += wp.where(on_surface, 1, 0)
+
+    @wp.func
+    def scatter(s: PhotonRef, world: WorldRef, sink: SinkRef, draws: wp.ref[Draws]):
+        # Here, not in `collide`: there a select takes the place of the branch, and a core waits for the flight.
+        s.collisions += 1
+        id = draws.base + wp.uint64(s.photon)
+        bounced = False
+        if wp.static(reflecting):
+            bounced = s.bounces.face > 0
+            if bounced:
+                bounce(s, world, sink, id)
+        if not bounced:
+            collision(s, world, sink, id)
+        s.stage = wp.where(continues(s.reason), FLIGHT, END)
+
+    return scatter
