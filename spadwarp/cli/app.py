@@ -29,14 +29,7 @@ FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 
 @dataclass
 class Running:
-    """The command that runs.
-
-    Attributes:
-        quiet: Whether only warnings and errors are printed.
-        overwrite: Whether existing files are replaced.
-        json: File for the summary.
-        given: Options and arguments that have another value than by default.
-    """
+    """The command that runs: its common options, and the names of all that have another value than by default."""
 
     quiet: bool = False
     overwrite: bool = False
@@ -88,7 +81,7 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         with warnings.catch_warnings(), _resources:
-            warnings.showwarning = _show_warning
+            warnings.showwarning = lambda message, *_, **__: complain(str(message), "warning")
             warnings.filterwarnings("default", category=SpadwarpWarning)
             try:
                 answer = super().invoke(ctx)
@@ -123,10 +116,6 @@ def _kept(error: Exception) -> str:
     except OSError:
         return f"this:\n{text}"
     return f"{path}, which says where it happened"
-
-
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    complain(str(message), "warning")
 
 
 def until_the_end(context: AbstractContextManager[Value]) -> Value:

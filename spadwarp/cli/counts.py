@@ -62,7 +62,7 @@ def detect(
     Example:
       spadwarp detect run1/ --pulses 1e6 --frames 100 --out frames/ --set detector.dark_count_rate=1e3
     """
-    recorded = _window(window)
+    recorded = None if window is None else _window(window)
     result = _with_detector(opt.load_run(run, channel), overrides)
     scene, methods = result.scene, list(dict.fromkeys(method or get_args(opt.Method)))
     bins = recorded[1] if recorded else scene.gate.bins
@@ -89,15 +89,12 @@ def detect(
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 
-def _window(window: tuple[str, str] | None) -> tuple[float, int] | None:
+def _window(window: tuple[str, str]) -> tuple[float, int]:
     """Start [s] and bins."""
-    if window is None:
-        return None
     try:
         return 1e-9 * opt.from_unit("ns")(window[0]), opt.whole_number(window[1])
     except typer.BadParameter as error:
-        error.param_hint = "--window"
-        raise
+        wrong(error.message, "--window")
 
 
 def _with_detector(result: Result, overrides: list[str] | None) -> Result:
@@ -393,7 +390,7 @@ def denoise(
     from spadwarp.denoise import denoise_file, depth_files
 
     facts, files = opt.read_measured(inputs)
-    depths = _gate(gate, facts.get("group_index"))
+    depths = None if gate is None else _gate(gate, facts.get("group_index"))
     paths = depth_files(path)
     stems = [one.stem for one in paths]
     if twice := sorted({one for one in stems if stems.count(one) > 1}):
@@ -431,17 +428,15 @@ def denoise(
         raise FileError(f"{path}: {len(paths) - len(summary)} of {len(paths)} files could not be denoised")
 
 
-def _gate(text: str | None, group_index: float | None) -> tuple[float, float] | None:
+def _gate(text: str, group_index: float | None) -> tuple[float, float]:
     """Depths [m] of a gate in depth, or in time of flight."""
-    in_time = text is not None and "s" in text  # no unit of length has an s
     try:
-        if text is None or not in_time:
-            return None if text is None else opt.from_to("m")(text)
-        if group_index is None:
-            problem = "is in time of flight: --input group_index=N makes depth of it; or give two lengths"
-            raise typer.BadParameter(f"{text!r} {problem}")
+        if "s" not in text:  # which no unit of length has
+            return opt.from_to("m")(text)
         start, stop = opt.from_to("s")(text)
     except typer.BadParameter as error:
-        error.param_hint = "--gate"
-        raise
+        wrong(error.message, "--gate")
+    if group_index is None:
+        problem = "is in time of flight: --input group_index=N makes depth of it; or give two lengths"
+        wrong(f"{text!r} {problem}", "--gate")
     return range_from_time(start, group_index), range_from_time(stop, group_index)

@@ -46,16 +46,12 @@ SHARED: dict[str, tuple[str, str] | tuple[str, str, str]] = {
     "device": ("NAME", '"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
     "devices": (
         "NAME",
-        '"cpu", "cuda:0", "cuda:0,cuda:2", "cuda:all" for every GPU of this host; by default the first GPU, else the '
-        "CPU.",
+        '"cpu", "cuda:0", "cuda:0,cuda:2", "cuda:all" (every GPU here); by default the first GPU, else the CPU.',
         "--device",
     ),
     "ray": ("ADDRESS", 'Workers of Ray: a running cluster, HOST:PORT or "auto", or "start" to start it here.'),
     "workers": ("N", "Workers of Ray; by default one for each GPU, or one for each machine without a GPU."),
-    "channel": (
-        "",
-        "Which light counts where the camera has an analyser: I (all of it, without the analyser), co or cross.",
-    ),
+    "channel": ("", "Light that counts where the camera has an analyser: I (all, without it), co or cross."),
     "inputs": (
         "NAME=VALUE,...",
         "What a measured file does not hold: bin_width=55ps, gate_start=20ns (time of flight at bin 0 or tag 0; by "
@@ -272,17 +268,16 @@ def _size(text: str) -> tuple[int, int]:
     return int(found[2]), int(found[1])
 
 
-def number_or(*others: str) -> Callable[[str], float | str]:
-    """A number, or one of the words; any text where none is named."""
+def number_or(word: str | None = None) -> Callable[[str], float | str]:
+    """A number, or the word; any text where none is named."""
 
     def parse(text: str) -> float | str:
         try:
-            return text if text in others else parse_number(text)
+            return text if text == word else parse_number(text)
         except ValueError:
-            if others:
-                words = " or ".join(map(repr, others))
-                raise typer.BadParameter(f"{text!r} is neither a number nor {words}") from None
-            return text
+            if word is None:
+                return text
+        raise typer.BadParameter(f"{text!r} is neither a number nor {word!r}")
 
     return parse
 
@@ -301,16 +296,9 @@ def _response(text: str) -> Any:
 
 
 # Names of --input and their readers: arguments of `spadwarp.frames.read_histograms`.
-MEASURED: dict[str, Callable[[str], Any]] = {
-    "bin_width": from_unit("s"),
-    "gate_start": from_unit("s"),
-    "irf": _response,
-    "axes": str,
-    "dataset": str,
-    "image_size": _size,
-    "tag_unit": from_unit("s"),
-    "sum_frames": bool,
-}
+MEASURED: dict[str, Callable[[str], Any]] = {"bin_width": from_unit("s"), "gate_start": from_unit("s")}
+MEASURED |= {"irf": _response, "axes": str, "dataset": str, "image_size": _size}
+MEASURED |= {"tag_unit": from_unit("s"), "sum_frames": bool}
 Measured = Annotated[dict[str, Any], items(MEASURED)]
 
 

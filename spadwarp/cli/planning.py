@@ -385,23 +385,16 @@ def water(
 
     A scene gets those of water by medium.chlorophyll, temperature and salinity, those of particles from the files.
 
-    \b
-    Particles in two components after Kopelevich [ppm]:
-      small, large   mineral particles below 1 um, organic ones above
-    or by Mie's theory, which needs miepython: pip install 'spadwarp[mie]':
-      index          index over that of the water, such as 1.05 or 1.15
-      absorbing      imaginary part of that index, 0 to 0.01
-      concentration  volume of the particles [ppm]
-      slope, smallest, largest  power law of diameters, slope mostly near 4
-      median, deviation         log-normal diameters, geometric standard deviation > 1
-      diameter                  particles of one diameter
-
     Args:
         wavelength_nm (NM): Vacuum wavelength, 400 to 700 [nm].
         chlorophyll (C): 0 (pure water) to 30 [mg/m3].
         temperature (T): 0 to 30 [degrees Celsius].
         salinity (S): 0 (fresh) to 40 [g/kg].
-        particles (NAME=VALUE,...): Their components, or index, concentration and sizes, as above.
+        particles (NAME=VALUE,...): After Kopelevich: small and large [ppm], mineral particles below 1 um and organic
+            ones above. Or by Mie's theory (pip install 'spadwarp[mie]'): index over that of the water, such as 1.05;
+            absorbing, its imaginary part, 0 to 0.01; concentration, their volume [ppm]; and slope (mostly near 4),
+            smallest, largest of a power law of diameters; or median, deviation (geometric, above 1) of log-normal ones;
+            or diameter, of all.
         water: With --particles: add the water's own optics.
         out: With --particles: the phase function as .csv, for medium.phase_table.
         matrix: By Mie's theory: the scattering matrix as .csv, for medium.matrix_table.
