@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import enum
-import functools
 import inspect
 import math
 import re
 from collections.abc import Callable, Mapping
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from types import NoneType, UnionType
+from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer
@@ -95,7 +94,6 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
             made.append(_parameter(one, hints[one.name], metavar, about, names[one.name]))
         defaults = {one.name: one.default for one in made}
 
-        @functools.wraps(function)
         def run(**values: Any) -> None:
             for common in _COMMON:
                 setattr(running, common, values.pop(common, None))
@@ -103,9 +101,7 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
             function(**{one: _plain(value) for one, value in values.items()})
 
         run.__doc__ = text
-        run.__dict__["__signature__"] = inspect.Signature(made)
-        del run.__dict__["__wrapped__"]
-        run.__annotations__ = {one.name: one.annotation for one in made}
+        vars(run)["__signature__"] = inspect.Signature(made)
         app.command(name or function.__name__)(run)
         return function
 
@@ -122,8 +118,7 @@ def _documentation(function: Callable[..., None]) -> tuple[str, dict[str, tuple[
 
 def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name: str) -> inspect.Parameter:
     """The parameter as typer takes it."""
-    optional = get_origin(kind) in (Union, UnionType)
-    inner = next(part for part in get_args(kind) if part is not NoneType) if optional else kind
+    inner = get_args(kind)[0] if get_origin(kind) in (Union, UnionType) else kind
     repeated = get_origin(inner) is list
     item: Any = get_args(inner)[0] if repeated else inner
     extra: dict[str, Any] = {"help": text}
@@ -147,8 +142,7 @@ def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name:
     else:
         names = [f"{name}/--no-{name[2:]}"] if one.default is True else [name]
         about = typer.Option(*names, *(["-q"] if one.name == "quiet" else []), **extra)
-    annotation = list[item] if repeated else item  # type: ignore[valid-type]
-    annotation = Annotated[annotation | None if optional else annotation, about]
+    annotation = Annotated[list[item] if repeated else item, about]  # type: ignore[valid-type]
     return one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
 
 
