@@ -45,8 +45,8 @@ def info(path: Path, *, verify: bool = False) -> None:
     elif (path / "recipe.toml").is_file():
         manifest = spadwarp.dataset.read_manifest(path)
         size = sum(one["bytes"] for one in manifest["files"].values())
-        shown = {"kind": "dataset", "bytes": size, **{**manifest, "files": len(manifest["files"])}}
-        answer({"kind": "dataset", **manifest}, shown=shown)
+        say(readable({"kind": "dataset", "bytes": size, **manifest, "files": len(manifest["files"])}))
+        write_json({"kind": "dataset", **manifest})
     else:
         summary = spadwarp.files.summary(spadwarp.load(path))
         shown = dict(summary)
