@@ -57,9 +57,8 @@ def test_frames_do_not_depend_on_the_parts_they_are_drawn_in(done, tmp_path, mon
 
 def test_the_detector_can_be_another(done, tmp_path):
     dark = ("--set", "detector.dark_count_rate=1e7", "--set", "laser.pulse_energy=1e-20")
-    run(
-        "detect", done, "--out", tmp_path / "dark", *dark, "--method", "peak", "--json", tmp_path / "dark.json", *DEVICE
-    )
+    options = (*dark, "--method", "peak", "--json", tmp_path / "dark.json", *DEVICE)
+    run("detect", done, "--out", tmp_path / "dark", *options)
     found = tables(tmp_path / "dark.json")
     expected = -np.expm1(-1e7 * 150 * 100e-12)  # one count a pulse at most
     assert found["detections_per_pulse_and_pixel"] == pytest.approx(expected, rel=0.02)

@@ -94,15 +94,8 @@ def test_plan_is_that_of_python_and_writes_a_scene(spad_scene, tmp_path):
     found = tables(summary)
     assert found["values"] == twin.values and found["terms"] == twin.terms and found["limit"] == twin.limit
     assert spadwarp.load_scene(written) == twin.scene
-    for words in (
-        "gate.start_ns",
-        "hazard distance",
-        "IEC 60825-1",
-        "Cramér–Rao bound",
-        "forward scattering",
-        twin.limit,
-    ):
-        assert words in printed.stdout, words
+    words = ("gate.start_ns", "hazard distance", "IEC 60825-1", "Cramér–Rao bound", "forward scattering", twin.limit)
+    assert all(word in printed.stdout for word in words)
     assert "is a time" in run("plan", spad_scene, "--depth-error", "1ns", code=2).stderr
     assert "FROM:TO" in run("plan", spad_scene, "--range", "3", code=2).stderr
 
