@@ -8,7 +8,7 @@ result.histogram, result.depth(), result.save("result.h5")
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from spadwarp.values import __version__
 
 # The packages, and which of their public names stand here too. Loaded when first used, so that `import spadwarp` and
 # `spadwarp --help` need neither Warp nor h5py.

@@ -240,3 +240,18 @@ def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
     if not all(isinstance(row, Mapping) for row in table):
         raise ArgumentError(f"rows hold a {type(table[0]).__name__}; data classes or dicts are needed")
     return pandas.DataFrame(table, index=index)
+
+
+# ---- Errors of kernels.
+
+
+@contextmanager
+def kernel_errors() -> Iterator[None]:
+    """Turns what the kernel library refuses into an `ArgumentError` of spadwarp: numbers that pass one by one, but
+    together leave the range of what is computed with."""
+    import spadwarp_kernels as sk
+
+    try:
+        yield
+    except sk.ArgumentError as error:
+        raise ArgumentError(str(error)) from error

@@ -85,7 +85,7 @@ def diagnose(
 def _system() -> dict[str, str]:
     import warp as wp
 
-    from spadwarp import __version__
+    from spadwarp.values import __version__
 
     toolkit, driver = wp.get_cuda_toolkit_version(), _driver_cuda()
     return {

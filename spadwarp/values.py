@@ -18,8 +18,7 @@ import operator
 import os
 import re
 import reprlib
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
@@ -29,6 +28,8 @@ __all__ += ["DeviceError", "FileError", "Interval", "MeshError", "SpadwarpError"
 __all__ += ["check_choice", "check_integer", "check_part", "check_real", "environment_integer", "in_words"]
 __all__ += ["parse_number", "path_from_time", "percent", "pulse_speed", "quantity", "range_from_time", "read_real"]
 __all__ += ["rounded", "shown", "suggestion", "time_from_path", "time_from_range", "with_prefix"]
+
+__version__ = "0.1.0"
 
 try:
     import resource
@@ -74,18 +75,6 @@ class DeviceError(SpadwarpError):
 
 class SpadwarpWarning(UserWarning):
     """A success that may still mislead; its text is meant for the user as it is."""
-
-
-@contextmanager
-def kernel_errors() -> Iterator[None]:
-    """Turns what the kernel library refuses into an `ArgumentError` of spadwarp: numbers that pass one by one, but
-    together leave the range of what is computed with."""
-    import spadwarp_kernels as sk
-
-    try:
-        yield
-    except sk.ArgumentError as error:
-        raise ArgumentError(str(error)) from error
 
 
 # What the loader and threads say when memory is short, which Python then reports as another error.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import kernel_errors
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import daylight_rate, phase_function, water_lines
@@ -26,7 +27,7 @@ from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import LinesOfSight, depth_per_time, lines_of_sight
 from spadwarp.transport.model import port_kind, port_parameters
-from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning, kernel_errors
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene

@@ -18,7 +18,7 @@ from spadwarp.analytic.model import (
     scene_optics,
     warn_of_model,
 )
-from spadwarp.arrays import labelled
+from spadwarp.arrays import kernel_errors, labelled
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.result.file import as_result
@@ -26,7 +26,7 @@ from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
-from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, kernel_errors
+from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer
 
 if TYPE_CHECKING:
     import xarray
@@ -224,7 +224,7 @@ class AnalyticResult:
         Raises:
             FileError: The file cannot be written.
         """
-        from spadwarp import __version__
+        from spadwarp.values import __version__
 
         if frames is not None:
             frames = check_integer("frames", frames, "[0, 2147483647]")

@@ -51,14 +51,11 @@ def check(
       spadwarp check configs/scenes/harbour_5m.toml --set medium.extinction=2.5
       spadwarp check sediment_4m --picture water.png
     """
-    from spadwarp.checks import summary
-    from spadwarp.mesh import build_mesh
-
     read = opt.read_scene(scene, overrides, mesh=mesh)
     check_outputs(files={"--picture": picture}, inputs=(scene, *read.files))
-    triangles = build_mesh(read)
+    triangles = spadwarp.mesh.build_mesh(read)
     messages = spadwarp.check(read, triangles)
-    numbers = {"faces": 0 if triangles is None else triangles.face_count, **summary(read, triangles)}
+    numbers = {"faces": 0 if triangles is None else triangles.face_count, **spadwarp.checks.summary(read, triangles)}
     say(readable(numbers) + "\n")
     for message in messages:
         (typer.echo if message.level == "warning" else say)(str(message))  # a warning also with --quiet

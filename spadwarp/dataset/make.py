@@ -183,7 +183,7 @@ def _finish(plan: Plan, folder: Path) -> tuple[str, ...]:
 
     Returns the shards that are missing.
     """
-    from spadwarp import __version__
+    from spadwarp.values import __version__
 
     files: dict[str, Any] = {}
     missing = []

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import pixel_maps, scene_optics
+from spadwarp.arrays import kernel_errors
 from spadwarp.dataset.plan import Plan, SceneDraw
 from spadwarp.device import pick_device
 from spadwarp.frames import Frames, crlb, detect
@@ -18,7 +19,7 @@ from spadwarp.result import Truth, analyser_channel, degree_of_polarisation
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import RunOptions, simulate, truth_maps
-from spadwarp.values import ConfigError, kernel_errors, path_from_time
+from spadwarp.values import ConfigError, path_from_time
 
 PROFILE_BINS = 64
 """Bins of `backscatter_profile`."""

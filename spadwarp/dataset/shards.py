@@ -287,7 +287,7 @@ def write_scene_index(plan: Plan, folder: Path) -> None:
 
 
 def _attributes(plan: Plan, shard: Shard, name: str) -> dict[str, Any]:
-    from spadwarp import __version__
+    from spadwarp.values import __version__
 
     return {
         "format": f"spadwarp {Path(name).name.partition('-')[0]}",

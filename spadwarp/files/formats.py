@@ -497,7 +497,7 @@ def _write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
     """
     import ptufile
 
-    from spadwarp import __version__
+    from spadwarp.values import __version__
 
     first, counts = frames.with_counts(chosen[0], ".ptu")
     height, width, bins = counts.shape

@@ -7,12 +7,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import kernel_errors
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.result import Result
 from spadwarp.scene import noise_rate
-from spadwarp.values import BIN_WIDTH, ArgumentError, check_choice, check_real, kernel_errors, percent
+from spadwarp.values import BIN_WIDTH, ArgumentError, check_choice, check_real, percent
 
 __all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
 

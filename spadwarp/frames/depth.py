@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, kernel_errors, real_array, tensor_of
 from spadwarp.scene import Camera, Medium, Scene
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
@@ -19,7 +19,6 @@ from spadwarp.values import (
     ArgumentError,
     check_choice,
     check_real,
-    kernel_errors,
     path_from_time,
     shown,
 )

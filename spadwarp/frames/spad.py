@@ -21,6 +21,7 @@ from spadwarp.arrays import (
     histogram_rows,
     in_torch_order,
     is_torch,
+    kernel_errors,
     labelled,
     on_host,
     output_tensor,
@@ -40,7 +41,6 @@ from spadwarp.values import (
     SpadwarpWarning,
     check_integer,
     check_real,
-    kernel_errors,
     shown,
 )
 
@@ -235,7 +235,16 @@ class Receiver:
         """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
         import warp as wp
 
-        slope = self._through(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device))
+        return self._followed(self._through(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)))
+
+    def noise_slope(self) -> Any:
+        """Derivative of λ by a noise rate [1/s] that all pixels share."""
+        import warp as wp
+
+        widths = np.tile(np.diff(self.window.edges).astype(np.float32), (self.image[0] * self.image[1], 1))
+        return self._followed(wp.array(widths, device=self.noise.device))
+
+    def _followed(self, slope: Any) -> Any:
         for effect in EFFECTS:
             effect.apply_to_slope(self, slope)
         return slope

@@ -230,11 +230,11 @@ class _PlacedReceiver(NamedTuple):
 
     def slopes(self, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown]) -> Rows:
         """Derivatives of λ, `[unknown, pixel, bin]`."""
-        widths = np.diff(self.receiver.window.edges).astype(np.float32)
-        result = np.empty((len(unknowns), self.receiver.image[0] * self.receiver.image[1], widths.size), np.float32)
+        height, width = self.receiver.image
+        result = np.empty((len(unknowns), height * width, self.receiver.window.recorded), np.float32)
         for row, unknown in zip(result, unknowns, strict=True):
             if unknown.name == BACKGROUND:
-                row[:] = widths
+                row[:] = self.receiver.noise_slope().numpy()
             else:
                 light = slopes[unknown.name]
                 row[:] = self._with_change(self.receiver.slope(light.total).numpy(), light)

@@ -386,7 +386,7 @@ def provenance(device: Any = None) -> dict[str, Any]:
     """What made a result: versions, machine, date; and a device."""
     import warp as wp
 
-    from spadwarp import __version__
+    from spadwarp.values import __version__
 
     made = {
         "spadwarp": __version__,

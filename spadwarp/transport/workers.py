@@ -17,7 +17,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
-from spadwarp.arrays import caller_tallies
+from spadwarp.arrays import caller_tallies, kernel_errors
 from spadwarp.device import core_count, pick_device, pick_devices, processor_name
 from spadwarp.parallel import Ray, Worker
 from spadwarp.parallel.ray import RayWorkers
@@ -38,7 +38,7 @@ from spadwarp.result.tallies import (
 from spadwarp.scene import Scene
 from spadwarp.transport.model import MeshCache, build_model, trace_truth, transport_spec
 from spadwarp.transport.plan import LARGEST_LAUNCH, LAUNCH_SIZE, Plan, RunOptions, make_plan
-from spadwarp.values import ConfigError, DeviceError, SpadwarpError, address_space, check_integer, kernel_errors
+from spadwarp.values import ConfigError, DeviceError, SpadwarpError, address_space, check_integer
 
 __all__ = ["ExpectedLight", "LightTracer", "prepare_kernels"]
 

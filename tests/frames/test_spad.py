@@ -13,6 +13,7 @@ from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp import ArgumentError
 from spadwarp.frames import InstrumentResponse, coates, detect, first_photon_probabilities, monte_carlo_noise
+from spadwarp.frames.spad import Receiver
 from spadwarp.scene import Detector, Laser
 from spadwarp.values import SpadwarpWarning
 
@@ -312,3 +313,18 @@ def test_a_warning_with_numbers_or_a_note_that_nobody_knows(whole):
         quiet = spadwarp.detect(whole[True], pulses=1000, **keywords)
         unknown = spadwarp.detect(whole[False], pulses=1000, **keywords)
     assert quiet.notes == () and "Monte Carlo noise is unknown" in unknown.notes[0]
+
+
+def test_slopes_of_a_receiver_with_crosstalk_are_differences_of_its_rates():
+    """By the light, and by the noise that all pixels share; weak light, of which every detection may leak."""
+    rows = np.full((12, 8), 1e-5, np.float32)
+
+    def receiver(ambient):
+        detector = Detector(crosstalk_probability=0.05, dark_count_rate=0.0)
+        return Receiver.of(detector, LASER, shape=(3, 4, 8), axis=(0.0, 1e-9), device="cpu", ambient=ambient)
+
+    here, light = receiver(2e3), wp.array(rows, device="cpu")
+    by_noise = (receiver(3e3).hazard(light).numpy() - here.hazard(light).numpy()) / 1e3
+    np.testing.assert_allclose(here.noise_slope().numpy(), by_noise, rtol=2e-3)
+    more = here.hazard(wp.array(1.5 * rows, device="cpu")).numpy() - here.hazard(light).numpy()
+    np.testing.assert_allclose(here.slope(light).numpy(), 2.0 * more, rtol=2e-3)
