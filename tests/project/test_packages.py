@@ -11,7 +11,8 @@ KERNELS = Path(__file__).parents[2] / "kernels" / "spadwarp_kernels"
 # A package imports those further down this table only.
 LEVELS = (
     ("cli",),
-    ("benchmark", "doctor", "validate"),
+    ("doctor",),
+    ("benchmark", "validate"),
     ("denoise",),
     ("viz",),
     ("files",),
