@@ -19,12 +19,11 @@ from pydantic import BeforeValidator
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
-from spadwarp.scene.document import Document, Overrides
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, vector_of
-from spadwarp.scene.sections import listed
+from spadwarp.scene.sections import Document, Overrides, listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
 from spadwarp.values import (
     ArgumentError,
