@@ -213,13 +213,9 @@ def report(results: Sequence[BenchResult]) -> dict[str, Any]:
     """Results as plain values, with device, processor, driver, versions, commit and date."""
     device = pick_device(results[0].device if results else None)
     made = {**provenance(device), "driver": nvidia_driver() if device.is_cuda else None, "commit": _commit()}
-    made["processor"] = processor_name(pick_device("cpu"))
-    return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "provenance": {**made, "threads": None if device.is_cuda else core_count()},
-        "results": [asdict(result) for result in results],
-    }
+    made |= {"processor": processor_name(pick_device("cpu")), "threads": None if device.is_cuda else core_count()}
+    rows = [asdict(result) for result in results]
+    return {"format": FORMAT, "format_version": FORMAT_VERSION, "provenance": made, "results": rows}
 
 
 def load_report(path: str | Path) -> dict[str, Any]:
@@ -279,8 +275,7 @@ def run(
             "analytic", "detect" and the cases of "scaling" named after their photons have sizes of their own.
         repeats: Timed runs of each case, > 0; rates are those of the fastest. Cases of "scaling" are not repeated
             once two seconds have been timed.
-        progress: Called with each case before it is run.
-        found: Called with each result.
+        progress, found: Called with each case before it is run, and with each result.
 
     Raises:
         ArgumentError: An unknown case, or a number out of range.
@@ -318,8 +313,11 @@ def measure(case: Case, device: wp.Device, photons: int | None, repeats: int) ->
     size, tally_bytes = facts["size"], facts.get("tally_bytes")
     del run_number  # and its histograms, before the next run makes its own
     error = check = None
-    if case.error and tally_bytes is not None:
-        error = _error(case, device, min(size["photons"], _usual_photons(device)), rates["photons"])
+    if case.error and tally_bytes is not None:  # from a separate run, since batches take time
+        scene = Scene.from_dict(case.scene)
+        photons = max(min(size["photons"], _usual_photons(device)), 2 * scene.scan_positions)
+        result = simulate(scene, photons=photons, device=device.alias, uncertainty=True)
+        error = result.relative_error * math.sqrt(result.photons / rates["photons"])
     if case.absorbed is not None:
         check = _absorbed(case, device, size["photons"], *case.absorbed)
     return BenchResult(
@@ -357,13 +355,6 @@ def _timed(device: wp.Device, work: Callable[[], Any]) -> tuple[Any, float]:
     result = work()
     wp.synchronize_device(device)
     return result, time.perf_counter() - began
-
-
-def _error(case: Case, device: wp.Device, photons: int, photons_per_second: float) -> float:
-    """Relative error after one second at that rate; from a separate run, since batches take time."""
-    scene = Scene.from_dict(case.scene)
-    result = simulate(scene, photons=max(photons, 2 * scene.scan_positions), device=device.alias, uncertainty=True)
-    return result.relative_error * math.sqrt(result.photons / photons_per_second)
 
 
 def _absorbed(case: Case, device: wp.Device, photons: int, reference: float, rounding: float) -> dict[str, Any]:

@@ -814,13 +814,11 @@ def _check_collisions(survey: Survey) -> None:
 
 def _cutoff_collisions(scene: Scene) -> float:
     """Collisions after which the analog weight is below the cut-off, on average; inf where it never is."""
-    transport = scene.transport
+    transport, albedo = scene.transport, scene.medium.range.albedo
     if transport.termination != "cutoff" or transport.weight_cutoff == 0.0:
         return math.inf
-    if scene.medium.albedo == "lu2024":
-        step = math.log(0.97) - 1.0  # the mean of ln ω for ω uniform in (0, 0.97)
-    else:
-        albedo = scene.medium.range.albedo
+    step = math.log(0.97) - 1.0  # the mean of ln ω for ω uniform in (0, 0.97)
+    if scene.medium.albedo != "lu2024":
         if albedo in (0.0, 1.0):
             return 1.0 if albedo == 0.0 else math.inf
         step = math.log(albedo)

@@ -22,15 +22,12 @@ from spadwarp.validate.cases import PENCIL, Estimate, Quantity, Run, scene, slab
 
 __all__ = ["Diagnosis", "SelfTest", "diagnose"]
 
-NEEDED = (
-    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py",
-    "matplotlib", "tomli-w", "PyYAML", "jinja2",
-)  # fmt: skip
+NEEDED = ("warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py")
+NEEDED += ("matplotlib", "tomli-w", "PyYAML", "jinja2")
 
 # Package → extra that brings it.
-OPTIONAL = {
-    "torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "plotly": "view", "imageio-ffmpeg": "video",
-}  # fmt: skip
+OPTIONAL = {"torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "plotly": "view"}
+OPTIONAL["imageio-ffmpeg"] = "video"
 
 _OLDEST_CUDA = 13000  # of the driver, R580: the CUDA that Warp is built with
 
@@ -149,10 +146,8 @@ def _gpu_reasons() -> list[str]:
     if not wp.get_cuda_toolkit_version():
         reason = "this build of Warp has no CUDA; the wheels for Linux and Windows on x86-64 and Linux on ARM have it"
     elif version is None and (Path("/proc/driver/nvidia").exists() or Path("/dev/nvidiactl").exists()):
-        reason = (
-            "the system has an NVIDIA driver, but its library libcuda is not found: start a container with --gpus all "
-            "(NVIDIA Container Toolkit)"
-        )
+        reason = "the system has an NVIDIA driver, but its library libcuda is not found: start a container with "
+        reason += "--gpus all (NVIDIA Container Toolkit)"
     elif version is None:
         reason = "no NVIDIA driver: an NVIDIA GPU needs driver R580 or newer; without one everything runs on the CPU"
     elif version < _OLDEST_CUDA:

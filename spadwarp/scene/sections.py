@@ -37,17 +37,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from spadwarp.io.text import parse_toml, read_columns
-from spadwarp.values import (
-    UNITS,
-    ConfigError,
-    FileError,
-    Interval,
-    bounds,
-    parse_number,
-    quantity,
-    shown,
-    suggestion,
-)
+from spadwarp.values import UNITS, ConfigError, FileError, Interval, bounds, parse_number, quantity, shown, suggestion
 
 __all__ = ["Preset", "parse_override", "presets"]
 

@@ -303,8 +303,7 @@ def slab_derivatives(run: Run) -> Iterator[Quantity]:
 def layers(run: Run) -> Iterator[Quantity]:
     """Three layers of different waters, illuminated from either side: adding–doubling"""
     for stack in references.STACKS:
-        waters: list[dict[str, float]] = []
-        depth = 0.0
+        waters, depth = list[dict[str, float]](), 0.0
         for anisotropy, albedo, extinction, thickness in stack.layers:
             waters.append({"start": depth, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy})
             depth += thickness
@@ -357,9 +356,8 @@ def moments(run: Run) -> Iterator[Quantity]:
 def near_axis(run: Run) -> Iterator[Quantity]:
     """The near-axis rule's bias: density of the cosine from collision to collision"""
     for threshold, reference in references.NEAR_AXIS.items():
-        (mean,) = run.by_photon(
-            scene(_FORWARD, PENCIL, max_collisions=6, axis_threshold=threshold), lambda r: [_cosine(r)]
-        )
+        tables = scene(_FORWARD, PENCIL, max_collisions=6, axis_threshold=threshold)
+        (mean,) = run.by_photon(tables, lambda r: [_cosine(r)])
         rule = "rule off" if threshold == 1.0 else f"threshold {threshold:g}"
         yield Quantity(f"⟨cosθ⟩, g 0.924, 5 collisions, {rule}", mean, reference)
 
@@ -427,14 +425,8 @@ def fournier_forand(run: Run) -> Iterator[Quantity]:
 
     # A record keeps the direction of its last flight: the second has scattered once, the sixth five times.
     estimates = [*measured(2, deflections), *measured(6, lambda r: [_cosine(r)]), *measured(5, _place)]
-    names = [
-        "scattered by more than 90°",
-        f"scattered by less than {angle:g}°",
-        "⟨cosθ⟩, 1 collision",
-        "⟨cosθ⟩, 5 collisions",
-        "⟨z⟩ [m], 5 collisions",
-        "⟨r²⟩ [m²], 5 collisions",
-    ]
+    names = ["scattered by more than 90°", f"scattered by less than {angle:g}°", "⟨cosθ⟩, 1 collision"]
+    names += [f"{name}, 5 collisions" for name in ("⟨cosθ⟩", "⟨z⟩ [m]", "⟨r²⟩ [m²]")]
     yield from quantities(names, estimates, references.FOURNIER_FORAND)
     once = _scattered_once({"extinction": 0.3, "albedo": 0.8, **law})
     bins = run.by_run(once, lambda result: result.histogram.sum(axis=(0, 1)))
@@ -533,12 +525,8 @@ def reciprocity(run: Run) -> Iterator[Quantity]:
     weights = _disc_weights(math.radians(half_angle), pixels)
 
     def measured(at: NDArray, along: NDArray, placement: NDArray, rotation: NDArray) -> list[Estimate]:
-        block = {
-            "builtin": "box",
-            "size": [0.7, 0.5, 0.6],
-            "rotation_deg": rotation_angles(rotation),
-            "translation": placement.tolist(),
-        }
+        block = {"builtin": "box", "size": [0.7, 0.5, 0.6], "rotation_deg": rotation_angles(rotation)}
+        block["translation"] = placement.tolist()
         tables = scene(
             {**_WATER, "extinction": 0.6},
             {"position": at.tolist(), "direction": along.tolist(), "half_angle_deg": half_angle},
@@ -586,9 +574,8 @@ def mean_path(run: Run) -> Iterator[Quantity]:
     for body, target in bodies.items():
         mesh = load_target(Target(**target))
         for water, medium in waters.items():
-            until = [
-                scene(medium, point_source(0.1, 0.2, 0.3), targets=[target], max_path=path) for path in (early, late)
-            ]
+            source = point_source(0.1, 0.2, 0.3)
+            until = [scene(medium, source, targets=[target], max_path=path) for path in (early, late)]
             # Events of one photon between two moments of its life: walls at the rate 1/⟨path⟩, water at the rate c.
             moments = zip(*(run.records(tables, key=body + water) for tables in until), strict=True)
             (events,) = block_means((last.collisions - first.collisions).astype(np.float64) for first, last in moments)
@@ -600,13 +587,8 @@ def mean_path(run: Run) -> Iterator[Quantity]:
 
 # A cube of white walls around a wide lens, whose gate opens when the light has become even.
 _VESSEL_SIDE, _VESSEL_GATE = 2.0, (6.0, 10.0)
-_VESSEL_CAMERA = {
-    "width": 2,
-    "height": 2,
-    "horizontal_fov_deg": 40.0,
-    "aperture_diameter": 1.0,
-    "focus_distance": math.inf,
-}
+_VESSEL_LENS = {"width": 2, "height": 2, "horizontal_fov_deg": 40.0, "aperture_diameter": 1.0}
+_VESSEL_LENS["focus_distance"] = math.inf
 
 
 def vessel_scene(estimator: str) -> dict[str, Any]:
@@ -621,7 +603,7 @@ def vessel_scene(estimator: str) -> dict[str, Any]:
     return scene(
         {**water, "layers": [clear, behind]},
         point_source(0.3, -0.2, 0.4),
-        camera=_VESSEL_CAMERA,
+        camera=_VESSEL_LENS,
         path_edges=(*_VESSEL_GATE, 4),
         targets=[walls],
         estimator=estimator,
@@ -630,8 +612,8 @@ def vessel_scene(estimator: str) -> dict[str, Any]:
 
 def vessel_reading() -> float:
     """What the camera in `vessel_scene` reads: A·Δs/(4πV)·∫cosψ dΩ over its field, of even light in all directions."""
-    half = math.tan(math.radians(0.5 * _VESSEL_CAMERA["horizontal_fov_deg"]))
-    area = math.pi * (0.5 * _VESSEL_CAMERA["aperture_diameter"]) ** 2
+    half = math.tan(math.radians(0.5 * _VESSEL_LENS["horizontal_fov_deg"]))
+    area = math.pi * (0.5 * _VESSEL_LENS["aperture_diameter"]) ** 2
     side = half / math.hypot(1.0, half)
     return area * (_VESSEL_GATE[1] - _VESSEL_GATE[0]) / _VESSEL_SIDE**3 / math.pi * side * math.atan(side)
 
@@ -723,11 +705,8 @@ def draw_results(results: Sequence[CaseResult], folder: str | Path) -> list[Path
 
     Raises `FileError`.
     """
-    return [
-        draw_validation(
-            [asdict(result) for result in results if result.name == name],
-            Path(folder) / f"{name}.png",
-            title=f"{name}: {CASES[name].summary}",
-        )
-        for name in dict.fromkeys(result.name for result in results)
-    ]
+    drawn = []
+    for name in dict.fromkeys(result.name for result in results):
+        rows, title = [asdict(result) for result in results if result.name == name], f"{name}: {CASES[name].summary}"
+        drawn.append(draw_validation(rows, Path(folder) / f"{name}.png", title=title))
+    return drawn
