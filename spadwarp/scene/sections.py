@@ -488,8 +488,13 @@ class Document(Section):
         `folder`: of the file that the text is for. Paths of files in it or in the folder above it, with the folders in
         these, are then relative to it: they still hold where all were moved together. Others stay absolute.
         """
+        import tomli_w
+
         tables = self.to_dict()
-        return toml_text(tables if folder is None else _relative(type(self), tables, folder))
+        text = tomli_w.dumps(tables if folder is None else _relative(type(self), tables, folder))
+        # Each array on one line. Strings are escaped to one line: a line that begins with a space, or with ] after a
+        # comma, belongs to an array.
+        return re.sub(r"\n +", " ", re.sub(r",\n *(?=\])|(?<=\[)\n +", "", text))
 
     def with_overrides(self, overrides: Overrides | None = None, /, **sections: Any) -> Self:
         """A changed copy: `with_overrides({"medium.extinction": 0.9})`, `with_overrides(medium={"extinction": 0.9})`.
@@ -504,14 +509,6 @@ class Document(Section):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, type(self)) and self.__dict__ == other.__dict__
-
-
-def toml_text(tables: Mapping[str, Any]) -> str:
-    """TOML of a document's tables, each array on one line."""
-    import tomli_w
-
-    # Strings are escaped to one line: a line that begins with a space, or with ] after a comma, belongs to an array.
-    return re.sub(r"\n +", " ", re.sub(r",\n *(?=\])|(?<=\[)\n +", "", tomli_w.dumps(tables)))
 
 
 def _absolute(model: type[BaseModel], tables: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
@@ -729,20 +726,19 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     literals = (part for part in parts_of(info) if typing.get_origin(part) is typing.Literal)
     choices = tuple(texts[1]) if len(texts) > 1 else tuple(w for part in literals for w in typing.get_args(part))
     if kind in _LIMITS and info is not None:
-        return f"{entry} is outside {interval_of(info)}{_also(' and not', choices)}{_percentage(info, value)}"
+        others = "".join(f" and not {word!r}" for word in choices)
+        return f"{entry} is outside {interval_of(info)}{others}{_percentage(info, value)}"
     if choices and not (kind in _KINDS and isinstance(value, str)):
         listed = ", ".join([*map(repr, choices), *texts[2:]]) if len(choices) < 9 else "the known presets"
         return f"{entry} is not one of {listed}{suggestion(value, choices)}"
     if kind in _KINDS:
         values = f" of {size} values" if kind == "tuple_type" and size is not None else ""
-        words = f" neither {_KINDS[kind]}{_also(' nor', choices)}" if choices else f" not {_KINDS[kind]}{values}"
+        words = f" not {_KINDS[kind]}{values}"
+        if choices:
+            words = f" neither {' nor '.join([_KINDS[kind], *map(repr, choices)])}"
         return f"{entry} is{words}{_instead(key, info, kind, value)}"
     message = problem["msg"]
     return f"{entry}: {message[0].lower()}{message[1:]}"
-
-
-def _also(before: str, words: Sequence[str]) -> str:
-    return "".join(f"{before} {word!r}" for word in words)
 
 
 def _factor(key: Key, value: Any) -> str:
