@@ -541,9 +541,9 @@ def _compared(now: Mapping[str, Any], before: Mapping[str, Any]) -> Comparison:
             verdict = "slower"
         elif max(high, 1.0 / low) <= 1.0 + _RESOLUTION:
             verdict = "same"
-    spreads = [float(side.std(ddof=1)) if side.size > 1 else None for side in (old, new)]
+    spread_before, spread_now = (float(side.std(ddof=1)) if side.size > 1 else None for side in (old, new))
     rates = math.exp(old.mean()), math.exp(new.mean())
-    return Comparison(now["case"], unit, *rates, *spreads, math.exp(difference), interval, verdict)
+    return Comparison(now["case"], unit, *rates, spread_before, spread_now, math.exp(difference), interval, verdict)
 
 
 def history(directory: str | Path) -> list[tuple[Path, dict[str, Any]]]:

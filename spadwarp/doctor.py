@@ -22,8 +22,8 @@ from spadwarp.validate.cases import PENCIL, Estimate, Quantity, Run, scene, slab
 
 __all__ = ["Diagnosis", "SelfTest", "diagnose"]
 
-NEEDED = ("warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py")
-NEEDED += ("matplotlib", "tomli-w", "PyYAML", "jinja2")
+NEEDED = ["warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py", "matplotlib"]
+NEEDED += ["tomli-w", "PyYAML", "jinja2"]
 
 # Package → extra that brings it.
 OPTIONAL = {"torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "plotly": "view"}
