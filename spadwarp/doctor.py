@@ -16,40 +16,31 @@ from typing import Any
 
 from spadwarp.device import devices, nvidia_driver, pick_device
 from spadwarp.scene import Scene
-from spadwarp.transport import simulate, trace
+from spadwarp.transport import simulate
+from spadwarp.validate import references
+from spadwarp.validate.cases import PENCIL, Estimate, Quantity, Run, scene, slab_faces
 
 __all__ = ["Diagnosis", "SelfTest", "diagnose"]
 
-NEEDED = (
-    "warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py",
-    "matplotlib", "tomli-w", "PyYAML", "jinja2",
-)  # fmt: skip
+NEEDED = ["warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py", "matplotlib"]
+NEEDED += ["tomli-w", "PyYAML", "jinja2"]
 
 # Package → extra that brings it.
-OPTIONAL = {
-    "torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "plotly": "view", "imageio-ffmpeg": "video",
-}  # fmt: skip
+OPTIONAL = {"torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "plotly": "view"}
+OPTIONAL["imageio-ffmpeg"] = "video"
 
 _OLDEST_CUDA = 13000  # of the driver, R580: the CUDA that Warp is built with
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """What `diagnose` found.
+    """What `diagnose` found."""
 
-    Attributes:
-        facts: Section → name → value, as text.
-        gpu: Why no GPU is used and what to do about it; empty with a GPU.
-        problems: What keeps spadwarp from working.
-        tests: The self-test, empty if it was not run.
-        seconds: Duration of the self-test: `compile` (or load) the kernels, `run`.
-    """
-
-    facts: dict[str, dict[str, str]]
-    gpu: list[str]
-    problems: list[str]
-    tests: list[SelfTest]
-    seconds: dict[str, float]
+    facts: dict[str, dict[str, str]]  # section → name → value, as text
+    gpu: list[str]  # why no GPU is used and what to do about it; empty with a GPU
+    problems: list[str]  # what keeps spadwarp from working
+    tests: list[SelfTest]  # empty if they were not run
+    seconds: dict[str, float]  # of the self-test: `compile` (or load) the kernels, `run`
 
     @property
     def healthy(self) -> bool:
@@ -79,9 +70,6 @@ def diagnose(
     return Diagnosis(facts=facts, gpu=_gpu_reasons(), problems=problems, tests=tests, seconds=seconds)
 
 
-# Facts
-
-
 def _system() -> dict[str, str]:
     import warp as wp
 
@@ -103,11 +91,9 @@ def _packages(problems: list[str]) -> dict[str, str]:
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            if name in OPTIONAL:
-                found[name] = f"not installed (optional: pip install 'spadwarp[{OPTIONAL[name]}]')"
-            else:
-                found[name] = "MISSING"
-                problems.append(f"{name} is not installed: pip install spadwarp")
+            extra = OPTIONAL.get(name)
+            found[name] = f"not installed (optional: pip install 'spadwarp[{extra}]')" if extra else "MISSING"
+            problems += [] if extra else [f"{name} is not installed: pip install spadwarp"]
     return found
 
 
@@ -160,10 +146,8 @@ def _gpu_reasons() -> list[str]:
     if not wp.get_cuda_toolkit_version():
         reason = "this build of Warp has no CUDA; the wheels for Linux and Windows on x86-64 and Linux on ARM have it"
     elif version is None and (Path("/proc/driver/nvidia").exists() or Path("/dev/nvidiactl").exists()):
-        reason = (
-            "the system has an NVIDIA driver, but its library libcuda is not found: start a container with --gpus all "
-            "(NVIDIA Container Toolkit)"
-        )
+        reason = "the system has an NVIDIA driver, but its library libcuda is not found: start a container with "
+        reason += "--gpus all (NVIDIA Container Toolkit)"
     elif version is None:
         reason = "no NVIDIA driver: an NVIDIA GPU needs driver R580 or newer; without one everything runs on the CPU"
     elif version < _OLDEST_CUDA:
@@ -180,42 +164,10 @@ def _gpu_reasons() -> list[str]:
 _LARGEST_Z = 4.5  # a correct simulator exceeds it once in 150 000 tests
 _PHOTONS = 400_000
 
-# A pencil beam at normal incidence on a plate in turbid water, seen by one pixel.
-_PENCIL = {"profile": "collimated", "beam_radius": 0.0, "position": [0.0, 0.0, 0.0]}
-_CAMERA = {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01}
-_PLATE = {
-    "medium": {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.924},
-    "laser": _PENCIL,
-    "camera": _CAMERA,
-    "gate": {"start_ns": 17.0, "bin_width_ps": 500.0, "bins": 8},
-    "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}],
-    "transport": {"axis_threshold": 1.0},
-}
-# Index-matched slab, normal incidence, g 0.75, albedo 0.9, optical depth 2 (van de Hulst, Multiple Light Scattering,
-# 1980).
-_SLAB = {
-    "medium": {"extinction": 1.0, "albedo": 0.9, "anisotropy": 0.75},
-    "laser": _PENCIL,
-    "camera": _CAMERA,
-    "domain": {"shape": "slab", "lower": [0.0, 0.0, 0.0], "upper": [0.0, 0.0, 2.0]},
-    "gate": {"start_ns": 0.0, "bin_width_ps": 1e6, "bins": 1},
-    "transport": {"axis_threshold": 1.0, "termination": "roulette", "weight_cutoff": 0.05},
-}
-_REFLECTED, _TRANSMITTED = 0.09739, 0.66096
-_ROUNDING = 5e-6  # of the published values
-
 
 @dataclass(frozen=True)
 class SelfTest:
-    """A measured value beside its known value.
-
-    Attributes:
-        name: What was measured.
-        value: By the simulator.
-        reference: The known value.
-        standard_error: Of `value`.
-        passed: Whether they differ by less than 4.5 standard errors.
-    """
+    """A measured value beside its known value; passed if they differ by less than 4.5 standard errors."""
 
     name: str
     value: float
@@ -232,27 +184,33 @@ class SelfTest:
 
 def _run_self_test(device: str, progress: Callable[[str], None]) -> tuple[list[SelfTest], dict[str, float]]:
     """The tests, and the seconds that it took to `compile` or load the kernels and to `run`."""
-    plate, slab = map(Scene.from_dict, (_PLATE, _SLAB))
     progress("loading kernels; the first time they are compiled")
     began = time.perf_counter()
-    simulate(plate, photons=1, seed=1, device=device)
-    trace(slab, photons=1, seed=1, device=device)
+    _quantities(device, 1)
     ready = time.perf_counter()
     progress("tracing")
-    result = simulate(plate, photons=_PHOTONS, seed=1, device=device)
-    records = trace(slab, photons=_PHOTONS, seed=1, device=device)
-    seconds = {"compile": ready - began, "run": time.perf_counter() - ready}
+    found = _quantities(device, _PHOTONS)
+    tests = [SelfTest(q.name, q.estimate.value, q.reference, q.standard_error, abs(q.z) < _LARGEST_Z) for q in found]
+    return tests, {"compile": ready - began, "run": time.perf_counter() - ready}
 
+
+def _quantities(device: str, photons: int) -> list[Quantity]:
+    """Ballistic light from a plate at 2 m in turbid water, seen by one pixel; a slab; and the energy balance."""
+    camera = {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01}
+    target = {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}
+    water = {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.924}
+    plate = Scene.from_dict(scene(water, PENCIL, camera=camera, path_edges=(3.8, 4.6, 8), targets=[target]))
+    result = simulate(plate, photons=photons, seed=1, device=device)
     # The photons that arrive without a collision are binomial; each gives Γ A / (π z²) exp(−c z) to the lens.
-    arrive = math.exp(-plate.medium.extinction * 2.0)
+    arrive = math.exp(-0.5 * 2.0)
     returned = 0.5 / math.pi * plate.camera.aperture_area / 2.0**2 * arrive
-    ballistic = float(result.component("ballistic").sum()) / returned
-    error = math.sqrt(arrive * (1 - arrive) / _PHOTONS)
-    measured = [("ballistic light from the plate", ballistic, arrive, error)]
-    for part, face, reference in (("reflected", "low", _REFLECTED), ("transmitted", "high", _TRANSMITTED)):
-        weight = records.weight * records.ended(f"exit_z_{face}")
-        error = math.hypot(float(weight.std()) / math.sqrt(_PHOTONS), _ROUNDING)
-        measured.append((f"{part} by the slab", float(weight.mean(dtype=float)), reference, error))
-    tests = [SelfTest(*row, abs(row[1] - row[2]) < _LARGEST_Z * row[3]) for row in measured]
-    difference = float(result.energy_report()["difference"])
-    return [*tests, SelfTest("energy that is not accounted for", difference, 0.0, 0.0, difference == 0)], seconds
+    error = math.sqrt(arrive * (1 - arrive) / photons)
+    ballistic = Estimate(float(result.component("ballistic").sum()) / returned, error)
+    row = references.SLABS[0]
+    reflected, transmitted = slab_faces(Run(photons, 1, device), row)
+    return [
+        Quantity("ballistic light from the plate", ballistic, arrive),
+        Quantity("reflected by the slab", reflected, row.reflected),
+        Quantity("transmitted by the slab", transmitted, row.transmitted),
+        Quantity("energy that is not accounted for", Estimate(float(result.energy_report()["difference"]), 0.0), 0.0),
+    ]

@@ -20,8 +20,7 @@ from spadwarp.analytic.result import simulate_analytic
 from spadwarp.io.text import parse_toml
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
-from spadwarp.scene.document import locate, parse_key
-from spadwarp.scene.sections import field_unit, takes_integers
+from spadwarp.scene.sections import field_unit, locate, parse_key, takes_integers
 from spadwarp.scene.sight import LinesOfSight, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
 from spadwarp.values import (

@@ -23,8 +23,7 @@ from pydantic import (
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
 from spadwarp.scene import Scene
-from spadwarp.scene.document import Document
-from spadwarp.scene.sections import FilePath, Section, Whole, listed
+from spadwarp.scene.sections import Document, FilePath, Section, Whole, listed
 from spadwarp.values import ArgumentError, ConfigError, check_real, shown
 
 __all__ = ["SPLITS", "Distribution", "Recipe", "load_recipe"]

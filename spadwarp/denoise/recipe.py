@@ -11,8 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
-from spadwarp.scene.document import Document
-from spadwarp.scene.sections import Section, Whole
+from spadwarp.scene.sections import Document, Section, Whole
 
 __all__ = ["LEAST_CROP", "MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
 

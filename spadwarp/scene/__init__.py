@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from spadwarp.scene.ambient_light import *
 from spadwarp.scene.camera import *
-from spadwarp.scene.document import *
 from spadwarp.scene.laser import *
 from spadwarp.scene.medium import *
 from spadwarp.scene.pose import *
@@ -17,5 +16,5 @@ from spadwarp.scene.sections import *
 from spadwarp.scene.settings import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _MODULES = (ambient_light, camera, document, laser, medium, pose, scene, sections, settings)
+    _MODULES = (ambient_light, camera, laser, medium, pose, scene, sections, settings)
     __all__ = [name for module in _MODULES for name in module.__all__]

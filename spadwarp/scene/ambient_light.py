@@ -38,18 +38,24 @@ _BAND_NODES = 13
 _PART_PIXELS = 1 << 16
 
 
-class _Field(NamedTuple):
+class _Field:
     """The light at the lens at one wavelength, per nm; directions in the camera frame."""
 
-    attenuation: float  # κ = a + b_b along a line of sight [1/m]
-    decay: float  # K_d with depth [1/m]
-    sun: float  # irradiance across the sun's light [W/m²]
-    sky: float  # radiance within Snell's window [W/m²/sr]
-    window: float  # cosine of its half angle
-    towards: Floats  # direction in which the sun's light goes
-    down: Floats  # away from the surface
-    scattered: Floats  # b·p(Θ) over `_ANGLES` [1/m/sr]
-    by_sky: Floats  # what the sky sends into directions of propagation, over the cosine with `down` from -1 to 1
+    def __init__(self, scene: Scene, wavelength_nm: float) -> None:
+        daylight, turn = _daylight(scene), rotation_matrix(scene.camera.rotation_deg)
+        direct, diffuse, decay, medium, phase = _irradiance(scene, wavelength_nm, daylight.depth)
+        index = medium.phase_index
+        self.depth, self.decay = daylight.depth, decay  # of the lens [m]; K_d [1/m]
+        # κ = a + b_b along a line of sight [1/m].
+        self.attenuation = medium.absorption + phase.backscatter_fraction * medium.scattering
+        # Irradiance across the sun's light [W/m²]; radiance within Snell's window, even: E = π L sin² [W/m²/sr].
+        self.sun = direct / refracted_cosine(daylight.sun_elevation_deg, index)
+        self.sky = diffuse / (math.pi / index**2)
+        self.window = math.sqrt(1.0 - 1.0 / index**2)  # cosine of its half angle
+        self.towards, self.down = daylight.sun_direction(index) @ turn, daylight.down @ turn  # of the sun's light
+        self.scattered = medium.scattering * phase.density(np.maximum(_ANGLES, 2e-5))  # b·p(Θ) over `_ANGLES` [1/m/sr]
+        # What the sky sends into directions of propagation, over the cosine with `down` from -1 to 1.
+        self.by_sky = self.sky * _window_average(self.scattered, self.window)
 
     def of_water(self, view: Floats, distance: Floats, depth: Floats | float) -> Floats:
         """Radiance of the water up to a distance on lines of sight `[..., 3]`; up to the surface at most [W/m²/sr]."""
@@ -67,22 +73,21 @@ class _Field(NamedTuple):
         source = self.sun * np.interp(angle, _ANGLES, self.scattered) + of_sky
         return source * np.where(small, length, -np.expm1(-np.where(small, 0.0, product)) / safe)
 
-    def radiance(self, seen: _Seen, depth: float) -> Floats:
+    def radiance(self, seen: _Seen) -> Floats:
         """Radiance that comes to the lens [W/m²/nm/sr], `[P]`."""
-        hit, begin = np.isfinite(seen.distance), np.maximum(depth + seen.deeper, 0.0)
+        hit, begin = np.isfinite(seen.distance), np.maximum(self.depth + seen.deeper, 0.0)
         of_sky = np.where(-(seen.view @ self.down) > self.window, self.sky, 0.0)  # within Snell's window
         total = self.of_water(seen.view, seen.distance, begin) + np.where(hit, 0.0, of_sky)
         if hit.any():
             below = seen.distance[hit] * (seen.view[hit] @ self.down)
             along = np.exp(-self.attenuation * seen.distance[hit] - self.decay * np.maximum(below, -begin[hit]))
-            total[hit] += seen.reflectance[hit] / math.pi * self._on_faces(seen.normal[hit], depth) * along
+            total[hit] += seen.reflectance[hit] / math.pi * self._on_faces(seen.normal[hit]) * along
         return total * np.exp(-self.decay * seen.deeper) * seen.passed
 
-    def _on_faces(self, normals: Floats, depth: float) -> Floats:
+    def _on_faces(self, normals: Floats) -> Floats:
         """Irradiance on faces of unit normals `[P, 3]` at the depth of the lens [W/m²/nm]: sun, sky, and the light that
         the water sends up."""
-        rings, azimuths = 16, 24
-        down = self.down
+        rings, azimuths, down = 16, 24, self.down
         first = np.cross(down, [1.0, 0.0, 0.0] if abs(down[0]) < 0.9 else [0.0, 1.0, 0.0])
         first /= np.linalg.norm(first)
         second = np.cross(down, first)
@@ -90,7 +95,7 @@ class _Field(NamedTuple):
         phi = 2.0 * math.pi * (np.arange(azimuths) + 0.5) / azimuths
         across = np.cos(phi)[:, None] * first + np.sin(phi)[:, None] * second
         seen = (z[:, None, None] * down + np.sqrt(1.0 - z**2)[:, None, None] * across).reshape(-1, 3)
-        water = self.of_water(seen, np.full(len(seen), np.inf), depth)
+        water = self.of_water(seen, np.full(len(seen), np.inf), self.depth)
         # All light that goes down, scattered or not, is in what K_d leaves of sun and sky.
         water[seen @ down < 0.0] = 0.0
         # The window's edge is not on the rings: its own irradiance sets the scale.
@@ -148,7 +153,7 @@ def daylight_radiance(
     """
     view = np.asarray(view, np.float64)
     seen = _seen(scene, view, distance, normal, reflectance)
-    return _field(scene, wavelength_nm).radiance(seen, _daylight(scene).depth).reshape(view.shape[:-1])
+    return _Field(scene, wavelength_nm).radiance(seen).reshape(view.shape[:-1])
 
 
 def daylight_rate(
@@ -172,14 +177,14 @@ def daylight_rate(
     nodes = _band(scene)
     passed = widths_of(nodes) * filter_transmission(scene.laser, scene.detector, nodes)
     photons = passed * nodes * 1e-9 / (PLANCK * SPEED_OF_LIGHT)
-    fields = [(_field(scene, float(nm)), weight) for nm, weight in zip(nodes, photons, strict=True) if weight > 0.0]
+    fields = [(_Field(scene, float(nm)), weight) for nm, weight in zip(nodes, photons, strict=True) if weight > 0.0]
     seen = _seen(scene, view, distance, normal, reflectance)
     total = np.zeros(len(seen.view))
     for first in range(0, len(total), _PART_PIXELS):
         part = slice(first, first + _PART_PIXELS)
         pixels = _Seen(*(values[part] for values in seen))
         for field, weight in fields:
-            total[part] += field.radiance(pixels, scene.daylight.depth) * weight
+            total[part] += field.radiance(pixels) * weight
     etendue = camera.aperture_area * camera.pixel_tangent**2 * view[..., 2] ** 4
     return total.reshape(view.shape[:-1]) * etendue * scene.detector.pde
 
@@ -260,34 +265,12 @@ def _irradiance(scene: Scene, wavelength_nm: float, depth: float) -> tuple[float
     return direct, factor * above.diffuse * (1.0 - SKY_REFLECTANCE), decay, medium, phase
 
 
-def _field(scene: Scene, wavelength_nm: float) -> _Field:
-    daylight = _daylight(scene)
-    direct, diffuse, decay, medium, phase = _irradiance(scene, wavelength_nm, daylight.depth)
-    to_camera = rotation_matrix(scene.camera.rotation_deg)  # its columns are the camera's axes
-    index = medium.phase_index
-    scattered = medium.scattering * phase.density(np.maximum(_ANGLES, 2e-5))
-    sky = diffuse / (math.pi / index**2)  # even within the window: E = π L sin²
-    window = math.sqrt(1.0 - 1.0 / index**2)
-    return _Field(
-        attenuation=medium.absorption + phase.backscatter_fraction * medium.scattering,
-        decay=decay,
-        sun=direct / refracted_cosine(daylight.sun_elevation_deg, index),
-        sky=sky,
-        window=window,
-        towards=daylight.sun_direction(index) @ to_camera,
-        down=daylight.down @ to_camera,
-        scattered=scattered,
-        by_sky=sky * _window_average(scattered, window),
-    )
-
-
 def _window_average(scattered: Floats, window: float) -> Floats:
     """∫ b·p over the directions in which the sky's light goes, for directions of propagation by their cosine with down.
 
     Rings of equal solid angle; the forward peak within the window is light that goes on, and is left out.
     """
-    cosines = np.linspace(-1.0, 1.0, 121)
-    rings, azimuths = 12, 32
+    cosines, rings, azimuths = np.linspace(-1.0, 1.0, 121), 12, 32
     mu = window + (1.0 - window) * (np.arange(rings) + 0.5) / rings
     phi = 2.0 * math.pi * (np.arange(azimuths) + 0.5) / azimuths
     weight = 2.0 * math.pi * (1.0 - window) / (rings * azimuths)

@@ -137,10 +137,9 @@ class Camera(Section):
     @property
     def principal_point(self) -> tuple[float, float]:
         """Image coordinates (column, row) of the optical axis, (0.5, 0.5) being the first pixel's centre."""
-        return (
-            self.width / 2.0 if self.cx is None else self.cx + 0.5,
-            self.height / 2.0 if self.cy is None else self.cy + 0.5,
-        )
+        middle = zip((self.cx, self.cy), (self.width, self.height), strict=True)
+        column, row = (size / 2.0 if at is None else at + 0.5 for at, size in middle)
+        return column, row
 
     @property
     def pixel_tangent(self) -> float:
@@ -222,7 +221,8 @@ _MARGIN = 0.01
 
 def image_points(camera: Camera, tangents: ArrayLike) -> Points:
     """Image coordinates at which directions with the given tangents are seen, `[..., 2]`."""
-    return _distort(np.asarray(tangents, np.float64), camera.distortion) * camera.focal_pixels + camera.principal_point
+    seen, _ = _distort(np.asarray(tangents, np.float64), camera.distortion)
+    return seen * camera.focal_pixels + camera.principal_point
 
 
 def image_tangents(camera: Camera, points: ArrayLike) -> Points:
@@ -234,13 +234,13 @@ def image_tangents(camera: Camera, points: ArrayLike) -> Points:
     tangents = seen.copy()
     with np.errstate(all="ignore"):
         for _ in range(50):
-            a, b, d = _jacobian(tangents, camera.distortion)
-            error = _distort(tangents, camera.distortion) - seen
+            distorted, (a, b, d) = _distort(tangents, camera.distortion)
+            error = distorted - seen
             step = np.stack([d * error[..., 0] - b * error[..., 1], a * error[..., 1] - b * error[..., 0]], axis=-1)
             tangents -= step / (a * d - b * b)[..., None]
             if np.nanmax(np.abs(error), initial=0.0) < 1e-14:
                 break
-        error = np.abs(_distort(tangents, camera.distortion) - seen).max(axis=-1)
+        error = np.abs(_distort(tangents, camera.distortion)[0] - seen).max(axis=-1)
         tangents[~(error < 1e-10)] = np.nan
     return tangents
 
@@ -256,7 +256,7 @@ def is_invertible(camera: Camera) -> bool:
     left, top, right, bottom = view_box(camera)
     if not np.isfinite([left, top, right, bottom]).all():
         return False
-    a, b, d = _jacobian(_grid(np.linspace(left, right, 65), np.linspace(top, bottom, 65)), camera.distortion)
+    _, (a, b, d) = _distort(_grid(np.linspace(left, right, 65), np.linspace(top, bottom, 65)), camera.distortion)
     return bool((a + d > 0.0).all() and (a * d - b * b > 0.0).all())
 
 
@@ -303,24 +303,17 @@ def _grid(columns: Points, rows: Points) -> Points:
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
 
-def _distort(tangents: Points, coefficients: tuple[float, ...]) -> Points:
-    """Brown's model (1966) in OpenCV's order k1, k2, p1, p2, k3."""
-    k1, k2, p1, p2, k3 = coefficients
-    x, y = tangents[..., 0], tangents[..., 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    column = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    return np.stack([column, y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y], axis=-1)
-
-
-def _jacobian(tangents: Points, coefficients: tuple[float, ...]) -> tuple[Points, Points, Points]:
-    """Derivatives of `_distort`: of x by x, of x by y and of y by x, which are the same, of y by y."""
+def _distort(tangents: Points, coefficients: tuple[float, ...]) -> tuple[Points, tuple[Points, Points, Points]]:
+    """Brown's model (1966) in OpenCV's order k1, k2, p1, p2, k3; and its derivatives: of x by x, of x by y and of y by
+    x, which are the same, of y by y."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = tangents[..., 0], tangents[..., 1]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))  # of the radial factor by r², twice
-    return (
+    column = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    row = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([column, row], axis=-1), (
         radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
         slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
         radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,

@@ -44,7 +44,7 @@ class Grid(Section):
     density 1. A file with coefficients gives the water itself.
     """
 
-    displaces: ClassVar = {"file": ("shape", "cells", "turbulence", "eddy_size", "seed"), "shape": ("file",)}
+    displaces: ClassVar = {"file": ("shape", *_OF_SHAPES), "shape": ("file",)}
     file: AnyFile = field(None, "path of a .npz, .h5 or .nvdb file with cells, relative to the scene file")
     shape: Literal["cloud", "plume", "sediment", "gradient"] | None = None
     """in place of a file: a round cloud, a plume that rises, matter stirred up from the bottom, a rise from top to
@@ -105,14 +105,11 @@ class Grid(Section):
 
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal table again."""
-        fields = super().to_dict()
         hidden = () if self.file is None else _OF_SHAPES
-        return {name: value for name, value in fields.items() if name not in hidden}
+        return {name: value for name, value in super().to_dict().items() if name not in hidden}
 
 
 # Shapes
-
-SHAPES = ("cloud", "plume", "sediment", "gradient")
 
 
 def shape_values(shape: str, x: Floats, y: Floats, z: Floats) -> Floats:

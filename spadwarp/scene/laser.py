@@ -52,8 +52,7 @@ class Laser(Section):
     alternatives: ClassVar = ENERGIES
     displaces: ClassVar = {
         **{name: tuple(set(ENERGIES) - {name}) for name in ENERGIES},
-        "linewidth_nm": ("spectrum",),
-        "spectrum": ("linewidth_nm",),
+        **{"linewidth_nm": ("spectrum",), "spectrum": ("linewidth_nm",)},
     }
     preset: str | None = field(None, "a named laser, see `spadwarp list presets laser`")
     position: Vector = field((0.0, 0.0, 0.0), "where the beam begins [m]")
@@ -101,15 +100,12 @@ class Laser(Section):
         duration, rate = _GAUSSIAN_AREA * self.pulse_fwhm_ps * 1e-12, self.repetition_rate
         if given == "peak_power" and duration == 0.0:
             raise ValueError(self._that("peak_power", "needs pulse_fwhm_ps > 0, from which the energy follows"))
-        energy = self.pulse_energy
-        if given == "average_power":
-            energy = self.average_power / rate
-        elif given == "peak_power":
-            energy = self.peak_power * duration
+        energies = {"average_power": self.average_power / rate, "peak_power": self.peak_power * duration}
+        energy = energies.get(given, self.pulse_energy)
         if energy not in (allowed := field_range(Laser, "pulse_energy")):
             raise ValueError(self._that(given, f"makes pulses of {energy:.3g} J, outside {allowed}"))
-        powers = {"average_power": energy * rate, "peak_power": energy / duration if duration else math.inf}
-        derived = {"pulse_energy": energy} | powers
+        derived = {"average_power": energy * rate, "peak_power": energy / duration if duration else math.inf}
+        derived["pulse_energy"] = energy
         self.__dict__.update({name: value for name, value in derived.items() if name != given})
         return self
 
@@ -146,12 +142,11 @@ def load_profile(laser: Laser) -> Floats:
     `FileError` if the file cannot be read, or holds no image of finite values ≥ 0 with light in it.
     """
     path = Path(laser.profile_image or "")
-    where = f"laser.profile_image = {str(path)!r}"
-    endings = (".npy", ".exr", ".png")
-    if path.suffix.lower() not in endings:
-        raise FileError(f"{where}: ending {path.suffix!r} is not one of {', '.join(endings)}")
+    where, ending = f"laser.profile_image = {str(path)!r}", path.suffix.lower()
+    if ending not in _READERS:
+        raise FileError(f"{where}: ending {path.suffix!r} is not one of {', '.join(_READERS)}")
     try:
-        image = _read_image(existing_file(path))
+        image = _READERS[ending](existing_file(path))
     except SpadwarpError as error:
         raise FileError(f"{where}: {error}") from error
     except Exception as error:  # what a reader raises depends on the format
@@ -162,6 +157,29 @@ def load_profile(laser: Laser) -> Floats:
     if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() > 0.0):
         raise FileError(f"{where}: holds {values.min()} to {values.max()}; finite values >= 0 with light are needed")
     return values
+
+
+def _read_colours(path: Path) -> NDArray[np.generic]:
+    channels, _ = read_exr(path, largest=4 * _LARGEST)
+    colours = [pixels.astype(np.float64) for name, pixels in channels.items() if name.rsplit(".", 1)[-1] != "A"]
+    return np.mean(colours, axis=0)
+
+
+def _read_png(path: Path) -> NDArray[np.generic]:
+    from matplotlib.image import imread
+    from PIL import Image
+
+    with warnings.catch_warnings(), Image.open(path, formats=("PNG",)) as image:
+        warnings.simplefilter("ignore")  # of Pillow's own limit
+        width, height = image.size
+    if width * height > _LARGEST:
+        raise FileError(f"{width} x {height} pixels; at most {_LARGEST} are read")
+    pixels = np.asarray(imread(path))
+    without_alpha = {2: 1, 4: 3}.get(pixels.shape[-1], pixels.shape[-1])
+    return pixels if pixels.ndim == 2 else pixels[..., :without_alpha].mean(axis=-1)
+
+
+_READERS = {".npy": lambda path: read_npy(path, largest=_LARGEST), ".exr": _read_colours, ".png": _read_png}
 
 
 def profile_extent(laser: Laser) -> tuple[float, float]:
@@ -182,34 +200,11 @@ def profile_axes(axis: ArrayLike) -> tuple[Floats, Floats]:
     return right, np.cross(forward, right)
 
 
-def _read_image(path: Path) -> NDArray[np.generic]:
-    """The pixels of an image, with the mean of its colours."""
-    if path.suffix.lower() == ".npy":
-        return read_npy(path, largest=_LARGEST)
-    if path.suffix.lower() == ".exr":
-        channels, _ = read_exr(path, largest=4 * _LARGEST)
-        colours = [pixels.astype(np.float64) for name, pixels in channels.items() if name.rsplit(".", 1)[-1] != "A"]
-        return np.mean(colours, axis=0)
-    from matplotlib.image import imread
-    from PIL import Image
-
-    with warnings.catch_warnings(), Image.open(path, formats=("PNG",)) as image:
-        warnings.simplefilter("ignore")  # of Pillow's own limit
-        width, height = image.size
-    if width * height > _LARGEST:
-        raise FileError(f"{width} x {height} pixels; at most {_LARGEST} are read")
-    pixels = np.asarray(imread(path))
-    without_alpha = {2: 1, 4: 3}.get(pixels.shape[-1], pixels.shape[-1])
-    return pixels if pixels.ndim == 2 else pixels[..., :without_alpha].mean(axis=-1)
-
-
 # The spectrum and the filter
 
 _WAVELENGTHS = str(field_range(Laser, "wavelength_nm"))
-SPECTRUM_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "power": "[0, 1e30]"}
-"""Columns of a laser's spectrum: vacuum wavelength [nm] and power per nm of any scale."""
+SPECTRUM_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "power": "[0, 1e30]"}  # per nm, of any scale
 FILTER_COLUMNS = {"wavelength_nm": _WAVELENGTHS, "transmission": "[0, 1]"}
-"""Columns of a filter: vacuum wavelength [nm] and transmission."""
 
 _MOST_LINES = 32
 _REACH = 2.0  # FWHM to either side, where a Gaussian has fallen to 1.5e-5 of its height

@@ -86,20 +86,14 @@ def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
     return {"absorption": a, "scattering": b, "extinction": c, "albedo": share}
 
 
-class PhaseFields(NamedTuple):
-    """Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and
-    those with a default, which phase functions may share."""
-
-    needed: tuple[str, ...] = ()
-    optional: tuple[str, ...] = ()
-
-
-PHASE_FIELDS = {
-    "henyey_greenstein": PhaseFields(optional=("anisotropy",)),
-    "two_term_henyey_greenstein": PhaseFields(needed=("g1", "g2", "alpha")),
-    "fournier_forand": PhaseFields(optional=("particle_index", "junge_slope")),
-    "rayleigh": PhaseFields(optional=("depolarisation_ratio",)),
-    "tabulated": PhaseFields(needed=("phase_table",)),
+# Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and those
+# with a default, which phase functions may share.
+PHASE_FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "henyey_greenstein": ((), ("anisotropy",)),
+    "two_term_henyey_greenstein": (("g1", "g2", "alpha"), ()),
+    "fournier_forand": ((), ("particle_index", "junge_slope")),
+    "rayleigh": ((), ("depolarisation_ratio",)),
+    "tabulated": (("phase_table",), ()),
 }
 
 # Tabulated phase functions: name -> (file in spadwarp/water/tables, source).
@@ -122,7 +116,7 @@ class Water(Section):
         "chlorophyll": (*COEFFICIENTS, "preset"),
         "temperature": ("phase_index", "group_index"),
         "salinity": ("phase_index", "group_index"),
-        "phase_function": tuple(name for fields in PHASE_FIELDS.values() for name in fields.needed),
+        "phase_function": tuple(name for needed, _ in PHASE_FIELDS.values() for name in needed),
     }
     preset: str | None = field(None, "a named water, see `spadwarp list presets medium`")
     absorption: float = field(0.0, "absorption coefficient a [1/m]", "[0, 1e6]")
@@ -386,27 +380,16 @@ def grid_cells(medium: Medium) -> GridCells:
 
 # Scattering
 
-PHASE_COLUMNS = {"angle_deg": "[0, 180]", "value": "[0, 1e30]"}
-"""Columns of a phase table: scattering angle [°] and value of any scale."""
-
 
 @dataclass(frozen=True, eq=False)
 class PhaseFunction:
-    """Probability density of the direction of scattered light, of unit integral over the sphere.
+    """Probability density of the direction of scattered light, of unit integral over the sphere."""
 
-    Attributes:
-        name: `medium.phase_function`.
-        parameters: The medium's fields that it takes.
-        molecular_share: Part of the scattering that is the water's own and not of that name.
-        over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
-        first_angle: Of a table [rad]; below it the table is continued.
-    """
-
-    name: str
-    parameters: dict[str, float | str]
-    molecular_share: float
-    over_t: Callable[[Floats], Floats]
-    first_angle: float = 0.0
+    name: str  # `medium.phase_function`
+    parameters: dict[str, float | str]  # the medium's fields that it takes
+    molecular_share: float  # part of the scattering that is the water's own and not of that name
+    over_t: Callable[[Floats], Floats]  # the density [1/sr] over t = 1 - cosθ in (0, 2]
+    first_angle: float = 0.0  # of a table [rad]; below it the table is continued
 
     def density(self, angle: ArrayLike) -> Floats:
         """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""
@@ -450,7 +433,7 @@ def phase_function(medium: Medium) -> PhaseFunction:
         path = Path(str(medium.phase_table))
         if str(path) in PHASE_TABLES:
             path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)][0]
-        angles, values = read_table("medium.phase_table", path, PHASE_COLUMNS)
+        angles, values = read_table("medium.phase_table", path, {"angle_deg": "[0, 180]", "value": "[0, 1e30]"})
         try:
             density = sk.interpolated_density(np.radians(angles), values)
             first_angle = math.radians(float(angles[0]))

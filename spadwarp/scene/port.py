@@ -203,9 +203,11 @@ class PortGeometry:
         for k, outward in enumerate((0.0, self.thickness)):
             length = self._to_face(y, v, outward)
             y = y + length[..., None] * v
-            normals, before = self._normals(y), v
-            v = _refracted(v, normals, self.index[k] / self.index[k + 1])
-            yield length, (before * normals).sum(axis=-1), (v * normals).sum(axis=-1), y, v
+            normals = self._normals(y)
+            cosine = (v * normals).sum(axis=-1, keepdims=True)
+            across = self.index[k] / self.index[k + 1] * (v - cosine * normals)
+            v = across + np.sqrt(1.0 - (across * across).sum(axis=-1, keepdims=True)) * normals
+            yield length, cosine[..., 0], (v * normals).sum(axis=-1), y, v
 
     def spread(self, x: ArrayLike, u: ArrayLike, distance: float) -> float:
         """Irradiance across a ray from x inside along the unit vector u, for an intensity of 1 in clear water, where it
@@ -214,8 +216,7 @@ class PortGeometry:
         start, direction, lead, _ = self.enter(x, u)
         middle = start + (distance - lead) * direction
         aside = np.linalg.svd(u[None])[2][1:]
-        step = 1e-4
-        sides = []
+        step, sides = 1e-4, []
         for axis in aside:
             ends = []
             for sign in (1.0, -1.0):
@@ -312,9 +313,3 @@ class PortGeometry:
             slopes = [u @ axis / u[2] for u in ends]
             curvature += 0.5 * (slopes[0] - slopes[1]) / (2.0 * step)
         return math.inf if curvature <= 1e-9 else 1.0 / curvature
-
-
-def _refracted(u: Floats, normals: Floats, ratio: float) -> Floats:
-    cosine = (u * normals).sum(axis=-1, keepdims=True)
-    across = ratio * (u - cosine * normals)
-    return across + np.sqrt(1.0 - (across * across).sum(axis=-1, keepdims=True)) * normals

@@ -15,6 +15,7 @@ from spadwarp.values import ArgumentError
 
 __all__ = ["look_at", "opencv_pose"]
 
+Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 
@@ -34,6 +35,16 @@ def rotation_angles(matrix: ArrayLike) -> Vector:
         return vector_of(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True))
 
 
+def interpolated_angles(times: Floats, known: Floats, angles: Floats) -> Floats:
+    """`rotation_deg` `[N, 3]` at times between known ones, by the shortest turn from one to the next."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    if len(known) < 2:
+        return np.repeat(angles, len(times), axis=0)
+    turns = Slerp(known, Rotation.from_euler("XYZ", angles, degrees=True))(times)
+    return np.array([rotation_angles(matrix) for matrix in turns.as_matrix()])
+
+
 def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     """`position` and `rotation_deg` of the camera that OpenCV calls (rvec, tvec), as `solvePnP` returns them.
 
@@ -44,17 +55,13 @@ def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
     """
     from scipy.spatial.transform import Rotation
 
-    rotation, shift = np.asarray(rvec, np.float64), np.asarray(tvec, np.float64).ravel()
-    if rotation.shape != (3, 3):
-        rotation = rotation.ravel()
-    if rotation.shape not in ((3,), (3, 3)) or shift.shape != (3,):
+    matrix, shift = np.asarray(rvec, np.float64), np.asarray(tvec, np.float64).ravel()
+    if matrix.size not in (3, 9) or (matrix.size == 9 and matrix.shape != (3, 3)) or shift.size != 3:
         raise ArgumentError(f"rvec {np.shape(rvec)} and tvec {np.shape(tvec)}; 3 numbers (or [3, 3]) and 3 are needed")
-    if rotation.shape == (3,):
-        matrix = Rotation.from_rotvec(rotation).as_matrix()
-    else:
-        matrix = rotation
-        if not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
-            raise ArgumentError(f"rvec = {matrix.tolist()} is not a rotation matrix")
+    if matrix.size == 3:
+        matrix = Rotation.from_rotvec(matrix.ravel()).as_matrix()
+    elif not (np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) and np.linalg.det(matrix) > 0):
+        raise ArgumentError(f"rvec = {matrix.tolist()} is not a rotation matrix")
     return {"position": vector_of(-matrix.T @ shift), "rotation_deg": rotation_angles(matrix.T)}
 
 

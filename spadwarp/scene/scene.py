@@ -19,12 +19,11 @@ from pydantic import BeforeValidator
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
-from spadwarp.scene.document import Document, Overrides
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.port import Port, PortGeometry
-from spadwarp.scene.pose import rotation_angles, rotation_matrix, vector_of
-from spadwarp.scene.sections import listed
+from spadwarp.scene.pose import interpolated_angles, rotation_matrix, vector_of
+from spadwarp.scene.sections import Document, Overrides, listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
 from spadwarp.values import (
     ArgumentError,
@@ -200,8 +199,7 @@ class Scene(Document):
             f"{camera.width} x {camera.height} pixels x {gate.bins} bins)"
         )
 
-    def __str__(self) -> str:
-        return repr(self)
+    __str__ = __repr__
 
 
 SceneLike = Scene | str | os.PathLike[str]
@@ -244,18 +242,12 @@ def template() -> str:
 
 
 class WaterLine(NamedTuple):
-    """A line of the light that passes the filter, in the water.
+    """A line of the light that passes the filter, in the water."""
 
-    Attributes:
-        share: Photons, over those of a pulse of one line at `laser.wavelength_nm`.
-        extinction, scattering: [1/m].
-        speed: Of a pulse [m/s].
-    """
-
-    share: float
-    extinction: float
-    scattering: float
-    speed: float
+    share: float  # photons, over those of a pulse of one line at `laser.wavelength_nm`
+    extinction: float  # [1/m]
+    scattering: float  # [1/m]
+    speed: float  # of a pulse [m/s]
 
 
 def water_lines(scene: Scene) -> list[WaterLine]:
@@ -270,10 +262,8 @@ def water_lines(scene: Scene) -> list[WaterLine]:
     try:
         waters = [(line.share, medium.at_wavelength(line.wavelength_nm)) for line in lines]
     except ArgumentError as error:
-        raise ConfigError(
-            f"laser: the spectrum reaches beyond where medium.chlorophyll, temperature and salinity hold: {error}",
-            source=None if scene.source is None else str(scene.source),
-        ) from None
+        text = "laser: the spectrum reaches beyond where medium.chlorophyll, temperature and salinity hold"
+        raise ConfigError(f"{text}: {error}", source=scene.source) from None
     return [WaterLine(share, water.extinction, water.scattering, water.pulse_speed) for share, water in waters]
 
 
@@ -306,19 +296,12 @@ _MOST_ROWS = 1_000_000
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trajectory:
-    """Values of fields of a scene at ascending times.
+    """Values of fields of a scene at ascending times."""
 
-    Attributes:
-        times: [s], `[N]`.
-        fields: Fields as overrides name them, such as `camera.position[0]` or `targets[1].translation[2]`.
-        values: `[N, fields]`, in the units of the fields.
-        source: The file that they came from.
-    """
-
-    times: NDArray[np.float64]
-    fields: tuple[str, ...]
-    values: NDArray[np.float64]
-    source: str | None = None
+    times: NDArray[np.float64]  # [s], `[N]`
+    fields: tuple[str, ...]  # as overrides name them, such as `camera.position[0]` or `targets[1].translation[2]`
+    values: NDArray[np.float64]  # `[N, fields]`, in the units of the fields
+    source: str | None = None  # the file that they came from
 
     def __len__(self) -> int:
         return len(self.times)
@@ -342,13 +325,15 @@ class Trajectory:
         """
         check_real("frame_rate", frame_rate, "[1e-6, 1e12]")
         span = float(self.times[-1] - self.times[0])
-        count = check_integer(
-            "frames of the trajectory", int(span * frame_rate * (1 + 1e-12)) + 1, f"[1, {_MOST_ROWS}]"
-        )
+        count = int(span * frame_rate * (1 + 1e-12)) + 1
+        check_integer("frames of the trajectory", count, f"[1, {_MOST_ROWS}]")
         times = np.minimum(self.times[0] + np.arange(count) / frame_rate, self.times[-1])
         values = np.stack([np.interp(times, self.times, column) for column in self.values.T], axis=1)
-        for columns in _rotations(self.fields):
-            values[:, columns] = _turned(times, self.times, self.values[:, columns])
+        for name in self.fields:
+            angles = [f"{name[:-3]}[{axis}]" for axis in range(3)]
+            if name.endswith("rotation_deg[0]") and set(angles) <= set(self.fields):
+                columns = [self.fields.index(angle) for angle in angles]
+                values[:, columns] = interpolated_angles(times, self.times, self.values[:, columns])
         return Trajectory(times=times, fields=self.fields, values=values, source=self.source)
 
 
@@ -367,7 +352,12 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
             if not cells or cells[0].lstrip().startswith("#"):
                 continue
             if not names:
-                names = _names(cells)
+                names = tuple(cell.strip() for cell in cells)
+                if names[0] != "time" or len(names) < 2:
+                    needed = "time and names of fields, such as time,camera.position[0]"
+                    raise ValueError(f"{shown(','.join(names))} is not {needed}")
+                if twice := next((name for name in names if names.count(name) > 1), None):
+                    raise ValueError(f"{shown(twice)} is there twice")
                 continue
             if len(cells) != len(names):
                 raise ValueError(f"{len(cells)} values for {len(names)} names")
@@ -383,29 +373,3 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise ConfigError(f"line {lines.line_num}: {error}", source=str(path)) from None
     table = np.array(rows, np.float64)
     return Trajectory(times=table[:, 0], fields=names[1:], values=table[:, 1:], source=str(Path(path)))
-
-
-def _names(cells: list[str]) -> tuple[str, ...]:
-    names = tuple(cell.strip() for cell in cells)
-    if names[0] != "time" or len(names) < 2:
-        raise ValueError(f"{shown(','.join(names))} is not time and names of fields, such as time,camera.position[0]")
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise ValueError(f"{shown(twice)} is there twice")
-    return names
-
-
-def _rotations(fields: tuple[str, ...]) -> Iterator[list[int]]:
-    """Columns of the angles of each rotation of which all three are given."""
-    for name in fields:
-        angles = [f"{name[:-3]}[{axis}]" for axis in range(3)]
-        if name.endswith("rotation_deg[0]") and set(angles) <= set(fields):
-            yield [fields.index(angle) for angle in angles]
-
-
-def _turned(times: NDArray[np.float64], known: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    from scipy.spatial.transform import Rotation, Slerp
-
-    if len(known) < 2:
-        return np.repeat(angles, len(times), axis=0)
-    turns = Slerp(known, Rotation.from_euler("XYZ", angles, degrees=True))(times)
-    return np.array([rotation_angles(matrix) for matrix in turns.as_matrix()])

@@ -80,12 +80,6 @@ class LinesOfSight:
     laser: Floats  # position of the laser [m]
     laser_port: PortGeometry | None = None  # what it shines through
 
-    @classmethod
-    def in_water(cls, view: Floats, laser: Floats, port: PortGeometry | None = None) -> LinesOfSight:
-        """Lines of sight of a lens in the water, along unit vectors."""
-        nothing = np.zeros(view.shape[:-1])
-        return cls(np.zeros(view.shape), view, nothing, nothing, laser, port)
-
     def __getitem__(self, index: Any) -> LinesOfSight:
         """The lines of some pixels."""
         lines = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
@@ -93,8 +87,7 @@ class LinesOfSight:
 
     def flat(self) -> LinesOfSight:
         """The lines of all pixels in one row, `[P, 3]`."""
-        vectors = self.start.reshape(-1, 3), self.direction.reshape(-1, 3)
-        return LinesOfSight(*vectors, self.lead.ravel(), self.delay.ravel(), self.laser, self.laser_port)
+        return self[np.unravel_index(np.arange(self.lead.size), self.lead.shape)]
 
     def points(self, distance: ArrayLike) -> Floats:
         """Points in the camera frame at ranges [m]."""
@@ -154,14 +147,18 @@ def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
     """Lines of sight of a scene's pixels `[H, W]`, or those that leave the lens centre along unit vectors."""
     view = pixel_directions(scene.camera) if view is None else view
     port, laser = camera_port(scene), np.array(scene.beam.position, np.float64)
-    if port is None:
-        return LinesOfSight.in_water(view, laser, laser_port(scene))
-    return LinesOfSight(*port.enter(np.zeros(3), view), laser, laser_port(scene))
+    lines = _in_water(view) if port is None else port.enter(np.zeros(3), view)
+    return LinesOfSight(*lines, laser, laser_port(scene))
 
 
 def lines_of_camera(camera: Camera) -> LinesOfSight:
     """Lines of sight of a camera in the water, with a laser in its lens."""
-    return LinesOfSight.in_water(pixel_directions(camera), np.zeros(3))
+    return LinesOfSight(*_in_water(pixel_directions(camera)), np.zeros(3))
+
+
+def _in_water(view: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of unit vectors what `PortGeometry.enter` has of rays, without a port."""
+    return np.zeros(view.shape), view, np.zeros(view.shape[:-1]), np.zeros(view.shape[:-1])
 
 
 def gate_deviation(scene: Scene, directions: Floats) -> Floats:
@@ -185,10 +182,11 @@ def depth_from_time(time: Floats, *, scene: Scene) -> Floats:
 
 def depth_per_time(scene: Scene, distance: Floats, view: Floats | None = None) -> Floats:
     """dz/dt at ranges along the lines of sight, `[H, W]` [m/s], or along those of unit vectors `view`."""
-    beam, lines, port = scene.beam, lines_of_sight(scene, view), laser_port(scene)
+    beam, lines = scene.beam, lines_of_sight(scene, view)
     if beam.profile != "collimated":
         light = lines.light_at(lines.points(distance))[0]
     else:
+        port = lines.laser_port
         light = np.array(beam.axis) if port is None else port.enter(beam.position, beam.axis)[1]
     # The path rises with the range by 1 + the cosine between both directions of light.
     return scene.medium.pulse_speed / (1.0 + (light * lines.direction).sum(axis=-1)) * lines.direction[..., 2]

@@ -1,53 +1,218 @@
-"""The cases, their runs, and how their quantities are judged together."""
+"""The reference cases, how they are measured, and how their quantities are judged together."""
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.mesh import load_target
-from spadwarp.scene import Target
+from spadwarp.scene import Scene, Target, phase_function
 from spadwarp.scene.pose import rotation_angles
+from spadwarp.transport import simulate, trace
 from spadwarp.validate import references
-from spadwarp.validate.measure import (
-    PENCIL,
-    Estimate,
-    Quantity,
-    Run,
-    block_means,
-    holm,
-    point_source,
-    quantities,
-    scene,
-    slab_domain,
-    two_sided_p,
-)
-from spadwarp.values import check_choice, check_integer, path_from_time
+from spadwarp.values import check_choice, check_integer, path_from_time, time_from_path
 from spadwarp.viz import draw_validation
 
 __all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run", "vessel_reading"]
 __all__ += ["vessel_scene"]
+
+BLOCK = 1 << 20  # photons whose records are held at a time
+BATCHES = 32  # independent runs behind a standard error of a histogram
+
+
+class Estimate(NamedTuple):
+    """A measured number with its standard error, and the degrees of freedom of that error (inf: exactly known)."""
+
+    value: float
+    standard_error: float
+    degrees: float = math.inf
+
+
+class Quantity(NamedTuple):
+    """One measured number of a case beside its reference."""
+
+    name: str  # what was measured, with its unit
+    estimate: Estimate
+    reference: float
+    reference_error: float = 0.0  # standard error of the reference, 0 where it is known
+    rounding: float = 0.0  # half a unit of the last published digit: z counts from the edge of this interval
+
+    @property
+    def standard_error(self) -> float:
+        """Of the difference between value and reference."""
+        return math.hypot(self.estimate.standard_error, self.reference_error)
+
+    @property
+    def z(self) -> float:
+        """Standard normal deviate of the difference; without any error 0 for equality and ±inf else.
+
+        As likely as Student's t, by Wallace (1959): within 0.04 from seven degrees of freedom on.
+        """
+        distance, degrees = self.estimate.value - self.reference, self.estimate.degrees
+        difference = math.copysign(max(abs(distance) - self.rounding, 0.0), distance)
+        if self.standard_error == 0.0:
+            return math.copysign(math.inf, difference) if difference else 0.0
+        t = difference / self.standard_error
+        if math.isinf(degrees):
+            return t
+        z = math.sqrt(degrees * math.log1p(t * t / degrees)) * (8 * degrees + 1) / (8 * degrees + 3)
+        return math.copysign(z, t)
+
+
+def quantities(names: Iterable[str], estimates: Iterable[Estimate], references: Iterable[float]) -> list[Quantity]:
+    """One quantity for each name, estimate and reference, which are equally many."""
+    return [Quantity(*row) for row in zip(names, estimates, references, strict=True)]
+
+
+def block_means(blocks: Iterable[ArrayLike]) -> list[Estimate]:
+    """Means over photons of scores that arrive block by block, `[N, scores]` or `[N]`."""
+    count, total, square = 0, np.zeros(1), np.zeros(1)
+    for block in blocks:
+        scores = np.asarray(block, np.float64)
+        scores = scores.reshape(len(scores), -1)
+        count, total, square = count + len(scores), total + scores.sum(axis=0), square + (scores**2).sum(axis=0)
+    mean = total / count
+    variance = np.maximum(square / count - mean**2, 0.0) / max(count - 1, 1)
+    return [Estimate(float(m), float(v)) for m, v in zip(mean, np.sqrt(variance), strict=True)]
+
+
+def batch_means(batches: ArrayLike) -> list[Estimate]:
+    """Estimates from independent runs of equal size: `[batches, quantities]`, at least two batches."""
+    array = np.asarray(batches, np.float64)
+    array = array.reshape(len(array), -1)
+    error = array.std(axis=0, ddof=1) / math.sqrt(len(array))
+    return [Estimate(float(m), float(e), len(array) - 1.0) for m, e in zip(array.mean(axis=0), error, strict=True)]
+
+
+def two_sided_p(z: float) -> float:
+    """Probability that a standard normal number is at least as far from zero."""
+    return math.erfc(abs(z) / math.sqrt(2.0))
+
+
+def holm(p_values: Iterable[float]) -> list[float]:
+    """Holm's family-wise p-values (1979), in the order given: reject where below the level of the whole family."""
+    p = np.array([*p_values])
+    order = np.argsort(p, kind="stable")
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, np.arange(p.size, 0, -1) * p[order]))
+    return adjusted.tolist()
+
+
+@dataclass(frozen=True)
+class Run:
+    """How the cases are run: photons for each scene, seed, device (None: the default one).
+
+    With a folder for `tables` every Henyey–Greenstein function is read from a file of angles and values, except those
+    of layers, which cannot have a table each. Random numbers differ from scene to scene, or from `key` to `key`.
+    """
+
+    photons: int
+    seed: int
+    device: str | None = None
+    tables: Path | None = None
+
+    def records(self, tables: Mapping[str, Any], *, key: str = "", derivatives: Sequence[str] = ()) -> Iterator[Any]:
+        """`PhotonRecords` of blocks of photons."""
+        traced = self._scene(tables)
+        for block, start in enumerate(range(0, self.photons, BLOCK)):
+            count, seed = min(BLOCK, self.photons - start), self._seed(key or repr(tables), block)
+            yield trace(traced, photons=count, seed=seed, device=self.device, derivatives=derivatives)
+
+    def by_photon(
+        self,
+        tables: Mapping[str, Any],
+        scores: Callable[[Any], Sequence[NDArray[Any]]],
+        derivatives: Sequence[str] = (),
+    ) -> list[Estimate]:
+        """Means over photons of the scores `[N]` each that a function makes of `PhotonRecords`."""
+        return block_means(np.stack(scores(r), axis=1) for r in self.records(tables, derivatives=derivatives))
+
+    def results(self, tables: Mapping[str, Any]) -> Iterator[Any]:
+        """`Result`s of `BATCHES` independent runs."""
+        simulated, photons = self._scene(tables), max(1, self.photons // BATCHES)
+        for batch in range(BATCHES):
+            yield simulate(simulated, photons=photons, seed=self._seed(repr(tables), batch), device=self.device)
+
+    def by_run(self, tables: Mapping[str, Any], numbers: Callable[[Any], Any]) -> list[Estimate]:
+        """Means over the runs of the numbers that a function makes of a `Result`."""
+        return batch_means([numbers(result) for result in self.results(tables)])
+
+    def _scene(self, tables: Mapping[str, Any]) -> Scene:
+        medium = tables["medium"]
+        if self.tables is None or "phase_function" in medium or "layers" in medium:
+            return Scene.from_dict(tables)
+        path = self.tables / f"g{medium.get('anisotropy', 0.924)}.csv"
+        if not path.exists():
+            # Dense at both ends, wherever the peak lies; 1e-5 between the points.
+            near = np.concatenate([[0.0], np.geomspace(1e-3, 90.0, 2000)])
+            angles = np.concatenate([near, 180.0 - near[-2::-1]])
+            law = phase_function(Scene.from_dict(tables).medium)
+            np.savetxt(path, np.column_stack([angles, law.density(np.radians(angles))]), fmt="%.9g", delimiter=",")
+        changed = {**medium, "phase_function": "tabulated", "phase_table": str(path)}
+        return Scene.from_dict({**tables, "medium": changed})
+
+    def _seed(self, key: str, block: int) -> int:
+        digest = hashlib.blake2b(f"{self.seed} {block} {key}".encode(), digest_size=8).digest()
+        return int.from_bytes(digest, "little")
+
+
+# Scenes; their text seeds the photons.
+
+PENCIL = {"profile": "collimated", "beam_radius": 0.0}
+_UNUSED_CAMERA = {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01}
+_EXACT = {"axis_threshold": 1.0, "weight_cutoff": 0.0, "max_collisions": 2**31 - 1}  # no approximation, no limit
+
+
+def scene(
+    medium: Mapping[str, Any],
+    laser: Mapping[str, Any],
+    *,
+    camera: Mapping[str, Any] = _UNUSED_CAMERA,
+    path_edges: tuple[float, float, int] = (0.0, 1e7, 1),
+    targets: list[dict[str, Any]] | None = None,
+    domain: Mapping[str, Any] | None = None,
+    **transport: Any,
+) -> dict[str, Any]:
+    """Tables of a scene with index 1 and exact transport; `path_edges` is (start [m], stop [m], bins) of the gate."""
+    start, stop, bins = path_edges
+    medium = {"group_index": 1.0, "phase_index": 1.0, **medium}
+    first, width = (time_from_path(path, medium["group_index"]) for path in (start, (stop - start) / bins))
+    tables: dict[str, Any] = {
+        "medium": medium,
+        "laser": dict(laser),
+        "camera": dict(camera),
+        "gate": {"start_ns": first * 1e9, "bin_width_ps": width * 1e12, "bins": bins},
+        "domain": dict(domain or {}),
+        "transport": {**_EXACT, **transport},
+    }
+    return tables | ({"targets": targets} if targets else {})
+
+
+def point_source(*position: float) -> dict[str, Any]:
+    """An isotropic point source at x, y, z [m]."""
+    return {"position": list(position), "profile": "uniform_cone", "half_angle_deg": 180.0}
+
+
+def slab_domain(thickness: float) -> dict[str, Any]:
+    """Water between z = 0 and `thickness` [m], which may be infinite."""
+    return {"shape": "slab", "lower": [-math.inf, -math.inf, 0.0], "upper": [math.inf, math.inf, thickness]}
+
 
 Measure = Callable[[Run], Iterator[Quantity]]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One reference case.
-
-    Attributes:
-        name: Its key.
-        summary: What is checked, and where the reference comes from.
-        measure: Runs it.
-    """
+    """One reference case: its key, what is checked and where the reference comes from, and its run."""
 
     name: str
     summary: str
@@ -74,11 +239,11 @@ _FORWARD = {"extinction": 1.0, "albedo": 1.0, "anisotropy": 0.924}
 
 def _leaving(records: Any, reason: str) -> NDArray[np.float64]:
     """Weight of the photons that ended for this reason, 0 for the others."""
-    return records.weight * (records.reason == records.reasons.index(reason))
+    return records.weight * records.ended(reason)
 
 
 def _both_faces(records: Any) -> list[NDArray]:
-    return [_leaving(records, "exit_z_low"), _leaving(records, "exit_z_high")]
+    return [_leaving(records, f"exit_z_{face}") for face in ("low", "high")]
 
 
 def _in_bins(weight: NDArray, value: NDArray, edges: tuple[float, ...]) -> list[NDArray]:
@@ -105,11 +270,16 @@ def _slab_scene(slab: references.Slab, **transport: Any) -> dict[str, Any]:
     return scene(medium, PENCIL, domain=slab_domain(slab.optical_depth), **transport)
 
 
+def slab_faces(run: Run, row: references.Slab) -> list[Estimate]:
+    """Fractions that a slab reflects and transmits."""
+    return run.by_photon(_slab_scene(row, **(_ROULETTE if row.albedo < 1 else {})), _both_faces)
+
+
 @_case
 def slab(run: Run) -> Iterator[Quantity]:
     """Slabs and half-spaces, index-matched, normal incidence: adding–doubling, published rows"""
     for row in references.SLABS:
-        faces = run.by_photon(_slab_scene(row, **(_ROULETTE if row.albedo < 1 else {})), _both_faces)
+        faces = slab_faces(run, row)
         both = quantities((f"R, {row.text}", f"T, {row.text}"), faces, (row.reflected, row.transmitted))
         yield from both[:1] if math.isinf(row.optical_depth) else both
 
@@ -133,8 +303,7 @@ def slab_derivatives(run: Run) -> Iterator[Quantity]:
 def layers(run: Run) -> Iterator[Quantity]:
     """Three layers of different waters, illuminated from either side: adding–doubling"""
     for stack in references.STACKS:
-        waters: list[dict[str, float]] = []
-        depth = 0.0
+        waters, depth = list[dict[str, float]](), 0.0
         for anisotropy, albedo, extinction, thickness in stack.layers:
             waters.append({"start": depth, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy})
             depth += thickness
@@ -187,9 +356,8 @@ def moments(run: Run) -> Iterator[Quantity]:
 def near_axis(run: Run) -> Iterator[Quantity]:
     """The near-axis rule's bias: density of the cosine from collision to collision"""
     for threshold, reference in references.NEAR_AXIS.items():
-        (mean,) = run.by_photon(
-            scene(_FORWARD, PENCIL, max_collisions=6, axis_threshold=threshold), lambda r: [_cosine(r)]
-        )
+        tables = scene(_FORWARD, PENCIL, max_collisions=6, axis_threshold=threshold)
+        (mean,) = run.by_photon(tables, lambda r: [_cosine(r)])
         rule = "rule off" if threshold == 1.0 else f"threshold {threshold:g}"
         yield Quantity(f"⟨cosθ⟩, g 0.924, 5 collisions, {rule}", mean, reference)
 
@@ -257,14 +425,8 @@ def fournier_forand(run: Run) -> Iterator[Quantity]:
 
     # A record keeps the direction of its last flight: the second has scattered once, the sixth five times.
     estimates = [*measured(2, deflections), *measured(6, lambda r: [_cosine(r)]), *measured(5, _place)]
-    names = [
-        "scattered by more than 90°",
-        f"scattered by less than {angle:g}°",
-        "⟨cosθ⟩, 1 collision",
-        "⟨cosθ⟩, 5 collisions",
-        "⟨z⟩ [m], 5 collisions",
-        "⟨r²⟩ [m²], 5 collisions",
-    ]
+    names = ["scattered by more than 90°", f"scattered by less than {angle:g}°", "⟨cosθ⟩, 1 collision"]
+    names += [f"{name}, 5 collisions" for name in ("⟨cosθ⟩", "⟨z⟩ [m]", "⟨r²⟩ [m²]")]
     yield from quantities(names, estimates, references.FOURNIER_FORAND)
     once = _scattered_once({"extinction": 0.3, "albedo": 0.8, **law})
     bins = run.by_run(once, lambda result: result.histogram.sum(axis=(0, 1)))
@@ -363,12 +525,8 @@ def reciprocity(run: Run) -> Iterator[Quantity]:
     weights = _disc_weights(math.radians(half_angle), pixels)
 
     def measured(at: NDArray, along: NDArray, placement: NDArray, rotation: NDArray) -> list[Estimate]:
-        block = {
-            "builtin": "box",
-            "size": [0.7, 0.5, 0.6],
-            "rotation_deg": rotation_angles(rotation),
-            "translation": placement.tolist(),
-        }
+        block = {"builtin": "box", "size": [0.7, 0.5, 0.6], "rotation_deg": rotation_angles(rotation)}
+        block["translation"] = placement.tolist()
         tables = scene(
             {**_WATER, "extinction": 0.6},
             {"position": at.tolist(), "direction": along.tolist(), "half_angle_deg": half_angle},
@@ -416,9 +574,8 @@ def mean_path(run: Run) -> Iterator[Quantity]:
     for body, target in bodies.items():
         mesh = load_target(Target(**target))
         for water, medium in waters.items():
-            until = [
-                scene(medium, point_source(0.1, 0.2, 0.3), targets=[target], max_path=path) for path in (early, late)
-            ]
+            source = point_source(0.1, 0.2, 0.3)
+            until = [scene(medium, source, targets=[target], max_path=path) for path in (early, late)]
             # Events of one photon between two moments of its life: walls at the rate 1/⟨path⟩, water at the rate c.
             moments = zip(*(run.records(tables, key=body + water) for tables in until), strict=True)
             (events,) = block_means((last.collisions - first.collisions).astype(np.float64) for first, last in moments)
@@ -430,13 +587,8 @@ def mean_path(run: Run) -> Iterator[Quantity]:
 
 # A cube of white walls around a wide lens, whose gate opens when the light has become even.
 _VESSEL_SIDE, _VESSEL_GATE = 2.0, (6.0, 10.0)
-_VESSEL_CAMERA = {
-    "width": 2,
-    "height": 2,
-    "horizontal_fov_deg": 40.0,
-    "aperture_diameter": 1.0,
-    "focus_distance": math.inf,
-}
+_VESSEL_LENS = {"width": 2, "height": 2, "horizontal_fov_deg": 40.0, "aperture_diameter": 1.0}
+_VESSEL_LENS["focus_distance"] = math.inf
 
 
 def vessel_scene(estimator: str) -> dict[str, Any]:
@@ -451,7 +603,7 @@ def vessel_scene(estimator: str) -> dict[str, Any]:
     return scene(
         {**water, "layers": [clear, behind]},
         point_source(0.3, -0.2, 0.4),
-        camera=_VESSEL_CAMERA,
+        camera=_VESSEL_LENS,
         path_edges=(*_VESSEL_GATE, 4),
         targets=[walls],
         estimator=estimator,
@@ -460,8 +612,8 @@ def vessel_scene(estimator: str) -> dict[str, Any]:
 
 def vessel_reading() -> float:
     """What the camera in `vessel_scene` reads: A·Δs/(4πV)·∫cosψ dΩ over its field, of even light in all directions."""
-    half = math.tan(math.radians(0.5 * _VESSEL_CAMERA["horizontal_fov_deg"]))
-    area = math.pi * (0.5 * _VESSEL_CAMERA["aperture_diameter"]) ** 2
+    half = math.tan(math.radians(0.5 * _VESSEL_LENS["horizontal_fov_deg"]))
+    area = math.pi * (0.5 * _VESSEL_LENS["aperture_diameter"]) ** 2
     side = half / math.hypot(1.0, half)
     return area * (_VESSEL_GATE[1] - _VESSEL_GATE[0]) / _VESSEL_SIDE**3 / math.pi * side * math.atan(side)
 
@@ -482,27 +634,16 @@ FAMILY_LEVEL = 1e-3
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One measured quantity of a case.
+    """One measured quantity of a case."""
 
-    Attributes:
-        name: Of the case.
-        quantity: What was measured, with its unit.
-        value: The simulator's value.
-        reference: The known value.
-        standard_error: Of the difference; 0 where both must be equal.
-        z: The difference in standard deviations of a normal distribution.
-        p: Two-sided probability of such a z, corrected for the number of quantities in the run (Holm 1979).
-        passed: Whether p exceeds `FAMILY_LEVEL`.
-    """
-
-    name: str
-    quantity: str
+    name: str  # of the case
+    quantity: str  # what was measured, with its unit
     value: float
     reference: float
-    standard_error: float
-    z: float
-    p: float
-    passed: bool
+    standard_error: float  # of the difference; 0 where both must be equal
+    z: float  # the difference in standard deviations of a normal distribution
+    p: float  # two-sided probability of such a z, corrected for the number of quantities in the run (Holm 1979)
+    passed: bool  # whether p exceeds `FAMILY_LEVEL`
 
 
 def run(
@@ -514,7 +655,7 @@ def run(
     tabulated: bool = False,
     progress: Callable[[Case], None] | None = None,
 ) -> list[CaseResult]:
-    """Runs reference cases and compares them with their references.
+    """Runs reference cases and compares them with their references: a result for each quantity.
 
     Args:
         cases: Names out of `CASES`; all by default.
@@ -524,9 +665,6 @@ def run(
         device: As for `spadwarp.simulate`.
         tabulated: Whether every Henyey–Greenstein phase function is first written to a table and read from it.
         progress: Called with each case before it is run.
-
-    Returns:
-        One result for each quantity, in the order of the cases.
 
     Raises:
         ArgumentError: An unknown case, or photons or seed out of range.
@@ -567,11 +705,8 @@ def draw_results(results: Sequence[CaseResult], folder: str | Path) -> list[Path
 
     Raises `FileError`.
     """
-    return [
-        draw_validation(
-            [asdict(result) for result in results if result.name == name],
-            Path(folder) / f"{name}.png",
-            title=f"{name}: {CASES[name].summary}",
-        )
-        for name in dict.fromkeys(result.name for result in results)
-    ]
+    drawn = []
+    for name in dict.fromkeys(result.name for result in results):
+        rows, title = [asdict(result) for result in results if result.name == name], f"{name}: {CASES[name].summary}"
+        drawn.append(draw_validation(rows, Path(folder) / f"{name}.png", title=title))
+    return drawn

@@ -70,10 +70,7 @@ class Stack(NamedTuple):
 
 # Adding–doubling. The same layers from both sides.
 _LAYERS = ((0.924, 0.8, 1.0, 1.0), (0.5, 0.9, 3.0, 0.5), (0.0, 0.5, 0.5, 1.0))
-STACKS = (
-    Stack(_LAYERS, 0.11763994, 0.30108700),
-    Stack(_LAYERS[::-1], 0.14047414, 0.30510878),
-)
+STACKS = (Stack(_LAYERS, 0.11763994, 0.30108700), Stack(_LAYERS[::-1], 0.14047414, 0.30510878))
 
 # Diffuse light by the cosine of its direction to the face's normal: adding–doubling.
 EXIT_COSINE_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)

@@ -13,8 +13,7 @@ from scipy import stats
 
 import spadwarp
 from helpers.cli import DEVICE, run
-from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, newest_report, report
-from spadwarp.benchmark.runs import measure
+from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, measure, newest_report, report
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
 from spadwarp.values import ArgumentError, FileError

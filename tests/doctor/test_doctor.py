@@ -9,6 +9,7 @@ import warp as wp
 
 import spadwarp
 from helpers.cli import DEVICE, ENVIRONMENT, run, tables
+from spadwarp.validate import references
 
 
 def test_self_test_measures_what_is_known(tmp_path):
@@ -24,7 +25,7 @@ def test_self_test_measures_what_is_known(tmp_path):
 
 
 def test_a_wrong_simulator_is_found_out(monkeypatch):
-    monkeypatch.setattr(spadwarp.doctor, "_TRANSMITTED", 0.67)
+    monkeypatch.setattr(references, "SLABS", (references.SLABS[0]._replace(transmitted=0.67),))
     outcome = run("doctor", *DEVICE, "--quiet", code=1)
     assert "self-test: transmitted by the slab" in outcome.stderr and "FAILED" in outcome.stderr
     assert outcome.stdout == ""

@@ -85,7 +85,8 @@ def test_level_radiance_is_that_of_a_full_walk(albedo):
     views = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     from spadwarp.scene import ambient_light
 
-    field = ambient_light._field(scene, 532.0)._replace(by_sky=np.zeros(121), sky=0.0)
+    field = ambient_light._Field(scene, 532.0)
+    field.by_sky, field.sky = np.zeros(121), 0.0
     ours = field.of_water(views, np.full(3, np.inf), 2.0)
     assert ours == pytest.approx(expected, rel=0.45)
     assert 0.65 < ours.mean() / expected.mean() < 1.0

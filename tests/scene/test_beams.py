@@ -8,7 +8,6 @@ from PIL import Image
 from scipy import stats
 
 import spadwarp
-import spadwarp.checks.checks
 from helpers.scenes import scene
 from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
@@ -183,7 +182,7 @@ def test_checks_tell_how_far_out_of_focus_a_target_is():
         camera={"focus_distance": 1.1}, targets=[{"builtin": "sphere", "size": 1.0, "translation": [0, 0, 2.7]}]
     )
     pixel = 2 * math.tan(math.radians(25)) / 4
-    far = spadwarp.checks.checks.summary(one)["target_range"][1]
+    far = spadwarp.checks.summary(one)["target_range"][1]
     (message,) = [message for message in spadwarp.check(one) if message.field == "camera.focus_distance"]
     assert message.values["pixels"] == pytest.approx(0.4 * (1 / 1.1 - 1 / far) / pixel)
     assert not any(

@@ -14,7 +14,7 @@ from reference.single_scatter import Lidar, lambertian_plane, single_scatter, si
 from reference.slab_derivatives import slab_derivatives
 from spadwarp.io import json_text
 from spadwarp.validate import CASES, draw_results, references, report, run
-from spadwarp.validate.measure import Estimate, Quantity, batch_means, block_means, holm, two_sided_p
+from spadwarp.validate.cases import Estimate, Quantity, batch_means, block_means, holm, two_sided_p
 from spadwarp.values import ArgumentError
 
 # The statistics

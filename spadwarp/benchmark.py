@@ -1,4 +1,4 @@
-"""Running the benchmark cases, the file of their results, and whether cases became faster.
+"""How fast this machine is, in numbers that can be kept and compared: `run` measures named cases.
 
 Kernels are loaded, and one run is discarded, before the clock starts; a launch ends when the device has finished it,
 and later copies to the host are not counted.
@@ -6,96 +6,222 @@ and later copies to the host are not counted.
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from spadwarp.analytic import simulate_analytic
-from spadwarp.benchmark.cases import CASES, GROUPS, Case
 from spadwarp.device import core_count, nvidia_driver, pick_device, processor_name
 from spadwarp.frames import detect
+from spadwarp.io.text import parse_json, read_text
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import provenance, simulate, trace, truth_maps
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.values import FileError, check_choice, check_integer
+from spadwarp.values import FileError, check_choice, check_integer, path_from_time, time_from_path
 
 if TYPE_CHECKING:
     import warp as wp
 
-    from spadwarp_kernels import Data, Model
+__all__ = ["CASES", "GROUPS", "MARGIN", "BenchResult", "Case", "Comparison", "TransportRun", "compare", "history"]
+__all__ += ["load_report", "newest_report", "report", "run"]
 
-__all__ = ["MARGIN", "BenchResult", "Comparison", "TransportRun", "compare", "history", "load_report", "newest_report"]
-__all__ += ["report", "run"]
+
+# Cases: scenes as tables, or a stage that is given artificial light; no other file is read
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing to measure."""
+
+    name: str  # its key
+    summary: str  # in one line
+    kind: Literal["transport", "analytic", "detect"] = "transport"
+    scene: Mapping[str, Any] = field(default_factory=dict)  # tables, as `Scene.from_dict` takes them
+    estimator: str | None = None  # replaces the scene's: "none" traces photons without a camera
+    photons: int | None = None  # of one run; None: chosen for the device
+    absorbed: tuple[float, float] | None = None  # known absorbed fraction of the light, and half its last digit
+    error: bool = True  # whether to use a run for the relative error
+    time_limit: float = math.inf  # seconds of timed runs after which none is repeated
+
+
+_EXACT = {"axis_threshold": 1.0}
+_WATER = {"extinction": 0.3, "albedo": 0.8, "anisotropy": 0.924, "group_index": "seawater"}
+
+
+def _staircase(subdivisions: int = 0) -> list[dict[str, Any]]:
+    """A plate of 4 x 4 m, its face at 5 m, and nine bars 0.1 to 0.6 m in front of it: ten boxes, 120 faces."""
+    boxes = [((-2.0, -2.0), (2.0, 2.0), -0.1)]  # two corners, and the height above the plate
+    for i in range(3):
+        boxes.append(((-2.0 + 0.67 * i, -2.0), (-1.37 + 0.67 * i, 2.0), 0.6 - 0.1 * i))
+        boxes.append(((0.0, -2.0 + 0.7 * i), (2.0, -1.4 + 0.7 * i), 0.3 - 0.1 * i))
+        boxes.append(((0.67 * i, 0.0), (0.63 + 0.67 * i, 2.0), 0.3 - 0.1 * i))
+    return [
+        {
+            "builtin": "box",
+            "size": [right - left, bottom - top, abs(height)],
+            "subdivisions": subdivisions,
+            "translation": [0.5 * (left + right), 0.5 * (top + bottom), 5.0 - 0.5 * height],
+            "reflectance": 0.5,
+        }
+        for (left, top), (right, bottom), height in boxes
+    ]
+
+
+def _at_5m(targets: Sequence[Mapping[str, Any]] = (), estimator: str = "next_event", **camera: Any) -> dict[str, Any]:
+    """A cone of 15° beside a camera of 30° in turbid water; bins of 2 cm of path."""
+    bins = camera.pop("bins", 1024)
+    return {
+        "medium": _WATER,
+        "laser": {"half_angle_deg": 15.0, "position": [-0.05, 0.0, 0.0]},
+        "camera": {"width": 64, "height": 64, "horizontal_fov_deg": 30.0, "aperture_diameter": 0.02, **camera},
+        "gate": {"bin_width_ps": 90.983, "bins": bins},
+        "targets": list(targets),
+        "transport": {"estimator": estimator, "max_collisions": 64, "weight_cutoff": 2e-4},
+    }
+
+
+def _confocal() -> dict[str, Any]:
+    """A coaxial beam of 0.1° that visits the 64 x 64 pixels of the staircase in turn."""
+    scene = _at_5m(_staircase(), "guided")
+    changed = {"laser": {"half_angle_deg": 0.1}, "scan": {"mode": "confocal"}}
+    return {**scene, **changed, "transport": {**scene["transport"], **_EXACT}}
+
+
+def _plane() -> dict[str, Any]:
+    """A grey wall at 5 m in index 1, 16 bins of 0.8 m of path from 2 m on."""
+    start, width, diameter = time_from_path(2.0, 1.0), time_from_path(0.8, 1.0), 2.0 * math.sqrt(1e-4 / math.pi)
+    return {
+        "medium": {**_WATER, "group_index": 1.0, "phase_index": 1.0},
+        "laser": {"half_angle_deg": 2.5, "position": [-0.1, 0.0, 0.0]},
+        "camera": {"width": 32, "height": 32, "horizontal_fov_deg": 10.0, "aperture_diameter": diameter},
+        "gate": {"start_ns": start * 1e9, "bin_width_ps": width * 1e12, "bins": 16},
+        "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}],
+        "transport": {"estimator": "guided", "max_collisions": 20, "weight_cutoff": 2e-4, **_EXACT},
+    }
+
+
+def _spheres() -> list[dict[str, Any]]:
+    """Four by three spheres of 81 920 faces each."""
+    sphere = {"builtin": "sphere", "size": 0.75, "subdivisions": 3, "reflectance": 0.5}
+    return [{**sphere, "translation": [0.9 * (i - 1.5), 0.9 * (j - 1.0), 5.0]} for j in range(3) for i in range(4)]
+
+
+def _cube60() -> dict[str, Any]:
+    """MCX's benchmark of that name: a scattering cube of 60 mm without reflections, a pencil beam, 5 ns."""
+    return {
+        "medium": {"absorption": 5.0, "scattering": 1000.0, "anisotropy": 0.01, "group_index": 1.37},
+        "laser": {"profile": "collimated", "beam_radius": 0.0, "position": [0.029, 0.029, 0.0]},
+        "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 1.0, "aperture_diameter": 0.01},  # not used
+        "gate": {"bin_width_ps": 5000.0, "bins": 1},
+        "domain": {"shape": "box", "lower": 0.0, "upper": 0.06},
+        "transport": {
+            "max_path": path_from_time(5e-9, 1.37),
+            "weight_cutoff": 0.0,
+            "max_collisions": 2**31 - 1,
+            **_EXACT,
+        },
+    }
+
+
+_STAIRCASE = _at_5m(_staircase())
+
+CASES: dict[str, Case] = {
+    case.name: case
+    for case in (
+        Case("water", "41 m of water alone, next_event, 64 x 64 x 2048 bins", scene=_at_5m(bins=2048)),
+        Case("water_20m", "20 m of water alone, 64 x 64 x 1024 bins", scene=_at_5m()),
+        Case("plane_5m", "a wall at 5 m, guided, 32 x 32 x 16 bins", scene=_plane()),
+        Case("staircase_5m", "a staircase at 5 m, next_event, 64 x 64 x 1024 bins", scene=_STAIRCASE),
+        Case("staircase_5m_guided", "the same, guided", scene=_at_5m(_staircase(), "guided")),
+        Case("confocal", "the staircase, guided, 64 x 64 positions scanned by beam and pixel", scene=_confocal()),
+        Case("staircase_5m_dense", "the same, next_event, more than 100 000 faces", scene=_at_5m(_staircase(5))),
+        Case("spheres", "twelve spheres, a million faces in all, next_event", scene=_at_5m(_spheres())),
+        replace(
+            Case("cube60", "MCX's cube60: 60 mm, 78 collisions a photon, no camera", scene=_cube60(), estimator="none"),
+            absorbed=(0.1769, 0.5e-4),  # as MCX prints it: 17.69 %
+        ),
+        Case(
+            "analytic",
+            "depth frames of 400 x 400 pixels from the analytic simulator",
+            "analytic",
+            _at_5m(_staircase(), width=400, height=400),
+        ),
+        Case("detect", "first-photon counts of 1e6 pulses; a frame of 256 x 192 x 1024 bins on a GPU", "detect"),
+    )
+}
+"""The cases by name."""
+
+
+def _scaling(cuda: bool) -> list[Case]:
+    """How cost and memory grow with photons, faces and bins; to larger sizes on a GPU than on a CPU."""
+    box = {"builtin": "box", "size": [3.0, 3.0, 0.5], "translation": [0.0, 0.0, 5.0], "reflectance": 0.5}
+    images = [(32, 32, 256), (64, 64, 1024), (128, 128, 1024), (256, 192, 1024), (256, 192, 4096)]
+    cases = [
+        Case(f"photons_1e{power}", f"staircase_5m, 1e{power} photons", scene=_STAIRCASE, photons=10**power)
+        for power in range(5, 11 if cuda else 8)
+    ]
+    for n in (0, 2, 4, 6, 8):
+        faces = 12 * 4**n
+        cases.append(Case(f"faces_{faces}", f"a box of {faces} faces", scene=_at_5m([{**box, "subdivisions": n}])))
+    for width, height, bins in images if cuda else images[:3]:
+        scene = _at_5m(_staircase(), width=width, height=height, bins=bins)
+        text = f"staircase_5m into {width} x {height} x {bins} bins"
+        cases.append(Case(f"bins_{width}x{height}x{bins}", text, scene=scene))
+    return [replace(case, error=False, time_limit=2.0) for case in cases]
+
+
+GROUPS: dict[str, Callable[[bool], list[Case]]] = {"scaling": _scaling}
+"""Names that stand for several cases, which depend on whether the device is a GPU."""
+
+
+# Results and their file
 
 FORMAT, FORMAT_VERSION = "spadwarp bench", 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchResult:
-    """What was measured in a case.
+    """What was measured in a case."""
 
-    Attributes:
-        case: Its name.
-        device: "cpu", "cuda:0", ...
-        threads: CPU threads; None on a GPU.
-        faces: Triangles of the target.
-        size: Work of one run by unit: photons; or frames, bins, pulses.
-        setup: Seconds for meshes, BVH and arrays.
-        compile: Seconds to compile the kernel or, if it was compiled before, to load it.
-        seconds: Of each timed run.
-        rates: Per second, from the fastest run: photons, collisions, queries (of surfaces, with shadow rays); or
-            frames, bins.
-        memory: Highest memory of the device that the case used [bytes]; None on the CPU, where Warp does not count it.
-        tally_bytes: Size of the histograms; None without a camera.
-        error_per_root_second: Relative standard error of the bins that decide the depth (`Result.relative_error`) after
-            one second of transport; it falls with the root of the time. None without a camera or where it was not asked
-            for, infinite where nothing returned.
-        check: Where a mean is known: `name`, `value`, `standard_error`, `reference`, `passed`.
-    """
-
-    case: str
-    device: str
-    threads: int | None
-    faces: int = 0
-    size: dict[str, int]
-    setup: float
-    compile: float
-    seconds: tuple[float, ...]
-    rates: dict[str, float]
-    memory: int | None = None
-    tally_bytes: int | None = None
+    case: str  # its name
+    device: str  # "cpu", "cuda:0", ...
+    threads: int | None  # of the CPU; None on a GPU
+    faces: int = 0  # triangles of the target
+    size: dict[str, int]  # work of one run by unit: photons; or frames, bins, pulses
+    setup: float  # seconds for meshes, BVH and arrays
+    compile: float  # seconds to compile the kernel or, if it was compiled before, to load it
+    seconds: tuple[float, ...]  # of each timed run
+    rates: dict[str, float]  # per second, from the fastest run: photons, collisions, queries; or frames, bins
+    memory: int | None = None  # most of the device that the case used [bytes]; None on the CPU: Warp does not count it
+    tally_bytes: int | None = None  # of the histograms; None without a camera
     error_per_root_second: float | None = None
+    """Relative standard error of the bins that decide the depth (`Result.relative_error`) after one second of
+    transport; it falls with the root of the time. None where it was not asked for, infinite where nothing returned."""
     check: dict[str, Any] | None = None
+    """Where a mean is known: `name`, `value`, `standard_error`, `reference`, `passed`."""
 
 
 def report(results: Sequence[BenchResult]) -> dict[str, Any]:
     """Results as plain values, with device, processor, driver, versions, commit and date."""
     device = pick_device(results[0].device if results else None)
     made = {**provenance(device), "driver": nvidia_driver() if device.is_cuda else None, "commit": _commit()}
-    made["processor"] = processor_name(pick_device("cpu"))
-    return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
-        "provenance": {**made, "threads": None if device.is_cuda else core_count()},
-        "results": [asdict(result) for result in results],
-    }
+    made |= {"processor": processor_name(pick_device("cpu")), "threads": None if device.is_cuda else core_count()}
+    rows = [asdict(result) for result in results]
+    return {"format": FORMAT, "format_version": FORMAT_VERSION, "provenance": made, "results": rows}
 
 
 def load_report(path: str | Path) -> dict[str, Any]:
     """Reads what `spadwarp bench --json` wrote. Raises `FileError`."""
     try:
-        stored = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+        stored = parse_json(read_text(path))
     except ValueError as error:
         raise FileError(f"{path}: not JSON: {error}") from error
     if not isinstance(stored, dict) or stored.get("format") != FORMAT or not isinstance(stored.get("results"), list):
@@ -110,7 +236,7 @@ def load_report(path: str | Path) -> dict[str, Any]:
 
 def _commit() -> str | None:
     """The commit of the checkout that this package lies in, "-dirty" where it was changed; None outside one."""
-    root = Path(__file__).resolve().parents[2]
+    root = Path(__file__).resolve().parents[1]
 
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
@@ -149,8 +275,7 @@ def run(
             "analytic", "detect" and the cases of "scaling" named after their photons have sizes of their own.
         repeats: Timed runs of each case, > 0; rates are those of the fastest. Cases of "scaling" are not repeated
             once two seconds have been timed.
-        progress: Called with each case before it is run.
-        found: Called with each result.
+        progress, found: Called with each case before it is run, and with each result.
 
     Raises:
         ArgumentError: An unknown case, or a number out of range.
@@ -163,14 +288,13 @@ def run(
     repeats = check_integer("repeats", repeats, "[1, 1000]")
     wp_device = pick_device(device)
     results = []
-    for case in (
-        case for name in names for case in (GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]])
-    ):
-        if progress is not None:
-            progress(case)
-        results.append(measure(case, wp_device, photons, repeats))
-        if found is not None:
-            found(results[-1])
+    for name in names:
+        for case in GROUPS[name](wp_device.is_cuda) if name in GROUPS else [CASES[name]]:
+            if progress is not None:
+                progress(case)
+            results.append(measure(case, wp_device, photons, repeats))
+            if found is not None:
+                found(results[-1])
     return results
 
 
@@ -189,8 +313,11 @@ def measure(case: Case, device: wp.Device, photons: int | None, repeats: int) ->
     size, tally_bytes = facts["size"], facts.get("tally_bytes")
     del run_number  # and its histograms, before the next run makes its own
     error = check = None
-    if case.error and tally_bytes is not None:
-        error = _error(case, device, min(size["photons"], _usual_photons(device)), rates["photons"])
+    if case.error and tally_bytes is not None:  # from a separate run, since batches take time
+        scene = Scene.from_dict(case.scene)
+        photons = max(min(size["photons"], _usual_photons(device)), 2 * scene.scan_positions)
+        result = simulate(scene, photons=photons, device=device.alias, uncertainty=True)
+        error = result.relative_error * math.sqrt(result.photons / rates["photons"])
     if case.absorbed is not None:
         check = _absorbed(case, device, size["photons"], *case.absorbed)
     return BenchResult(
@@ -230,13 +357,6 @@ def _timed(device: wp.Device, work: Callable[[], Any]) -> tuple[Any, float]:
     return result, time.perf_counter() - began
 
 
-def _error(case: Case, device: wp.Device, photons: int, photons_per_second: float) -> float:
-    """Relative error after one second at that rate; from a separate run, since batches take time."""
-    scene = Scene.from_dict(case.scene)
-    result = simulate(scene, photons=max(photons, 2 * scene.scan_positions), device=device.alias, uncertainty=True)
-    return result.relative_error * math.sqrt(result.photons / photons_per_second)
-
-
 def _absorbed(case: Case, device: wp.Device, photons: int, reference: float, rounding: float) -> dict[str, Any]:
     scene = Scene.from_dict(case.scene)
     weights = trace(scene, photons=max(2, min(photons, _CHECK_PHOTONS)), device=device.alias).weight
@@ -258,14 +378,8 @@ _Stage = tuple[dict[str, Any], Callable[[int], tuple[dict[str, int], float]]]
 
 
 class TransportRun:
-    """A transport case on a device, set up and compiled.
-
-    Attributes:
-        setup, compile: Seconds that this took, see `BenchResult`.
-        faces: Triangles of the target.
-        scores: Whether the estimator fills a histogram; else photons travel without a camera.
-        tally_bytes: Of the histograms; None without a camera.
-    """
+    """A transport case on a device, set up and compiled; `setup`, `compile`, `faces` and `tally_bytes` as in
+    `BenchResult`."""
 
     def __init__(self, case: Case, device: wp.Device) -> None:
         import warp as wp
@@ -276,15 +390,15 @@ class TransportRun:
         began = time.perf_counter()
         mesh = build_mesh(scene)
         self._spec = transport_spec(scene, mesh, **({} if case.estimator is None else {"estimator": case.estimator}))
-        self.scores: bool = sk.ESTIMATORS[self._spec.estimator](self._spec).scores
-        self._model: Model = build_model(scene, device, mesh, camera=self.scores)
-        self._data: Data = sk.make_data(self._model)
+        scores = sk.ESTIMATORS[self._spec.estimator](self._spec).scores  # else photons travel without a camera
+        self._model = build_model(scene, device, mesh, camera=scores)
+        self._data = sk.make_data(self._model)
         wp.synchronize_device(device)
         ready = time.perf_counter()
         sk.load_transport_kernel(self._spec, device, model=self._model)
         self.setup, self.compile = ready - began, time.perf_counter() - ready
         self.faces = 0 if mesh is None else mesh.face_count
-        self.tally_bytes = 8 * self._model.tally_size if self.scores else None
+        self.tally_bytes = 8 * self._model.tally_size if scores else None
 
     def run(self, photons: int, *, first: int = 0) -> tuple[dict[str, int], dict[str, int], float]:
         """Ledger and counters of the photons with ids from `first` on, on a CPU with a thread for each core, and the
@@ -383,38 +497,26 @@ _TIMER = 1e-3  # the least relative scatter of a timed run: clocks are not bette
 
 @dataclass(frozen=True)
 class Comparison:
-    """One case now and before.
+    """One case now and before."""
 
-    Attributes:
-        case: Its name.
-        unit: What is counted: photons, frames or bins a second.
-        before, now: Rate [1/s], geometric mean of the timed runs.
-        spread_before, spread_now: Relative standard deviation of a timed run; None from one run.
-        ratio: now / before; above 1 is faster.
-        interval: Confidence interval of the ratio at 99 %; None where one side has a single run.
-        verdict: "faster" or "slower" where the whole interval lies more than `MARGIN` from 1; else "same", or
-            "unclear" where it reaches further than 10 % from 1.
-    """
-
-    case: str
-    unit: str
-    before: float
+    case: str  # its name
+    unit: str  # what is counted: photons, frames or bins a second
+    before: float  # rate [1/s], geometric mean of the timed runs
     now: float
-    spread_before: float | None
+    spread_before: float | None  # relative standard deviation of a timed run; None from one run
     spread_now: float | None
-    ratio: float
-    interval: tuple[float, float] | None
+    ratio: float  # now / before; above 1 is faster
+    interval: tuple[float, float] | None  # of the ratio at 99 % confidence; None where one side has a single run
     verdict: Literal["faster", "slower", "same", "unclear"]
+    """"faster" or "slower" where the whole interval lies more than `MARGIN` from 1; else "same", or "unclear" where it
+    reaches further than 10 % from 1."""
 
 
 def compare(now: Mapping[str, Any], before: Mapping[str, Any]) -> list[Comparison]:
-    """Compares two reports case by case, those that both have.
+    """Compares two reports, of `report` or `load_report`, case by case, those that both have.
 
     Logarithms of rates are compared, so that a ratio is a difference, by the t-test of Welch (1947), which takes the
     scatter of either side as it is. It knows the noise between runs of one process alone; `MARGIN` stands for the rest.
-
-    Args:
-        now, before: From `report` or `load_report`.
     """
     earlier = {row["case"]: row for row in before["results"]}
     return [_compared(row, earlier[row["case"]]) for row in now["results"] if row["case"] in earlier]
@@ -439,18 +541,9 @@ def _compared(now: Mapping[str, Any], before: Mapping[str, Any]) -> Comparison:
             verdict = "slower"
         elif max(high, 1.0 / low) <= 1.0 + _RESOLUTION:
             verdict = "same"
-    spread_now, spread_before = (float(side.std(ddof=1)) if side.size > 1 else None for side in sides)
-    return Comparison(
-        case=now["case"],
-        unit=unit,
-        before=math.exp(old.mean()),
-        now=math.exp(new.mean()),
-        spread_before=spread_before,
-        spread_now=spread_now,
-        ratio=math.exp(difference),
-        interval=interval,
-        verdict=verdict,
-    )
+    spread_before, spread_now = (float(side.std(ddof=1)) if side.size > 1 else None for side in (old, new))
+    rates = math.exp(old.mean()), math.exp(new.mean())
+    return Comparison(now["case"], unit, *rates, spread_before, spread_now, math.exp(difference), interval, verdict)
 
 
 def history(directory: str | Path) -> list[tuple[Path, dict[str, Any]]]:
@@ -462,16 +555,8 @@ def history(directory: str | Path) -> list[tuple[Path, dict[str, Any]]]:
 
 
 def newest_report(directory: str | Path, *, like: Mapping[str, Any], cases: Sequence[str]) -> Path:
-    """The newest report of a directory with one of these cases, from the same kind of device.
-
-    Args:
-        directory: Of reports.
-        like: Provenance of a report: `device_name` and `threads` count.
-        cases: Names of cases.
-
-    Raises:
-        FileError: There is none.
-    """
+    """The newest report of a directory with one of these cases, from a device as that of a report's provenance `like`
+    (`device_name` and `threads`). Raises `FileError` if there is none."""
     for path, stored in reversed(history(directory)):
         made = stored["provenance"]
         same = all(made.get(name) == like[name] for name in ("device_name", "threads"))

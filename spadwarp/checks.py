@@ -1,18 +1,21 @@
-"""The checks in order, and the numbers that follow from a scene."""
+"""Warnings and notes on a scene that is valid, in numbers, before a photon is traced.
+
+A survey holds a scene's numbers and the findings so far; the checks run in the order of `_CHECKS`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic import PILE_UP
-from spadwarp.checks.survey import CheckMessage, OnAxis, Survey
+from spadwarp.analytic import PILE_UP, axis_fluence
 from spadwarp.frames import detector_response
-from spadwarp.mesh import TriangleMesh, guess_unit
+from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.scene import (
     Laser,
     Layer,
@@ -30,16 +33,178 @@ from spadwarp.scene import (
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import profile_extent
 from spadwarp.scene.medium import WATER_INDICES, grid_cells
-from spadwarp.scene.port import Port
+from spadwarp.scene.port import Port, PortGeometry
+from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sections import field_unit
-from spadwarp.scene.sight import beam_planes, points_inside, view_planes
+from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
 from spadwarp.transport import points_per_flight
-from spadwarp.values import ArgumentError, ConfigError, path_from_time, quantity, with_prefix
+from spadwarp.values import (
+    ArgumentError,
+    ConfigError,
+    path_from_time,
+    quantity,
+    range_from_time,
+    time_from_path,
+    with_prefix,
+)
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
-__all__ = ["check", "summary"]
+__all__ = ["CheckMessage", "check", "summary"]
 
 Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CheckMessage:
+    """One finding: `warning` if the run will not show what the scene asks for, `note` if one should know it.
+
+    `field` names the place in the scene, `values` the numbers in `text` (units as in the text).
+    """
+
+    level: Literal["warning", "note"]
+    field: str
+    text: str
+    values: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.level}: {self.field}: {self.text}"
+
+
+@dataclass(frozen=True)
+class OnAxis:
+    """Unscattered light on the beam's axis at the range of the nearest illuminated point."""
+
+    distance: float  # that range [m]
+    optical_depth: float  # to it, one way
+    irradiance: float  # mean over time [W/m²]
+    samples_per_pixel: float  # traced photons that reach one pixel's part of the target
+    photons_per_pixel: float  # from the target, of a pulse
+    signal_per_pulse: float  # detected of these
+
+
+class Survey:
+    """A scene's targets as the camera sees them and the beam illuminates them, without occlusion; and the findings."""
+
+    def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
+        if mesh is None and scene.targets:
+            mesh = build_mesh(scene)
+        self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
+        triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
+        # The faces of each target in the camera frame `[F, 3, 3]` [m].
+        self.targets = [] if mesh is None else [triangles[mesh.target == i] for i in range(len(scene.targets))]
+        self.reflectance = 0.0 if mesh is None else float(mesh.reflectance.max(initial=0.0))
+        self.focus_distance = focus_distance(scene, mesh)  # [m]; None for a pinhole
+        self.camera_port, self.laser_port = camera_port(scene), laser_port(scene)
+        self.view = view_planes(scene.camera)
+        # A scan brings its beam to all that is in view.
+        self.beam = beam_planes(laser) if scene.scan_positions == 1 else np.zeros((0, 4))
+        # Planes in air, the port that they are bent at, its axis, and where they begin; of view and beam.
+        self._sides = (
+            (self.view, self.camera_port, (0.0, 0.0, 1.0), np.zeros(3)),
+            (self.beam, self.laser_port, laser.axis, np.array(laser.position)),
+        )
+        # Range that a bin covers [m]; width of the response, if pulse and jitter are Gaussian; one set of tallies.
+        self.bin_range = range_from_time(scene.gate.bin_width, scene.medium.group_index)
+        self.irf_fwhm_ps = math.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps)
+        self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+        # Nearest and farthest point from the lens that is in view and beam [m], first and last unscattered return from
+        # them [ns], optical depth and light of the nearest; None if there are none, or it lies at the lens centre.
+        self.target_range = self.target_arrival_ns = self.optical_depth = self.on_axis = None
+        illuminated = self.illuminated_part(triangles)
+        if len(illuminated):
+            ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
+            self.target_range = float(ranges.min()), float(ranges.max())
+            self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
+            self.optical_depth = scene.optical_depth((0.0, 0.0, 0.0), illuminated[ranges.argmin()].tolist())
+            if self.target_range[0]:
+                self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
+
+    def warn(self, field: str, text: str, **values: float) -> None:
+        """Adds a warning."""
+        self.messages.append(CheckMessage("warning", field, text, values))
+
+    def note(self, field: str, text: str, **values: float) -> None:
+        """Adds a note."""
+        self.messages.append(CheckMessage("note", field, text, values))
+
+    def illuminated_part(self, triangles: Points) -> Points:
+        """Points of triangles in the view and the beam, `[N, 3]`; behind ports, of those that planes in air hold."""
+        has_port = self.camera_port is not None or self.laser_port is not None
+        whole = [np.array([[0.0, 0.0, 1.0, 0.0]])] if has_port else []
+        for planes, port, axis, _ in self._sides:
+            # Bent towards its normal, light stays within the planes in air, but about a tilted port.
+            if port is None or port.shape == "dome" or np.dot(port.normal, axis) > 0.999:
+                whole.append(planes)
+        points = points_inside(triangles, np.concatenate(whole))
+        for planes, port, _, origin in self._sides:
+            if port is not None and len(points):
+                ahead = origin + port.connect(points, origin)[0]
+                points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
+        return points
+
+    def paths(self, points: Points) -> Points:
+        """Paths [m] from the laser by points `[N, 3]` to the lens, as lengths in water."""
+        return self._ways(points, self._sides[::-1], 3)
+
+    def _ways(self, points: Points, sides: tuple, item: int) -> Points:
+        """Lengths of the ways of light [m] from points to the origins of sides, an item of what `connect` returns."""
+        ways = (
+            np.linalg.norm(points - origin, axis=1) if port is None else port.connect(points, origin)[item]
+            for _, port, _, origin in sides
+        )
+        return sum(ways)
+
+    def arrival_ns(self, path: float) -> float:
+        """Time of flight [ns] along a path [m]."""
+        return 1e9 * time_from_path(path, self.scene.medium.group_index)
+
+    def range_of(self, time: float) -> float:
+        """Range [m] of a round trip of `time` [s], laser at the lens."""
+        return range_from_time(time, self.scene.medium.group_index) + (port_advance(self.scene) if time > 0.0 else 0.0)
+
+    def _on_axis(self, distance: float, optical_depth: float) -> OnAxis:
+        scene, passed, port = self.scene, math.exp(-optical_depth), self.camera_port
+        ballistic = self._pixel_share(distance) * passed
+        # Lambertian, towards the lens
+        collected = self.reflectance / math.pi * scene.camera.aperture_area / distance**2
+        share = ballistic * passed * _transmission(port)
+        if port is not None and port.shape == "dome":
+            share *= (port.index[0] / port.index[2]) ** 2
+        photons = share * collected * scene.laser.photons_per_pulse
+        return OnAxis(
+            distance=distance,
+            optical_depth=optical_depth,
+            irradiance=axis_fluence(scene, distance) * passed * scene.laser.average_power,
+            samples_per_pixel=scene.transport.photons / scene.scan_positions * ballistic,
+            photons_per_pixel=photons,
+            signal_per_pulse=photons * scene.detections_per_photon,
+        )
+
+    def _pixel_share(self, distance: float) -> float:
+        """Part of the beam within one pixel's footprint at `distance` [m], on the beam's axis, without water."""
+        laser, footprint = self.scene.laser, (self.scene.camera.pixel_tangent * distance) ** 2
+        footprint *= _narrowed(self.camera_port) / _narrowed(self.laser_port) * _transmission(self.laser_port)
+        if laser.profile == "uniform_cone":
+            area = 2.0 * math.pi * (1.0 - math.cos(laser.half_angle)) * distance**2
+        elif laser.profile == "gaussian":
+            area = 0.5 * math.pi * (math.tan(laser.half_angle) * distance) ** 2
+        elif laser.profile == "measured":
+            wide, tall = profile_extent(laser)
+            area = 4.0 * wide * tall * distance**2  # if it were even
+        else:
+            area = math.pi * laser.beam_radius**2
+        return min(1.0, footprint / area) if area > 0.0 else 1.0
+
+
+def _narrowed(port: PortGeometry | None) -> float:
+    """By which a flat port makes a small solid angle about its normal smaller."""
+    return 1.0 if port is None or port.shape != "flat" else (port.index[0] / port.index[2]) ** 2
+
+
+def _transmission(port: PortGeometry | None) -> float:
+    """Of light that falls on a port at right angles."""
+    first, second, third = (1.0, 1.0, 1.0) if port is None else port.index
+    return (4.0 * first * second / (first + second) ** 2) * (4.0 * second * third / (second + third) ** 2)
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
@@ -235,8 +400,26 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
     """One target; where light cannot come back from it, the first reason alone."""
     scene, laser, in_view = survey.scene, survey.scene.beam, points_inside(triangles, survey.view)
     illuminated = survey.illuminated_part(triangles) if len(in_view) else in_view
-    if _is_dark(survey, name, triangles, in_view, illuminated):
-        return
+    corners, depth = triangles.reshape(-1, 3), float(triangles[..., 2].max())
+    ends = zip("xyz", corners.min(0), corners.max(0), strict=True)
+    where = f"spans {', '.join(f'{axis} {low:.4g} to {high:.4g}' for axis, low, high in ends)} m"
+    where += " in the camera frame" if scene.camera.is_posed else ""
+    if not len(in_view) and depth <= 0:
+        return survey.warn(name, f"behind the camera: {where}", depth=depth)
+    if not len(in_view):
+        left, top, right, bottom = (depth * tangent for tangent in scene.camera.view_box)
+        wide, tall = max(-left, right), max(-top, bottom)
+        text = f"outside the view: {where}, the view at its far end is |x| < {wide:.3g}, |y| < {tall:.3g} m"
+        return survey.warn(name, text, half_width=wide, half_height=tall, depth=depth)
+    if (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
+        return survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
+    if not len(illuminated):
+        angles = np.degrees(_angles(in_view, laser))
+        text = (
+            f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
+            f"off the axis, {_beam_text(scene.laser)}"
+        )
+        return survey.warn(name, text, nearest_angle_deg=float(angles.min()))
     if laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0:
         widest = math.degrees(float(_angles(in_view, laser).max()))
         if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
@@ -250,7 +433,7 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
     if side > scene.transport.lateral_limit:
         text = f"lateral_limit = {scene.transport.lateral_limit:.4g} m cuts {name}, which is seen out to {side:.4g} m"
         survey.warn("transport.lateral_limit", text, side=side)
-    corners, bounds = to_world(scene.camera, triangles.reshape(-1, 3)), scene.domain.bounds
+    corners, bounds = to_world(scene.camera, corners), scene.domain.bounds
     low, high = corners.min(axis=0), corners.max(axis=0)
     if (low < bounds[0]).any() or (high > bounds[1]).any():
         text = (
@@ -265,34 +448,6 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
             "beside it shares its pixel"
         )
         survey.warn(name, text, columns=float(extent[0]), rows=float(extent[1]))
-
-
-def _is_dark(survey: Survey, name: str, triangles: Points, in_view: Points, illuminated: Points) -> bool:
-    """Whether no light comes back from a target; says why."""
-    scene, corners = survey.scene, triangles.reshape(-1, 3)
-    ends = zip("xyz", corners.min(0), corners.max(0), strict=True)
-    where = f"spans {', '.join(f'{axis} {low:.4g} to {high:.4g}' for axis, low, high in ends)} m"
-    where += " in the camera frame" if scene.camera.is_posed else ""
-    depth = float(triangles[..., 2].max())
-    if not len(in_view) and depth <= 0:
-        survey.warn(name, f"behind the camera: {where}", depth=depth)
-    elif not len(in_view):
-        left, top, right, bottom = (depth * tangent for tangent in scene.camera.view_box)
-        wide, tall = max(-left, right), max(-top, bottom)
-        text = f"outside the view: {where}, the view at its far end is |x| < {wide:.3g}, |y| < {tall:.3g} m"
-        survey.warn(name, text, half_width=wide, half_height=tall, depth=depth)
-    elif (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
-        survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
-    elif not len(illuminated):
-        angles = np.degrees(_angles(in_view, scene.beam))
-        text = (
-            f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
-            f"off the axis, {_beam_text(scene.laser)}"
-        )
-        survey.warn(name, text, nearest_angle_deg=float(angles.min()))
-    else:
-        return False
-    return True
 
 
 def _check_gate(survey: Survey, name: str, paths: Points) -> None:
@@ -595,24 +750,19 @@ def _check_medium(survey: Survey) -> None:
             text += f", where pure water absorbs {pure:.3g} 1/m and not {green:.3g}"
         survey.warn(f"{name}.preset", text, **values)
     for name, water in waters.items():
-        if medium.layers and medium.phase_function == "henyey_greenstein" and water.chlorophyll is not None:
-            _check_molecular_scattering(survey, name, water, water.chlorophyll)
-
-
-def _check_molecular_scattering(survey: Survey, name: str, water: Medium | Layer, chlorophyll: float) -> None:
-    """Water molecules scatter little, but nearly evenly: the phase function of particles misses it straight back."""
-    medium = survey.scene.medium
-    optics = water_optics(survey.scene.laser.wavelength_nm, chlorophyll=chlorophyll, **medium.state)
-    molecules = optics.water_scattering * float(molecular_density(np.array(2.0)))
-    g = medium.anisotropy if water.anisotropy is None else water.anisotropy
-    particles = (optics.scattering - optics.water_scattering) * (1.0 - g) / (4.0 * math.pi * (1.0 + g) ** 2)
-    missing = molecules / (molecules + particles)
-    if missing > 0.1:
-        text = (
-            f"layers have the phase function of particles alone: {100.0 * missing:.2g} % of what would be scattered "
-            "straight back is the water's own and is missing"
-        )
-        survey.note(f"{name}.chlorophyll", text, missing=missing)
+        if not medium.layers or medium.phase_function != "henyey_greenstein" or water.chlorophyll is None:
+            continue
+        # Water molecules scatter little, but nearly evenly: the phase function of particles misses it straight back.
+        optics = water_optics(laser.wavelength_nm, chlorophyll=water.chlorophyll, **medium.state)
+        molecules = optics.water_scattering * float(molecular_density(np.array(2.0)))
+        g = medium.anisotropy if water.anisotropy is None else water.anisotropy
+        particles = (optics.scattering - optics.water_scattering) * (1.0 - g) / (4.0 * math.pi * (1.0 + g) ** 2)
+        if (missing := molecules / (molecules + particles)) > 0.1:
+            text = (
+                f"layers have the phase function of particles alone: {100.0 * missing:.2g} % of what would be "
+                "scattered straight back is the water's own and is missing"
+            )
+            survey.note(f"{name}.chlorophyll", text, missing=missing)
 
 
 def _check_phase_table(survey: Survey) -> None:
@@ -664,13 +814,11 @@ def _check_collisions(survey: Survey) -> None:
 
 def _cutoff_collisions(scene: Scene) -> float:
     """Collisions after which the analog weight is below the cut-off, on average; inf where it never is."""
-    transport = scene.transport
+    transport, albedo = scene.transport, scene.medium.range.albedo
     if transport.termination != "cutoff" or transport.weight_cutoff == 0.0:
         return math.inf
-    if scene.medium.albedo == "lu2024":
-        step = math.log(0.97) - 1.0  # the mean of ln ω for ω uniform in (0, 0.97)
-    else:
-        albedo = scene.medium.range.albedo
+    step = math.log(0.97) - 1.0  # the mean of ln ω for ω uniform in (0, 0.97)
+    if scene.medium.albedo != "lu2024":
         if albedo in (0.0, 1.0):
             return 1.0 if albedo == 0.0 else math.inf
         step = math.log(albedo)
