@@ -317,8 +317,7 @@ def _intersect_plane(size: wp.vec3, x: wp.vec3, u: wp.vec3, least: float) -> Sha
     hit = _miss()
     s = -x[2] / u[2]  # infinite or not a number for a ray along the plane, which fails below
     y = x + s * u
-    inside = (size[0] <= 0.0 or wp.abs(y[0]) <= 0.5 * size[0]) and (size[1] <= 0.0 or wp.abs(y[1]) <= 0.5 * size[1])
-    if inside:
+    if (size[0] <= 0.0 or wp.abs(y[0]) <= 0.5 * size[0]) and (size[1] <= 0.0 or wp.abs(y[1]) <= 0.5 * size[1]):
         hit = _nearer(hit, least, s, wp.vec3(0.0, 0.0, 1.0))
     return hit
 
@@ -473,16 +472,6 @@ def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp
     return hit
 
 
-@wp.struct
-class SceneHit:
-    """The nearest shape along a ray."""
-
-    distance: float  # [m]; -1 for none
-    normal: wp.vec3  # unit vector against the ray
-    reflectance: float  # at this point
-    shape: int  # its index; -1 for none
-
-
 @wp.func
 def _reflectance_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
     reflectance = table.reflectance[k]
@@ -499,8 +488,9 @@ def _reflectance_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
 
 
 @wp.func
-def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> SceneHit:
-    """The nearest shape of a world along the ray x + s u; every shape of the world is tried."""
+def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3):
+    """The nearest shape of a world along the ray x + s u, with the normal against it, and the reflectance at this
+    point; every shape of the world is tried."""
     nearest = ShapeHit()
     nearest.distance = _REACH
     nearest.face = -1
@@ -519,12 +509,11 @@ def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> S
             if hit.distance > 0.0 and hit.distance < nearest.distance:
                 nearest = hit
                 found = k
-    result = SceneHit()
-    result.distance = -1.0
-    result.shape = found
+    reflectance = float(0.0)
     if found >= 0:
         normal = wp.transform_vector(table.pose[found], nearest.normal)
-        result.distance = nearest.distance
-        result.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
-        result.reflectance = _reflectance_at(table, found, nearest)
-    return result
+        nearest.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
+        reflectance = _reflectance_at(table, found, nearest)
+    else:
+        nearest.distance = -1.0
+    return nearest, reflectance
