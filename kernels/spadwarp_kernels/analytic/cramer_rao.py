@@ -143,15 +143,6 @@ def outlier_probabilities(signal_count: wp.array, level: wp.array, window: wp.ar
 # ---- The bound of a pulse.
 
 
-@wp.struct
-class PulseIntegrals:
-    """Integrals over the time of a pulse of the rates of the signal S, the background B and both L, per laser pulse."""
-
-    information: wp.float64  # ∫ (dL/dμ)²/L dt [1/s²]
-    background: wp.float64  # ∫ S B dt [1/s]
-    signal: wp.float64  # ∫ S dt
-
-
 # Nodes in [-1, 1] and weights of the Gauss-Legendre rule of five nodes.
 _NODES = 0.0, 0.5384693101056831, -0.5384693101056831, 0.9061798459386640, -0.9061798459386640
 _WEIGHTS = 0.5688888888888889, 0.47862867049936647, 0.47862867049936647, 0.23692688505618908, 0.23692688505618908
@@ -160,15 +151,15 @@ _RULE = wp.constant(wp.types.matrix((2, 5), wp.float64)(*_NODES, *_WEIGHTS))
 
 @memoised
 def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
-    see, background_rate = optics.see, make_single_scatter(optics).background
+    see, background_rate = optics.see, make_single_scatter(optics)[2]
 
     @wp.func
     def integrate_pulse(
         lidar: Lidar, water: Scattering, i: int, sight: SightRay, s: wp.float64, mu: wp.float64, ambient: wp.float64
-    ) -> PulseIntegrals:
-        """The integrals for a signal of s detections that arrives at mu: on both sides, since backscatter ends there,
-        24 panels of at most σ/2 with five Gauss-Legendre nodes."""
-        total = PulseIntegrals()
+    ):
+        """∫ (dL/dμ)²/L dt [1/s²], ∫ S B dt [1/s] and ∫ S dt of the rates of signal S, background B and both L, for s
+        detections that arrive at mu: on both sides, since backscatter ends there, 24 panels of at most σ/2."""
+        information, shared, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         sigma = lidar.sigma
         for side in range(2):
             low = wp.max(lidar.start, mu - wp.float64(12.0) * sigma)
@@ -195,10 +186,10 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
                             noise_rate = background_rate(lidar, water, i, sight, side, t) + ambient
                         rate = noise_rate + pulse
                         if rate > ZERO:
-                            total.information += w * pulse * (pulse / rate) * z * z / (sigma * sigma)
-                        total.background += w * pulse * noise_rate
-                        total.signal += w * pulse
-        return total
+                            information += w * pulse * (pulse / rate) * z * z / (sigma * sigma)
+                        shared += w * pulse * noise_rate
+                        total += w * pulse
+        return information, shared, total
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
     def statistics_kernel(
@@ -233,18 +224,18 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
         if s > ZERO:
             fraction = normal_cdf((lidar.stop - mu) / sigma) - normal_cdf((lidar.start - mu) / sigma)
         a = noise + s * fraction
-        pulse = PulseIntegrals()
+        information, shared, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         if s * fraction > ZERO:
-            pulse = integrate_pulse(lidar, water, i, see(lidar.ports, view[i]), s, mu, beside)
+            information, shared, total = integrate_pulse(lidar, water, i, see(lidar.ports, view[i]), s, mu, beside)
         counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
         f = wp.float64(0.0)
         sigma_star = wp.float64(wp.nan)
         p = wp.float64(wp.nan)
         # The outlier model takes the background as flat, at the level under the pulse: what is brighter elsewhere
         # weighs less in a fit that knows the background.
-        flat = pulse.background / wp.max(pulse.signal, wp.float64(1.0e-300))
-        if pulse.information > ZERO:
-            f = pulse.information / a
+        flat = shared / wp.max(total, wp.float64(1.0e-300))
+        if information > ZERO:
+            f = information / a
             sigma_star = ONE / wp.sqrt(counts * f)
             if with_outliers == 1:
                 p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)

@@ -143,20 +143,17 @@ def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     return wp.vec2(lower, upper)
 
 
-@wp.func
-def field(camera: Camera) -> wp.vec4:
+def field(camera: Any) -> wp.vec4:
     """Tangents (left, top, right, bottom) of what the image shows, for square pixels about the optical axis."""
-    half_width = 0.5 * float(camera.width) * camera.pixel_tangent
-    half_height = 0.5 * float(camera.height) * camera.pixel_tangent
+    tangent = np.float32(camera.pixel_tangent)
+    half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
     return wp.vec4(-half_width, -half_height, half_width, half_height)
 
 
 def ready_camera(copy: Any, camera: Any) -> None:
-    """Readies a copy for a kernel with what threads would otherwise compute: as its view its `field`, rounded as there,
-    and the focal lengths and principal point of square pixels about the axis."""
+    """Readies a copy for a kernel with view, focal lengths and principal point of square pixels about the axis."""
     tangent = np.float32(camera.pixel_tangent)
-    half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
-    copy.view = wp.vec4(-half_width, -half_height, half_width, half_height)
+    copy.view = field(camera)
     focal = float(1.0 / tangent) if tangent > 0.0 else 0.0  # 0 where nothing asks for an image
     copy.focal = wp.vec2(focal, focal)
     copy.principal = wp.vec2(0.5 * int(camera.width), 0.5 * int(camera.height))

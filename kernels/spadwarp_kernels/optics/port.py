@@ -612,10 +612,8 @@ def _slopes(inside: float, layer: float, angle: float) -> tuple[float, float]:
 
 
 def _set_times(port: Port, lengths: Sequence[tuple[float, float]]) -> None:
-    """Bounds of a way's time, from the least and largest lengths in the layers.
-
-    The ray is no shorter than the straight line, and by Fermat's principle its optical length is not longer.
-    """
+    """Bounds of a way's time, from the least and largest lengths in the layers: the ray is no shorter than the straight
+    line, and by Fermat's principle its optical length is not longer."""
     early, late = 0.0, 0.0
     for k, (least, largest) in enumerate(lengths):
         delay, ratio = port.delay[k], port.index[k] / port.index[2]

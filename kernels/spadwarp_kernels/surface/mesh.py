@@ -18,7 +18,7 @@ from spadwarp_kernels.base.arguments import (
     check_values,
 )
 from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.visibility import near_depth_map, update_near_depth
+from spadwarp_kernels.optics.visibility import near_depth_map
 
 from .bvh import empty_bvh, pack_bvh, refit_bvh
 from .patches import BRUTE_FORCE_FACES, PATCH_ROWS, pack_patches, set_patches
@@ -231,7 +231,7 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     if surfaces.patches.size:
         set_patches(mesh, surfaces.patches, surfaces.normals)
     if camera is not None:
-        update_near_depth(surfaces.near_depth, mesh, camera)
+        near_depth_map(mesh, camera, surfaces.near_depth)
 
 
 def check_faces(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:

@@ -251,15 +251,7 @@ def _move_kernel(table: ShapeTable, body_q: wp.array[wp.transform]):
 
 
 def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
-    """Carries the shapes to the poses of their bodies, on the device.
-
-    Args:
-        shapes: From `make_shapes`.
-        body_q: `wp.transform` `[bodies]`, in the worlds' frames; None where no shape is on a body.
-
-    Raises:
-        ArgumentError: Fewer poses than the shapes' bodies, or on another device.
-    """
+    """Carries the shapes to the poses of their bodies `[bodies]`, None where no shape is on one; on the device."""
     check_kind("shapes", shapes, Shapes)
     if body_q is None:
         body_q = wp.empty(0, dtype=wp.transform, device=shapes.device)
@@ -436,10 +428,7 @@ def _intersect_scaled_mesh(mesh: wp.uint64, size: wp.vec3, x: wp.vec3, u: wp.vec
 
 @wp.func
 def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp.vec3, reach: float) -> ShapeHit:
-    """The nearest point, up to `reach`, at which the ray x + s u meets a shape of `SHAPE_KINDS` in its own frame.
-
-    `size` is that of `ShapeTable`; a mesh is an id of a `wp.Mesh`.
-    """
+    """The nearest point, up to `reach`, at which the ray x + s u meets a shape of `ShapeTable` in its own frame."""
     # From the point of the ray that is nearest the centre: differences of squares would cancel far away.
     start = -wp.dot(x, u)
     y = x + start * u
