@@ -24,18 +24,6 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 COUNT_LAWS = ("per_pulse", "per_frame", "per_frame_lu2024")
 
 
-@wp.func
-def recorded_photons(
-    alpha: wp.float64, count_law: int, acquisitions: wp.float64, pulses_per_frame: wp.float64
-) -> wp.float64:
-    """Photons that a pixel records in so many pulses (law 0) or frames of ην pulses each (laws 1 and 2)."""
-    if count_law == 0:
-        return acquisitions * one_minus_exp(alpha)
-    if count_law == 1:
-        return acquisitions * one_minus_exp(alpha * pulses_per_frame)
-    return acquisitions * (ONE - wp.pow(wp.max(ONE - alpha, ZERO), pulses_per_frame))
-
-
 # ---- How often a fit reports background instead of the target: where the bound is out of reach.
 
 
@@ -227,7 +215,10 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
         information, shared, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         if s * fraction > ZERO:
             information, shared, total = integrate_pulse(lidar, water, i, see(lidar.ports, view[i]), s, mu, beside)
-        counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
+        # In pulses, or in frames of ην pulses each.
+        counts = acquisitions * one_minus_exp(a * wp.where(count_law == 1, pulses_per_frame, ONE))
+        if count_law == 2:
+            counts = acquisitions * (ONE - wp.pow(wp.max(ONE - a, ZERO), pulses_per_frame))
         f = wp.float64(0.0)
         sigma_star = wp.float64(wp.nan)
         p = wp.float64(wp.nan)

@@ -19,25 +19,6 @@ def _texel(tangent: float, low: float, high: float) -> float:
     return (tangent - low) / (high - low) * float(_TEXELS)
 
 
-@wp.func
-def _rectangle(camera: Camera, view: wp.vec4, p: wp.vec3, q: wp.vec3, r: wp.vec3, depth: float) -> wp.vec4i:
-    """First column and row, last column and row of the texels that a face before the lens may cover."""
-    # A ray to the rim of the lens differs from the line to its centre by less than this, as a tangent.
-    spread = camera.aperture_radius / depth
-    left = wp.min(p[0] / p[2], wp.min(q[0] / q[2], r[0] / r[2])) - spread
-    right = wp.max(p[0] / p[2], wp.max(q[0] / q[2], r[0] / r[2])) + spread
-    top = wp.min(p[1] / p[2], wp.min(q[1] / q[2], r[1] / r[2])) - spread
-    bottom = wp.max(p[1] / p[2], wp.max(q[1] / q[2], r[1] / r[2])) + spread
-    # One texel more on each side makes up for rounding.
-    edge = float(_TEXELS)
-    return wp.vec4i(
-        int(wp.clamp(_texel(left, view[0], view[2]) - 1.0, 0.0, edge)),
-        int(wp.clamp(_texel(top, view[1], view[3]) - 1.0, 0.0, edge)),
-        int(wp.clamp(_texel(right, view[0], view[2]) + 1.0, -1.0, edge - 1.0)),
-        int(wp.clamp(_texel(bottom, view[1], view[3]) + 1.0, -1.0, edge - 1.0)),
-    )
-
-
 @wp.kernel(enable_backward=False)
 def _near_depth_kernel(camera: Camera, view: wp.vec4, mesh: wp.uint64, threads: int, near_depth: wp.array2d[float]):
     """Lowers each texel of a view to the least depth of the faces that may cover it. Launch: (faces, their threads)."""
@@ -49,9 +30,17 @@ def _near_depth_kernel(camera: Camera, view: wp.vec4, mesh: wp.uint64, threads: 
     if wp.max(p[2], wp.max(q[2], r[2])) < 0.0:
         return  # behind the lens, and between nothing and it
     depth = wp.min(p[2], wp.min(q[2], r[2]))
+    edge = float(_TEXELS)
     box = wp.vec4i(0, 0, int(_TEXELS - 1), int(_TEXELS - 1))
     if depth > camera.aperture_radius:
-        box = _rectangle(camera, view, p, q, r, depth)
+        # A ray to the rim of the lens differs from the line to its centre by less than this, as a tangent; one texel
+        # more on each side makes up for rounding.
+        spread = camera.aperture_radius / depth
+        for i in range(2):
+            least = wp.min(p[i] / p[2], wp.min(q[i] / q[2], r[i] / r[2])) - spread
+            most = wp.max(p[i] / p[2], wp.max(q[i] / q[2], r[i] / r[2])) + spread
+            box[i] = int(wp.clamp(_texel(least, view[i], view[2 + i]) - 1.0, 0.0, edge))
+            box[2 + i] = int(wp.clamp(_texel(most, view[i], view[2 + i]) + 1.0, -1.0, edge - 1.0))
     else:
         depth = 0.0  # beside the lens: of its points, only those of the plane tell
     # Also no nearer than its plane: n y >= far for all y of the face. A ray from x to a point o of the lens meets it at

@@ -25,7 +25,7 @@ import warp as wp
 from spadwarp_kernels.base.native import bits_of, from_bits
 
 from .patches import SAME, join_faces, shared_corner
-from .triangle import box_padding, face_in, meet_face, number_in, set_rows
+from .triangle import box_padding, face_in, load_plane, meet_planes, number_in, set_rows
 
 
 @wp.func_native("""
@@ -503,9 +503,11 @@ def step_leaf(faces: wp.array[wp.vec4], order: wp.array[int], walk: TreeWalk, x:
     """Tries the face that a walk has come to: its node is below NO_NODE; origin and unit direction of the ray."""
     step = LeafStep()
     slot = slot_of(walk.node)
-    distance, met, last = meet_face(faces, slot, x, u)
-    step.slot = met
-    step.distance = distance
+    n = load_plane(faces, slot, 2)
+    met = meet_planes(load_plane(faces, slot, 0), load_plane(faces, slot, 1), n, x, u)
+    last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
+    step.slot = wp.where(met[1] > 0.0, last, slot)
+    step.distance = met[0]
     step.hit = step.distance >= 0.0 and step.distance < walk.nearest
     step.node = NO_NODE
     if (walk.node & 1) != 0:

@@ -198,11 +198,9 @@ def check_poses(name: str, poses: wp.array, count: int | None = None) -> None:
 
 def _check_shapes(table: ShapeTable, seen: np.ndarray, given: tuple[wp.Mesh, ...]) -> tuple[wp.Mesh, ...]:
     """Shapes that are in range; returns the meshes that they use, as far as they can be found by their ids."""
-    for name, high in (("kind", len(SHAPE_KINDS) - 1), ("reflectance", 1)):
-        values = getattr(table, name).numpy()
-        if not ((values >= 0) & (values <= high)).all():
-            raise ArgumentError(f"{name} holds {values.min()} to {values.max()}, outside [0, {high}]")
-    check_values("body", table.body, "[-1, 2147483647]")
+    ranges = {"kind": f"[0, {len(SHAPE_KINDS) - 1}]", "reflectance": "[0, 1]", "body": "[-1, 2147483647]"}
+    for name, interval in ranges.items():
+        check_values(name, getattr(table, name), interval)
     check_poses("local", table.local)
     kind, size = table.kind.numpy(), table.size.numpy()
     needed = np.array([_COMPONENTS[name] for name in SHAPE_KINDS])[kind]
@@ -301,17 +299,6 @@ def _roots(a: float, b: float, c: float) -> wp.vec2:
     if q == 0.0:
         return wp.vec2(0.0, 0.0)
     return wp.vec2(q / a, c / q)
-
-
-@wp.func
-def _intersect_plane(size: wp.vec3, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
-    """The plane z = 0."""
-    hit = _miss()
-    s = -x[2] / u[2]  # infinite or not a number for a ray along the plane, which fails below
-    y = x + s * u
-    if (size[0] <= 0.0 or wp.abs(y[0]) <= 0.5 * size[0]) and (size[1] <= 0.0 or wp.abs(y[1]) <= 0.5 * size[1]):
-        hit = _nearer(hit, least, s, wp.vec3(0.0, 0.0, 1.0))
-    return hit
 
 
 @wp.func
@@ -435,7 +422,10 @@ def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp
     least = -start
     hit = _miss()
     if kind == PLANE:
-        hit = _intersect_plane(size, y, u, least)
+        s = -y[2] / u[2]  # infinite or not a number for a ray along the plane, which fails below
+        z = y + s * u
+        if (size[0] <= 0.0 or wp.abs(z[0]) <= 0.5 * size[0]) and (size[1] <= 0.0 or wp.abs(z[1]) <= 0.5 * size[1]):
+            hit = _nearer(hit, least, s, wp.vec3(0.0, 0.0, 1.0))
     elif kind == SPHERE:
         hit = _intersect_ball(hit, 0.0, size[0], 0.0, y, u, least)
     elif kind == CAPSULE:
