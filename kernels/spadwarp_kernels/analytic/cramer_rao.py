@@ -34,14 +34,10 @@ def outlier_probability(signal_count: wp.float64, level: wp.float64, window: wp.
     The score of a delay is the sum over counts of g(z) = ln(1 + r exp(-z^2/2)), a Poisson shot noise. K(s) is the
     cumulant function of its background part; the score at the true delay has the same law tilted to s = 1. Rice's
     formula with the saddlepoint density gives the mean number of upcrossings of x = K'(s) over the window, and
-    P = E[1 - exp(-upcrossings of the true delay's score)].
-    What first order leaves out: 1/sqrt(1 + s) is the gain of the score by the fit's freedom (half a chi^2 of one
-    degree), and 1 - 0.18 b/(b + 0.2), for crossings that come in clusters, is fitted to Monte Carlo.
-
-    Args:
-        signal_count: Expected signal counts of the whole acquisition.
-        level: Expected background counts per sigma, b.
-        window: Gate over sigma.
+    P = E[1 - exp(-upcrossings of the true delay's score)]. Counts are those of the whole acquisition, `level` is
+    the background per sigma, b, `window` the gate over sigma. What first order leaves out: 1/sqrt(1 + s) is the gain of
+    the score by the fit's freedom (half a chi^2 of one degree), and 1 - 0.18 b/(b + 0.2), for crossings that come in
+    clusters, is fitted to Monte Carlo.
     """
     # A fit that knows nothing is anywhere in the window.
     blind = wp.max(ONE - wp.float64(8.0) / window, ZERO)
@@ -253,10 +249,8 @@ def _histogram_information(
     # Out:
     information: wp.array[wp.float64],
 ):
-    """Fisher information of the delay per pulse, in 1/bins². Launch grid: pixels.
-
-    Taps convolve both cubes with the response; slope taps give the derivative of a bin's signal by the delay.
-    """
+    """Fisher information of the delay per pulse, in 1/bins². Launch grid: pixels. Taps convolve both cubes with the
+    response; slope taps give the derivative of a bin's signal by the delay."""
     i = first + wp.tid()
     row = i % background.shape[0]
     bins = signal.shape[1]

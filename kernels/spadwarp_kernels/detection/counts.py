@@ -210,12 +210,7 @@ def dark_count_rates(
 
 @wp.kernel(enable_backward=False)
 def _crosstalk_kernel(
-    first_pixel: int,
-    width: int,
-    probability: float,
-    detections: wp.array2d[float],
-    # In and out:
-    hazard: wp.array2d[float],
+    first_pixel: int, width: int, probability: float, detections: wp.array2d[float], hazard: wp.array2d[float]
 ):
     pixel = first_pixel + wp.tid()
     x = pixel % width
@@ -327,10 +322,7 @@ def coates(counts: wp.array, *, pulses: float) -> wp.array:
 def _check_exposure(
     hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int, first_frame: int | wp.array
 ) -> tuple[int, int, int, int]:
-    """Pulses, frames, the largest count of a bin and the seed, in range: at most 2^31 - 1 rows in one call.
-
-    Every rate is one, which is checked on the CPU, where nobody has to wait for it.
-    """
+    """Pulses, frames, the largest count of a bin and the seed, in range; on the CPU, rates are checked, too."""
     check_array("hazard", hazard, wp.float32, (None, None))
     if isinstance(first_frame, wp.array):
         check_array("first_frame", first_frame, wp.int64, (1,), hazard.device)
@@ -367,49 +359,6 @@ def _exponential(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.u
     return -wp.log(wp.float64(1.0) - u[0])
 
 
-@wp.func
-def _draw_row(
-    hazard: wp.array2d[float],
-    pixel: int,
-    row: int,
-    pulses: int,
-    depth: int,
-    seed: wp.uint64,
-    id: wp.uint64,
-    # Out, zero before or counts to add to:
-    counts: wp.array2d[int],
-):
-    """Adds the counts of `pulses` pulses of a pixel to a row; `id` names the draw."""
-    block = wp.uint32(0)
-    left = int(pulses)  # pulses without a count so far
-    waiting = int(0)
-    wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
-    for k in range(hazard.shape[1]):
-        h = wp.float64(hazard[pixel, k])
-        if h > wp.float64(0.0) and left > 0:
-            count = int(0)
-            if wp.float64(left) * h < _SPARSE:
-                # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
-                if waiting == 0:
-                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                    block = block + _ONE
-                    waiting = 1
-                while left > 0 and wait < wp.float64(left) * h:
-                    h = h - wait / wp.float64(left)
-                    left = left - 1
-                    count = count + 1
-                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                    block = block + _ONE
-                wait = wait - wp.float64(left) * h
-            else:
-                # Exponential waits have no memory: the one begun may be dropped.
-                waiting = 0
-                count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
-                left = left - count
-            if count > 0:
-                counts[row, k] = counts[row, k] + wp.min(count, depth)
-
-
 @wp.kernel(enable_backward=False)
 def _first_photon_kernel(
     first_row: int,
@@ -422,13 +371,41 @@ def _first_photon_kernel(
     # Out, zero before:
     counts: wp.array2d[int],
 ):
+    """Counts of `summed` frames in a row; frame and pixel name a draw. Launch: rows."""
     row = first_row + wp.tid()
     pixels = hazard.shape[0]
     pixel = row % pixels
     for part in range(summed):
         frame = wp.uint64(first_frame[0]) + wp.uint64(row / pixels * summed + part)
         id = frame * wp.uint64(pixels) + wp.uint64(pixel)
-        _draw_row(hazard, pixel, row, pulses, depth, seed, id, counts)
+        block = wp.uint32(0)
+        left = int(pulses)  # pulses without a count so far
+        waiting = int(0)
+        wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
+        for k in range(hazard.shape[1]):
+            h = wp.float64(hazard[pixel, k])
+            if h > wp.float64(0.0) and left > 0:
+                count = int(0)
+                if wp.float64(left) * h < _SPARSE:
+                    # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
+                    if waiting == 0:
+                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                        block = block + _ONE
+                        waiting = 1
+                    while left > 0 and wait < wp.float64(left) * h:
+                        h = h - wait / wp.float64(left)
+                        left = left - 1
+                        count = count + 1
+                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                        block = block + _ONE
+                    wait = wait - wp.float64(left) * h
+                else:
+                    # Exponential waits have no memory: the one begun may be dropped.
+                    waiting = 0
+                    count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
+                    left = left - count
+                if count > 0:
+                    counts[row, k] = counts[row, k] + wp.min(count, depth)
 
 
 def first_photon_counts(
@@ -645,15 +622,6 @@ def _event_kernel(
     tag_count[row] = tags
 
 
-def _rising_edges(edges: np.ndarray, bins: int, period: float) -> np.ndarray:
-    edges = check_numbers("edges", edges)
-    if edges.shape != (bins + 1,):
-        raise ArgumentError(f"edges has shape {edges.shape}; ({bins + 1},), one more than the bins, is needed")
-    if not (edges[0] == 0.0 and (np.diff(edges) > 0.0).all() and edges[-1] <= period * (1.0 + 1e-9)):
-        raise ArgumentError(f"edges do not rise from 0 to at most the period, {period} s")
-    return edges
-
-
 def event_counts(
     hazard: wp.array,
     *,
@@ -703,7 +671,11 @@ def event_counts(
     detector.dead_time = check_number("dead_time", dead_time, "[0, inf)")
     detector.afterpulsing = check_number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
     detector.time_constant = afterpulsing_time_constant
-    rising = _rising_edges(edges, bins, period)
+    rising = check_numbers("edges", edges)
+    if rising.shape != (bins + 1,):
+        raise ArgumentError(f"edges has shape {rising.shape}; ({bins + 1},), one more than the bins, is needed")
+    if not (rising[0] == 0.0 and (np.diff(rising) > 0.0).all() and rising[-1] <= period * (1.0 + 1e-9)):
+        raise ArgumentError(f"edges do not rise from 0 to at most the period, {period} s")
     detector.edges = wp.array(rising[None, :], dtype=wp.float64, device=device)
     rows = frames * pixels
     counts = _zeroed_counts(counts, (rows, recorded), device)

@@ -52,11 +52,8 @@ class Camera:
 
 @wp.func
 def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
-    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0.
-
-    The line through x and o meets the focus plane at a point that the lens centre sees in this direction,
-    x/z + o (1/focus - 1/z).
-    """
+    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0: that in which the
+    lens centre sees the point where their line meets the focus plane, x/z + o (1/focus - 1/z)."""
     inverse = 1.0 / x[2]
     return wp.vec2(
         (x[0] - o[0]) * inverse + camera.inverse_focus * o[0], (x[1] - o[1]) * inverse + camera.inverse_focus * o[1]
@@ -265,11 +262,8 @@ def gate_bin(gate: Gate, path: float) -> int:
 @wp.func
 def clip_to_gate(gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, interval: wp.vec2) -> wp.vec2:
     """The part of the interval [s0, s1] of the flight x + s u whose light arrives within the gate by way of a lens
-    point; empty where s0 >= s1.
-
-    The arrival path s + r(s) rises with s, so the gate cuts out an interval: s + r = L at
-    s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u.
-    """
+    point; empty where s0 >= s1. The arrival path s + r(s) rises with s, so that the gate cuts out an interval: it is L
+    at s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u."""
     if interval[0] >= interval[1]:
         return interval
 

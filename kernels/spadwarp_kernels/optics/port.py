@@ -80,13 +80,9 @@ class PortRay:
 
 @wp.func
 def transmission(n: wp.vec4, q: wp.vec4) -> float:
-    """Fraction of unpolarised light that two interfaces let through: half the sum of the products of both
-    polarisations. Light that a window reflects inside is left out.
-
-    Args:
-        n: Phase indices: before and behind the first interface, before and behind the second.
-        q: The same times the cosine to the normal there.
-    """
+    """Fraction of unpolarised light that two interfaces let through, without what a window reflects inside: half the
+    sum of the products of both polarisations. n: phase indices before and behind the first and before and behind the
+    second; q: the same times the cosine to the normal there."""
     s1 = q[0] + q[1]
     s2 = q[2] + q[3]
     first = 4.0 * q[0] * q[1]

@@ -503,8 +503,10 @@ def step_leaf(faces: wp.array[wp.vec4], order: wp.array[int], walk: TreeWalk, x:
     """Tries the face that a walk has come to: its node is below NO_NODE; origin and unit direction of the ray."""
     step = LeafStep()
     slot = slot_of(walk.node)
+    a = load_plane(faces, slot, 0)
+    b = load_plane(faces, slot, 1)
     n = load_plane(faces, slot, 2)
-    met = meet_planes(load_plane(faces, slot, 0), load_plane(faces, slot, 1), n, x, u)
+    met = meet_planes(a, b, n, x, u)
     last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
     step.slot = wp.where(met[1] > 0.0, last, slot)
     step.distance = met[0]

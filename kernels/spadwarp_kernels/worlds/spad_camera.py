@@ -249,12 +249,7 @@ def _normal_integral(z: float) -> float:
 
 @wp.kernel(enable_backward=False)
 def _backscatter_kernel(
-    first: int,
-    lidar: Lidar,
-    water: Scattering,
-    view: wp.array[wp.vec3d],
-    # Out:
-    rates: wp.array2d[float],
+    first: int, lidar: Lidar, water: Scattering, view: wp.array[wp.vec3d], rates: wp.array2d[float]
 ):
     """Mean over each bin of the single-scatter rate times its width. Launch: pixels."""
     i = first + wp.tid()

@@ -205,10 +205,8 @@ def _rates_kernel(
     # Out:
     rates: wp.array2d[float],
 ):
-    """Expected detections per pulse of one camera: light of the tally, blurred by the response.
-
-    `taps` has zeros for the _RUN - 1 bins before and after the response. Launch: (pixels, runs of bins).
-    """
+    """Expected detections per pulse of one camera: light of the tally, blurred by the response, whose taps have zeros
+    for the _RUN - 1 bins before and after it. Launch: (pixels, runs of bins)."""
     pixel, run = wp.tid()
     parts = tally.shape[1] / rates.shape[1]
     first = run * _RUN
