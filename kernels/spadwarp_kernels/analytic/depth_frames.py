@@ -124,21 +124,12 @@ def _make_sample_kernel(optics: Optics) -> wp.Kernel:
         for k in range(2):
             frame = 2 * pair + k - first_frame
             if frame >= 0 and frame < frame_count:
-                shift = radius * wp.cos(angle)
-                word = block[2]
-                if k == 1:
-                    shift = radius * wp.sin(angle)
-                    word = block[3]
-                value = maps.depth[pixel] + shift
-                reports_background = u01(word) < p
+                value = maps.depth[pixel] + radius * wp.where(k == 0, wp.cos(angle), wp.sin(angle))
+                reports_background = u01(block[2 + k]) < p
                 if reports_background:
                     extra = random_block(seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
-                    kind = u01(extra[0])
-                    draw = u01(extra[1])
-                    if k == 1:
-                        kind = u01(extra[2])
-                        draw = u01(extra[3])
-                    value = background_depth(maps, pixel, kind < maps.flat_share[pixel], draw)
+                    flat = u01(extra[2 * k]) < maps.flat_share[pixel]
+                    value = background_depth(maps, pixel, flat, u01(extra[2 * k + 1]))
                 frames[frame, pixel] = value
                 labels[frame, pixel] = reports_background
 

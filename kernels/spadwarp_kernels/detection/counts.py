@@ -137,27 +137,25 @@ def expected_detections(
     check_array("source", source, RATES, (None, None))
     device = source.device
     check_array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
-    _check_matrix(source.shape[1], row_start, source_bin, weight, width)
-    hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
-    kinds = ((row_start, int), (source_bin, int), (weight, float), (width, float))
-    matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
-    return _by_row(_response_kernel(source.dtype), [source, *matrix, noise_rate], hazard)
-
-
-def _check_matrix(columns: int, row_start: Any, source_bin: Any, weight: Any, width: Any) -> None:
     given = {"row_start": row_start, "source_bin": source_bin, "weight": weight, "width": width}
-    rows, entries, weight, width = (check_numbers(name, values, 1) for name, values in given.items())
-    if rows.size != width.size + 1:
-        raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {width.shape}, is needed")
-    if weight.shape != entries.shape:
-        raise ArgumentError(f"source_bin {entries.shape} and weight {weight.shape} are not two equal lists")
+    rows, entries, factors, widths = (check_numbers(name, values, 1) for name, values in given.items())
+    if rows.size != widths.size + 1:
+        raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {widths.shape}, is needed")
+    if factors.shape != entries.shape:
+        raise ArgumentError(f"source_bin {entries.shape} and weight {factors.shape} are not two equal lists")
     if rows[0] != 0 or rows[-1] != entries.size or (np.diff(rows) < 0).any():
         raise ArgumentError(f"row_start does not rise from 0 to {entries.size}, the number of entries")
-    if entries.size and not (entries.min() >= 0 and entries.max() < columns):
-        raise ArgumentError(f"source_bin holds {entries.min():g} to {entries.max():g}, outside [0, {columns - 1}]")
-    for name, values in {"weight": weight, "width": width}.items():
+    if entries.size and not (entries.min() >= 0 and entries.max() < source.shape[1]):
+        raise ArgumentError(
+            f"source_bin holds {entries.min():g} to {entries.max():g}, outside [0, {source.shape[1] - 1}]"
+        )
+    for name, values in {"weight": factors, "width": widths}.items():
         if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
             raise ArgumentError(f"{name} holds numbers that are negative or not finite")
+    hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
+    kinds = zip(given.values(), (int, int, float, float), strict=True)
+    matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
+    return _by_row(_response_kernel(source.dtype), [source, *matrix, noise_rate], hazard)
 
 
 @wp.kernel(enable_backward=False)

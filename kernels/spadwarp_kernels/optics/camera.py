@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_fields, check_integer, check_number, check_struct, check_vector
+from spadwarp_kernels.base.arguments import check_fields, check_integer, check_number, check_struct
 from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
@@ -212,13 +212,9 @@ def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     check_fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
     if not calibrated:
         return
-    for focal in camera.focal:
-        check_number(f"{name}.focal", focal, "(0, inf)")
-    check_vector(f"{name}.principal", camera.principal, size=2)
-    check_vector(f"{name}.radial", camera.radial)
-    check_vector(f"{name}.tangential", camera.tangential, size=2)
+    finite = dict.fromkeys(("principal", "radial", "tangential", "view"), "(-inf, inf)")
+    check_fields(name, camera, {"focal": "(0, inf)", **finite})
     left, top, right, bottom = camera.view
-    check_vector(f"{name}.view", camera.view, size=4)
     check_number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
     check_number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_range, check_vector
+from spadwarp_kernels.base.arguments import ArgumentError, check_fields, check_number, check_range, check_vector
 
 __all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
 
@@ -566,14 +566,8 @@ def make_dome_port(
 
 def check_port(name: str, port: Port, kind: PortKind) -> None:
     """Parameters of a port of that kind; raises `ArgumentError`."""
-    for k, value in enumerate(port.index):
-        check_number(f"{name}.index[{k}]", value, "[1, inf)")
-    if kind.name == FLAT_PORT.name:
-        check_number(f"{name}.distance", port.distance, "(-inf, inf)")
-        check_vector(f"{name}.normal", port.normal, unit=True)
-    else:
-        check_number(f"{name}.radius", port.radius, "(0, inf)")
-        check_vector(f"{name}.centre", port.centre)
+    flat, dome = {"distance": "(-inf, inf)", "normal": "unit"}, {"radius": "(0, inf)", "centre": "(-inf, inf)"}
+    check_fields(name, port, {"index": "[1, inf)"} | (flat if kind.name == FLAT_PORT.name else dome))
 
 
 def _port(

@@ -121,8 +121,15 @@ def make_surfaces(
             with points that are not finite.
     """
     surfaces = Surfaces()
-    device = check_device("device", device) if mesh is None else _check_mesh(mesh)
-    face_count = 0 if mesh is None else mesh.indices.size // 3
+    face_count = 0
+    if mesh is None:
+        device = check_device("device", device)
+    else:
+        check_kind("mesh", mesh, wp.Mesh)
+        if mesh.indices.size < 3:
+            raise ArgumentError(f"mesh.indices has {mesh.indices.size} entries; 3 for each face are needed")
+        check_values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+        device, face_count = mesh.device, mesh.indices.size // 3
 
     def by_face(name: str, value: Any, dtype: type, interval: str = "[0, 1]") -> wp.array:
         if mesh is None or value is None:
@@ -247,14 +254,6 @@ def check_patches(name: str, surfaces: Surfaces, faces: int, device: wp.Device) 
     size = surfaces.patches.size
     if size == 0 or size % PATCH_ROWS:
         raise ArgumentError(f"{name}.patches has {size} entries; make_surfaces fills it")
-
-
-def _check_mesh(mesh: Any) -> wp.Device:
-    check_kind("mesh", mesh, wp.Mesh)
-    if mesh.indices.size < 3:
-        raise ArgumentError(f"mesh.indices has {mesh.indices.size} entries; 3 for each face are needed")
-    check_values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
-    return mesh.device
 
 
 def _check_sum(surfaces: Surfaces) -> None:

@@ -452,21 +452,6 @@ def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp
 
 
 @wp.func
-def _reflectance_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
-    reflectance = table.reflectance[k]
-    first = table.first_face[k]
-    if hit.face >= 0 and first >= 0:
-        row = first + hit.face
-        index = table.textures.face[row]
-        if index >= 0:
-            uv = hit.corner[0] * table.textures.coordinates[row, 0]
-            uv += hit.corner[1] * table.textures.coordinates[row, 1]
-            uv += (1.0 - hit.corner[0] - hit.corner[1]) * table.textures.coordinates[row, 2]
-            reflectance *= texture_at(table.textures, index, uv)
-    return reflectance
-
-
-@wp.func
 def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3):
     """The nearest shape of a world along the ray x + s u, with the normal against it, and the reflectance at this
     point; every shape of the world is tried."""
@@ -492,7 +477,12 @@ def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3):
     if found >= 0:
         normal = wp.transform_vector(table.pose[found], nearest.normal)
         nearest.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
-        reflectance = _reflectance_at(table, found, nearest)
+        reflectance = table.reflectance[found]
+        first = table.first_face[found]
+        if nearest.face >= 0 and first >= 0:
+            corner = nearest.corner
+            shares = wp.vec3(corner[0], corner[1], 1.0 - corner[0] - corner[1])
+            reflectance *= texture_at(table.textures, first + nearest.face, shares)
     else:
         nearest.distance = -1.0
     return nearest, reflectance
