@@ -432,14 +432,6 @@ def refit_bvh(
     set_rows(mesh, order, faces)
 
 
-def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of no faces at all: a root whose four children no ray meets."""
-    x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
-    rows = [[x, x, x, 0.0], [0.0, 0.0, bits, bits], [bits] * 4, [bits] * 4]
-    nodes = wp.array(rows, dtype=wp.vec4, device=device)
-    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
-
-
 @wp.struct
 class TreeWalk:
     """A ray on its way down the tree; its stack is a `Stack` beside it."""

@@ -20,10 +20,10 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.visibility import near_depth_map
 
-from .bvh import empty_bvh, pack_bvh, refit_bvh
+from .bvh import pack_bvh, refit_bvh
 from .patches import BRUTE_FORCE_FACES, PATCH_ROWS, pack_patches, set_patches
 from .triangle import LANES, face_vectors, pack_faces, set_faces
-from .wide import empty_wide, pack_wide, refit_wide
+from .wide import empty_tree, pack_wide, refit_wide
 
 __all__ = ["Surfaces", "Textures", "make_surfaces", "make_textures", "surface_choices", "update_surfaces"]
 
@@ -157,7 +157,7 @@ def make_surfaces(
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float, "[0.01, 1]")
     _check_sum(surfaces)
     surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device) if device.is_cuda else empty_wide()
+    surfaces.nodes, surfaces.faces, surfaces.order = empty_tree(device)
     surfaces.depth = wp.zeros(0, dtype=int, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     surfaces.patches, surfaces.normals = (wp.zeros(0, dtype=wp.vec4, device=device) for _ in range(2))
