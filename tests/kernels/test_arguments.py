@@ -171,7 +171,7 @@ def test_parts_of_a_model_name_what_is_wrong(make, arguments, text):
         (sk.TransportSpec("next_event", layered=True), "model.layers.start is None; a wp.array of float32"),
         (sk.TransportSpec("next_event", phase=sk.TABULATED), "model.medium.phase.cells is None"),
         (sk.TransportSpec("next_event", measured_beam=True), "model.laser.rows is None"),
-        (sk.TransportSpec("next_event", lens=sk.CALIBRATED), r"model.camera.focal = 0.0 is outside \(0, inf\)"),
+        (sk.TransportSpec("next_event", lens=sk.CALIBRATED), r"model.camera.focal\[0\] = 0.0 is outside \(0, inf\)"),
         (
             sk.TransportSpec("next_event", rotated_domain=True),
             "model.limits.rotation = .* a unit vector is needed",

@@ -24,18 +24,6 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 COUNT_LAWS = ("per_pulse", "per_frame", "per_frame_lu2024")
 
 
-@wp.func
-def recorded_photons(
-    alpha: wp.float64, count_law: int, acquisitions: wp.float64, pulses_per_frame: wp.float64
-) -> wp.float64:
-    """Photons that a pixel records in so many pulses (law 0) or frames of ην pulses each (laws 1 and 2)."""
-    if count_law == 0:
-        return acquisitions * one_minus_exp(alpha)
-    if count_law == 1:
-        return acquisitions * one_minus_exp(alpha * pulses_per_frame)
-    return acquisitions * (ONE - wp.pow(wp.max(ONE - alpha, ZERO), pulses_per_frame))
-
-
 # ---- How often a fit reports background instead of the target: where the bound is out of reach.
 
 
@@ -46,14 +34,10 @@ def outlier_probability(signal_count: wp.float64, level: wp.float64, window: wp.
     The score of a delay is the sum over counts of g(z) = ln(1 + r exp(-z^2/2)), a Poisson shot noise. K(s) is the
     cumulant function of its background part; the score at the true delay has the same law tilted to s = 1. Rice's
     formula with the saddlepoint density gives the mean number of upcrossings of x = K'(s) over the window, and
-    P = E[1 - exp(-upcrossings of the true delay's score)].
-    What first order leaves out: 1/sqrt(1 + s) is the gain of the score by the fit's freedom (half a chi^2 of one
-    degree), and 1 - 0.18 b/(b + 0.2), for crossings that come in clusters, is fitted to Monte Carlo.
-
-    Args:
-        signal_count: Expected signal counts of the whole acquisition.
-        level: Expected background counts per sigma, b.
-        window: Gate over sigma.
+    P = E[1 - exp(-upcrossings of the true delay's score)]. Counts are those of the whole acquisition, `level` is
+    the background per sigma, b, `window` the gate over sigma. What first order leaves out: 1/sqrt(1 + s) is the gain of
+    the score by the fit's freedom (half a chi^2 of one degree), and 1 - 0.18 b/(b + 0.2), for crossings that come in
+    clusters, is fitted to Monte Carlo.
     """
     # A fit that knows nothing is anywhere in the window.
     blind = wp.max(ONE - wp.float64(8.0) / window, ZERO)
@@ -143,15 +127,6 @@ def outlier_probabilities(signal_count: wp.array, level: wp.array, window: wp.ar
 # ---- The bound of a pulse.
 
 
-@wp.struct
-class PulseIntegrals:
-    """Integrals over the time of a pulse of the rates of the signal S, the background B and both L, per laser pulse."""
-
-    information: wp.float64  # ∫ (dL/dμ)²/L dt [1/s²]
-    background: wp.float64  # ∫ S B dt [1/s]
-    signal: wp.float64  # ∫ S dt
-
-
 # Nodes in [-1, 1] and weights of the Gauss-Legendre rule of five nodes.
 _NODES = 0.0, 0.5384693101056831, -0.5384693101056831, 0.9061798459386640, -0.9061798459386640
 _WEIGHTS = 0.5688888888888889, 0.47862867049936647, 0.47862867049936647, 0.23692688505618908, 0.23692688505618908
@@ -160,15 +135,15 @@ _RULE = wp.constant(wp.types.matrix((2, 5), wp.float64)(*_NODES, *_WEIGHTS))
 
 @memoised
 def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
-    see, background_rate = optics.see, make_single_scatter(optics).background
+    see, background_rate = optics.see, make_single_scatter(optics)[2]
 
     @wp.func
     def integrate_pulse(
         lidar: Lidar, water: Scattering, i: int, sight: SightRay, s: wp.float64, mu: wp.float64, ambient: wp.float64
-    ) -> PulseIntegrals:
-        """The integrals for a signal of s detections that arrives at mu: on both sides, since backscatter ends there,
-        24 panels of at most σ/2 with five Gauss-Legendre nodes."""
-        total = PulseIntegrals()
+    ):
+        """∫ (dL/dμ)²/L dt [1/s²], ∫ S B dt [1/s] and ∫ S dt of the rates of signal S, background B and both L, for s
+        detections that arrive at mu: on both sides, since backscatter ends there, 24 panels of at most σ/2."""
+        information, shared, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         sigma = lidar.sigma
         for side in range(2):
             low = wp.max(lidar.start, mu - wp.float64(12.0) * sigma)
@@ -195,10 +170,10 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
                             noise_rate = background_rate(lidar, water, i, sight, side, t) + ambient
                         rate = noise_rate + pulse
                         if rate > ZERO:
-                            total.information += w * pulse * (pulse / rate) * z * z / (sigma * sigma)
-                        total.background += w * pulse * noise_rate
-                        total.signal += w * pulse
-        return total
+                            information += w * pulse * (pulse / rate) * z * z / (sigma * sigma)
+                        shared += w * pulse * noise_rate
+                        total += w * pulse
+        return information, shared, total
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
     def statistics_kernel(
@@ -233,18 +208,21 @@ def _make_statistics_kernel(optics: Optics) -> wp.Kernel:
         if s > ZERO:
             fraction = normal_cdf((lidar.stop - mu) / sigma) - normal_cdf((lidar.start - mu) / sigma)
         a = noise + s * fraction
-        pulse = PulseIntegrals()
+        information, shared, total = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         if s * fraction > ZERO:
-            pulse = integrate_pulse(lidar, water, i, see(lidar.ports, view[i]), s, mu, beside)
-        counts = recorded_photons(a, count_law, acquisitions, pulses_per_frame)
+            information, shared, total = integrate_pulse(lidar, water, i, see(lidar.ports, view[i]), s, mu, beside)
+        # In pulses, or in frames of ην pulses each.
+        counts = acquisitions * one_minus_exp(a * wp.where(count_law == 1, pulses_per_frame, ONE))
+        if count_law == 2:
+            counts = acquisitions * (ONE - wp.pow(wp.max(ONE - a, ZERO), pulses_per_frame))
         f = wp.float64(0.0)
         sigma_star = wp.float64(wp.nan)
         p = wp.float64(wp.nan)
         # The outlier model takes the background as flat, at the level under the pulse: what is brighter elsewhere
         # weighs less in a fit that knows the background.
-        flat = pulse.background / wp.max(pulse.signal, wp.float64(1.0e-300))
-        if pulse.information > ZERO:
-            f = pulse.information / a
+        flat = shared / wp.max(total, wp.float64(1.0e-300))
+        if information > ZERO:
+            f = information / a
             sigma_star = ONE / wp.sqrt(counts * f)
             if with_outliers == 1:
                 p = outlier_probability(counts * s * fraction / a, counts * flat * sigma / a, gate / sigma)
@@ -271,10 +249,8 @@ def _histogram_information(
     # Out:
     information: wp.array[wp.float64],
 ):
-    """Fisher information of the delay per pulse, in 1/bins². Launch grid: pixels.
-
-    Taps convolve both cubes with the response; slope taps give the derivative of a bin's signal by the delay.
-    """
+    """Fisher information of the delay per pulse, in 1/bins². Launch grid: pixels. Taps convolve both cubes with the
+    response; slope taps give the derivative of a bin's signal by the delay."""
     i = first + wp.tid()
     row = i % background.shape[0]
     bins = signal.shape[1]

@@ -50,20 +50,6 @@ class PixelMaps:
 
 
 @wp.func
-def path_at_share(paths: wp.array2d[float], cumulative: wp.array2d[float], pixel: int, u: float) -> float:
-    """The path [m] at which a pixel's cumulative distribution of backscatter reaches u."""
-    row = pixel % cumulative.shape[0]
-    edges = pixel % paths.shape[0]
-    k = wp.max(first_above(cumulative[row], u), 1)
-    below = cumulative[row, k - 1]
-    width = cumulative[row, k] - below
-    w = wp.float32(0.5)
-    if width > 0.0:
-        w = wp.clamp((u - below) / width, 0.0, 1.0)
-    return paths[edges, k - 1] + w * (paths[edges, k] - paths[edges, k - 1])
-
-
-@wp.func
 def depth_of_path(laser: wp.vec3, view: wp.vec3, path: float) -> float:
     """Planar depth at which light has gone `path` from laser to target to lens [m]; 0 if there is none."""
     baseline2 = wp.length_sq(laser)
@@ -94,8 +80,16 @@ def _make_depths(optics: Optics) -> tuple[wp.Function, wp.Function]:
     @wp.func
     def background_depth(maps: PixelMaps, pixel: int, flat: bool, draw: float) -> float:
         path = maps.nearest + draw * (maps.farthest - maps.nearest)
-        if not flat:
-            path = path_at_share(maps.paths, maps.cumulative, pixel, draw)
+        if not flat:  # the path at which the pixel's cumulative distribution of backscatter reaches the draw
+            row = pixel % maps.cumulative.shape[0]
+            edges = pixel % maps.paths.shape[0]
+            k = wp.max(first_above(maps.cumulative[row], draw), 1)
+            below = maps.cumulative[row, k - 1]
+            width = maps.cumulative[row, k] - below
+            w = wp.float32(0.5)
+            if width > 0.0:
+                w = wp.clamp((draw - below) / width, 0.0, 1.0)
+            path = maps.paths[edges, k - 1] + w * (maps.paths[edges, k] - maps.paths[edges, k - 1])
         return depth_at(maps, pixel, path)
 
     return depth_at, background_depth
@@ -117,10 +111,8 @@ def _make_sample_kernel(optics: Optics) -> wp.Kernel:
         frames: wp.array2d[float],
         labels: wp.array2d[wp.bool],
     ):
-        """μ + N(0, σ*²), or with some probability a background photon. Launch grid: frame pairs x pixels.
-
-        One block of random numbers serves two frames; a draw depends on seed, pixel and frame number alone.
-        """
+        """μ + N(0, σ*²), or with some probability a background photon; a draw depends on seed, pixel and frame number
+        alone, one block of random numbers serves two frames. Launch grid: frame pairs x pixels."""
         tid = first + wp.tid()
         pair = tid / pixels
         pixel = tid - pair * pixels
@@ -132,21 +124,12 @@ def _make_sample_kernel(optics: Optics) -> wp.Kernel:
         for k in range(2):
             frame = 2 * pair + k - first_frame
             if frame >= 0 and frame < frame_count:
-                shift = radius * wp.cos(angle)
-                word = block[2]
-                if k == 1:
-                    shift = radius * wp.sin(angle)
-                    word = block[3]
-                value = maps.depth[pixel] + shift
-                reports_background = u01(word) < p
+                value = maps.depth[pixel] + radius * wp.where(k == 0, wp.cos(angle), wp.sin(angle))
+                reports_background = u01(block[2 + k]) < p
                 if reports_background:
                     extra = random_block(seed, wp.uint64(pixel), wp.uint32(2 * pair + 1), STREAM_ANALYTIC)
-                    kind = u01(extra[0])
-                    draw = u01(extra[1])
-                    if k == 1:
-                        kind = u01(extra[2])
-                        draw = u01(extra[3])
-                    value = background_depth(maps, pixel, kind < maps.flat_share[pixel], draw)
+                    flat = u01(extra[2 * k]) < maps.flat_share[pixel]
+                    value = background_depth(maps, pixel, flat, u01(extra[2 * k + 1]))
                 frames[frame, pixel] = value
                 labels[frame, pixel] = reports_background
 

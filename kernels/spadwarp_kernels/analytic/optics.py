@@ -116,15 +116,6 @@ class SightRay:
 
 
 @wp.struct
-class BeamRay:
-    """A ray of the laser's beam in the water."""
-
-    x: wp.vec3d  # where it begins [m]
-    u: wp.vec3d  # its unit direction
-    transmission: wp.float64  # fraction of its light that got there
-
-
-@wp.struct
 class LaserConnection:
     """The way from the laser to a point in clear water."""
 
@@ -134,15 +125,6 @@ class LaserConnection:
     fluence: wp.float64  # fraction of a pulse per area across it [1/m^2]
 
 
-@wp.struct
-class LensConnection:
-    """The way to the lens of light that a surface scatters evenly."""
-
-    ray: wp.vec3d  # in the direction in which the lens sees it, of any length
-    share: wp.float64  # cosine at the surface times solid angle and transmission, over the lens's area [1/m^2]
-    water: wp.float64  # its length in the water [m]
-
-
 class Optics(NamedTuple):
     """Warp functions for a camera and a laser, each in the water or behind a port."""
 
@@ -150,9 +132,13 @@ class Optics(NamedTuple):
     see: wp.Function  # (ports, view) -> SightRay of a pixel, from the unit vector in which the lens sees it
     beside: wp.Function  # (lidar, sight, x, a, b) -> point at the depth of x that is seen a and b pixels beside it
     footprint: wp.Function  # (lidar, distance) -> about the side of a pixel [m]
-    receive: wp.Function  # (lidar, normal, x) -> LensConnection of a point of a surface
+    # (lidar, normal, x) -> way to the lens of light that a point of a surface scatters evenly: direction in which it is
+    # seen, of any length; cosine at the surface times solid angle and transmission, over the lens's area [1/m^2]; its
+    # length in the water [m]
+    receive: wp.Function
     spot: wp.Function  # (lidar, path) -> about the radius of the beam [m]
-    emit: wp.Function  # (lidar, x, u) -> BeamRay in the water of a ray from the laser
+    # (lidar, x, u) -> where a ray from the laser begins in the water [m], its unit direction, the fraction of its light
+    emit: wp.Function
     light: wp.Function  # (lidar, x) -> LaserConnection of a point
     # (laser, ports, sight, path) -> range at which light has gone a path from laser to target to lens [m]; 0 or less if
     # there is none
@@ -210,21 +196,14 @@ def _make_camera(kind: PortKind | None) -> tuple[wp.Function, ...]:
         return side
 
     @wp.func
-    def receive(lidar: Lidar, normal: wp.vec3d, x: wp.vec3d) -> LensConnection:
-        out = LensConnection()
+    def receive(lidar: Lidar, normal: wp.vec3d, x: wp.vec3d):
         if wp.static(not has_port):
             r = wp.length(x)
-            out.ray = x
-            out.share = -wp.dot(normal, x) / r * (x[2] / r) / (r * r)
-            out.water = r
-            return out
+            return x, -wp.dot(normal, x) / r * (x[2] / r) / (r * r), r
         c = connect(lidar.ports.camera, wp.vec3(x), wp.vec3(0.0))
-        if c.density > 0.0:
-            out.ray = -wp.vec3d(c.inside)
-            cos_out = wp.dot(normal, wp.vec3d(c.to_port))
-            out.share = cos_out * out.ray[2] * wp.float64(c.density * c.transmission)
-            out.water = wp.float64(c.water)
-        return out
+        ray = -wp.vec3d(c.inside)
+        cos_out = wp.dot(normal, wp.vec3d(c.to_port))
+        return ray, cos_out * ray[2] * wp.float64(c.density * c.transmission), wp.float64(c.water)
 
     return see, beside, footprint, receive
 
@@ -243,8 +222,7 @@ def beam_path(lidar: Lidar, x: wp.vec3d) -> wp.float64:
 
 @wp.func
 def beam_fluence(lidar: Lidar, y: wp.vec3d, r2: wp.float64) -> wp.float64:
-    """Fraction of a pulse per area across a diverging beam, at y from its laser in clear water [1/m^2], y² being r2;
-    at a unit vector, that per solid angle [1/sr]."""
+    """Fraction of a pulse per area across a diverging beam at y from its laser, y² being r2 [1/m^2], in clear water."""
     along = wp.dot(y, lidar.axis)
     if along <= ZERO:
         return ZERO
@@ -292,17 +270,11 @@ def _make_beam(kind: PortKind | None) -> tuple[wp.Function, ...]:
         return radius
 
     @wp.func
-    def emit(lidar: Lidar, x: wp.vec3d, u: wp.vec3d) -> BeamRay:
-        ray = BeamRay()
-        ray.x = x
-        ray.u = u
-        ray.transmission = ONE
+    def emit(lidar: Lidar, x: wp.vec3d, u: wp.vec3d):
         if wp.static(has_port):
             p = enter(lidar.ports.laser, wp.vec3(x), wp.vec3(u))
-            ray.x = wp.vec3d(p.x)
-            ray.u = wp.vec3d(p.u)
-            ray.transmission = wp.float64(p.transmission)
-        return ray
+            return wp.vec3d(p.x), wp.vec3d(p.u), wp.float64(p.transmission)
+        return x, u, ONE
 
     @wp.func
     def parallel_light(lidar: Lidar, x: wp.vec3d) -> LaserConnection:

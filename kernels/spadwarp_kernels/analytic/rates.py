@@ -4,7 +4,7 @@ Equation numbers are those of *A Simulation Method for Underwater SPAD Depth Ima
 Times are from the emission of the pulse, rates in detections per pulse and second; everything in float64.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import warp as wp
 
@@ -30,10 +30,7 @@ _PANELS = wp.constant(TABLE_EDGES - 1)
 
 @wp.func
 def lu2024_signal(lidar: Lidar, distance: wp.float64, reflectance: wp.float64) -> wp.float64:
-    """Signal detections per pulse, eq 3 to 6 in a row, which is eq 7 with K = 8.
-
-    The focal length cancels; here it is 1 m: the pixel's sides are pixel_tangent, the radius of the lens is 1/(2 N).
-    """
+    """Signal detections per pulse, eq 3 to 6 in a row: eq 7 with K = 8; the focal length, here 1 m, cancels."""
     passed = wp.exp(-lidar.extinction * distance)
     # Eq 3 and 5: photons per area on the target, and at the lens, reflected evenly into the half-space.
     on_target = lidar.photons * passed / (PI * distance * distance * lidar.tan2)
@@ -48,15 +45,14 @@ def lu2024_signal(lidar: Lidar, distance: wp.float64, reflectance: wp.float64) -
 
 @wp.func
 def collection(lidar: Lidar, axial: wp.float64) -> wp.float64:
-    """A cos(psi)/r² to the lens times the r² (pitch/f)² cos³(psi) that a pixel sees, cos(psi) being the z of its line
-    of sight [m² sr]."""
+    """A cos(psi)/r² to the lens times the r² (pitch/f)² cos³(psi) that a pixel sees, cos(psi) = `axial` [m² sr]."""
     cos_psi2 = axial * axial
     return lidar.aperture_area * lidar.pixel_tangent * lidar.pixel_tangent * cos_psi2 * cos_psi2
 
 
 @wp.func
-def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin: wp.bool) -> wp.vec3d:
-    """Origin or direction of the ray at a quantile of the beam's radius and azimuth, both in [0, 1)."""
+def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64):
+    """Origin and direction of the ray at a quantile of the beam's radius and azimuth, both in [0, 1)."""
     sign = wp.where(lidar.axis[2] < ZERO, -ONE, ONE)
     a = -ONE / (sign + lidar.axis[2])
     b = lidar.axis[0] * lidar.axis[1] * a
@@ -64,23 +60,18 @@ def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64, out_origin:
     b2 = wp.vec3d(b, sign + lidar.axis[1] * lidar.axis[1] * a, -lidar.axis[1])
     phi = TWO * PI * azimuth
     across = wp.cos(phi) * b1 + wp.sin(phi) * b2
-    if out_origin:
-        if lidar.profile == 2:
-            return lidar.laser + lidar.radius * wp.sqrt(radial) * across
-        return lidar.laser
     if lidar.profile == 0:
         t = lidar.spread * radial
-        return (ONE - t) * lidar.axis + wp.sqrt(t * (TWO - t)) * across
+        return lidar.laser, (ONE - t) * lidar.axis + wp.sqrt(t * (TWO - t)) * across
     if lidar.profile == 1:
         tangent = wp.sqrt(-HALF * lidar.tan2 * wp.log(ONE - radial))
-        return wp.normalize(lidar.axis + tangent * across)
-    return lidar.axis
+        return lidar.laser, wp.normalize(lidar.axis + tangent * across)
+    return lidar.laser + lidar.radius * wp.sqrt(radial) * across, lidar.axis
 
 
 @memoised
 def make_radiometric_signal(optics: Optics) -> wp.Function:
-    """The Warp function ``(lidar, sight, distance, normal, reflectance)`` -> signal detections per pulse, `distance`
-    being the range."""
+    """The Warp function ``(lidar, sight, range, normal, reflectance)`` -> signal detections per pulse."""
     emit, receive, light_at, beside = optics.emit, optics.receive, optics.light, optics.beside
     spot, footprint = optics.spot, optics.footprint
 
@@ -95,17 +86,16 @@ def make_radiometric_signal(optics: Optics) -> wp.Function:
             for j in range(16):
                 radial = (wp.float64(i) + HALF) / wp.float64(16.0)
                 azimuth = (wp.float64(j) + HALF) / wp.float64(16.0)
-                origin = _beam_ray(lidar, radial, azimuth, True)
-                ray = emit(lidar, origin, _beam_ray(lidar, radial, azimuth, False))
-                facing = -wp.dot(normal, ray.u)
+                origin, heading = _beam_ray(lidar, radial, azimuth)
+                begin, u, passed = emit(lidar, origin, heading)
+                facing = -wp.dot(normal, u)
                 if facing > wp.float64(1.0e-6):
-                    s = wp.dot(normal, ray.x - x) / facing
-                    seen = receive(lidar, normal, ray.x + s * ray.u)
-                    d = seen.ray
+                    s = wp.dot(normal, begin - x) / facing
+                    d, share, water = receive(lidar, normal, begin + s * u)
                     inside = wp.abs(d[0] - view[0] / view[2] * d[2]) <= half * d[2]
                     inside = inside and wp.abs(d[1] - view[1] / view[2] * d[2]) <= half * d[2]
-                    if s > ZERO and inside and seen.share > ZERO:
-                        total += ray.transmission * seen.share * wp.exp(-lidar.extinction * (s + seen.water))
+                    if s > ZERO and inside and share > ZERO:
+                        total += passed * share * wp.exp(-lidar.extinction * (s + water))
         scale = lidar.photons * lidar.pde * reflectance / PI * lidar.aperture_area
         return scale * total / wp.float64(256.0)
 
@@ -262,19 +252,10 @@ def phase_at(phase: wp.array[wp.float64], cos_theta: wp.float64) -> wp.float64:
     return (ONE - w) * phase[k] + w * phase[k + 1]
 
 
-class SingleScatter(NamedTuple):
-    """Warp functions for single scattering seen through some optics."""
-
-    per_metre: wp.Function  # (lidar, water, sight, r) -> detections per pulse and metre of range [1/m]
-    rate: wp.Function  # (lidar, water, sight, time) -> C_back(t) [1/s] without a target
-    # (lidar, water, i, sight, beyond, time) -> C_dark + C_back at a time inside the gate [1/s]; `beyond` is 1 after the
-    # target's arrival, where water behind it scatters nothing back
-    background: wp.Function
-
-
 @memoised
-def make_single_scatter(optics: Optics) -> SingleScatter:
-    """The functions for a camera and a laser with these optics."""
+def make_single_scatter(optics: Optics) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """Warp functions for single scattering seen through some optics: detections per pulse and metre of range [1/m],
+    C_back(t) without a target [1/s], and C_dark + C_back of a pixel i inside the gate [1/s]."""
     light_at, range_of_path = optics.light, optics.range_of_path
 
     @wp.func
@@ -313,7 +294,8 @@ def make_single_scatter(optics: Optics) -> SingleScatter:
     def background_rate(
         lidar: Lidar, water: Scattering, i: int, sight: SightRay, beyond: int, time: wp.float64
     ) -> wp.float64:
-        """A profile is interpolated between bin centres."""
+        """`beyond` is 1 after the target's arrival, where water behind it scatters nothing back; a profile is
+        interpolated between bin centres."""
         if lidar.source == 0:
             return lidar.dark + lidar.constant
         if lidar.source == 1:
@@ -328,17 +310,17 @@ def make_single_scatter(optics: Optics) -> SingleScatter:
         value = (ONE - w) * wp.float64(water.profile[row, k]) + w * wp.float64(water.profile[row, wp.min(k + 1, last)])
         return lidar.dark + value / lidar.bin_width
 
-    return SingleScatter(single_scatter_per_metre, single_scatter_rate, background_rate)
+    return single_scatter_per_metre, single_scatter_rate, background_rate
 
 
-single_scatter_rate = make_single_scatter(IN_WATER).rate
+single_scatter_rate = make_single_scatter(IN_WATER)[1]
 """That of a camera and a laser in the water."""
 
 
 @memoised
 def _make_table_kernel(optics: Optics) -> wp.Kernel:
     see, light_at, range_of_path, illuminated = optics.see, optics.light, optics.range_of_path, optics.illuminated
-    per_metre = make_single_scatter(optics).per_metre
+    per_metre, *_ = make_single_scatter(optics)
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
     def table_kernel(

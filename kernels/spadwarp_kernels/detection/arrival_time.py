@@ -38,15 +38,6 @@ def _offer(position: float, score: float, best: wp.vec3) -> wp.vec3:
     return best
 
 
-@wp.func
-def _parabola_vertex(left: float, centre: float, right: float) -> float:
-    """Offset of the maximum of the parabola through three equidistant scores, in steps, within half a step."""
-    curvature = left - 2.0 * centre + right
-    if curvature >= 0.0:
-        return 0.0
-    return wp.clamp(0.5 * (left - right) / curvature, -0.5, 0.5)
-
-
 @wp.struct
 class _Search:
     """The search in a histogram, see `arrival_bins`."""
@@ -196,7 +187,9 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
             centre = int(fine[1])
             left = score_of(histogram, search, pixel, centre - 1, least, 0.0)
             right = score_of(histogram, search, pixel, centre + 1, least, 0.0)
-            top += _parabola_vertex(left, fine[0], right)
+            curvature = left - 2.0 * fine[0] + right
+            if curvature < 0.0:  # the vertex of the parabola through the three
+                top += wp.clamp(0.5 * (left - right) / curvature, -0.5, 0.5)
         arrival[pixel] = top / float(PHASES)
 
     return find
@@ -234,8 +227,15 @@ class ArrivalEstimator:
         search.background = background
         taps = np.zeros((0, 0))
         if method in ("matched", "likelihood"):
-            taps = _check_response(method, response)
+            if response is None:
+                raise ArgumentError(f"method = {method!r} needs a response")
+            taps = check_numbers("response", response)
+            if taps.ndim != 2 or taps.shape[0] != PHASES or taps.size == 0:
+                raise ArgumentError(f"response has shape {taps.shape}; ({PHASES}, taps) is needed")
             largest = taps.max()
+            if not (np.isfinite(taps).all() and taps.min() >= 0.0 and largest > 0.0):
+                limits = "finite values >= 0 are needed, and one above"
+                raise ArgumentError(f"response holds {taps.min()} to {largest}; {limits}")
             search.floor = floor = RESPONSE_FLOOR * float(largest)
             # A narrow response loses signal between the delays of the coarse search, a wide one does not.
             search.coarse_step = PHASES if largest < 0.25 else PHASES // 2 if largest < 0.5 else PHASES // 4
@@ -252,19 +252,6 @@ class ArrivalEstimator:
         make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
         kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
         launch_pixels(kernel, pixels, [histogram, self._search, arrival], device=self.device)
-
-
-def _check_response(method: str, response: np.ndarray | None) -> np.ndarray:
-    if response is None:
-        raise ArgumentError(f"method = {method!r} needs a response")
-    response = check_numbers("response", response)
-    if response.ndim != 2 or response.shape[0] != PHASES or response.size == 0:
-        raise ArgumentError(f"response has shape {response.shape}; ({PHASES}, taps) is needed")
-    if not (np.isfinite(response).all() and response.min() >= 0.0 and response.max() > 0.0):
-        raise ArgumentError(
-            f"response holds {response.min()} to {response.max()}; finite values >= 0 are needed, and one above"
-        )
-    return response
 
 
 def arrival_bins(

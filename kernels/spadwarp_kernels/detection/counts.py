@@ -137,27 +137,25 @@ def expected_detections(
     check_array("source", source, RATES, (None, None))
     device = source.device
     check_array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
-    _check_matrix(source.shape[1], row_start, source_bin, weight, width)
-    hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
-    kinds = ((row_start, int), (source_bin, int), (weight, float), (width, float))
-    matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
-    return _by_row(_response_kernel(source.dtype), [source, *matrix, noise_rate], hazard)
-
-
-def _check_matrix(columns: int, row_start: Any, source_bin: Any, weight: Any, width: Any) -> None:
     given = {"row_start": row_start, "source_bin": source_bin, "weight": weight, "width": width}
-    rows, entries, weight, width = (check_numbers(name, values, 1) for name, values in given.items())
-    if rows.size != width.size + 1:
-        raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {width.shape}, is needed")
-    if weight.shape != entries.shape:
-        raise ArgumentError(f"source_bin {entries.shape} and weight {weight.shape} are not two equal lists")
+    rows, entries, factors, widths = (check_numbers(name, values, 1) for name, values in given.items())
+    if rows.size != widths.size + 1:
+        raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {widths.shape}, is needed")
+    if factors.shape != entries.shape:
+        raise ArgumentError(f"source_bin {entries.shape} and weight {factors.shape} are not two equal lists")
     if rows[0] != 0 or rows[-1] != entries.size or (np.diff(rows) < 0).any():
         raise ArgumentError(f"row_start does not rise from 0 to {entries.size}, the number of entries")
-    if entries.size and not (entries.min() >= 0 and entries.max() < columns):
-        raise ArgumentError(f"source_bin holds {entries.min():g} to {entries.max():g}, outside [0, {columns - 1}]")
-    for name, values in {"weight": weight, "width": width}.items():
+    if entries.size and not (entries.min() >= 0 and entries.max() < source.shape[1]):
+        raise ArgumentError(
+            f"source_bin holds {entries.min():g} to {entries.max():g}, outside [0, {source.shape[1] - 1}]"
+        )
+    for name, values in {"weight": factors, "width": widths}.items():
         if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
             raise ArgumentError(f"{name} holds numbers that are negative or not finite")
+    hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
+    kinds = zip(given.values(), (int, int, float, float), strict=True)
+    matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
+    return _by_row(_response_kernel(source.dtype), [source, *matrix, noise_rate], hazard)
 
 
 @wp.kernel(enable_backward=False)
@@ -210,12 +208,7 @@ def dark_count_rates(
 
 @wp.kernel(enable_backward=False)
 def _crosstalk_kernel(
-    first_pixel: int,
-    width: int,
-    probability: float,
-    detections: wp.array2d[float],
-    # In and out:
-    hazard: wp.array2d[float],
+    first_pixel: int, width: int, probability: float, detections: wp.array2d[float], hazard: wp.array2d[float]
 ):
     pixel = first_pixel + wp.tid()
     x = pixel % width
@@ -327,10 +320,7 @@ def coates(counts: wp.array, *, pulses: float) -> wp.array:
 def _check_exposure(
     hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int, first_frame: int | wp.array
 ) -> tuple[int, int, int, int]:
-    """Pulses, frames, the largest count of a bin and the seed, in range: at most 2^31 - 1 rows in one call.
-
-    Every rate is one, which is checked on the CPU, where nobody has to wait for it.
-    """
+    """Pulses, frames, the largest count of a bin and the seed, in range; on the CPU, rates are checked, too."""
     check_array("hazard", hazard, wp.float32, (None, None))
     if isinstance(first_frame, wp.array):
         check_array("first_frame", first_frame, wp.int64, (1,), hazard.device)
@@ -367,49 +357,6 @@ def _exponential(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.u
     return -wp.log(wp.float64(1.0) - u[0])
 
 
-@wp.func
-def _draw_row(
-    hazard: wp.array2d[float],
-    pixel: int,
-    row: int,
-    pulses: int,
-    depth: int,
-    seed: wp.uint64,
-    id: wp.uint64,
-    # Out, zero before or counts to add to:
-    counts: wp.array2d[int],
-):
-    """Adds the counts of `pulses` pulses of a pixel to a row; `id` names the draw."""
-    block = wp.uint32(0)
-    left = int(pulses)  # pulses without a count so far
-    waiting = int(0)
-    wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
-    for k in range(hazard.shape[1]):
-        h = wp.float64(hazard[pixel, k])
-        if h > wp.float64(0.0) and left > 0:
-            count = int(0)
-            if wp.float64(left) * h < _SPARSE:
-                # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
-                if waiting == 0:
-                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                    block = block + _ONE
-                    waiting = 1
-                while left > 0 and wait < wp.float64(left) * h:
-                    h = h - wait / wp.float64(left)
-                    left = left - 1
-                    count = count + 1
-                    wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                    block = block + _ONE
-                wait = wait - wp.float64(left) * h
-            else:
-                # Exponential waits have no memory: the one begun may be dropped.
-                waiting = 0
-                count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
-                left = left - count
-            if count > 0:
-                counts[row, k] = counts[row, k] + wp.min(count, depth)
-
-
 @wp.kernel(enable_backward=False)
 def _first_photon_kernel(
     first_row: int,
@@ -422,13 +369,41 @@ def _first_photon_kernel(
     # Out, zero before:
     counts: wp.array2d[int],
 ):
+    """Counts of `summed` frames in a row; frame and pixel name a draw. Launch: rows."""
     row = first_row + wp.tid()
     pixels = hazard.shape[0]
     pixel = row % pixels
     for part in range(summed):
         frame = wp.uint64(first_frame[0]) + wp.uint64(row / pixels * summed + part)
         id = frame * wp.uint64(pixels) + wp.uint64(pixel)
-        _draw_row(hazard, pixel, row, pulses, depth, seed, id, counts)
+        block = wp.uint32(0)
+        left = int(pulses)  # pulses without a count so far
+        waiting = int(0)
+        wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
+        for k in range(hazard.shape[1]):
+            h = wp.float64(hazard[pixel, k])
+            if h > wp.float64(0.0) and left > 0:
+                count = int(0)
+                if wp.float64(left) * h < _SPARSE:
+                    # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
+                    if waiting == 0:
+                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                        block = block + _ONE
+                        waiting = 1
+                    while left > 0 and wait < wp.float64(left) * h:
+                        h = h - wait / wp.float64(left)
+                        left = left - 1
+                        count = count + 1
+                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
+                        block = block + _ONE
+                    wait = wait - wp.float64(left) * h
+                else:
+                    # Exponential waits have no memory: the one begun may be dropped.
+                    waiting = 0
+                    count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
+                    left = left - count
+                if count > 0:
+                    counts[row, k] = counts[row, k] + wp.min(count, depth)
 
 
 def first_photon_counts(
@@ -645,15 +620,6 @@ def _event_kernel(
     tag_count[row] = tags
 
 
-def _rising_edges(edges: np.ndarray, bins: int, period: float) -> np.ndarray:
-    edges = check_numbers("edges", edges)
-    if edges.shape != (bins + 1,):
-        raise ArgumentError(f"edges has shape {edges.shape}; ({bins + 1},), one more than the bins, is needed")
-    if not (edges[0] == 0.0 and (np.diff(edges) > 0.0).all() and edges[-1] <= period * (1.0 + 1e-9)):
-        raise ArgumentError(f"edges do not rise from 0 to at most the period, {period} s")
-    return edges
-
-
 def event_counts(
     hazard: wp.array,
     *,
@@ -703,7 +669,11 @@ def event_counts(
     detector.dead_time = check_number("dead_time", dead_time, "[0, inf)")
     detector.afterpulsing = check_number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
     detector.time_constant = afterpulsing_time_constant
-    rising = _rising_edges(edges, bins, period)
+    rising = check_numbers("edges", edges)
+    if rising.shape != (bins + 1,):
+        raise ArgumentError(f"edges has shape {rising.shape}; ({bins + 1},), one more than the bins, is needed")
+    if not (rising[0] == 0.0 and (np.diff(rising) > 0.0).all() and rising[-1] <= period * (1.0 + 1e-9)):
+        raise ArgumentError(f"edges do not rise from 0 to at most the period, {period} s")
     detector.edges = wp.array(rising[None, :], dtype=wp.float64, device=device)
     rows = frames * pixels
     counts = _zeroed_counts(counts, (rows, recorded), device)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_fields, check_integer, check_number, check_struct, check_vector
+from spadwarp_kernels.base.arguments import check_fields, check_integer, check_number, check_struct
 from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
@@ -52,11 +52,8 @@ class Camera:
 
 @wp.func
 def image_tangents(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec2:
-    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0.
-
-    The line through x and o meets the focus plane at a point that the lens centre sees in this direction,
-    x/z + o (1/focus - 1/z).
-    """
+    """Tangents of the direction in which light from x through the lens point o is seen, for x[2] > 0: that in which the
+    lens centre sees the point where their line meets the focus plane, x/z + o (1/focus - 1/z)."""
     inverse = 1.0 / x[2]
     return wp.vec2(
         (x[0] - o[0]) * inverse + camera.inverse_focus * o[0], (x[1] - o[1]) * inverse + camera.inverse_focus * o[1]
@@ -143,20 +140,17 @@ def clip_half_space(value: float, slope: float, interval: wp.vec2) -> wp.vec2:
     return wp.vec2(lower, upper)
 
 
-@wp.func
-def field(camera: Camera) -> wp.vec4:
+def field(camera: Any) -> wp.vec4:
     """Tangents (left, top, right, bottom) of what the image shows, for square pixels about the optical axis."""
-    half_width = 0.5 * float(camera.width) * camera.pixel_tangent
-    half_height = 0.5 * float(camera.height) * camera.pixel_tangent
+    tangent = np.float32(camera.pixel_tangent)
+    half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
     return wp.vec4(-half_width, -half_height, half_width, half_height)
 
 
 def ready_camera(copy: Any, camera: Any) -> None:
-    """Readies a copy for a kernel with what threads would otherwise compute: as its view its `field`, rounded as there,
-    and the focal lengths and principal point of square pixels about the axis."""
+    """Readies a copy for a kernel with view, focal lengths and principal point of square pixels about the axis."""
     tangent = np.float32(camera.pixel_tangent)
-    half_width, half_height = (np.float32(0.5) * np.float32(size) * tangent for size in (camera.width, camera.height))
-    copy.view = wp.vec4(-half_width, -half_height, half_width, half_height)
+    copy.view = field(camera)
     focal = float(1.0 / tangent) if tangent > 0.0 else 0.0  # 0 where nothing asks for an image
     copy.focal = wp.vec2(focal, focal)
     copy.principal = wp.vec2(0.5 * int(camera.width), 0.5 * int(camera.height))
@@ -218,13 +212,9 @@ def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     check_fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
     if not calibrated:
         return
-    for focal in camera.focal:
-        check_number(f"{name}.focal", focal, "(0, inf)")
-    check_vector(f"{name}.principal", camera.principal, size=2)
-    check_vector(f"{name}.radial", camera.radial)
-    check_vector(f"{name}.tangential", camera.tangential, size=2)
+    finite = dict.fromkeys(("principal", "radial", "tangential", "view"), "(-inf, inf)")
+    check_fields(name, camera, {"focal": "(0, inf)", **finite})
     left, top, right, bottom = camera.view
-    check_vector(f"{name}.view", camera.view, size=4)
     check_number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
     check_number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")
 
@@ -268,11 +258,8 @@ def gate_bin(gate: Gate, path: float) -> int:
 @wp.func
 def clip_to_gate(gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3, interval: wp.vec2) -> wp.vec2:
     """The part of the interval [s0, s1] of the flight x + s u whose light arrives within the gate by way of a lens
-    point; empty where s0 >= s1.
-
-    The arrival path s + r(s) rises with s, so the gate cuts out an interval: s + r = L at
-    s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u.
-    """
+    point; empty where s0 >= s1. The arrival path s + r(s) rises with s, so that the gate cuts out an interval: it is L
+    at s = (L^2 - |x|^2)/(2 (L - t_c)), x from the lens point, t_c = -x.u."""
     if interval[0] >= interval[1]:
         return interval
 

@@ -133,10 +133,8 @@ def first_above(table: wp.array[float], u: float) -> int:
 
 @wp.func
 def emit_measured(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
-    """Start position [m] and unit direction of photon `id` from a laser with a measured profile, turned to an axis.
-
-    The profile is the irradiance on a plane across the axis; a pixel is drawn by its power and a point evenly in it.
-    """
+    """Start position [m] and unit direction of photon `id` from a laser with a measured profile, the irradiance across
+    the axis: a pixel is drawn by its power and a point evenly in it."""
     block = random_block(seed, id, wp.uint32(0), STREAM_EMISSION)
     row = first_above(laser.rows, u01(block[0]))
     column = first_above(laser.columns[row], u01(block[1]))

@@ -1,7 +1,6 @@
 """What polarised light depends on: the laser's state, the scattering matrix of the water, facets, and the receiver."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -68,7 +67,12 @@ def make_polarisation(
     """
     device = check_device("device", device)
     polarisation = Polarisation()
-    polarisation.laser = wp.vec4(*check_stokes("laser", laser))
+    stokes = check_numbers("laser", laser)
+    if stokes.shape != (4,) or not np.isfinite(stokes).all() or stokes[0] != 1.0:
+        raise ArgumentError(f"laser = {laser!r} is not a Stokes vector with I = 1")
+    if float(np.linalg.norm(stokes[1:])) > 1.0 + 1e-6:
+        raise ArgumentError(f"laser = {laser!r} is polarised by more than 1")
+    polarisation.laser = wp.vec4(*stokes.tolist())
     cosines = matrix_cosines()
     table = np.tile([0.0, 1.0, 1.0, 0.0, 1.0], (cosines.size, 1))
     if not (matrix is None or callable(matrix)):
@@ -93,13 +97,3 @@ def make_polarisation(
         raise ArgumentError("facet_index holds numbers outside (0, inf)")
     polarisation.facet_index = wp.array(facets.astype(np.float32), dtype=float, device=device)
     return polarisation
-
-
-def check_stokes(name: str, stokes: Any) -> list[float]:
-    """Four numbers of light with I = 1 that is polarised by 1 at most; raises `ArgumentError`."""
-    found = check_numbers(name, stokes)
-    if found.shape != (4,) or not np.isfinite(found).all() or found[0] != 1.0:
-        raise ArgumentError(f"{name} = {stokes!r} is not a Stokes vector with I = 1")
-    if float(np.linalg.norm(found[1:])) > 1.0 + 1e-6:
-        raise ArgumentError(f"{name} = {stokes!r} is polarised by more than 1")
-    return [float(value) for value in found]

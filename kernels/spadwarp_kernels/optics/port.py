@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_range, check_vector
+from spadwarp_kernels.base.arguments import ArgumentError, check_fields, check_number, check_range, check_vector
 
 __all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
 
@@ -80,13 +80,9 @@ class PortRay:
 
 @wp.func
 def transmission(n: wp.vec4, q: wp.vec4) -> float:
-    """Fraction of unpolarised light that two interfaces let through: half the sum of the products of both
-    polarisations. Light that a window reflects inside is left out.
-
-    Args:
-        n: Phase indices: before and behind the first interface, before and behind the second.
-        q: The same times the cosine to the normal there.
-    """
+    """Fraction of unpolarised light that two interfaces let through, without what a window reflects inside: half the
+    sum of the products of both polarisations. n: phase indices before and behind the first and before and behind the
+    second; q: the same times the cosine to the normal there."""
     s1 = q[0] + q[1]
     s2 = q[2] + q[3]
     first = 4.0 * q[0] * q[1]
@@ -570,14 +566,8 @@ def make_dome_port(
 
 def check_port(name: str, port: Port, kind: PortKind) -> None:
     """Parameters of a port of that kind; raises `ArgumentError`."""
-    for k, value in enumerate(port.index):
-        check_number(f"{name}.index[{k}]", value, "[1, inf)")
-    if kind.name == FLAT_PORT.name:
-        check_number(f"{name}.distance", port.distance, "(-inf, inf)")
-        check_vector(f"{name}.normal", port.normal, unit=True)
-    else:
-        check_number(f"{name}.radius", port.radius, "(0, inf)")
-        check_vector(f"{name}.centre", port.centre)
+    flat, dome = {"distance": "(-inf, inf)", "normal": "unit"}, {"radius": "(0, inf)", "centre": "(-inf, inf)"}
+    check_fields(name, port, {"index": "[1, inf)"} | (flat if kind.name == FLAT_PORT.name else dome))
 
 
 def _port(
@@ -612,10 +602,8 @@ def _slopes(inside: float, layer: float, angle: float) -> tuple[float, float]:
 
 
 def _set_times(port: Port, lengths: Sequence[tuple[float, float]]) -> None:
-    """Bounds of a way's time, from the least and largest lengths in the layers.
-
-    The ray is no shorter than the straight line, and by Fermat's principle its optical length is not longer.
-    """
+    """Bounds of a way's time, from the least and largest lengths in the layers: the ray is no shorter than the straight
+    line, and by Fermat's principle its optical length is not longer."""
     early, late = 0.0, 0.0
     for k, (least, largest) in enumerate(lengths):
         delay, ratio = port.delay[k], port.index[k] / port.index[2]

@@ -19,37 +19,9 @@ def _texel(tangent: float, low: float, high: float) -> float:
     return (tangent - low) / (high - low) * float(_TEXELS)
 
 
-@wp.func
-def _map_view(camera: Camera) -> wp.vec4:
-    """Tangents (left, top, right, bottom) of the map: those of the camera's view, or its field where that is empty."""
-    view = camera.view
-    if view[2] == view[0]:
-        view = field(camera)
-    return view
-
-
-@wp.func
-def _rectangle(camera: Camera, view: wp.vec4, p: wp.vec3, q: wp.vec3, r: wp.vec3, depth: float) -> wp.vec4i:
-    """First column and row, last column and row of the texels that a face before the lens may cover."""
-    # A ray to the rim of the lens differs from the line to its centre by less than this, as a tangent.
-    spread = camera.aperture_radius / depth
-    left = wp.min(p[0] / p[2], wp.min(q[0] / q[2], r[0] / r[2])) - spread
-    right = wp.max(p[0] / p[2], wp.max(q[0] / q[2], r[0] / r[2])) + spread
-    top = wp.min(p[1] / p[2], wp.min(q[1] / q[2], r[1] / r[2])) - spread
-    bottom = wp.max(p[1] / p[2], wp.max(q[1] / q[2], r[1] / r[2])) + spread
-    # One texel more on each side makes up for rounding.
-    edge = float(_TEXELS)
-    return wp.vec4i(
-        int(wp.clamp(_texel(left, view[0], view[2]) - 1.0, 0.0, edge)),
-        int(wp.clamp(_texel(top, view[1], view[3]) - 1.0, 0.0, edge)),
-        int(wp.clamp(_texel(right, view[0], view[2]) + 1.0, -1.0, edge - 1.0)),
-        int(wp.clamp(_texel(bottom, view[1], view[3]) + 1.0, -1.0, edge - 1.0)),
-    )
-
-
 @wp.kernel(enable_backward=False)
-def _near_depth_kernel(camera: Camera, mesh: wp.uint64, threads: int, near_depth: wp.array2d[float]):
-    """Lowers each texel to the least depth of the faces that may cover it. Launch: (faces, threads of a face)."""
+def _near_depth_kernel(camera: Camera, view: wp.vec4, mesh: wp.uint64, threads: int, near_depth: wp.array2d[float]):
+    """Lowers each texel of a view to the least depth of the faces that may cover it. Launch: (faces, their threads)."""
     face, thread = wp.tid()
     m = wp.mesh_get(mesh)
     p = m.points[m.indices[3 * face]]
@@ -57,11 +29,18 @@ def _near_depth_kernel(camera: Camera, mesh: wp.uint64, threads: int, near_depth
     r = m.points[m.indices[3 * face + 2]]
     if wp.max(p[2], wp.max(q[2], r[2])) < 0.0:
         return  # behind the lens, and between nothing and it
-    view = _map_view(camera)
     depth = wp.min(p[2], wp.min(q[2], r[2]))
+    edge = float(_TEXELS)
     box = wp.vec4i(0, 0, int(_TEXELS - 1), int(_TEXELS - 1))
     if depth > camera.aperture_radius:
-        box = _rectangle(camera, view, p, q, r, depth)
+        # A ray to the rim of the lens differs from the line to its centre by less than this, as a tangent; one texel
+        # more on each side makes up for rounding.
+        spread = camera.aperture_radius / depth
+        for i in range(2):
+            least = wp.min(p[i] / p[2], wp.min(q[i] / q[2], r[i] / r[2])) - spread
+            most = wp.max(p[i] / p[2], wp.max(q[i] / q[2], r[i] / r[2])) + spread
+            box[i] = int(wp.clamp(_texel(least, view[i], view[2 + i]) - 1.0, 0.0, edge))
+            box[2 + i] = int(wp.clamp(_texel(most, view[i], view[2 + i]) + 1.0, -1.0, edge - 1.0))
     else:
         depth = 0.0  # beside the lens: of its points, only those of the plane tell
     # Also no nearer than its plane: n y >= far for all y of the face. A ray from x to a point o of the lens meets it at
@@ -87,36 +66,29 @@ def _near_depth_kernel(camera: Camera, mesh: wp.uint64, threads: int, near_depth
             wp.atomic_min(near_depth, row, column, wp.max(depth, far / slope))
 
 
-def near_depth_map(mesh: wp.Mesh, camera: Camera) -> wp.array:
-    """Least depth [m] at which a face of the mesh can stand in each part of the view, float32 [rows, columns].
+def near_depth_map(mesh: wp.Mesh, camera: Camera, near_depth: wp.array | None = None) -> wp.array:
+    """Least depth [m] at which a face of the mesh can stand in each part of the view, float32 [rows, columns], anew or
+    in place; raises `ArgumentError` for a camera that images nothing.
 
     A point of the view that lies before it is seen from everywhere on the lens: the segments to the lens stay within
-    the texel's cone, up to what the outlines of faces are widened by, and before every face in it. Raises
-    `ArgumentError` for a camera that images nothing.
+    the texel's cone, up to what the outlines of faces are widened by, and before every face in it.
     """
     check_kind("mesh", mesh, wp.Mesh)
-    near_depth = wp.empty((int(_TEXELS), int(_TEXELS)), dtype=float, device=mesh.device)
-    update_near_depth(near_depth, mesh, camera)
-    return near_depth
-
-
-def update_near_depth(near_depth: wp.array, mesh: wp.Mesh, camera: Camera) -> None:
-    """`near_depth_map` anew, in place, on the device."""
     check_camera("camera", camera, calibrated=False)
-    check_array("near_depth", near_depth, wp.float32, (int(_TEXELS), int(_TEXELS)), mesh.device)
-    near_depth.fill_(_NOTHING)
+    shape = (int(_TEXELS), int(_TEXELS))
+    near_depth = wp.empty(shape, dtype=float, device=mesh.device) if near_depth is None else near_depth
+    check_array("near_depth", near_depth, wp.float32, shape, mesh.device).fill_(_NOTHING)
+    view = field(camera) if camera.view[2] == camera.view[0] else camera.view
     # A warp for each face on a GPU: some cover all of the map.
     threads = 32 if mesh.device.is_cuda else 1
     faces = (mesh.indices.size // 3, threads)
-    wp.launch(_near_depth_kernel, faces, [camera, mesh.id, threads], [near_depth], device=mesh.device)
+    wp.launch(_near_depth_kernel, faces, [camera, view, mesh.id, threads], [near_depth], device=mesh.device)
+    return near_depth
 
 
 @wp.func
 def may_be_hidden(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
-    """Whether something may stand between the point x, x[2] > 0, and the lens; False is certain.
-
-    True for points beside the view (left, top, right, bottom), which the lens sees out of focus.
-    """
+    """Whether something may stand between x, x[2] > 0, and the lens, as of points beside the view; False is certain."""
     if near_depth.shape[0] == 0:
         return True
     column = _texel(x[0] / x[2], view[0], view[2])
@@ -136,9 +108,7 @@ class PortView(NamedTuple):
 
     clip: wp.Function  # as `clip_to_view`, holding the part that lies in the view
     shows: wp.Function  # as `in_view`
-    gate: (
-        wp.Function
-    )  # (camera, gate) -> Gate of `clip_to_gate` that holds the part whose light arrives within the gate
+    gate: wp.Function  # (camera, gate) -> Gate of `clip_to_gate` for what may arrive within the gate
 
 
 @wp.func

@@ -25,7 +25,7 @@ import warp as wp
 from spadwarp_kernels.base.native import bits_of, from_bits
 
 from .patches import SAME, join_faces, shared_corner
-from .triangle import box_padding, face_in, meet_face, number_in, set_rows
+from .triangle import box_padding, face_in, load_plane, meet_planes, number_in, set_rows
 
 
 @wp.func_native("""
@@ -95,40 +95,26 @@ DEEPEST = 32
     // The linear builder fills all nodes that there are room for, the others count theirs.
     const bool linear = m.bvh.constructor_type == BVH_CONSTRUCTOR_LBVH;
     const bool there = node < (linear ? m.bvh.max_nodes : m.bvh.num_nodes);
-    leaf.data[node] = there ? static_cast<int>(m.bvh.node_lowers[node].b) : -1;
+    links.data[3 * node] = there ? static_cast<int>(m.bvh.node_lowers[node].b) : -1;
     for (int k = 0; there && k < 2; ++k) {
         const wp::BVHPackedNodeHalf half = k ? m.bvh.node_uppers[node] : m.bvh.node_lowers[node];
         boxes.data[2 * node + k] = wp::vec3(half.x, half.y, half.z);
-        children.data[2 * node + k] = static_cast<int32_t>(half.i);
+        links.data[3 * node + 1 + k] = static_cast<int32_t>(half.i);
     }
-    if (node < faces.shape[0]) faces.data[node] = m.bvh.primitive_indices[node];
-    if (node == 0) root.data[0] = *m.bvh.root;
+    const int count = faces.shape[0] - 1;
+    if (node < count) faces.data[node] = m.bvh.primitive_indices[node];
+    if (node == 0) faces.data[count] = *m.bvh.root;
 """)
-def _read_node(
-    mesh: wp.uint64,
-    node: int,
-    leaf: wp.array[int],
-    boxes: wp.array2d[wp.vec3],
-    children: wp.array2d[int],
-    faces: wp.array[int],
-    root: wp.array[int],
-):
-    """Whether a node is a leaf, -1 beyond the tree; the corners of its box; its children, or of a leaf the first face
-    and the one after the last."""
+def _read_node(mesh: wp.uint64, node: int, links: wp.array2d[int], boxes: wp.array2d[wp.vec3], faces: wp.array[int]):
+    """Whether a node is a leaf, -1 beyond the tree, and its children, or of a leaf the first face and the one after the
+    last; the corners of its box; the faces, and behind them the root."""
     ...
 
 
 @wp.kernel(enable_backward=False)
-def _read_kernel(
-    mesh: wp.uint64,
-    leaf: wp.array[int],
-    boxes: wp.array2d[wp.vec3],
-    children: wp.array2d[int],
-    faces: wp.array[int],
-    root: wp.array[int],
-):
+def _read_kernel(mesh: wp.uint64, links: wp.array2d[int], boxes: wp.array2d[wp.vec3], faces: wp.array[int]):
     """Launch: nodes that the tree may have."""
-    _read_node(mesh, wp.tid(), leaf, boxes, children, faces, root)
+    _read_node(mesh, wp.tid(), links, boxes, faces)
 
 
 class Tree(NamedTuple):
@@ -147,10 +133,11 @@ def read_tree(mesh: wp.Mesh, extent: float) -> Tree:
     """The tree of any `wp.Mesh` with coordinates up to the extent [m]."""
     count, device = mesh.indices.size // 3, mesh.device
     most = 2 * count + 1
-    shapes = ((most, int), ((most, 2), wp.vec3), ((most, 2), int), (count, int), (1, int))
+    shapes = (((most, 3), int), ((most, 2), wp.vec3), (count + 1, int))
     arrays = [wp.zeros(shape, dtype=kind, device=device) for shape, kind in shapes]
     wp.launch(_read_kernel, most, [mesh.id], arrays, device=device)
-    kind, boxes, children, slots, root = (array.numpy() for array in arrays)
+    links, boxes, slots = (array.numpy() for array in arrays)
+    kind, children, root = links[:, 0], links[:, 1:], slots[-1:]
     levels, leaves, here = [], [], root
     while here.size:
         leaves.append(here[kind[here] == 1])
@@ -263,9 +250,8 @@ def set_node(nodes: wp.array[wp.vec4], node: int, children: wp.vec4i, low: Corne
     nodes[4 * node] = wp.vec4(origin[0], origin[1], origin[2], scale[0])
     nodes[4 * node + 1] = wp.vec4(scale[1], scale[2], from_bits(lower[0]), from_bits(lower[1]))
     nodes[4 * node + 2] = wp.vec4(from_bits(lower[2]), from_bits(upper[0]), from_bits(upper[1]), from_bits(upper[2]))
-    nodes[4 * node + 3] = wp.vec4(
-        from_bits(children[0]), from_bits(children[1]), from_bits(children[2]), from_bits(children[3])
-    )
+    for k in range(4):
+        nodes[4 * node + 3][k] = from_bits(children[k])
 
 
 @wp.func
@@ -361,18 +347,11 @@ def _nodes_kernel(
 
 
 def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array, wp.array, wp.array, wp.array]:
-    """A mesh's tree for `step_node` and `step_leaf`; see `refit_bvh` for moved points.
+    """A mesh's tree for `step_node` and `step_leaf`: nodes, vec4 [4 * nodes]; faces, vec4 [3 * slots]; the face in each
+    slot, int32 [slots], or ~face where others of its leaf are tried after it; the level of each node.
 
-    Args:
-        mesh: Any `wp.Mesh`.
-        extent: Its largest coordinate [m], for the padding of the boxes.
-        join: Whether two faces that make a parallelogram are tried as one: not where the points will move.
-
-    Returns:
-        nodes: vec4 [4 * nodes], see above.
-        faces: vec4 [3 * slots], see `meet_planes`.
-        order: int32 [slots]: the face in each slot, or ~face where others of its leaf are tried after it.
-        levels: int32 [nodes]: how deep in the tree each stands.
+    Boxes are padded for coordinates up to the extent [m]. `join`: two faces that make a parallelogram are tried as one,
+    not where the points will move, see `refit_bvh`.
     """
     tree, device = read_tree(mesh, extent), mesh.device
     faces, size, closed = tree.faces, tree.stop - tree.start, tree.children[:, 0] < 0
@@ -457,14 +436,6 @@ def refit_bvh(
     set_rows(mesh, order, faces)
 
 
-def empty_bvh(device: wp.DeviceLike) -> tuple[wp.array, wp.array, wp.array]:
-    """Nodes, faces and order of no faces at all: a root whose four children no ray meets."""
-    x, bits = 1.0e30, float(np.array(-1, np.int32).view(np.float32))
-    rows = [[x, x, x, 0.0], [0.0, 0.0, bits, bits], [bits] * 4, [bits] * 4]
-    nodes = wp.array(rows, dtype=wp.vec4, device=device)
-    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
-
-
 @wp.struct
 class TreeWalk:
     """A ray on its way down the tree; its stack is a `Stack` beside it."""
@@ -528,9 +499,13 @@ def step_leaf(faces: wp.array[wp.vec4], order: wp.array[int], walk: TreeWalk, x:
     """Tries the face that a walk has come to: its node is below NO_NODE; origin and unit direction of the ray."""
     step = LeafStep()
     slot = slot_of(walk.node)
-    distance, met, last = meet_face(faces, slot, x, u)
-    step.slot = met
-    step.distance = distance
+    a = load_plane(faces, slot, 0)
+    b = load_plane(faces, slot, 1)
+    n = load_plane(faces, slot, 2)
+    met = meet_planes(a, b, n, x, u)
+    last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
+    step.slot = wp.where(met[1] > 0.0, last, slot)
+    step.distance = met[0]
     step.hit = step.distance >= 0.0 and step.distance < walk.nearest
     step.node = NO_NODE
     if (walk.node & 1) != 0:

@@ -18,12 +18,12 @@ from spadwarp_kernels.base.arguments import (
     check_values,
 )
 from spadwarp_kernels.optics.camera import Camera
-from spadwarp_kernels.optics.visibility import near_depth_map, update_near_depth
+from spadwarp_kernels.optics.visibility import near_depth_map
 
-from .bvh import empty_bvh, pack_bvh, refit_bvh
+from .bvh import pack_bvh, refit_bvh
 from .patches import BRUTE_FORCE_FACES, PATCH_ROWS, pack_patches, set_patches
 from .triangle import LANES, face_vectors, pack_faces, set_faces
-from .wide import empty_wide, pack_wide, refit_wide
+from .wide import empty_tree, pack_wide, refit_wide
 
 __all__ = ["Surfaces", "Textures", "make_surfaces", "make_textures", "surface_choices", "update_surfaces"]
 
@@ -121,8 +121,15 @@ def make_surfaces(
             with points that are not finite.
     """
     surfaces = Surfaces()
-    device = check_device("device", device) if mesh is None else _check_mesh(mesh)
-    face_count = 0 if mesh is None else mesh.indices.size // 3
+    face_count = 0
+    if mesh is None:
+        device = check_device("device", device)
+    else:
+        check_kind("mesh", mesh, wp.Mesh)
+        if mesh.indices.size < 3:
+            raise ArgumentError(f"mesh.indices has {mesh.indices.size} entries; 3 for each face are needed")
+        check_values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+        device, face_count = mesh.device, mesh.indices.size // 3
 
     def by_face(name: str, value: Any, dtype: type, interval: str = "[0, 1]") -> wp.array:
         if mesh is None or value is None:
@@ -150,7 +157,7 @@ def make_surfaces(
     surfaces.roughness = by_face("roughness", None if specular is None else roughness, float, "[0.01, 1]")
     _check_sum(surfaces)
     surfaces.textures = no_textures(device) if textures is None else textures
-    surfaces.nodes, surfaces.faces, surfaces.order = empty_bvh(device) if device.is_cuda else empty_wide()
+    surfaces.nodes, surfaces.faces, surfaces.order = empty_tree(device)
     surfaces.depth = wp.zeros(0, dtype=int, device=device)
     surfaces.near_depth = wp.zeros((0, 0), dtype=float, device=device)
     surfaces.patches, surfaces.normals = (wp.zeros(0, dtype=wp.vec4, device=device) for _ in range(2))
@@ -231,7 +238,7 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     if surfaces.patches.size:
         set_patches(mesh, surfaces.patches, surfaces.normals)
     if camera is not None:
-        update_near_depth(surfaces.near_depth, mesh, camera)
+        near_depth_map(mesh, camera, surfaces.near_depth)
 
 
 def check_faces(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:
@@ -247,14 +254,6 @@ def check_patches(name: str, surfaces: Surfaces, faces: int, device: wp.Device) 
     size = surfaces.patches.size
     if size == 0 or size % PATCH_ROWS:
         raise ArgumentError(f"{name}.patches has {size} entries; make_surfaces fills it")
-
-
-def _check_mesh(mesh: Any) -> wp.Device:
-    check_kind("mesh", mesh, wp.Mesh)
-    if mesh.indices.size < 3:
-        raise ArgumentError(f"mesh.indices has {mesh.indices.size} entries; 3 for each face are needed")
-    check_values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
-    return mesh.device
 
 
 def _check_sum(surfaces: Surfaces) -> None:

@@ -134,9 +134,15 @@ def barycentric(mesh: wp.uint64, face: int, x: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def texture_at(textures: Textures, index: int, uv: wp.vec2) -> float:
-    """Bilinear value of a repeating texture; its corners are at uv = (0, 0) and (1, 1), texel centres half a texel
-    inside."""
+def texture_at(textures: Textures, face: int, shares: wp.vec3) -> float:
+    """Bilinear value of a face's repeating texture at a point with these shares of its corners, 1 without a texture;
+    its corners are at uv = (0, 0) and (1, 1), texel centres half a texel inside."""
+    index = textures.face[face]
+    if index < 0:
+        return 1.0
+    uv = shares[0] * textures.coordinates[face, 0]
+    uv += shares[1] * textures.coordinates[face, 1]
+    uv += shares[2] * textures.coordinates[face, 2]
     region = textures.region[index]
     width = region[1]
     height = region[2]
@@ -168,12 +174,7 @@ def pattern_reflectance(surfaces: Surfaces, face: int, x: wp.vec3) -> float:
     # Differences, so that equal corners give their value to the bit.
     value = corners[0] + shares[1] * (corners[1] - corners[0]) + shares[2] * (corners[2] - corners[0])
     if surfaces.textures.face.shape[0] > 0:
-        index = surfaces.textures.face[face]
-        if index >= 0:
-            uv = shares[0] * surfaces.textures.coordinates[face, 0]
-            uv += shares[1] * surfaces.textures.coordinates[face, 1]
-            uv += shares[2] * surfaces.textures.coordinates[face, 2]
-            value *= texture_at(surfaces.textures, index, uv)
+        value *= texture_at(surfaces.textures, face, shares)
     return value
 
 

@@ -8,7 +8,7 @@ coordinates and of the face itself, then the lower and the upper corner of each 
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_integer
-from spadwarp_kernels.base.native import bits_of, zeros
+from spadwarp_kernels.base.native import zeros
 
 # Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
 WIDENING = wp.constant(4.0e-7)
@@ -84,18 +84,6 @@ def _plane(normal: wp.vec3, offset: float) -> wp.vec4:
 
 
 @wp.func
-def _planes(mesh: wp.uint64, face: int):
-    """Normals and offsets of the three planes of a face on the CPU."""
-    m = wp.mesh_get(mesh)
-    p = m.points[m.indices[3 * face]]
-    e1 = m.points[m.indices[3 * face + 1]] - p
-    e2 = m.points[m.indices[3 * face + 2]] - p
-    a, b, n, steepest = _coordinates(e1, e2, 1.0)
-    n = n / steepest
-    return _plane(a, -wp.dot(a, p)), _plane(b, -wp.dot(b, p)), _plane(n, wp.dot(n, p))
-
-
-@wp.func
 def middle_planes(p: wp.vec3, e1: wp.vec3, e2: wp.vec3, triangle: float):
     """Planes of a triangle with corner p and edges e1, e2 from it, or with `triangle` = 0 of the parallelogram: two
     coordinates as normals and offsets, -1 to 1 from edge to edge of the parallelogram; its unit normal and offset; half
@@ -156,12 +144,18 @@ def _blocks_kernel(mesh: wp.uint64, padding: float, order: wp.array[int], faces:
     low = wp.vec3(1.0e30)
     high = wp.vec3(-1.0e30)
     if face >= 0:
-        a, b, n = _planes(mesh, face)
-        for i in range(4):
+        m = wp.mesh_get(mesh)
+        first = m.points[m.indices[3 * face]]
+        e1 = m.points[m.indices[3 * face + 1]] - first
+        a, b, n, steepest = _coordinates(e1, m.points[m.indices[3 * face + 2]] - first, 1.0)
+        n = n / steepest
+        for i in range(3):
             faces[face_number(slot, i)] = a[i]
             faces[face_number(slot, 4 + i)] = b[i]
             faces[face_number(slot, 8 + i)] = n[i]
-        m = wp.mesh_get(mesh)
+        faces[face_number(slot, 3)] = -wp.dot(a, first)
+        faces[face_number(slot, 7)] = -wp.dot(b, first)
+        faces[face_number(slot, 11)] = wp.dot(n, first)
         for corner in range(3):
             p = m.points[m.indices[3 * face + corner]]
             low = wp.min(low, p - wp.vec3(padding))
@@ -224,18 +218,6 @@ def meet_planes(a: wp.vec4, b: wp.vec4, n: wp.vec4, x: wp.vec3, u: wp.vec3) -> w
     if not ((1.0 - most) * wp.abs(rate) >= -hair and distance >= 0.0):
         distance = -1.0
     return wp.vec2(distance, both)
-
-
-@wp.func
-def meet_face(faces: wp.array[wp.vec4], slot: int, x: wp.vec3, u: wp.vec3):
-    """A ray against the face or faces kept in a slot on CUDA, see `meet_planes`: the distance, the slot of the triangle
-    that it would hit, and the last slot that belongs to these, the next one for a parallelogram."""
-    a = load_plane(faces, slot, 0)
-    b = load_plane(faces, slot, 1)
-    n = load_plane(faces, slot, 2)
-    met = meet_planes(a, b, n, x, u)
-    last = slot + wp.where(bits_of(n[3]) < 0, 1, 0)
-    return met[0], wp.where(met[1] > 0.0, last, slot), last
 
 
 @wp.func

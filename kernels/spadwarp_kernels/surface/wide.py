@@ -85,12 +85,15 @@ def refit_wide(mesh: wp.Mesh, extent: float, nodes: wp.array, faces: wp.array, o
     wp.launch(_boxes_kernel, 1, [numbers_of(faces)], [numbers_of(nodes)], device="cpu")
 
 
-def empty_wide() -> tuple[wp.array, wp.array, wp.array]:
-    """The tree of no faces at all, see `pack_wide`."""
-    rows = np.zeros((7, LANES), np.float32)
-    rows[:3], rows[3:6], rows[6] = 1.0e30, -1.0e30, np.array(-1, np.int32).view(np.float32)
-    nodes = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device="cpu")
-    return nodes, wp.zeros(0, dtype=wp.vec4, device="cpu"), wp.zeros(0, dtype=int, device="cpu")
+def empty_tree(device: wp.Device) -> tuple[wp.array, wp.array, wp.array]:
+    """Nodes, faces and order of no faces at all: a root whose children no ray meets; of `bvh` on CUDA."""
+    rows = np.full((4, 4) if device.is_cuda else (7, LANES), np.array(-1, np.int32).view(np.float32))
+    if device.is_cuda:
+        rows[0], rows[1, :2] = (1.0e30, 1.0e30, 1.0e30, 0.0), 0.0
+    else:
+        rows[:3], rows[3:6] = 1.0e30, -1.0e30
+    nodes = wp.array(rows.reshape(-1, 4), dtype=wp.vec4, device=device)
+    return nodes, wp.zeros(0, dtype=wp.vec4, device=device), wp.zeros(0, dtype=int, device=device)
 
 
 @wp.func_native("""

@@ -451,11 +451,15 @@ def make_grid(
     columns = {"extinction": (extinction, "[0, inf)"), "albedo": (albedo, "[0, 1]")}
     if anisotropy is not None:
         columns["anisotropy"] = (anisotropy, "(-1, 1)")
-    arrays = {name: _checked_cells(name, values, interval) for name, (values, interval) in columns.items()}
+    arrays = {name: check_numbers(name, values, 3).astype(np.float32) for name, (values, _) in columns.items()}
     shape = arrays["extinction"].shape
+    if not 0 < math.prod(shape) <= LARGEST_CELL_COUNT:
+        raise ArgumentError(f"extinction has cells {shape}; 1 to 2^30 of them are needed")
     for name, array in arrays.items():
         if array.shape != shape:
             raise ArgumentError(f"{name} has cells {array.shape}, extinction {shape}")
+        for value in (array.min(), array.max()):
+            check_number(name, float(value), columns[name][1])
     check_vector("size", size)
     for edge in size:
         check_number("size", edge, "(0, inf)")
@@ -486,15 +490,6 @@ def make_grid(
         mean = np.repeat(mean, edge_cells, axis=axis).take(range(count), axis=axis)
     grid.residual = wp.array((arrays["extinction"] - mean).ravel(), dtype=float, device=device)
     return grid
-
-
-def _checked_cells(name: str, values: ArrayLike, interval: str) -> NDArray[np.float32]:
-    array = np.ascontiguousarray(check_numbers(name, values, 3), np.float32)
-    if not 0 < array.size <= LARGEST_CELL_COUNT:
-        raise ArgumentError(f"{name} has cells {array.shape}; 1 to 2^30 of them are needed")
-    for value in (array.min(), array.max()):
-        check_number(name, float(value), interval)
-    return array
 
 
 def block_statistics(extinction: NDArray[np.float32], edge: int) -> tuple[NDArray[np.float32], ...]:

@@ -198,11 +198,9 @@ def check_poses(name: str, poses: wp.array, count: int | None = None) -> None:
 
 def _check_shapes(table: ShapeTable, seen: np.ndarray, given: tuple[wp.Mesh, ...]) -> tuple[wp.Mesh, ...]:
     """Shapes that are in range; returns the meshes that they use, as far as they can be found by their ids."""
-    for name, high in (("kind", len(SHAPE_KINDS) - 1), ("reflectance", 1)):
-        values = getattr(table, name).numpy()
-        if not ((values >= 0) & (values <= high)).all():
-            raise ArgumentError(f"{name} holds {values.min()} to {values.max()}, outside [0, {high}]")
-    check_values("body", table.body, "[-1, 2147483647]")
+    ranges = {"kind": f"[0, {len(SHAPE_KINDS) - 1}]", "reflectance": "[0, 1]", "body": "[-1, 2147483647]"}
+    for name, interval in ranges.items():
+        check_values(name, getattr(table, name), interval)
     check_poses("local", table.local)
     kind, size = table.kind.numpy(), table.size.numpy()
     needed = np.array([_COMPONENTS[name] for name in SHAPE_KINDS])[kind]
@@ -251,15 +249,7 @@ def _move_kernel(table: ShapeTable, body_q: wp.array[wp.transform]):
 
 
 def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
-    """Carries the shapes to the poses of their bodies, on the device.
-
-    Args:
-        shapes: From `make_shapes`.
-        body_q: `wp.transform` `[bodies]`, in the worlds' frames; None where no shape is on a body.
-
-    Raises:
-        ArgumentError: Fewer poses than the shapes' bodies, or on another device.
-    """
+    """Carries the shapes to the poses of their bodies `[bodies]`, None where no shape is on one; on the device."""
     check_kind("shapes", shapes, Shapes)
     if body_q is None:
         body_q = wp.empty(0, dtype=wp.transform, device=shapes.device)
@@ -309,18 +299,6 @@ def _roots(a: float, b: float, c: float) -> wp.vec2:
     if q == 0.0:
         return wp.vec2(0.0, 0.0)
     return wp.vec2(q / a, c / q)
-
-
-@wp.func
-def _intersect_plane(size: wp.vec3, x: wp.vec3, u: wp.vec3, least: float) -> ShapeHit:
-    """The plane z = 0."""
-    hit = _miss()
-    s = -x[2] / u[2]  # infinite or not a number for a ray along the plane, which fails below
-    y = x + s * u
-    inside = (size[0] <= 0.0 or wp.abs(y[0]) <= 0.5 * size[0]) and (size[1] <= 0.0 or wp.abs(y[1]) <= 0.5 * size[1])
-    if inside:
-        hit = _nearer(hit, least, s, wp.vec3(0.0, 0.0, 1.0))
-    return hit
 
 
 @wp.func
@@ -437,17 +415,17 @@ def _intersect_scaled_mesh(mesh: wp.uint64, size: wp.vec3, x: wp.vec3, u: wp.vec
 
 @wp.func
 def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp.vec3, reach: float) -> ShapeHit:
-    """The nearest point, up to `reach`, at which the ray x + s u meets a shape of `SHAPE_KINDS` in its own frame.
-
-    `size` is that of `ShapeTable`; a mesh is an id of a `wp.Mesh`.
-    """
+    """The nearest point, up to `reach`, at which the ray x + s u meets a shape of `ShapeTable` in its own frame."""
     # From the point of the ray that is nearest the centre: differences of squares would cancel far away.
     start = -wp.dot(x, u)
     y = x + start * u
     least = -start
     hit = _miss()
     if kind == PLANE:
-        hit = _intersect_plane(size, y, u, least)
+        s = -y[2] / u[2]  # infinite or not a number for a ray along the plane, which fails below
+        z = y + s * u
+        if (size[0] <= 0.0 or wp.abs(z[0]) <= 0.5 * size[0]) and (size[1] <= 0.0 or wp.abs(z[1]) <= 0.5 * size[1]):
+            hit = _nearer(hit, least, s, wp.vec3(0.0, 0.0, 1.0))
     elif kind == SPHERE:
         hit = _intersect_ball(hit, 0.0, size[0], 0.0, y, u, least)
     elif kind == CAPSULE:
@@ -473,34 +451,10 @@ def intersect_shape(kind: int, size: wp.vec3, mesh: wp.uint64, x: wp.vec3, u: wp
     return hit
 
 
-@wp.struct
-class SceneHit:
-    """The nearest shape along a ray."""
-
-    distance: float  # [m]; -1 for none
-    normal: wp.vec3  # unit vector against the ray
-    reflectance: float  # at this point
-    shape: int  # its index; -1 for none
-
-
 @wp.func
-def _reflectance_at(table: ShapeTable, k: int, hit: ShapeHit) -> float:
-    reflectance = table.reflectance[k]
-    first = table.first_face[k]
-    if hit.face >= 0 and first >= 0:
-        row = first + hit.face
-        index = table.textures.face[row]
-        if index >= 0:
-            uv = hit.corner[0] * table.textures.coordinates[row, 0]
-            uv += hit.corner[1] * table.textures.coordinates[row, 1]
-            uv += (1.0 - hit.corner[0] - hit.corner[1]) * table.textures.coordinates[row, 2]
-            reflectance *= texture_at(table.textures, index, uv)
-    return reflectance
-
-
-@wp.func
-def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> SceneHit:
-    """The nearest shape of a world along the ray x + s u; every shape of the world is tried."""
+def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3):
+    """The nearest shape of a world along the ray x + s u, with the normal against it, and the reflectance at this
+    point; every shape of the world is tried."""
     nearest = ShapeHit()
     nearest.distance = _REACH
     nearest.face = -1
@@ -519,12 +473,16 @@ def intersect_shapes(table: ShapeTable, world: int, x: wp.vec3, u: wp.vec3) -> S
             if hit.distance > 0.0 and hit.distance < nearest.distance:
                 nearest = hit
                 found = k
-    result = SceneHit()
-    result.distance = -1.0
-    result.shape = found
+    reflectance = float(0.0)
     if found >= 0:
         normal = wp.transform_vector(table.pose[found], nearest.normal)
-        result.distance = nearest.distance
-        result.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
-        result.reflectance = _reflectance_at(table, found, nearest)
-    return result
+        nearest.normal = wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
+        reflectance = table.reflectance[found]
+        first = table.first_face[found]
+        if nearest.face >= 0 and first >= 0:
+            corner = nearest.corner
+            shares = wp.vec3(corner[0], corner[1], 1.0 - corner[0] - corner[1])
+            reflectance *= texture_at(table.textures, first + nearest.face, shares)
+    else:
+        nearest.distance = -1.0
+    return nearest, reflectance

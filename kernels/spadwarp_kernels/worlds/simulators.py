@@ -173,13 +173,10 @@ def write_poses(position: wp.array, rotation: wp.array, out: wp.array) -> None:
     check_array("rotation", rotation, (wp.mat33, wp.quat), position.shape, position.device)
     check_array("out", out, wp.transform, (shape[0] * shape[1],), position.device, contiguous=True)
     if position.ndim == 1:
-        position, rotation = _column(position), _column(rotation)
+        # Views [n, 1] of arrays [n] that need not be contiguous.
+        position, rotation = (
+            wp.array(ptr=x.ptr, dtype=x.dtype, shape=shape, strides=(x.strides[0], 0), device=x.device)
+            for x in (position, rotation)
+        )
     kernel = _from_matrix_kernel if matrix else _from_quaternion_kernel
     wp.launch(kernel, shape, [position, rotation], [out.reshape(shape)], device=out.device)
-
-
-def _column(array: wp.array) -> wp.array:
-    """A view `[n, 1]` of an array `[n]`, which need not be contiguous."""
-    return wp.array(
-        ptr=array.ptr, dtype=array.dtype, shape=(array.shape[0], 1), strides=(array.strides[0], 0), device=array.device
-    )

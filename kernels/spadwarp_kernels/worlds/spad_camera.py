@@ -247,21 +247,9 @@ def _normal_integral(z: float) -> float:
     return z * 0.5 * math.erfc(-z / math.sqrt(2.0)) + math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
 
 
-def check_config(config: Any) -> SpadConfig:
-    """A `SpadConfig`, or the default for None."""
-    config = SpadConfig() if config is None else config
-    check_kind("config", config, SpadConfig)
-    return config
-
-
 @wp.kernel(enable_backward=False)
 def _backscatter_kernel(
-    first: int,
-    lidar: Lidar,
-    water: Scattering,
-    view: wp.array[wp.vec3d],
-    # Out:
-    rates: wp.array2d[float],
+    first: int, lidar: Lidar, water: Scattering, view: wp.array[wp.vec3d], rates: wp.array2d[float]
 ):
     """Mean over each bin of the single-scatter rate times its width. Launch: pixels."""
     i = first + wp.tid()
@@ -310,14 +298,15 @@ def _trace_kernel(
     v, i, j = wp.tid()
     pose = wp.transform_multiply(camera_q[v], optical)
     u = view[i * depth.shape[2] + j]
-    hit = intersect_shapes(shapes, world[v], wp.transform_get_translation(pose), wp.transform_vector(pose, u))
+    x = wp.transform_get_translation(pose)
+    hit, hit_reflectance = intersect_shapes(shapes, world[v], x, wp.transform_vector(pose, u))
     depth[v, i, j] = wp.NAN
     normal[v, i, j] = wp.vec3(wp.NAN)
     reflectance[v, i, j] = wp.NAN
-    if hit.shape >= 0:
+    if hit.distance >= 0.0:
         depth[v, i, j] = hit.distance * u[2]
         normal[v, i, j] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), hit.normal)
-        reflectance[v, i, j] = hit.reflectance
+        reflectance[v, i, j] = hit_reflectance
 
 
 @wp.kernel(enable_backward=False)
@@ -385,7 +374,8 @@ class WorldCameras:
         frame: str,
         device: wp.DeviceLike,
     ) -> None:
-        self.config = config = check_config(config)
+        self.config = config = SpadConfig() if config is None else config
+        check_kind("config", config, SpadConfig)
         self.device = device = check_device("device", device)
         self.cameras = check_integer("cameras", cameras, 1)
         sizes = {"cameras": self.cameras, "config.height": config.height, "config.width": config.width}
@@ -393,8 +383,16 @@ class WorldCameras:
         sizes["config.bins"] = config.bins
         check_memory("rates, counts and background", sizes, 8 + 24 // self.cameras, device, rows=3)
         self._optical = optical_to(frame)
-        self._world = _camera_worlds(world, self.cameras, device)
-        self._most_worlds = 0 if isinstance(world, wp.array) else int(self._world.numpy().max()) + 1
+        self._most_worlds = 0
+        if isinstance(world, wp.array):
+            self._world = check_array("world", world, wp.int32, (self.cameras,), device)
+        else:
+            items = range(self.cameras) if world is None else check_items("world", world)
+            worlds = [check_integer("world", one, 0) for one in items]
+            if len(worlds) != self.cameras:
+                text = f"world has {len(worlds)} entries; one for each of {self.cameras} cameras is needed"
+                raise ArgumentError(text)
+            self._world, self._most_worlds = wp.array(worlds, dtype=int, device=device), max(worlds) + 1
         self._poses_checked = False
         self.rates = wp.zeros((*image, config.bins), dtype=float, device=device)
         self.histogram = wp.zeros((*image, config.bins), dtype=int, device=device)
@@ -448,17 +446,6 @@ class WorldCameras:
         wp.launch(_points_kernel, self.depth.shape, inputs, [out], device=self.device)
 
 
-def _camera_worlds(world: wp.array | Sequence[int] | None, cameras: int, device: wp.Device) -> wp.array:
-    """World of each camera on the device."""
-    if isinstance(world, wp.array):
-        return check_array("world", world, wp.int32, (cameras,), device)
-    items = range(cameras) if world is None else check_items("world", world)
-    worlds = [check_integer("world", one, 0) for one in items]
-    if len(worlds) != cameras:
-        raise ArgumentError(f"world has {len(worlds)} entries; one for each of {cameras} cameras is needed")
-    return wp.array(worlds, dtype=int, device=device)
-
-
 # ---- The fast camera.
 
 
@@ -497,7 +484,8 @@ def _images_kernel(
             n = wp.quat_rotate_inv(wp.transform_get_rotation(camera_q[v]), n)
         n = wp.quat_rotate_inv(wp.transform_get_rotation(optical), n)
     else:
-        n = _slope(view, depth_in, along_ray, v, i, j)
+        n = wp.cross(_edge(view, depth_in, along_ray, v, i, j, 0, 1), _edge(view, depth_in, along_ray, v, i, j, 1, 0))
+        n = wp.where(wp.length_sq(n) > 0.0, n, u)
     n = wp.normalize(n)
     normal[v, i, j] = wp.where(wp.dot(n, u) > 0.0, -n, n)
 
@@ -509,31 +497,23 @@ def _point(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v
 
 
 @wp.func
-def _slope(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v: int, i: int, j: int) -> wp.vec3:
-    """Normal of the surface through a pixel and of its two neighbours along each axis that which is nearer in depth,
-    not across an edge of a thing; towards the camera where it has none."""
+def _edge(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v: int, i: int, j: int, di: int, dj: int):
+    """From a pixel's surface to the neighbour's along an axis which is nearer in depth, not across an edge of a thing;
+    0 for none."""
     here = _point(view, depth, along_ray, v, i, j)
-    across = wp.vec3(0.0)
-    down = wp.vec3(0.0)
-    for axis in range(2):
-        best = wp.vec3(0.0)
-        least = float(1.0e30)
-        for side in range(2):
-            sign = 2 * side - 1
-            ii = i + sign * axis
-            jj = j + sign * (1 - axis)
-            if ii >= 0 and jj >= 0 and ii < depth.shape[1] and jj < depth.shape[2]:
-                there = _point(view, depth, along_ray, v, ii, jj)
-                gap = wp.abs(there[2] - here[2])
-                if wp.isfinite(gap) and gap < least:
-                    least = gap
-                    best = float(sign) * (there - here)
-        if axis == 0:
-            across = best
-        else:
-            down = best
-    n = wp.cross(across, down)
-    return wp.where(wp.length_sq(n) > 0.0, n, view[i * depth.shape[2] + j])
+    best = wp.vec3(0.0)
+    least = float(1.0e30)
+    for side in range(2):
+        sign = 2 * side - 1
+        ii = i + sign * di
+        jj = j + sign * dj
+        if ii >= 0 and jj >= 0 and ii < depth.shape[1] and jj < depth.shape[2]:
+            there = _point(view, depth, along_ray, v, ii, jj)
+            gap = wp.abs(there[2] - here[2])
+            if wp.isfinite(gap) and gap < least:
+                least = gap
+                best = float(sign) * (there - here)
+    return best
 
 
 @wp.kernel(enable_backward=False)

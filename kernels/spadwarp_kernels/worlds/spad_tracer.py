@@ -18,8 +18,8 @@ from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
-from .shapes import BOX, CAPSULE, CONE, CYLINDER, ELLIPSOID, MESH, PLANE, SPHERE, Shapes, ShapeTable
-from .spad_camera import SpadConfig, WorldCameras, check_config, check_memory
+from .shapes import BOX, CAPSULE, CONE, CYLINDER, MESH, PLANE, SPHERE, Shapes, ShapeTable
+from .spad_camera import SpadConfig, WorldCameras, check_memory
 
 __all__ = ["SpadTracer"]
 
@@ -33,53 +33,50 @@ ESTIMATORS = ("guided", "next_event")
 SEGMENTS, RINGS = 48, 24
 
 
-def _revolution(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A surface of revolution from (radius, height, lift) rows: vertices [n, 4] of x, y, z and lift, and faces."""
-    angle = 2.0 * np.pi * np.arange(SEGMENTS) / SEGMENTS
-    # As much cross-section as the circle has: half of the polygon lies outside.
-    size = math.sqrt(2.0 * np.pi / SEGMENTS / math.sin(2.0 * np.pi / SEGMENTS))
-    radius = size * profile[:, :1]
-    columns = [radius * np.cos(angle), radius * np.sin(angle)]
-    columns += [np.broadcast_to(profile[:, k : k + 1], columns[0].shape) for k in (1, 2)]
-    vertices = np.stack(columns, axis=-1).reshape(-1, 4)
-    row = np.arange(len(profile) - 1)[:, None] * SEGMENTS
-    here, there = np.arange(SEGMENTS), (np.arange(SEGMENTS) + 1) % SEGMENTS
-    quads = np.stack([row + here, row + there, row + SEGMENTS + here, row + SEGMENTS + there], axis=-1).reshape(-1, 4)
-    faces = quads[:, [0, 1, 2, 2, 1, 3]].reshape(-1, 3)
-    corners = vertices[faces, :4]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3]), axis=1
-    )
-    lifted = np.ptp(corners[..., 3], axis=1) > 0.0
-    return vertices, faces[(area > 1e-9) | lifted]
-
-
 def _profile(kind: int) -> np.ndarray:
-    """(radius, height, lift) from the bottom to the top, of a shape of size 1."""
+    """Radius, height and end (-1 or 1 of a capsule) of a round shape of size 1 from bottom to top, [3, rows]."""
     if kind == CYLINDER:
-        return np.array([(0.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
+        return np.array([(0.0, 1.0, 1.0, 0.0), (-1.0, -1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0)])
     if kind == CONE:
-        return np.array([(0.0, -1.0, 0.0), (1.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
+        return np.array([(0.0, 1.0, 0.0), (-1.0, -1.0, 1.0), (0.0, 0.0, 0.0)])
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, RINGS + 1)
-    rows = np.stack([np.abs(np.cos(angle)), np.sin(angle), np.zeros_like(angle)], axis=1)
-    rows[[0, -1], 0] = 0.0
-    if kind == CAPSULE:
-        low, high = rows[: RINGS // 2 + 1].copy(), rows[RINGS // 2 :].copy()
-        low[:, 2], high[:, 2] = -1.0, 1.0
-        return np.concatenate([low, high])
+    rows = np.array([np.abs(np.cos(angle)), np.sin(angle), np.zeros(RINGS + 1)])
+    rows[0, [0, -1]] = 0.0
+    if kind == CAPSULE:  # twice the middle
+        rows = np.insert(rows, RINGS // 2, rows[:, RINGS // 2], axis=1)
+        rows[2] = np.repeat([-1.0, 1.0], RINGS // 2 + 1)
     return rows
 
 
-def _unit_triangles(kind: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [n, 4] and faces [m, 3] of a shape of size 1, see `_corner`."""
-    if kind == PLANE:
-        corners = [(-1, -1, 0, 0), (1, -1, 0, 0), (1, 1, 0, 0), (-1, 1, 0, 0)]
-        return np.array(corners, float), np.array([(0, 1, 2), (0, 2, 3)])
-    if kind == BOX:
-        corners = np.array([(x, y, z, 0) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-        quads = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
-        return corners, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-    return _revolution(_profile(kind))
+def _triangles(kind: int) -> tuple[np.ndarray, np.ndarray]:
+    """A shape: vertices [n, 3, 3], matrices whose product with its size is the point, and faces [m, 3].
+
+    Round shapes become polygons with as much cross-section as the circle, half of which lie outside of it.
+    """
+    end = np.zeros(1)
+    if kind in (PLANE, BOX):
+        x = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in ((0,) if kind == PLANE else (-1, 1))], float)
+        sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        faces = np.array([(0, 2, 3, 1)] if kind == PLANE else sides)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    else:
+        radius, height, end = np.repeat(_profile(kind), SEGMENTS, axis=1)
+        number = np.arange(radius.size)
+        angle = 2.0 * np.pi * (number % SEGMENTS) / SEGMENTS
+        radius = math.sqrt(2.0 * np.pi / SEGMENTS / math.sin(2.0 * np.pi / SEGMENTS)) * radius
+        x = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+        here, there = number, number // SEGMENTS * SEGMENTS + (number + 1) % SEGMENTS
+        quads = np.stack([here, there, here + SEGMENTS, there + SEGMENTS], axis=1)[:-SEGMENTS]
+        faces = quads[:, [0, 1, 2, 2, 1, 3]].reshape(-1, 3)
+        a, b, c = np.swapaxes((x + end[:, None] * (0.0, 0.0, 1.0))[faces], 0, 1)
+        faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-9]
+    vertices = np.zeros((len(x), 3, 3))
+    if kind in (SPHERE, CAPSULE):
+        vertices[:, :, 0], vertices[:, 2, 1] = x, end
+    elif kind in (CYLINDER, CONE):
+        vertices[:, :2, 0], vertices[:, 2, 1] = x[:, :2], x[:, 2]
+    else:
+        vertices = np.eye(3) * x[:, :, None] * (0.5 if kind == PLANE else 1.0)
+    return vertices, faces
 
 
 @wp.struct
@@ -88,24 +85,8 @@ class Corners:
 
     camera: wp.array[int]
     shape: wp.array[int]
-    unit: wp.array[wp.vec4]  # x, y, z for a shape of size 1, and on which end of a capsule it is (lift)
     source: wp.array[int]  # index in the shape's own `wp.Mesh`; -1 for other shapes
-
-
-@wp.func
-def _corner(kind: int, size: wp.vec3, unit: wp.vec4) -> wp.vec3:
-    scale = size  # of a box or an ellipsoid
-    lift = float(0.0)
-    if kind == SPHERE:
-        scale = wp.vec3(size[0])
-    elif kind == CAPSULE:
-        scale = wp.vec3(size[0])
-        lift = size[1] * unit[3]
-    elif kind == PLANE:
-        scale = wp.vec3(0.5 * size[0], 0.5 * size[1], 0.0)
-    elif kind != BOX and kind != ELLIPSOID:
-        scale = wp.vec3(size[0], size[0], size[1])
-    return wp.cw_mul(scale, wp.vec3(unit[0], unit[1], unit[2])) + wp.vec3(0.0, 0.0, lift)
+    of_size: wp.array[wp.mat33]  # of these, the matrix whose product with the size is the point
 
 
 @wp.kernel(enable_backward=False)
@@ -121,38 +102,30 @@ def _place_kernel(
     """Launch: vertices."""
     i = wp.tid()
     k = corners.shape[i]
-    kind = table.kind[k]
     size = table.size[k]
     camera = wp.transform_multiply(camera_q[corners.camera[i]], optical)
-    x = wp.vec3(0.0)
+    x = corners.of_size[i] * size
     if corners.source[i] >= 0:
         mesh = wp.mesh_get(table.mesh[k])
         x = wp.cw_mul(size, mesh.points[corners.source[i]])
-    else:
-        x = _corner(kind, size, corners.unit[i])
-        if kind == PLANE:
-            # Without a width it goes as far as the camera can see.
-            below = wp.transform_point(wp.transform_inverse(table.pose[k]), wp.transform_get_translation(camera))
-            for axis in range(2):
-                if size[axis] <= 0.0:
-                    x[axis] = below[axis] + reach * corners.unit[i][axis]
+    elif table.kind[k] == PLANE:
+        # Without a width it goes as far as the camera can see.
+        below = wp.transform_point(wp.transform_inverse(table.pose[k]), wp.transform_get_translation(camera))
+        for axis in range(2):
+            if size[axis] <= 0.0:
+                x[axis] = below[axis] + 2.0 * reach * corners.of_size[i][axis, axis]
     points[i] = wp.transform_point(wp.transform_inverse(camera), wp.transform_point(table.pose[k], x))
 
 
 @wp.kernel(enable_backward=False)
 def _reflectance_kernel(
-    shape: wp.array[int],
-    table: ShapeTable,
-    # Out:
-    reflectance: wp.array[float],
-    corner_reflectance: wp.array[wp.vec3],
+    shape: wp.array[int], table: ShapeTable, reflectance: wp.array[float], corner_reflectance: wp.array[wp.vec3]
 ):
-    """Launch: faces."""
+    """Writes both, the latter if there is one. Launch: faces."""
     i = wp.tid()
-    value = table.reflectance[shape[i]]
-    reflectance[i] = value
+    reflectance[i] = table.reflectance[shape[i]]
     if corner_reflectance.shape[0] > 0:
-        corner_reflectance[i] = wp.vec3(value)
+        corner_reflectance[i] = wp.vec3(reflectance[i])
 
 
 class CameraMeshes:
@@ -161,33 +134,37 @@ class CameraMeshes:
     def __init__(self, shapes: Shapes, world: list[int], device: wp.Device) -> None:
         table = shapes.table
         kind, first, member = (array.numpy() for array in (table.kind, table.first, table.member))
-        own, ids = {one.id: one for one in shapes.meshes}, table.mesh.numpy().tolist()
-        parts = {}  # of shapes that are not meshes, and of meshes
+        own = {one.id: one for one in shapes.meshes}
+        keys = np.where(kind == MESH, table.mesh.numpy(), kind.astype(np.uint64)).tolist()
+        parts: dict[int, tuple[np.ndarray, ...]] = {}  # source and vertices, see `Corners`, and faces
         for k in member.tolist():
-            key = ids[k] if kind[k] == MESH else -int(kind[k])
-            if key not in parts:
-                parts[key] = _mesh_triangles(k, own.get(key)) if kind[k] == MESH else _unit_triangles(int(kind[k]))
+            if keys[k] in parts:
+                continue
+            if kind[k] != MESH:
+                vertices, faces = _triangles(int(kind[k]))
+                parts[keys[k]] = np.full(len(vertices), -1), vertices, faces
+            elif (mesh := own.get(keys[k])) is None:
+                raise ArgumentError(f"the wp.Mesh with the id mesh[{k}] is not found; give it instead")
+            else:
+                count = mesh.points.size
+                parts[keys[k]] = np.arange(count), np.zeros((count, 3, 3)), mesh.indices.numpy().reshape(-1, 3)
         self.shapes, self.device = shapes, device
-        self._indices, self.face_shape, self._ends = [], [], [0]
-        camera, shape, unit, source = [], [], [np.zeros((0, 4))], []
+        self._indices, self.face_shape, self._ends, rows = [], [], [0], []
         for v, w in enumerate(world):
             seen = np.concatenate([member[first[w] : first[w + 1]], member[first[-2] : first[-1]]])
-            held = [parts[ids[k] if kind[k] == MESH else -int(kind[k])] for k in seen]
-            counts = np.array([len(vertices) for vertices, _ in held], int)
-            start = np.append(0, np.cumsum(counts))
-            faces = [faces + begin for (_, faces), begin in zip(held, start, strict=False)]
-            self._indices.append(np.concatenate([np.zeros((0, 3), int), *faces]))
-            self.face_shape.append(np.repeat(seen, np.array([len(each) for each in faces], int)))
-            self._ends.append(self._ends[-1] + int(start[-1]))
-            camera.append(np.full(start[-1], v))
-            shape.append(np.repeat(seen, counts))
-            unit += [vertices for vertices, _ in held]
-            own_index = np.arange(start[-1]) - np.repeat(start[:-1], counts)
-            source.append(np.where(np.repeat(kind[seen], counts) == MESH, own_index, -1))
+            if not seen.size:
+                raise ArgumentError(f"world {w} of camera {v} has no shapes")
+            sources, vertices, faces = zip(*(parts[keys[k]] for k in seen), strict=True)
+            counts = [len(each) for each in sources]
+            ends = np.cumsum(counts)
+            self._indices.append(np.concatenate([f + e - n for f, e, n in zip(faces, ends, counts, strict=True)]))
+            self.face_shape.append(np.repeat(seen, [len(each) for each in faces]))
+            self._ends.append(self._ends[-1] + int(ends[-1]))
+            columns = (np.full(ends[-1], v), np.repeat(seen, counts), np.concatenate(sources), np.concatenate(vertices))
+            rows.append(columns)
         self.corners = Corners()
-        for name, rows in (("camera", camera), ("shape", shape), ("source", source)):
-            setattr(self.corners, name, wp.array(np.concatenate(rows), dtype=int, device=device))
-        self.corners.unit = wp.array(np.concatenate(unit), dtype=wp.vec4, device=device)
+        for (name, var), column in zip(Corners.vars.items(), zip(*rows, strict=True), strict=True):
+            setattr(self.corners, name, wp.array(np.concatenate(column), dtype=var.type.dtype, device=device))
         self.points = wp.zeros(self._ends[-1], dtype=wp.vec3, device=device)
 
     def place(self, camera_q: wp.array, optical: wp.transform, reach: float) -> None:
@@ -203,13 +180,6 @@ class CameraMeshes:
             wp.Mesh(self.points[start:stop], wp.array(indices.ravel(), dtype=int, device=self.device), **kind)
             for indices, start, stop in zip(self._indices, self._ends, self._ends[1:], strict=False)
         ]
-
-
-def _mesh_triangles(k: int, mesh: wp.Mesh | None) -> tuple[np.ndarray, np.ndarray]:
-    """Stand-in vertices and the faces of the mesh of a shape."""
-    if mesh is None:
-        raise ArgumentError(f"the wp.Mesh with the id mesh[{k}] is not found; give it instead")
-    return np.zeros((mesh.points.size, 4)), mesh.indices.numpy().reshape(-1, 3)
 
 
 # ---- The camera.
@@ -235,10 +205,8 @@ def _rates_kernel(
     # Out:
     rates: wp.array2d[float],
 ):
-    """Expected detections per pulse of one camera: light of the tally, blurred by the response.
-
-    `taps` has zeros for the _RUN - 1 bins before and after the response. Launch: (pixels, runs of bins).
-    """
+    """Expected detections per pulse of one camera: light of the tally, blurred by the response, whose taps have zeros
+    for the _RUN - 1 bins before and after it. Launch: (pixels, runs of bins)."""
     pixel, run = wp.tid()
     parts = tally.shape[1] / rates.shape[1]
     first = run * _RUN
@@ -259,21 +227,13 @@ def _advance_kernel(offset: wp.array[wp.uint64], count: wp.uint64):
     offset[0] = offset[0] + count
 
 
-@dataclasses.dataclass(frozen=True)
-class _Lane:
-    """Memory that cameras share which are traced one after the other; lanes run side by side on a GPU."""
-
-    stream: wp.Stream | None  # none for the device's current one
-    data: Data  # its tally and cursor; the ledger and the offset are those of all lanes
-
-
 class SpadTracer(WorldCameras):
     """As `SpadCamera`, with all scattering: photons are traced through the water and against the shapes.
 
     A step is a loop over the cameras of launches that wait for nothing, then one launch for the counts of all; it
     allocates nothing and reads nothing back, so that it can be captured in a CUDA graph, after a first one that checks
-    the poses and builds the meshes. Round shapes become polygons of
-    48 sides. The light of a photon depends on `config.seed` and its number, and every step has new photons.
+    the poses and builds the meshes. Round shapes become polygons of 48 sides. The light of a photon depends on
+    `config.seed` and its number, and every step has new photons.
 
     Args:
         shapes: What stands in the worlds. Kinds and meshes stay; poses, sizes, reflectance and the points of meshes may
@@ -311,11 +271,10 @@ class SpadTracer(WorldCameras):
         device: wp.DeviceLike = None,
     ) -> None:
         check_kind("shapes", shapes, Shapes)
-        config = check_config(config)
         self._parts = check_integer("oversampling", oversampling, 1, 1024)
-        sizes = {"config.height": config.height, "config.width": config.width, "config.bins": config.bins}
-        check_memory("tallies", {**sizes, "oversampling": self._parts}, 8, shapes.device, rows=4)
         super().__init__(config, cameras, world=world, frame=frame, device=shapes.device if device is None else device)
+        sizes = {f"config.{name}": getattr(self.config, name) for name in ("height", "width", "bins")}
+        check_memory("tallies", {**sizes, "oversampling": self._parts}, 8, shapes.device, rows=4)
         if self.device != shapes.device:
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
         check_choice("estimator", estimator, ESTIMATORS)
@@ -325,15 +284,14 @@ class SpadTracer(WorldCameras):
         if max(worlds) >= shapes.worlds:
             raise ArgumentError(f"world = {max(worlds)} is none of the {shapes.worlds} worlds of the shapes")
         self._meshes = CameraMeshes(shapes, worlds, self.device)
-        for v, faces in enumerate(self._meshes.face_shape):
-            if not len(faces):
-                raise ArgumentError(f"world {worlds[v]} of camera {v} has no shapes")
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(np.pad(taps, (_RUN - 1) * self._parts), dtype=float, device=self.device)
         self._lane_count = min(check_integer("lanes", lanes, 1, 64), self.cameras if self.device.is_cuda else 1)
         self._estimator = estimator
         self._models: list[Model] = []
-        self._lanes: list[_Lane] = []
+        # Memory that cameras share which are traced one after the other; lanes run side by side on a GPU, each on its
+        # stream, None for the current one. Tally and cursor are a lane's own, ledger and offset those of all.
+        self._lanes: list[tuple[wp.Stream | None, Data]] = []
         self.data: Data | None = None
 
     def update(self, camera_q: wp.array, body_q: wp.array | None = None) -> None:
@@ -344,32 +302,32 @@ class SpadTracer(WorldCameras):
             self._build()
         data, models = self.data, self._models
         data.ledger.zero_()
-        for lane in self._lanes[1:]:
-            lane.stream.wait_stream(self.device.stream)
+        for stream, _ in self._lanes[1:]:
+            stream.wait_stream(self.device.stream)
         for v in range(self.cameras):
-            lane = self._lanes[v % len(self._lanes)]
-            with wp.ScopedStream(lane.stream, sync_enter=False):
-                self._trace(v, models[v], lane)
-        for lane in self._lanes[1:]:
-            self.device.stream.wait_stream(lane.stream)
+            stream, own = self._lanes[v % len(self._lanes)]
+            with wp.ScopedStream(stream, sync_enter=False):
+                self._trace(v, models[v], own)
+        for stream, _ in self._lanes[1:]:
+            self.device.stream.wait_stream(stream)
         wp.launch(_advance_kernel, 1, [data.offset, self.cameras * self.photons], device=self.device)
         self._detect()
 
-    def _trace(self, v: int, model: Model, lane: _Lane) -> None:
+    def _trace(self, v: int, model: Model, data: Data) -> None:
         """Expected detections of one camera, on the device's current stream."""
         config, surfaces, photons = self.config, model.surfaces, self.photons
         inputs = [self._face_shape[v], self.shapes.table]
         outputs = [surfaces.reflectance, surfaces.corner_reflectance]
         wp.launch(_reflectance_kernel, surfaces.reflectance.size, inputs, outputs, device=self.device)
         update_surfaces(surfaces, model.mesh, model.camera)
-        lane.data.tally.zero_()
+        data.tally.zero_()
         threads = CUDA_THREADS // len(self._lanes)
         launch_transport(
-            self._spec, model, lane.data, seed=config.seed, first_id=v * photons, photon_count=photons, threads=threads
+            self._spec, model, data, seed=config.seed, first_id=v * photons, photon_count=photons, threads=threads
         )
         pixels = config.height * config.width
         factor = config.photons * config.pde / (model.scale * photons)
-        tally = lane.data.tally.reshape((pixels, model.gate.bins))
+        tally = data.tally.reshape((pixels, model.gate.bins))
         rates = self.rates[v].reshape((pixels, config.bins))
         runs = (pixels, -(-config.bins // int(_RUN)))
         inputs = [tally, factor, self._dark, self._taps, self._lowest]
@@ -417,27 +375,22 @@ class SpadTracer(WorldCameras):
         self._spec = TransportSpec(self._estimator, stepped=True, merged=True, roulette=True, **choices)
         if self.data is None:
             shared = make_data(models[0], histogram=False)
-            self._lanes = [self._make_lane(k, models[0], shared) for k in range(self._lane_count)]
-            self.data = self._lanes[0].data
-
-    def _make_lane(self, k: int, model: Model, shared: Data) -> _Lane:
-        size = self.config.height * self.config.width * model.gate.bins
-        tally = wp.zeros(size, dtype=wp.int64, device=self.device)
-        data = dataclasses.replace(shared, tally=tally, cursor=wp.zeros(1, dtype=int, device=self.device))
-        return _Lane(wp.Stream(self.device) if k > 0 else None, data)
+            for k in range(self._lane_count):
+                tally = wp.zeros(config.height * config.width * gate.bins, dtype=wp.int64, device=self.device)
+                data = dataclasses.replace(shared, tally=tally, cursor=wp.zeros(1, dtype=int, device=self.device))
+                self._lanes.append((wp.Stream(self.device) if k else None, data))
+            self.data = self._lanes[0][1]
 
     def _textures(self, owner: np.ndarray) -> "Textures | None":
         """The shapes' images for the faces of one camera's mesh."""
-        table = self.shapes.table
-        if not table.textures.face.size:
+        images = self.shapes.table.textures
+        if not images.face.size:
             return None
-        first = table.first_face.numpy()[owner]
+        first = self.shapes.table.first_face.numpy()[owner]
         _, start, each = np.unique(owner, return_index=True, return_inverse=True)
-        number = np.arange(len(owner)) - start[each]  # of the face in its own mesh
-        row = np.where(first >= 0, first + number, 0)
+        row = np.where(first >= 0, first + np.arange(len(owner)) - start[each], 0)
         textures = Textures()
-        face = np.where(first >= 0, table.textures.face.numpy()[row], -1)
-        textures.face = wp.array(face, dtype=int, device=self.device)
-        textures.coordinates = wp.array(table.textures.coordinates.numpy()[row], dtype=wp.vec2, device=self.device)
-        textures.region, textures.texels = table.textures.region, table.textures.texels
+        textures.face = wp.array(np.where(first >= 0, images.face.numpy()[row], -1), dtype=int, device=self.device)
+        textures.coordinates = wp.array(images.coordinates.numpy()[row], dtype=wp.vec2, device=self.device)
+        textures.region, textures.texels = images.region, images.texels
         return textures

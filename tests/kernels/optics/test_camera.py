@@ -7,7 +7,7 @@ import warp as wp
 from helpers.launch import Vectors, launched
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import Camera, Gate, random_block, u01
-from spadwarp_kernels.optics.camera import clip_to_gate, clip_to_view, field, in_view, lens_point, project, ready_camera
+from spadwarp_kernels.optics.camera import clip_to_gate, clip_to_view, in_view, lens_point, project, ready_camera
 
 _LENS_POINT = wp.constant(wp.vec2(0.1, -0.25))
 
@@ -23,7 +23,7 @@ def _lens(camera: Camera, o: Vectors):
 def _clips(camera: Camera, gate: Gate, x: Vectors, u: Vectors, path: float, out: wp.array(dtype=wp.vec2)):
     i = wp.tid()
     o = wp.vec3(_LENS_POINT[0], _LENS_POINT[1], 0.0)
-    seen = clip_to_view(camera, field(camera), x[i], u[i], o, 9.0)
+    seen = clip_to_view(camera, camera.view, x[i], u[i], o, 9.0)
     out[i] = clip_to_gate(gate, x[i], u[i], path, o, seen)
 
 
@@ -31,7 +31,7 @@ def _clips(camera: Camera, gate: Gate, x: Vectors, u: Vectors, path: float, out:
 def _images(camera: Camera, x: Vectors, o: Vectors, pixel: wp.array(dtype=int), visible: wp.array(dtype=int)):
     i = wp.tid()
     pixel[i] = project(camera, camera.view, -1, x[i], o[i])
-    visible[i] = int(in_view(camera, field(camera), x[i]))
+    visible[i] = int(in_view(camera, camera.view, x[i]))
 
 
 def test_lens_points_fill_the_aperture_evenly(device):
@@ -60,6 +60,7 @@ def test_the_clip_is_what_camera_and_gate_see(inverse_focus, device):
     """Against points along each flight, tested one by one for view and arrival."""
     camera, gate = Camera(), Gate()
     camera.width, camera.height, camera.pixel_tangent, camera.inverse_focus = 20, 12, 0.05, inverse_focus
+    ready_camera(camera, camera)
     gate.start, gate.stop = 4.0, 11.0
     rng = np.random.default_rng(5)
     x = rng.uniform([-3, -3, -1], [3, 3, 6], size=(5000, 3)).astype(np.float32)

@@ -70,7 +70,7 @@ def test_poses_of_a_first_step(kind, row, text):
         ({"mesh": 2}, "mesh is int; a list is needed"),
         ({"world": [3, 0]}, "world is not one of -1 to 0"),
         ({"body": [1, 2, 3]}, "body does not fit 2 shapes"),
-        ({"reflectance": 1.5}, r"reflectance holds .* outside \[0, 1\]"),
+        ({"reflectance": 1.5}, r"reflectance\[.*\] = .* is outside \[0, 1\]"),
         ({"visible": [True] * 3}, r"visible is bool of shape \(3,\)"),
         ({"size": [(0, 0, 0), (-1, 1, 1)]}, r"size\[1\] = \[-1.0, 1.0, 1.0\] of a box is not finite and 0 or more"),
         ({"size": wp.full(2, wp.vec3(np.nan), device="cpu")}, r"size\[0\] = \[nan, .* of a plane is not finite"),
