@@ -10,8 +10,7 @@ from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.photon.derivatives import LogDerivatives
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
-from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
-from spadwarp_kernels.surface.triangle import face_in, face_normal
+from spadwarp_kernels.surface.triangle import face_in
 from spadwarp_kernels.water.medium import boundary_ahead, layer_index
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
 
@@ -42,7 +41,7 @@ def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3,
 
 
 def _make_fly(spec: TransportSpec) -> wp.Function:
-    count, layered = len(spec.derivatives), spec.layered
+    count, layered = len(spec.derivatives), spec.water.layered
     on_path = parameters_of(spec, "absorption", "scattering")
 
     @wp.func
@@ -75,12 +74,11 @@ def _make_fly(spec: TransportSpec) -> wp.Function:
 
 
 def _make_event(spec: TransportSpec) -> wp.Function:
-    count, layered, has_mesh, specular = len(spec.derivatives), spec.layered, spec.mesh, spec.specular
+    count, layered, shares = len(spec.derivatives), spec.water.layered, spec.faces.shares
     by_scattering, by_anisotropy, by_reflectance = (
         parameters_of(spec, kind) for kind in ("scattering", "anisotropy", "reflectance")
     )
     in_water = by_scattering | by_anisotropy
-    reflectance_at = spec.reflectance_at
 
     @wp.func
     def in_the_water(d: LogDerivatives, world: WorldRef, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
@@ -98,15 +96,8 @@ def _make_event(spec: TransportSpec) -> wp.Function:
 
     @wp.func
     def on_a_face(d: LogDerivatives, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
-        # The Lambertian part of the light that is reflected.
-        part = float(1.0)
-        face = face_in(world.surfaces.order, slot)
-        if wp.static(specular):
-            normal = face_normal(world.surfaces.faces, slot, u)
-            lambert = lambert_brdf(reflectance_at(world.surfaces, face, x))
-            both = lambert + world.surfaces.specular[face] * ggx_brdf(u, v, normal, world.surfaces.roughness[face])
-            part = lambert / wp.max(both, 1.0e-30)
-        here = world.derivatives.faces[face]
+        part = shares(world.surfaces, slot, x, u, v)[0]
+        here = world.derivatives.faces[face_in(world.surfaces.order, slot)]
         for p in range(wp.static(count)):
             if (wp.static(by_reflectance) >> p) & 1 == 1:
                 d[p] = d[p] + wp.where((here >> p) & 1 == 1, part / world.derivatives.value[p], 0.0)
@@ -114,12 +105,10 @@ def _make_event(spec: TransportSpec) -> wp.Function:
 
     @wp.func
     def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
-        if wp.static(has_mesh):
-            if slot >= 0:
-                if wp.static(by_reflectance > 0):
-                    c.log_derivatives = on_a_face(c.log_derivatives, world, slot, x, u, v)
-                return
-        if wp.static(in_water > 0):
+        if slot >= 0:
+            if wp.static(by_reflectance > 0):
+                c.log_derivatives = on_a_face(c.log_derivatives, world, slot, x, u, v)
+        elif wp.static(in_water > 0):
             c.log_derivatives = in_the_water(c.log_derivatives, world, x, u, v)
 
     return event
