@@ -11,7 +11,6 @@ from spadwarp_kernels.optics.visibility import Link
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Contribution, PhotonState, World
-from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
 from spadwarp_kernels.water.medium import Layers, Medium, Profile
@@ -178,7 +177,7 @@ class ScoredPoint:
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
-    tracks, rides = spec.water.profile is not None, make_rider(spec) is not NOTHING
+    tracks, rides = spec.water.profile is not None, make_rider(spec).rides
 
     @wp.func
     def event_request(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
@@ -337,7 +336,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     sight = spec.sight
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
     rider = make_rider(spec)
-    rides, (_begin, fork, fly, event, _mirror, deliver) = rider is not NOTHING, rider
+    rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
 
     @wp.func
     def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):

@@ -14,7 +14,6 @@ from spadwarp_kernels.optics.camera import clip_to_gate, lens_point
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, World
-from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
@@ -92,7 +91,7 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, rides = spec.local_albedo, make_rider(spec) is not NOTHING
+    local_albedo, rides = spec.local_albedo, make_rider(spec).rides
     collides = spec.scores_collisions
     spares = collides and not spec.domain.reflects  # mirrored, any flight may lead to an image of the lens
 

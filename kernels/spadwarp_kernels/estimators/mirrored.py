@@ -8,7 +8,6 @@ from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Contribution, PhotonState, Sink, World, make_deposit, tally_index
-from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED
@@ -45,7 +44,7 @@ def _make_follow(spec: TransportSpec) -> wp.Function:
     has_mesh, hides, water_extinction = spec.faces.mesh, spec.faces.hides, spec.water.extinction
     point_back, turn_back = spec.domain.point_back, spec.domain.turn_back
     rider = make_rider(spec)
-    rides, (_begin, fork, fly, event, mirror, deliver) = rider is not NOTHING, rider
+    rides, (_begin, fork, fly, event, mirror, deliver) = rider.rides, rider
 
     @wp.func
     def follow(
@@ -102,7 +101,7 @@ def _make_follow(spec: TransportSpec) -> wp.Function:
 def _make_score_image(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, number, world) -> Mirrored`` of an event by way of one of `Boundary.images`."""
     measured = spec.faces.mesh or spec.varies
-    followed = measured or make_rider(spec) is not NOTHING
+    followed = measured or make_rider(spec).rides
     sight, domain = spec.sight, spec.domain
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
     scattering_density, follow = make_scattering(spec), _make_follow(spec)

@@ -174,7 +174,7 @@ class Faces(NamedTuple):
     after."""
 
     hides: wp.Function  # ``(surfaces, x, u, length) -> bool``, whether a face stands in the way
-    reflectance: wp.Function  # ``(surfaces, face, x) -> float``, Lambertian
+    survival: wp.Function  # ``(surfaces, hit, x, albedo) -> vec2``, part that an event leaves, of that part the lobe's
     density: wp.Function  # ``(surfaces, slot, x, u, v) -> float``, of what is sent to v [1/sr]
     shares: wp.Function  # ``(surfaces, slot, x, u, v) -> vec2``, of that by the Lambertian law and by the lobe
     pdf: wp.Function  # ``(surfaces, hit, u, v, lobe, other) -> float``, of `sample_reflection` [1/sr]; in water `other`
@@ -193,6 +193,17 @@ def make_faces(mesh: bool, tried: bool, pattern: bool, specular: bool) -> Faces:
         if wp.static(tried):
             return bits_of(nearest_patch(surfaces.patches, x, u, length)[3]) >= 0
         return intersect_surfaces(surfaces, x, u, length, True).slot >= 0
+
+    @wp.func
+    def survival(surfaces: Surfaces, hit: SurfaceHit, x: wp.vec3, albedo: float) -> wp.vec2:
+        part = wp.vec2(albedo, 0.0)
+        if hit.face >= 0:
+            part[0] = reflectance(surfaces, hit.face, x)
+            if wp.static(specular):
+                lobe = surfaces.specular[hit.face]
+                part[0] += lobe
+                part[1] = lobe / wp.max(part[0], 1.0e-30)
+        return part
 
     @wp.func
     def parts(surfaces: Surfaces, face: int, normal: wp.vec3, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec2:
@@ -229,7 +240,7 @@ def make_faces(mesh: bool, tried: bool, pattern: bool, specular: bool) -> Faces:
                 density = reflection_pdf(u, v, hit.normal, surfaces.roughness[hit.face], lobe)
         return density
 
-    return Faces(hides, reflectance, density, shares, pdf, mesh, tried, specular)
+    return Faces(hides, survival, density, shares, pdf, mesh, tried, specular)
 
 
 # ---- What the camera would see through clear water: one ray a pixel against the mesh.

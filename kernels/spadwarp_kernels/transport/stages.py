@@ -38,7 +38,6 @@ from spadwarp_kernels.photon.state import (
     reweigh,
     shorten,
 )
-from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box
 from spadwarp_kernels.surface.patches import nearest_patch
@@ -328,7 +327,7 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
     estimator says so, with what rides along."""
     crosses, leave = cross is not None, spec.sight.leave
     rider = make_rider(spec)
-    rides, (_begin, fork, fly, _event, _mirror, deliver) = rider is not NOTHING, rider
+    rides, (_begin, fork, fly, _event, _mirror, deliver) = rider.rides, rider
 
     @wp.func
     def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
@@ -353,39 +352,12 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
 
 
 @wp.struct
-class Survival:
-    """What an event leaves of a photon: the part of its weight, and at a surface the part of that which is specular."""
-
-    part: float
-    lobe: float
-
-
-@wp.struct
 class Outcome:
     """What an event makes of a photon: see `PhotonState`, which takes it over once nothing asks for the old weight."""
 
     weight: Weight
     analog_weight: float
     reason: int
-
-
-def make_survive(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
-    reflectance_at, specular = spec.faces.reflectance, spec.faces.specular
-
-    @wp.func
-    def survive(s: PhotonRef, world: WorldRef) -> Survival:
-        survival = Survival()
-        survival.part = s.albedo
-        if s.hit.face >= 0:
-            survival.part = reflectance_at(world.surfaces, s.hit.face, s.x)
-            if wp.static(specular):
-                specular_part = world.surfaces.specular[s.hit.face]
-                survival.part += specular_part
-                survival.lobe = specular_part / wp.max(survival.part, 1.0e-30)
-        return survival
-
-    return survive
 
 
 def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
@@ -495,7 +467,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     `flies_on`: see `make_continues`.
     """
     specular, reflects, directed = spec.faces.specular, spec.domain.reflects, direct is not None
-    survive, sample_direction = make_survive(spec), make_sample_direction(spec, direct)
+    survival_of, sample_direction = spec.faces.survival, make_sample_direction(spec, direct)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
     continues, turn_carried = make_continues(flies_on), make_rider(spec).event
 
@@ -536,16 +508,16 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         new.reason = -1
         new.weight = s.weight
         on_surface = s.hit.face >= 0
-        survival = survive(s, world)
+        survival = survival_of(world.surfaces, s.hit, s.x, s.albedo)
         if on_surface:
-            reweigh(new.weight, survival.part)
+            reweigh(new.weight, survival[0])
             s.absorbed_surface += new.weight.taken
         else:
-            new.weight.value *= survival.part
-        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
+            new.weight.value *= survival[0]
+        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival[0], new.weight.value)
         terminate(new, s, world, sink, id)
         if continues(new.reason):
-            turn(new, s, world, sink, id, on_surface, survival.lobe)
+            turn(new, s, world, sink, id, on_surface, survival[1])
         s.weight = new.weight
         s.analog_weight = new.analog_weight
         s.reason = new.reason
