@@ -2,9 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from .contribution import *
 from .estimator import *
 from .registry import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = estimator.__all__ + contribution.__all__ + registry.__all__
+    __all__ = estimator.__all__ + registry.__all__

@@ -1,125 +1,20 @@
 """What a photon adds to a pixel by a next event: from where it scatters, or from a sampled point of its flight."""
 
-from typing import NamedTuple
-
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
-from spadwarp_kernels.base.rotations import cos_sin_turn, cotangent, one_minus_cosine, snap_from
-from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
+from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
+from spadwarp_kernels.optics.camera import lens_point
+from spadwarp_kernels.optics.visibility import Link
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Contribution, PhotonState, World, tally_index
-from spadwarp_kernels.riders.rider import NOTHING
+from spadwarp_kernels.photon.state import Contribution, PhotonState, World
 from spadwarp_kernels.riders.riders import make_rider
-from spadwarp_kernels.surface.ray_cast import patch_face, tree_face
-from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
 from spadwarp_kernels.water.medium import Layers, Medium, Profile
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
-
-__all__ = ["next_event_value"]
-
-
-# ---- The way of light from a point that is scored to a point of the lens, in water alone or through a port.
-
-
-@wp.struct
-class Link:
-    """A way to the lens."""
-
-    to_lens: wp.vec3  # unit direction at the point
-    image: wp.vec3  # a point that the lens sees in the same direction, in air alone [m]
-    end: wp.vec3  # where the way leaves the water [m]
-    water: float  # its length in the water [m]
-    path: float  # length in water that takes as long as all of it [m]
-    # what the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2]; by a port
-    gather: float
-
-
-@wp.func
-def next_event_value(
-    camera: Camera, extinction: float, weight: float, scattering: float, to_lens: wp.vec3, distance: float
-) -> float:
-    """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
-    unit vector."""
-    cos_lens = wp.max(-to_lens[2], 0.0)
-    # Times -1: Warp's unary minus is 0 - x, an addition.
-    passed = wp.exp((-1.0 * extinction) * distance)
-    return weight * scattering * passed * camera.aperture_area * cos_lens / (distance * distance)
-
-
-class LensWay(NamedTuple):
-    """Warp functions of the way from x in the water to the point o of the lens."""
-
-    link: wp.Function  # ``(camera, x, o) -> Link``
-    value: wp.Function  # ``(camera, extinction, weight, scattering, link) -> float``, part of the photon that arrives
-    apparent: wp.Function  # ``(camera, x, o) -> vec3``, from where the light of o seems to come at x
-    toward: wp.Function  # ``(camera, x, o) -> vec3``, unit direction of the way at x; straight where there is no way
-    toward_centre: wp.Function  # ``(camera, x) -> vec3``, about that to the lens's centre
-
-
-@memoised
-def make_lens_way(port: PortKind | None) -> LensWay:
-    """The ways behind a kind of port; None: without one."""
-    has_port, kind = port is not None, port or FLAT_PORT
-    connect, apparent_of, apparent_centre = kind.connect, kind.apparent, kind.apparent_centre
-
-    @wp.func
-    def link_to(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
-        link = Link()
-        if wp.static(has_port):
-            way = connect(camera.port, x, o)
-            link.to_lens = way.to_port
-            link.image = o - way.inside
-            link.end = way.exit
-            link.water = way.water
-            link.path = way.path
-            link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
-        else:
-            to_lens = o - x
-            r = wp.length(to_lens)
-            link.to_lens = to_lens / r
-            link.image = x
-            link.end = o
-            link.water = r
-            link.path = r
-        return link
-
-    @wp.func
-    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
-        if wp.static(has_port):
-            return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
-        return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
-
-    @wp.func
-    def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        seen = wp.vec3(o)
-        if wp.static(has_port):
-            way = connect(camera.port, x, o)
-            if way.density > 0.0:
-                seen = apparent_of(camera.port, x, o, way)
-        return seen
-
-    @wp.func
-    def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        straight = wp.normalize(o - x)
-        if wp.static(has_port):
-            way = connect(camera.port, x, o)
-            straight = wp.where(way.density > 0.0, way.to_port, straight)
-        return straight
-
-    @wp.func
-    def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
-        if wp.static(has_port):
-            return wp.normalize(apparent_centre(camera.port) - x)
-        return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
-
-    return LensWay(link_to, value_of, apparent, toward, toward_centre)
-
 
 # ---- Points of flights, drawn by distance and angle at once, after Kulla & Fajardo 2012 (equi-angular sampling) and
 # Georgiev et al. 2013 (joint distance-angle sampling).
@@ -134,51 +29,6 @@ class FlightSample:
     r: float
     density: float
     depth: float
-
-
-@wp.struct
-class LensSample:
-    """A point of the lens [m]; its density if it were uniform, over that of the draw."""
-
-    point: wp.vec3
-    weight: float
-
-
-@memoised
-def make_sample_lens(port: PortKind | None) -> wp.Function:
-    """The Warp function ``(camera, x, u, xi1, xi2) -> LensSample``: a point of the lens by which the flight x + s u is
-    scored.
-
-    The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the lens,
-    the point is drawn with that density, uniform in angle and distance about the place: even draws would have no finite
-    variance. Else it is even.
-    """
-    has_port, leave = port is not None, (port or FLAT_PORT).leave
-
-    @wp.func
-    def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
-        p = wp.vec2(1.0e30, 0.0)
-        if wp.static(has_port):
-            ray = leave(camera.port, x, wp.where(u[2] < 0.0, u, -u))
-            if ray.transmission > 0.0:
-                p = wp.vec2(ray.x[0], ray.x[1])
-        else:
-            s = -x[2] / u[2]
-            p = wp.vec2(x[0] + s * u[0], x[1] + s * u[1])
-        sample = LensSample()
-        sample.point = lens_point(camera, xi1, xi2)
-        sample.weight = 1.0
-        radius2 = camera.aperture_radius * camera.aperture_radius
-        if wp.dot(p, p) < radius2:
-            turn = cos_sin_turn(xi2)
-            aside = p[0] * turn[1] - p[1] * turn[0]
-            to_rim = wp.sqrt(wp.max(radius2 - aside * aside, 0.0)) - wp.dot(p, turn)
-            distance = xi1 * to_rim
-            sample.point = wp.vec3(p[0] + distance * turn[0], p[1] + distance * turn[1], 0.0)
-            sample.weight = 2.0 * to_rim * distance / radius2
-        return sample
-
-    return sample_lens
 
 
 @wp.func
@@ -326,27 +176,23 @@ class ScoredPoint:
 @memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
-    view_of, shows = spec.lens.view, spec.in_view
-    reflecting, tracks, has_mesh = spec.reflecting, spec.grid is not None, spec.mesh
-    rides = make_rider(spec) is not NOTHING
+    view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
+    tracks, rides = spec.water.profile is not None, make_rider(spec).rides
 
     @wp.func
     def event_request(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
         q = Request()
-        on_surface = False
-        if wp.static(has_mesh):
-            on_surface = s.hit.face >= 0
+        on_surface = s.hit.face >= 0
         # Mirrored, any point may be seen.
-        if wp.static(not flights or reflecting) or on_surface:
-            if wp.static(reflecting) or shows(world.camera, view_of(world.camera, s.view), s.x):
+        if wp.static(not flights or reflects) or on_surface:
+            if wp.static(reflects) or shows(world.camera, view_of(world.camera, s.view), s.x):
                 q.wanted = True
-                if wp.static(reflecting):
+                if wp.static(reflects):
                     q.wanted = s.bounces.face == 0
                 q.x = s.x
                 q.u = s.u
                 q.weight = s.weight.value
                 q.path = s.path
-                q.interval = wp.vec2(0.0, 0.0)
                 q.first = s.flight.block[3]
                 if wp.static(tracks):
                     q.second = s.flight.block[0]
@@ -362,7 +208,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                         q.component = BALLISTIC
                 else:
                     q.weight *= s.albedo
-                    if wp.static(not has_mesh) or s.surface_count == 0:
+                    if s.surface_count == 0:
                         q.component = BACKSCATTER
         return q
 
@@ -381,10 +227,10 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     local_albedo = spec.local_albedo
     water, profile = spec.water, spec.water.profile
     water_extinction, water_at = water.extinction, water.at
-    sample_flight = make_sample_flight(spec.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
+    sample_flight = make_sample_flight(water.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
     has_profile, collides = profile is not None, spec.scores_collisions
     depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
-    apparent_lens = make_lens_way(spec.port).apparent
+    apparent_lens = spec.sight.apparent
 
     @wp.func
     def flight_point(request: Request, world: wp.ref[World]) -> ScoredPoint:
@@ -463,26 +309,14 @@ def make_point_of(points: int) -> wp.Function:
 def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
     request scatters at x into the direction v."""
-    has_mesh, specular = spec.mesh, spec.specular
-    water_at = spec.water.at
-    phase_pdf = spec.phase.pdf
-    reflectance_at = spec.reflectance_at
-    face_at = patch_face if spec.tries_faces else tree_face
+    water_at, phase_pdf, face_density = spec.water.at, spec.water.phase.pdf, spec.faces.density
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
         scattering = float(0.0)
-        on_surface = False
-        if wp.static(has_mesh):
-            on_surface = request.slot >= 0
-            if on_surface:
-                face, normal = face_at(world.surfaces, request.slot, request.u)
-                cos_out = wp.max(wp.dot(v, normal), 0.0)
-                scattering = lambert_brdf(reflectance_at(world.surfaces, face, x)) * cos_out
-                if wp.static(specular):
-                    lobe = ggx_brdf(request.u, v, normal, world.surfaces.roughness[face])
-                    scattering += world.surfaces.specular[face] * lobe * cos_out
-        if not on_surface:
+        if request.slot >= 0:
+            scattering = face_density(world.surfaces, request.slot, x, request.u, v)
+        else:
             snapped = snap_from(request.u, world.medium.axis_threshold)
             scattering = phase_pdf(one_minus_cosine(snapped, v), water_at(world.medium, world.layers, x))
         return scattering
@@ -496,13 +330,13 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
 
     `flights`: whether requests may ask for a point of a flight.
     """
-    confocal, reflecting, merged = spec.confocal, spec.reflecting, spec.merged
+    reflects, index_of = spec.domain.reflects, spec.tally_index
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
-    image_of = spec.image_of
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    link_to, value_of, *_ = make_lens_way(spec.port)
+    sight = spec.sight
+    image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
     rider = make_rider(spec)
-    rides, (_begin, fork, fly, event, _mirror, deliver) = rider is not NOTHING, rider
+    rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
 
     @wp.func
     def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):
@@ -523,7 +357,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         ahead = float(0.0)
         lens = lens_point(world.camera, u01_high(request.first), u01_low(request.first))
         if wp.static(flights):
-            if wp.static(reflecting):
+            if wp.static(reflects):
                 if request.interval[0] >= request.interval[1] and request.slot < 0:
                     return found  # an event in the water, for its reflections alone
             if request.interval[0] < request.interval[1]:
@@ -533,9 +367,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                 weight = point.weight
                 path = point.path
                 ahead = point.ahead
-        view = world.camera.view
-        if wp.static(confocal):
-            view = world.scan.view[request.target]
+        view = scan_view(world.camera, world.scan, request.target)
         link = link_to(world.camera, found.origin, lens)
         found.lens = link.end
         pixel = image_of(world.camera, view, request.target, link.image, lens)
@@ -555,9 +387,8 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                     ahead = wp.where(ahead > 0.0, 0.0, -1.0)
             else:
                 extinction = water_extinction(world.medium, world.layers, found.origin, link.to_lens, link.water, seed)
-            component = wp.where(wp.static(merged), BALLISTIC, request.component)
             found.contribution.value = value_of(world.camera, extinction, weight, scattering, link)
-            found.contribution.index = tally_index(world.camera, world.gate, pixel, path + link.path, component)
+            found.contribution.index = index_of(world.camera, world.gate, pixel, path + link.path, request.component)
             if wp.static(rides):
                 if found.contribution.value > 0.0:
                     carry(found, request, link, world, lens - link.image)

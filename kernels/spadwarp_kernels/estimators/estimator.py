@@ -35,8 +35,6 @@ class Estimator(NamedTuple):
     alone change the state.
 
     Attributes:
-        max_registers: Registers of a CUDA thread, without and with a BVH: fewer spill, more leave too few warps to hide
-            latency.
         cross: ``(s, world) -> Contribution``, what the photon itself brings on the flight that ends in
             its event; needs no shadow ray.
         plan_flight: ``(s, block, world) -> FlightPlan``, before a flight is traced;
@@ -49,7 +47,6 @@ class Estimator(NamedTuple):
             `reflected` is the draw of a rough specular surface.
     """
 
-    max_registers: tuple[int, int] = (64, 64)
     cross: wp.Function | None = None
     plan_flight: wp.Function | None = None
     request_flight: wp.Function | None = None

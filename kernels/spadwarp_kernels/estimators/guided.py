@@ -11,15 +11,12 @@ from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
 from spadwarp_kernels.optics.camera import clip_to_gate, lens_point
-from spadwarp_kernels.optics.visibility import port_view
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonState, World
-from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
-from spadwarp_kernels.surface.reflectance import reflection_pdf, sample_cosine_law
+from spadwarp_kernels.surface.reflectance import sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
-from spadwarp_kernels.water.limits import make_domain
 from spadwarp_kernels.water.medium import Medium
 from spadwarp_kernels.water.phase_functions import (
     HENYEY_GREENSTEIN,
@@ -30,7 +27,7 @@ from spadwarp_kernels.water.phase_functions import (
     sample_henyey_greenstein,
 )
 
-from .contribution import make_event_request, make_lens_way, make_sample_lens, make_score, scores_collision
+from .contribution import make_event_request, make_score, scores_collision
 from .estimator import Direction, Estimator, FlightPlan
 
 # A photon's weight is at most this times its analog weight, see `guided_part`.
@@ -44,13 +41,7 @@ ASIDE_SCORED_IN = 16
 def make_guided(spec: TransportSpec) -> Estimator:
     """Water is scored at a point of each flight, surfaces where they are hit."""
     request_flight, request_event = make_requests(spec)
-    registers = (96, 96)
-    if spec.polarised:
-        registers = (128, 128)
-    elif spec.grid is not None:
-        registers = (72 if spec.scores_collisions else 80, 72)
     return Estimator(
-        max_registers=registers,
         plan_flight=make_plan_flight(spec),
         request_flight=request_flight,
         request_event=request_event,
@@ -61,11 +52,9 @@ def make_guided(spec: TransportSpec) -> Estimator:
 
 def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
-    view_of = spec.lens.view
-    varies, bounded, has_phase_guide = spec.varies, spec.bounded, spec.phase.guide is not None
-    to_exit = make_domain(spec.rotated_domain).exit_distance
-    clip_to_view, _, gate_of = port_view(spec.port)
-    sample_lens = make_sample_lens(spec.port)
+    sight, varies, has_phase_guide = spec.sight, spec.varies, spec.water.phase.guide is not None
+    view_of, clip_to_view, gate_of, sample_lens = sight.view, sight.clip, sight.gate, sight.sample_lens
+    within = spec.domain.within
 
     @wp.func
     def plan_flight(s: wp.ref[PhotonState], block: wp.vec4ui, world: wp.ref[World]) -> FlightPlan:
@@ -78,9 +67,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
             lens = sample_lens(world.camera, s.x, s.u, u01(block[2]), u01(block[3]))
             plan.lens = lens.point
             plan.lens_weight = lens.weight
-        limit = world.limits.max_path - s.path
-        if wp.static(bounded):
-            limit = wp.min(limit, to_exit(world.limits, s.x, s.u))
+        limit = within(world.limits, world.limits.max_path - s.path, s.x, s.u)
         plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), s.x, s.u, plan.lens, limit)
         gate = gate_of(world.camera, world.gate)
         plan.interval = clip_to_gate(gate, s.x, s.u, s.path, plan.lens, plan.interval)
@@ -104,9 +91,9 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, rides = spec.local_albedo, make_rider(spec) is not NOTHING
+    local_albedo, rides = spec.local_albedo, make_rider(spec).rides
     collides = spec.scores_collisions
-    spares = collides and not spec.reflecting  # mirrored, any flight may lead to an image of the lens
+    spares = collides and not spec.domain.reflects  # mirrored, any flight may lead to an image of the lens
 
     @wp.func
     def request_flight(s: wp.ref[PhotonState]) -> Request:
@@ -202,24 +189,20 @@ def guided_part(weight: float, analog_weight: float, surfaces_met: int, probabil
 
 def make_direct(spec: TransportSpec) -> wp.Function:
     """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
-    phase_pdf = spec.phase.pdf
-    guide = spec.phase.guide or HENYEY_GREENSTEIN_GUIDE
-    has_phase_guide = spec.phase.guide is not None
-    lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(spec.phase)
-    water_at, tracks, collides = spec.water.at, spec.grid is not None, spec.scores_collisions
-    view_of, toward_middle = spec.lens.view, spec.lens.toward_middle
-    has_mesh, specular = spec.mesh, spec.specular
-    in_view = spec.in_view
-    *_, toward, toward_centre = make_lens_way(spec.port)
+    phase, water_at = spec.water.phase, spec.water.at
+    guide, has_phase_guide, phase_pdf = phase.guide or HENYEY_GREENSTEIN_GUIDE, phase.guide is not None, phase.pdf
+    lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(phase)
+    tracks, collides = spec.water.profile is not None, spec.scores_collisions
+    face_pdf, specular, sight = spec.faces.pdf, spec.faces.specular, spec.sight
+    view_of, in_view, toward_middle = sight.view, sight.shows, sight.toward_middle
+    toward, toward_centre = sight.toward, sight.toward_centre
 
     @wp.func
     def direct(
         s: wp.ref[PhotonState], reflected: wp.vec3, lobe: float, world: wp.ref[World], id: wp.uint64
     ) -> Direction:
         new = Direction()
-        on_surface = False
-        if wp.static(has_mesh):
-            on_surface = s.hit.face >= 0
+        on_surface = s.hit.face >= 0
         here = water_at(world.medium, world.layers, s.x)
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
         extinction = float(0.0)
@@ -260,18 +243,13 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         axis = wp.where(to_lens, v, wp.where(directed, to_axis, axis))
         t = sample_angle(s.flight.block[1], to_lens, directed, here, world.medium, world.guiding)
         # Selected rather than branched to, so that what is left out stays in no register.
-        if wp.static(has_mesh):
-            t = wp.where(on_surface and not directed, sample_cosine_law(u01(s.flight.block[1])), t)
+        t = wp.where(on_surface and not directed, sample_cosine_law(u01(s.flight.block[1])), t)
         new.u = rotate_by(axis, t, cos_sin_word(s.flight.block[2]))
         if wp.static(specular):
             if on_surface and not directed:
                 new.u = reflected
         density = phase_pdf(one_minus_cosine(snapped, new.u), here)
-        if wp.static(has_mesh):
-            density = wp.where(on_surface, wp.max(wp.dot(new.u, s.hit.normal), 0.0) * 0.3183098861837907, density)
-        if wp.static(specular):
-            if on_surface:
-                density = reflection_pdf(s.u, new.u, s.hit.normal, world.surfaces.roughness[s.hit.face], lobe)
+        density = face_pdf(world.surfaces, s.hit, s.u, new.u, lobe, density)
         mixture = (1.0 - to_lens_chance - to_view_chance) * density
         mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), world.medium, world.guiding)
         mixture += to_view_chance * henyey_greenstein_pdf(

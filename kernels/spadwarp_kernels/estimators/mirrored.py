@@ -8,10 +8,8 @@ from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Contribution, PhotonState, Sink, World, make_deposit, tally_index
-from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import segment_meets_box
-from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 from spadwarp_kernels.tally.tally import BALLISTIC, FORWARD_SCATTERED
 from spadwarp_kernels.water.limits import (
     face_index,
@@ -19,13 +17,12 @@ from spadwarp_kernels.water.limits import (
     image_direction,
     image_point,
     image_reflectance,
-    make_domain,
     next_face,
     reflections_of,
     to_next_face,
 )
 
-from .contribution import make_lens_way, make_scattering
+from .contribution import make_scattering
 
 
 @wp.struct
@@ -40,15 +37,14 @@ class Mirrored:
 
 
 @memoised
-def _make_follow(spec: TransportSpec, brute_force: bool) -> wp.Function:
+def _make_follow(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(found, request, x, v, length, reflections, end, inside, world, seed)`` that follows the
     light of a request's event, which leaves x along v in the domain's axes and is reflected so many times within that
     length, to the end of the water, and delivers what rides along."""
-    has_mesh, water_extinction = spec.mesh, spec.water.extinction
-    domain = make_domain(spec.rotated_domain)
-    point_back, turn_back = domain.point_back, domain.turn_back
+    has_mesh, hides, water_extinction = spec.faces.mesh, spec.faces.hides, spec.water.extinction
+    point_back, turn_back = spec.domain.point_back, spec.domain.turn_back
     rider = make_rider(spec)
-    rides, (_begin, fork, fly, event, mirror, deliver) = rider is not NOTHING, rider
+    rides, (_begin, fork, fly, event, mirror, deliver) = rider.rides, rider
 
     @wp.func
     def follow(
@@ -86,10 +82,7 @@ def _make_follow(spec: TransportSpec, brute_force: bool) -> wp.Function:
             if wp.static(has_mesh):
                 if found.clear and segment_meets_box(start, heading, part, world.surfaces.lower, world.surfaces.upper):
                     found.shadow_queries += 1
-                    if wp.static(brute_force):
-                        found.clear = not meets_faces(world.surfaces, start, heading, part)
-                    else:
-                        found.clear = intersect_surfaces(world.surfaces, start, heading, part, True).face < 0
+                    found.clear = not hides(world.surfaces, start, heading, part)
             begin += part * along
             rest -= part
             if face > 0:
@@ -105,14 +98,13 @@ def _make_follow(spec: TransportSpec, brute_force: bool) -> wp.Function:
 
 
 @memoised
-def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
+def _make_score_image(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, number, world) -> Mirrored`` of an event by way of one of `Boundary.images`."""
-    confocal, measured = spec.confocal, spec.mesh or spec.varies
-    followed = measured or make_rider(spec) is not NOTHING
-    image_of = spec.image_of
-    scattering_density, follow = make_scattering(spec), _make_follow(spec, brute_force)
-    link_to, value_of, *_ = make_lens_way(spec.port)
-    domain = make_domain(spec.rotated_domain)
+    measured = spec.faces.mesh or spec.varies
+    followed = measured or make_rider(spec).rides
+    sight, domain = spec.sight, spec.domain
+    image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
+    scattering_density, follow = make_scattering(spec), _make_follow(spec)
     point, point_back, turn, turn_back = domain.point, domain.point_back, domain.turn, domain.turn_back
 
     @wp.func
@@ -124,9 +116,7 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
         x = point(limits, request.x)
         seen = point_back(limits, image_point(limits.lower, limits.upper, image, x))
         lens = lens_point(world.camera, u01_high(request.first), u01_low(request.first))
-        view = world.camera.view
-        if wp.static(confocal):
-            view = world.scan.view[request.target]
+        view = scan_view(world.camera, world.scan, request.target)
         # The lens, or a port, sees the image as it would see a point in water without an end.
         link = link_to(world.camera, seen, lens)
         pixel = image_of(world.camera, view, request.target, link.image, lens)
@@ -158,10 +148,10 @@ def _make_score_image(spec: TransportSpec, brute_force: bool) -> wp.Function:
 
 
 @memoised
-def make_score_images(spec: TransportSpec, brute_force: bool, split: bool) -> wp.Function:
+def make_score_images(spec: TransportSpec, split: bool) -> wp.Function:
     """The Warp function ``(s, request, world, sink)`` that scores a request's event by way of all images; a point of a
     flight is not scored so: events are."""
-    score_image, deposit = _make_score_image(spec, brute_force), make_deposit(spec.signed, 0, split)
+    score_image, deposit = _make_score_image(spec), make_deposit(spec.signed, 0, split)
 
     @wp.func
     def score_images(s: wp.ref[PhotonState], request: Request, world: wp.ref[World], sink: wp.ref[Sink]):

@@ -1,14 +1,17 @@
 """The pulsed laser: where photons start and where they go."""
 
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_numbers
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
 
-from .port import Port
+from .port import Port, PortKind
 
 __all__ = ["LASER_PROFILES", "Laser", "Scan", "emit_photon", "profile_tables"]
 
@@ -160,3 +163,36 @@ class Scan:
     count: int
     axis: wp.array[wp.vec3]
     view: wp.array[wp.vec4]
+
+
+class Beam(NamedTuple):
+    """How photons start, as Warp functions."""
+
+    emit: wp.Function  # ``(laser, scan, seed, id) -> spatial_vector``: start [m], then unit direction
+    axis: wp.Function  # ``(laser, scan, target) -> vec3``, the beam's, for a position of the scan
+    enter: wp.Function | None  # this and the next: see `PortKind`; None without a port
+    cosines: wp.Function | None
+    scans: bool
+
+
+@memoised
+def make_beam(measured: bool, port: PortKind | None, scans: bool) -> Beam:
+    """The beam of a spec."""
+    emit_from = emit_measured if measured else emit_along
+
+    @wp.func
+    def axis(laser: Laser, scan: Scan, target: int) -> wp.vec3:
+        along = laser.axis
+        if wp.static(scans):
+            along = scan.axis[target]
+        return along
+
+    @wp.func
+    def emit(laser: Laser, scan: Scan, seed: wp.uint64, id: wp.uint64) -> wp.spatial_vector:
+        target = int(-1)
+        if wp.static(scans):
+            target = int(id % wp.uint64(scan.count))
+        start, heading = emit_from(laser, axis(laser, scan, target), seed, id)
+        return wp.spatial_vector(start, heading)
+
+    return Beam(emit, axis, port and port.enter, port and port.cosines, scans)

@@ -76,6 +76,7 @@ class PortRay:
     water: float  # length of its way in the water up to the port [m]; negative if the ray began behind that
     path: float  # length in water that takes as long as the way behind that [m]
     transmission: float  # fraction of unpolarised light that gets through; 0: none
+    seen: wp.vec3  # of `Sight.leave`, a point that the lens sees it come from, in air alone [m]
 
 
 @wp.func

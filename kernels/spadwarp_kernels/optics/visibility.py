@@ -1,13 +1,18 @@
-"""What the lens sees: a coarse map that answers most shadow rays without a BVH, and the water behind a port."""
+"""What the lens sees: a coarse map that answers most shadow rays without a BVH, and the ways of light to it."""
 
 from typing import NamedTuple
 
 import warp as wp
 
 from spadwarp_kernels.base.arguments import check_array, check_kind
+from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.rotations import cos_sin_turn
 
-from .camera import Camera, Gate, check_camera, clip_half_space, clip_to_view, field, in_view
-from .port import DOME_PORT, FLAT_PORT, Port, PortKind
+from .camera import Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
+from .laser import Scan
+from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay
+
+__all__ = ["next_event_value"]
 
 # Texels along each side of the field of view: fine against the relief of a target, small against a GPU's cache.
 _TEXELS = wp.constant(128)
@@ -101,14 +106,6 @@ def may_be_hidden(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> b
 
 # ---- What a camera sees of the water behind a port: parts of flights that hold all of it, and a little more, which is
 # rejected by its pixel: densities may be too wide, not too narrow.
-
-
-class PortView(NamedTuple):
-    """Warp functions for one kind of port, or none."""
-
-    clip: wp.Function  # as `clip_to_view`, holding the part that lies in the view
-    shows: wp.Function  # as `in_view`
-    gate: wp.Function  # (camera, gate) -> Gate of `clip_to_gate` for what may arrive within the gate
 
 
 @wp.func
@@ -220,13 +217,200 @@ def dome_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
     return shown
 
 
+# ---- The way of light from a point that is scored to a point of the lens, in water alone or through a port.
+
+
+@wp.struct
+class Link:
+    """A way to the lens."""
+
+    to_lens: wp.vec3  # unit direction at the point
+    image: wp.vec3  # a point that the lens sees in the same direction, in air alone [m]
+    end: wp.vec3  # where the way leaves the water [m]
+    water: float  # its length in the water [m]
+    path: float  # length in water that takes as long as all of it [m]
+    # what the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2]; by a port
+    gather: float
+
+
+@wp.func
+def next_event_value(
+    camera: Camera, extinction: float, weight: float, scattering: float, to_lens: wp.vec3, distance: float
+) -> float:
+    """Fraction of the photon that reaches a point of the aperture: w f exp(-c r) A cos(psi)/r^2, f [1/sr], to_lens a
+    unit vector."""
+    cos_lens = wp.max(-to_lens[2], 0.0)
+    # Times -1: Warp's unary minus is 0 - x, an addition.
+    passed = wp.exp((-1.0 * extinction) * distance)
+    return weight * scattering * passed * camera.aperture_area * cos_lens / (distance * distance)
+
+
+@wp.struct
+class LensSample:
+    """A point of the lens [m]; its density if it were uniform, over that of the draw."""
+
+    point: wp.vec3
+    weight: float
+
+
+@memoised
+def make_sample_lens(port: PortKind | None) -> wp.Function:
+    """The Warp function ``(camera, x, u, xi1, xi2) -> LensSample``: a point of the lens by which the flight x + s u is
+    scored.
+
+    The score goes with 1/D, D its distance from the flight's line. Where this, refracted by a port, passes the lens,
+    the point is drawn with that density, uniform in angle and distance about the place: even draws would have no finite
+    variance. Else it is even.
+    """
+    has_port, leave = port is not None, (port or FLAT_PORT).leave
+
+    @wp.func
+    def sample_lens(camera: Camera, x: wp.vec3, u: wp.vec3, xi1: float, xi2: float) -> LensSample:
+        p = wp.vec2(1.0e30, 0.0)
+        if wp.static(has_port):
+            ray = leave(camera.port, x, wp.where(u[2] < 0.0, u, -u))
+            if ray.transmission > 0.0:
+                p = wp.vec2(ray.x[0], ray.x[1])
+        else:
+            s = -x[2] / u[2]
+            p = wp.vec2(x[0] + s * u[0], x[1] + s * u[1])
+        sample = LensSample()
+        sample.point = lens_point(camera, xi1, xi2)
+        sample.weight = 1.0
+        radius2 = camera.aperture_radius * camera.aperture_radius
+        if wp.dot(p, p) < radius2:
+            turn = cos_sin_turn(xi2)
+            aside = p[0] * turn[1] - p[1] * turn[0]
+            to_rim = wp.sqrt(wp.max(radius2 - aside * aside, 0.0)) - wp.dot(p, turn)
+            distance = xi1 * to_rim
+            sample.point = wp.vec3(p[0] + distance * turn[0], p[1] + distance * turn[1], 0.0)
+            sample.weight = 2.0 * to_rim * distance / radius2
+        return sample
+
+    return sample_lens
+
+
+@wp.func
+def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
+    """True: the map is of straight lines to the lens."""
+    return True
+
+
+class Sight(NamedTuple):
+    """How the lens sees the water, as Warp functions: x and u are of the water, o is a point of the lens."""
+
+    cosines: wp.Function | None  # see `PortKind`; None without a port
+    project: wp.Function  # this and the next two: see `Lens`
+    view: wp.Function
+    toward_middle: wp.Function
+    scan_view: wp.Function  # ``(camera, scan, target) -> vec4``, the view in which a pixel of a scan, or all, is
+    clip: wp.Function  # as `clip_to_view`, holding the part of a flight that lies in the view
+    shows: wp.Function  # as `in_view`
+    gate: wp.Function  # ``(camera, gate) -> Gate`` of `clip_to_gate`, for what arrives within the gate
+    may_hide: wp.Function  # as `may_be_hidden`
+    leave: wp.Function  # ``(camera, x, u) -> PortRay``, see `PortKind`; without a port straight on
+    link: wp.Function  # ``(camera, x, o) -> Link``
+    value: wp.Function  # ``(camera, extinction, weight, scattering, link) -> float``, part of the photon that arrives
+    apparent: wp.Function  # ``(camera, x, o) -> vec3``, from where the light of o seems to come at x
+    toward: wp.Function  # ``(camera, x, o) -> vec3``, unit direction of the way at x; straight where there is no way
+    toward_centre: wp.Function  # ``(camera, x) -> vec3``, about that to the lens's centre
+    sample_lens: wp.Function  # see `make_sample_lens`
+
+
+@memoised
+def _make_ways(port: PortKind | None) -> tuple[wp.Function, ...]:
+    """What `Sight` has from `leave` to `toward_centre`."""
+    has_port, kind = port is not None, port or FLAT_PORT
+    connect, apparent_of, apparent_centre, leave_port = kind.connect, kind.apparent, kind.apparent_centre, kind.leave
+
+    @wp.func
+    def leave(camera: Camera, x: wp.vec3, u: wp.vec3) -> PortRay:
+        ray = PortRay()
+        if wp.static(has_port):
+            ray = leave_port(camera.port, x, u)
+            ray.seen = ray.x - ray.u
+        else:
+            ray.seen = x
+            ray.u = u
+            if u[2] < 0.0:
+                ray.water = -x[2] / u[2]
+                ray.x = x + ray.water * u
+                ray.transmission = 1.0
+        return ray
+
+    @wp.func
+    def link_to(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
+        link = Link()
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            link.to_lens = way.to_port
+            link.image = o - way.inside
+            link.end = way.exit
+            link.water = way.water
+            link.path = way.path
+            link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
+        else:
+            to_lens = o - x
+            r = wp.length(to_lens)
+            link.to_lens = to_lens / r
+            link.image = x
+            link.end = o
+            link.water = r
+            link.path = r
+        return link
+
+    @wp.func
+    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
+        if wp.static(has_port):
+            return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
+        return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
+
+    @wp.func
+    def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        seen = wp.vec3(o)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            if way.density > 0.0:
+                seen = apparent_of(camera.port, x, o, way)
+        return seen
+
+    @wp.func
+    def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        straight = wp.normalize(o - x)
+        if wp.static(has_port):
+            way = connect(camera.port, x, o)
+            straight = wp.where(way.density > 0.0, way.to_port, straight)
+        return straight
+
+    @wp.func
+    def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
+        if wp.static(has_port):
+            return wp.normalize(apparent_centre(camera.port) - x)
+        return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
+
+    return leave, link_to, value_of, apparent, toward, toward_centre
+
+
+# Of what lies behind a kind of port: `clip`, `shows` and `gate`.
 _VIEWS = {
-    None: PortView(clip_to_view, in_view, _same_gate),
-    FLAT_PORT.name: PortView(clip_to_flat_view, flat_view_shows, _gate_behind_port),
-    DOME_PORT.name: PortView(clip_to_dome_view, dome_view_shows, _gate_behind_port),
+    FLAT_PORT.name: (clip_to_flat_view, flat_view_shows, _gate_behind_port),
+    DOME_PORT.name: (clip_to_dome_view, dome_view_shows, _gate_behind_port),
 }
 
 
-def port_view(port: PortKind | None) -> PortView:
-    """What a camera sees behind a kind of port; None: without one."""
-    return _VIEWS[port and port.name]
+@memoised
+def make_sight(lens: Lens, port: PortKind | None, confocal: bool) -> Sight:
+    """For a way of imaging, a kind of port or None, and whether pixels are scanned."""
+
+    @wp.func
+    def scan_view(camera: Camera, scan: Scan, target: int) -> wp.vec4:
+        view = camera.view
+        if wp.static(confocal):
+            view = scan.view[target]
+        return view
+
+    cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows, _same_gate)
+    if port is not None:
+        cosines, may_hide, view = port.cosines, _may_hide_behind_port, _VIEWS[port.name]
+    imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
+    return Sight(cosines, *imaging, *view, may_hide, *_make_ways(port), make_sample_lens(port))

@@ -303,7 +303,7 @@ def make_queue(
         long: Whether a lane may add two requests, a flight and an event, before the queue is read.
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
     """
-    confocal, polarised, more = spec.confocal, spec.polarised, _has_more(spec, flights)
+    confocal, polarised, has_mesh, more = spec.confocal, spec.polarised, spec.mesh, _has_more(spec, flights)
     rank_of = _among_takers if traces else _lane
     derivative_vectors = -(-len(spec.derivatives) // 4)
     carried = 3 + more
@@ -360,6 +360,8 @@ def make_queue(
             request.lens = wp.vec3(d[2], d[3], 0.0)
         if wp.static(confocal):
             request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
+        if wp.static(not has_mesh):
+            request.slot = -1
         for i in range(wp.static(derivative_vectors)):
             part = get(memory, entry, wp.static(carried) + i)
             for k in range(4):

@@ -7,14 +7,17 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer
 from spadwarp_kernels.optics.camera import PLAIN, Lens
+from spadwarp_kernels.optics.laser import Beam, make_beam
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
 from spadwarp_kernels.optics.port import PortKind
-from spadwarp_kernels.optics.visibility import port_view
-from spadwarp_kernels.surface.reflectance import face_reflectance, pattern_reflectance
+from spadwarp_kernels.optics.visibility import Sight, make_sight
+from spadwarp_kernels.surface.ray_cast import Faces, make_faces
+from spadwarp_kernels.water.limits import Domain, make_domain
 from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
 
 from .derivatives import BLOCK_DERIVATIVES, DERIVATIVES, MOST_DERIVATIVES
+from .state import merged_index, tally_index
 
 __all__ = ["TransportSpec"]
 
@@ -97,9 +100,42 @@ class TransportSpec(NamedTuple):
         return len(self.derivatives) + self.channels
 
     @property
+    def on_cpu(self) -> "TransportSpec":
+        """What of it makes a difference on a CPU, where a core walks the tree."""
+        return self._replace(brute_force=False)
+
+    # ---- What transport asks of the packages below, each made for the choices that it owns.
+
+    @property
     def water(self) -> Water:
-        """What transport asks of the water."""
-        return self.grid or (LAYERED if self.layered else HOMOGENEOUS)
+        """Of the water, with the phase function."""
+        return (self.grid or (LAYERED if self.layered else HOMOGENEOUS))._replace(phase=self.phase)
+
+    @property
+    def domain(self) -> Domain:
+        """Of the limits."""
+        return make_domain(self.bounded, self.rotated_domain, self.reflecting)
+
+    @property
+    def faces(self) -> Faces:
+        """Of the mesh."""
+        tried = self.mesh and self.brute_force and not self.use_warp_bvh
+        return make_faces(self.mesh, tried, self.pattern, self.specular)
+
+    @property
+    def sight(self) -> Sight:
+        """Of the camera."""
+        return make_sight(self.lens, self.port, self.confocal)
+
+    @property
+    def beam(self) -> Beam:
+        """Of the laser."""
+        return make_beam(self.measured_beam, self.laser_port, self.confocal)
+
+    @property
+    def tally_index(self) -> wp.Function:
+        """Where the tally has a contribution, see the function of that name."""
+        return merged_index if self.merged else tally_index
 
     @property
     def varies(self) -> bool:
@@ -110,26 +146,6 @@ class TransportSpec(NamedTuple):
     def local_albedo(self) -> bool:
         """Whether the albedo at an event is that of the water there."""
         return self.varies and not self.random_albedo
-
-    @property
-    def reflectance_at(self) -> wp.Function:
-        """The Warp function ``(surfaces, face, x) -> float``."""
-        return pattern_reflectance if self.pattern else face_reflectance
-
-    @property
-    def tries_faces(self) -> bool:
-        """Whether a GPU tries every face."""
-        return self.brute_force and not self.use_warp_bvh
-
-    @property
-    def image_of(self) -> wp.Function:
-        """The pixel of a point, see `Lens.project`."""
-        return self.lens.project
-
-    @property
-    def in_view(self) -> wp.Function:
-        """The Warp function ``(camera, view, x) -> bool``: whether the camera may see a point."""
-        return self.lens.shows if self.port is None else port_view(self.port).shows
 
     @property
     def scores_collisions(self) -> bool:

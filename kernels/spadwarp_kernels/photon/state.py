@@ -247,6 +247,7 @@ def first_state(world: WorldRef, slot: int) -> PhotonState:
     s.albedo = world.medium.albedo
     s.view = world.camera.view
     s.target = -1
+    s.hit.face = -1  # for good where there is no mesh: so a compiler leaves out what is done on faces
     s.walk.node = NO_NODE
     return s
 
@@ -309,6 +310,12 @@ def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: 
     if k < 0:
         return k
     return (component * camera.width * camera.height + pixel) * gate.bins + k
+
+
+@wp.func
+def merged_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
+    """`tally_index` for the light of all components together."""
+    return tally_index(camera, gate, pixel, path, 0)
 
 
 @wp.func

@@ -9,14 +9,12 @@ is turned by an angle a from e1 towards e2 gives Q' = Q cos 2a + U sin 2a and U'
 
 import warp as wp
 
-from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis, set_apart
 from spadwarp_kernels.optics.laser import beam_frame
-from spadwarp_kernels.optics.port import Port, PortKind
+from spadwarp_kernels.optics.port import Port
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
-from spadwarp_kernels.surface.reflectance import ggx_brdf, lambert_brdf
-from spadwarp_kernels.surface.triangle import face_in, face_normal
+from spadwarp_kernels.surface.triangle import face_in
 
 from .rider import NOTHING, Rider
 
@@ -164,12 +162,11 @@ def window_elements(n: wp.vec4, q: wp.vec4) -> Elements:
     return m
 
 
-@memoised
-def make_port_elements(port: PortKind | None) -> wp.Function | None:
-    """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u; None without a port."""
-    if port is None:
+def make_port_elements(cosines: wp.Function | None) -> wp.Function | None:
+    """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u, for those of a
+    `PortKind`; None without."""
+    if cosines is None:
         return None
-    cosines = port.cosines
 
     @wp.func
     def port_elements(port: Port, x: wp.vec3, u: wp.vec3) -> Elements:
@@ -191,15 +188,12 @@ def make_polarisation_rider(spec: TransportSpec) -> Rider:
 
 def _make_begin(spec: TransportSpec) -> wp.Function:
     """A beam's field on its axis is turned to the direction of each photon by the smallest rotation."""
-    confocal, has_port = spec.confocal, spec.laser_port is not None
-    elements = make_port_elements(spec.laser_port)
+    axis_of, elements = spec.beam.axis, make_port_elements(spec.beam.cosines)
+    has_port = elements is not None
 
     @wp.func
     def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
-        axis = world.laser.axis
-        if wp.static(confocal):
-            axis = world.scan.axis[target]
-        axis = set_apart(axis)
+        axis = set_apart(axis_of(world.laser, world.scan, target))
         right, _down = beam_frame(axis)
         heading = set_apart(wp.spatial_bottom(emitted))
         stokes = transport_stokes(stokes_from(world.polarisation.laser, right, axis), axis, heading)
@@ -214,30 +208,25 @@ def _make_begin(spec: TransportSpec) -> wp.Function:
 def _make_event(spec: TransportSpec) -> wp.Function:
     """Water multiplies by L M L/m11. A Lambertian surface depolarises; a specular lobe has Fresnel's matrix of the
     facet between u and v, over its m11; both in proportion to what they send to v."""
-    has_mesh, specular = spec.mesh, spec.specular
-    reflectance_at = spec.reflectance_at
+    shares, specular = spec.faces.shares, spec.faces.specular
 
     @wp.func
     def on_a_face(stokes: wp.vec4, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec4:
         left = wp.vec4(stokes[0], 0.0, 0.0, 0.0)
         if wp.static(specular):
-            face = face_in(world.surfaces.order, slot)
-            normal = face_normal(world.surfaces.faces, slot, u)
-            lambert = lambert_brdf(reflectance_at(world.surfaces, face, x))
-            lobe = world.surfaces.specular[face] * ggx_brdf(u, v, normal, world.surfaces.roughness[face])
-            turned = turn_stokes(stokes, u, v, facet_elements(u, v, world.polarisation.facet_index[face]))
-            left += (lobe / wp.max(lambert + lobe, 1.0e-30)) * (turned - left)
+            index = world.polarisation.facet_index[face_in(world.surfaces.order, slot)]
+            turned = turn_stokes(stokes, u, v, facet_elements(u, v, index))
+            left += shares(world.surfaces, slot, x, u, v)[1] * (turned - left)
         return left
 
     @wp.func
     def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
         before, after = set_apart(u), set_apart(v)
-        if wp.static(has_mesh):
-            if slot >= 0:
-                c.stokes = on_a_face(c.stokes, world, slot, set_apart(x), before, after)
-                return
-        m = table_elements(world.polarisation.first, world.polarisation.last, one_minus_cosine(before, after))
-        c.stokes = turn_stokes(c.stokes, before, after, m)
+        if slot >= 0:
+            c.stokes = on_a_face(c.stokes, world, slot, set_apart(x), before, after)
+        else:
+            m = table_elements(world.polarisation.first, world.polarisation.last, one_minus_cosine(before, after))
+            c.stokes = turn_stokes(c.stokes, before, after, m)
 
     return event
 
@@ -252,7 +241,8 @@ def _mirror(c: CarriedRef, u: wp.vec3, v: wp.vec3, index: float):
 def _make_deliver(spec: TransportSpec) -> wp.Function:
     """What a port does to the light, and what the receiver takes of it: with respect to the image's x, to which the
     lens turns all light by the smallest rotation to the optical axis."""
-    channels, has_port, elements = spec.channels, spec.port is not None, make_port_elements(spec.port)
+    channels, elements = spec.channels, make_port_elements(spec.sight.cosines)
+    has_port = elements is not None
 
     @wp.func
     def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):

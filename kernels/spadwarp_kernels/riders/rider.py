@@ -64,5 +64,10 @@ class Rider(NamedTuple):
     mirror: wp.Function = _mirror
     deliver: wp.Function = _deliver
 
+    @property
+    def rides(self) -> bool:
+        """Whether anything does."""
+        return self != NOTHING
+
 
 NOTHING = Rider()

@@ -1,10 +1,29 @@
-"""The riders of a spec."""
+"""The riders of a spec; derivatives of the logarithm of what light has met, and of that by block of a grid's cells.
+
+Derivatives are by the water's coefficients and the surfaces' reflectances: per flight -length for absorption and
+scattering; per event 1/b, the derivative of the phase function, and the part of the Lambertian reflectance.
+
+Those by block are by the same addition to a coefficient of all its cells. Per block -L for absorption, n/b - L for
+scattering at fixed absorption and n/c - L for extinction at fixed albedo: L the path in the block, and over n, the
+scatterings there, the coefficient of the cell of each. They ask for nothing but the way, so that they hold however the
+flights were drawn and what passes was estimated: by regular tracking, delta tracking or ratio tracking. A thread keeps
+them in `Blocks.memory`: in the first half of its rows those of the history, in the second half those of the
+contribution that is scored, until it is added or, behind a surface, forgotten. Of many blocks light meets few, so that
+the thread keeps a list of them.
+"""
+
+import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
+from spadwarp_kernels.photon.derivatives import NOT_MET, Blocks, LogDerivatives, met_count, met_entry, score_entry
 from spadwarp_kernels.photon.spec import TransportSpec
+from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
+from spadwarp_kernels.surface.triangle import face_in
+from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
+from spadwarp_kernels.water.medium import boundary_ahead, layer_index
+from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
 
-from .blocks import make_blocks_rider
-from .derivatives import make_derivatives_rider
 from .polarisation import make_polarisation_rider
 from .rider import NOTHING, Rider
 
@@ -16,7 +35,212 @@ def make_rider(spec: TransportSpec) -> Rider:
     if spec.polarised:
         rider = make_polarisation_rider(spec)
     if spec.derivatives:
-        rider = make_derivatives_rider(spec)
+        rider = _make_derivatives_rider(spec)
     if spec.blocks:
-        rider = make_blocks_rider(spec, rider)
+        rider = _make_blocks_rider(spec, rider)
     return rider
+
+
+# ---- Derivatives.
+
+
+def _bits(kinds: tuple[str, ...], *wanted: str) -> int:
+    """Bit p is set where kind p is one of the wanted. Bits, since a `wp.static` that reads the index of a loop does not
+    enter the hash of Warp's kernel cache."""
+    return sum(1 << p for p, kind in enumerate(kinds) if kind in wanted)
+
+
+def _make_derivatives_rider(spec: TransportSpec) -> Rider:
+    """Of the parameters of a spec."""
+    return NOTHING._replace(begin=_begin, fly=_make_fly(spec), event=_make_event(spec), deliver=_deliver)
+
+
+@wp.func
+def _begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+    c.log_derivatives = LogDerivatives()
+
+
+@wp.func
+def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+    k.factors = c.log_derivatives
+
+
+def _make_fly(spec: TransportSpec) -> wp.Function:
+    count, layered = len(spec.derivatives), spec.water.layered
+    on_path = _bits(spec.derivatives, "absorption", "scattering")
+
+    @wp.func
+    def shorter(d: LogDerivatives, parameters: int, length: float) -> LogDerivatives:
+        for p in range(wp.static(count)):
+            if (parameters >> p) & 1 == 1:
+                d[p] = d[p] - length
+        return d
+
+    @wp.func
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
+        if wp.static(not layered):
+            c.log_derivatives = shorter(c.log_derivatives, wp.static(on_path), length)
+        else:
+            d = c.log_derivatives
+            along = wp.dot(world.layers.axis, x)
+            slope = wp.dot(world.layers.axis, u)
+            step = wp.where(slope > 0.0, 1, -1)
+            layer = layer_index(world.layers, along)
+            begin = float(0.0)
+            boundary = boundary_ahead(world.layers, layer, step, along, slope)
+            while boundary < length:
+                d = shorter(d, world.derivatives.waters[layer] & wp.static(on_path), boundary - begin)
+                layer += step
+                begin = boundary
+                boundary = boundary_ahead(world.layers, layer, step, along, slope)
+            c.log_derivatives = shorter(d, world.derivatives.waters[layer] & wp.static(on_path), length - begin)
+
+    return fly
+
+
+def _make_event(spec: TransportSpec) -> wp.Function:
+    count, layered, shares = len(spec.derivatives), spec.water.layered, spec.faces.shares
+    by_scattering, by_anisotropy, by_reflectance = (
+        _bits(spec.derivatives, kind) for kind in ("scattering", "anisotropy", "reflectance")
+    )
+    in_water = by_scattering | by_anisotropy
+
+    @wp.func
+    def in_the_water(d: LogDerivatives, world: WorldRef, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
+        here = int(wp.static(in_water))
+        if wp.static(layered):
+            here = here & world.derivatives.waters[layer_index(world.layers, wp.dot(world.layers.axis, x))]
+        t = one_minus_cosine(snap_from(u, world.medium.axis_threshold), v)
+        for p in range(wp.static(count)):
+            if (wp.static(by_scattering) >> p) & 1 == 1:
+                d[p] = d[p] + wp.where((here >> p) & 1 == 1, 1.0 / world.derivatives.value[p], 0.0)
+            if (wp.static(by_anisotropy) >> p) & 1 == 1:
+                slope = henyey_greenstein_log_derivative(t, world.derivatives.value[p])
+                d[p] = d[p] + wp.where((here >> p) & 1 == 1, slope, 0.0)
+        return d
+
+    @wp.func
+    def on_a_face(d: LogDerivatives, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
+        part = shares(world.surfaces, slot, x, u, v)[0]
+        here = world.derivatives.faces[face_in(world.surfaces.order, slot)]
+        for p in range(wp.static(count)):
+            if (wp.static(by_reflectance) >> p) & 1 == 1:
+                d[p] = d[p] + wp.where((here >> p) & 1 == 1, part / world.derivatives.value[p], 0.0)
+        return d
+
+    @wp.func
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+        if slot >= 0:
+            if wp.static(by_reflectance > 0):
+                c.log_derivatives = on_a_face(c.log_derivatives, world, slot, x, u, v)
+        elif wp.static(in_water > 0):
+            c.log_derivatives = in_the_water(c.log_derivatives, world, x, u, v)
+
+    return event
+
+
+# ---- Derivatives by block.
+
+
+@wp.func
+def _forget(blocks: Blocks, half: int):
+    """No block has been met."""
+    for i in range(met_count(blocks, half)):
+        block = int(blocks.memory[met_entry(blocks, half, i)])
+        blocks.memory[score_entry(blocks, half, 0, block)] = NOT_MET
+    blocks.memory[met_entry(blocks, half, blocks.count)] = 0.0
+
+
+@memoised
+def _make_meet(kinds: int) -> wp.Function:
+    @wp.func
+    def meet(blocks: Blocks, half: int, block: int):
+        """A block that light comes to, for the first time or again."""
+        if blocks.memory[score_entry(blocks, half, 0, block)] == NOT_MET:
+            for q in range(wp.static(kinds)):
+                blocks.memory[score_entry(blocks, half, q, block)] = 0.0
+            number = met_count(blocks, half)
+            blocks.memory[met_entry(blocks, half, number)] = float(block)
+            blocks.memory[met_entry(blocks, half, blocks.count)] = float(number + 1)
+
+    return meet
+
+
+def _make_blocks_rider(spec: TransportSpec, beside: Rider) -> Rider:
+    """Of the blocks of a spec, after what rides beside them."""
+    kinds = len(spec.blocks)
+
+    @wp.func
+    def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+        beside.begin(c, world, target, emitted, x, u)
+        c.half = 0
+        _forget(world.derivatives.blocks, 0)
+
+    @wp.func
+    def fork(c: CarriedRef, world: WorldRef):
+        beside.fork(c, world)
+        blocks = world.derivatives.blocks
+        _forget(blocks, 1)
+        count = met_count(blocks, 0)
+        for i in range(count):
+            block = blocks.memory[met_entry(blocks, 0, i)]
+            blocks.memory[met_entry(blocks, 1, i)] = block
+            for q in range(wp.static(kinds)):
+                value = blocks.memory[score_entry(blocks, 0, q, int(block))]
+                blocks.memory[score_entry(blocks, 1, q, int(block))] = value
+        blocks.memory[met_entry(blocks, 1, blocks.count)] = float(count)
+        c.half = 1
+
+    return beside._replace(
+        begin=begin, fork=fork, fly=_make_block_fly(kinds, beside), event=_make_block_event(spec, beside)
+    )
+
+
+def _make_block_fly(kinds: int, beside: Rider) -> wp.Function:
+    meet = _make_meet(kinds)
+
+    @wp.func
+    def add(blocks: Blocks, half: int, block: int, value: float):
+        meet(blocks, half, block)
+        for q in range(wp.static(kinds)):
+            entry = score_entry(blocks, half, q, block)
+            blocks.memory[entry] = blocks.memory[entry] + value
+
+    @wp.func
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
+        beside.fly(c, world, x, u, length)
+        blocks = world.derivatives.blocks
+        line = grid_line(blocks.grid, x, u, length)
+        if line.begin < line.end:
+            place = first_place(line, blocks.grid.size)
+            while place.leave < line.end:
+                add(blocks, c.half, place.cell, place.t - place.leave)
+                place = next_place(line, place)
+            add(blocks, c.half, place.cell, place.t - line.end)
+
+    return fly
+
+
+def _make_block_event(spec: TransportSpec, beside: Rider) -> wp.Function:
+    kinds, water_at, meet = len(spec.blocks), spec.water.at, _make_meet(len(spec.blocks))
+    by_scattering, by_extinction = _bits(spec.blocks, "scattering"), _bits(spec.blocks, "extinction")
+
+    @wp.func
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+        beside.event(c, world, slot, x, u, v)
+        blocks = world.derivatives.blocks
+        block = grid_cell(blocks.grid, x)
+        if slot < 0 and block >= 0:
+            meet(blocks, c.half, block)
+            water = water_at(world.medium, world.layers, x)
+            for q in range(wp.static(kinds)):
+                coefficient = float(0.0)
+                if (wp.static(by_scattering) >> q) & 1 == 1:
+                    coefficient = water.extinction * water.albedo
+                if (wp.static(by_extinction) >> q) & 1 == 1:
+                    coefficient = water.extinction
+                if coefficient > 0.0:
+                    entry = score_entry(blocks, c.half, q, block)
+                    blocks.memory[entry] = blocks.memory[entry] + 1.0 / coefficient
+
+    return event

@@ -1,14 +1,24 @@
 """Rays against the target: its nearest face, and where the next ray starts."""
 
+from typing import NamedTuple
+
 import warp as wp
 
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.optics.camera import Camera, pixel_direction
 
 from .bvh import NO_NODE, Stack, TreeWalk, inverse_direction, place, step_leaf, step_node
 from .mesh import Surfaces
 from .patches import load_row, nearest_patch, patch_faces
-from .reflectance import reflectance_at
+from .reflectance import (
+    face_reflectance,
+    ggx_brdf,
+    lambert_brdf,
+    pattern_reflectance,
+    reflectance_at,
+    reflection_pdf,
+)
 from .triangle import face_in, face_normal, times_sign
 from .wide import walk_wide
 
@@ -74,12 +84,6 @@ def patch_hit(surfaces: Surfaces, met: wp.vec4) -> SurfaceHit:
     return hit
 
 
-@wp.func
-def meets_faces(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, max_distance: float) -> bool:
-    """Whether the ray x + s u, 0 <= s < max_distance, hits one of a handful of faces."""
-    return bits_of(nearest_patch(surfaces.patches, x, u, max_distance)[3]) >= 0
-
-
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     return false;
@@ -100,9 +104,7 @@ def tree_face(surfaces: Surfaces, slot: int, u: wp.vec3):
 
 @wp.func
 def patch_face(surfaces: Surfaces, slot: int, u: wp.vec3):
-    """`tree_face` for surfaces with patches."""
-    if _on_cpu():
-        return face_in(surfaces.order, slot), face_normal(surfaces.faces, slot, u)
+    """`tree_face` for surfaces with patches, on CUDA."""
     row = load_row(surfaces.normals, slot)
     normal = wp.vec3(row[0], row[1], row[2])
     return place(bits_of(row[3])), wp.where(wp.dot(normal, u) > 0.0, -normal, normal)
@@ -162,6 +164,83 @@ def offset_from_surface(x: wp.vec3, normal: wp.vec3, distance: float) -> wp.vec3
     coordinates and of the distance, so that a new ray does not hit the same face."""
     magnitude = wp.max(wp.max(wp.abs(x[0]), wp.abs(x[1])), wp.abs(x[2]))
     return x + (5.0e-7 * (magnitude + distance)) * normal
+
+
+# ---- What transport asks of the faces of a mesh.
+
+
+class Faces(NamedTuple):
+    """What becomes of light on faces, as Warp functions: x is a point of a face, u and v are directions before and
+    after."""
+
+    hides: wp.Function  # ``(surfaces, x, u, length) -> bool``, whether a face stands in the way
+    survival: wp.Function  # ``(surfaces, hit, x, albedo) -> vec2``, part that an event leaves, of that part the lobe's
+    density: wp.Function  # ``(surfaces, slot, x, u, v) -> float``, of what is sent to v [1/sr]
+    shares: wp.Function  # ``(surfaces, slot, x, u, v) -> vec2``, of that by the Lambertian law and by the lobe
+    pdf: wp.Function  # ``(surfaces, hit, u, v, lobe, other) -> float``, of `sample_reflection` [1/sr]; in water `other`
+    mesh: bool  # whether there are any
+    tried: bool  # each by itself, on CUDA: none walks the tree
+    specular: bool  # with a rough lobe
+
+
+@memoised
+def make_faces(mesh: bool, tried: bool, pattern: bool, specular: bool) -> Faces:
+    """The faces of a spec, see `Faces`; `pattern`: their reflectance varies."""
+    find, reflectance = patch_face if tried else tree_face, pattern_reflectance if pattern else face_reflectance
+
+    @wp.func
+    def hides(surfaces: Surfaces, x: wp.vec3, u: wp.vec3, length: float) -> bool:
+        if wp.static(tried):
+            return bits_of(nearest_patch(surfaces.patches, x, u, length)[3]) >= 0
+        return intersect_surfaces(surfaces, x, u, length, True).slot >= 0
+
+    @wp.func
+    def survival(surfaces: Surfaces, hit: SurfaceHit, x: wp.vec3, albedo: float) -> wp.vec2:
+        part = wp.vec2(albedo, 0.0)
+        if hit.face >= 0:
+            part[0] = reflectance(surfaces, hit.face, x)
+            if wp.static(specular):
+                lobe = surfaces.specular[hit.face]
+                part[0] += lobe
+                part[1] = lobe / wp.max(part[0], 1.0e-30)
+        return part
+
+    @wp.func
+    def parts(surfaces: Surfaces, face: int, normal: wp.vec3, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec2:
+        lobe = float(0.0)
+        if wp.static(specular):
+            lobe = surfaces.specular[face] * ggx_brdf(u, v, normal, surfaces.roughness[face])
+        return wp.vec2(lambert_brdf(reflectance(surfaces, face, x)), lobe)
+
+    @wp.func
+    def density(surfaces: Surfaces, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
+        face, normal = find(surfaces, slot, u)
+        cos_out = wp.max(wp.dot(v, normal), 0.0)
+        sent = parts(surfaces, face, normal, x, u, v)
+        total = sent[0] * cos_out
+        if wp.static(specular):
+            total += sent[1] * cos_out
+        return total
+
+    @wp.func
+    def shares(surfaces: Surfaces, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec2:
+        share = wp.vec2(1.0, 0.0)
+        if wp.static(specular):
+            face, normal = tree_face(surfaces, slot, u)
+            sent = parts(surfaces, face, normal, x, u, v)
+            both = wp.max(sent[0] + sent[1], 1.0e-30)
+            share = wp.vec2(sent[0] / both, sent[1] / both)
+        return share
+
+    @wp.func
+    def pdf(surfaces: Surfaces, hit: SurfaceHit, u: wp.vec3, v: wp.vec3, lobe: float, other: float) -> float:
+        density = wp.where(hit.face >= 0, lambert_brdf(wp.max(wp.dot(v, hit.normal), 0.0)), other)
+        if wp.static(specular):
+            if hit.face >= 0:
+                density = reflection_pdf(u, v, hit.normal, surfaces.roughness[hit.face], lobe)
+        return density
+
+    return Faces(hides, survival, density, shares, pdf, mesh, tried, specular)
 
 
 # ---- What the camera would see through clear water: one ray a pixel against the mesh.

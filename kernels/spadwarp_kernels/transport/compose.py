@@ -6,14 +6,13 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.estimators.contribution import Scored, make_point_of
+from spadwarp_kernels.estimators.estimator import Estimator
 from spadwarp_kernels.estimators.mirrored import make_score_images
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.optics.visibility import may_be_hidden
 from spadwarp_kernels.photon.queue import Request, long_queue_fits, make_queue
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonRef, SinkRef, WorldRef, is_planned, make_deposit
 from spadwarp_kernels.surface.bvh import segment_meets_box
-from spadwarp_kernels.surface.ray_cast import intersect_surfaces, meets_faces
 
 from .stages import (
     make_begin,
@@ -72,24 +71,23 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     """
     estimator = make_estimator(spec)
     alone = not cuda or bool(spec.blocks) or (spec.mesh and spec.use_warp_bvh)
-    brute_force = spec.mesh and spec.tries_faces and cuda
-    in_tree, flies_on = spec.mesh and not brute_force, estimator.cross is not None
+    in_tree, flies_on = spec.mesh and not spec.faces.tried, estimator.cross is not None
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)
     deposit = make_deposit(spec.signed, len(spec.blocks), split)
     memory, push, pop = make_queue(spec, flights, scores, two_requests, in_tree)
-    serve = _make_serve(spec, brute_force, split, deposit, waits=in_tree and not alone) if scores else push
+    serve = _make_serve(spec, split, deposit, waits=in_tree and not alone) if scores else push
     ask_flight, ask_event = _make_asks(spec, _make_serve_now(serve) if alone and scores else push)
     return Stages(
-        prepare=make_prepare(spec, cuda),
+        prepare=make_prepare(spec.stepped, bool(spec.blocks), cuda),
         emit=make_emit(spec),
         begin=make_begin(spec),
-        fly=make_fly(spec, estimator.plan_flight, brute_force, cuda),
+        fly=make_fly(spec, estimator.plan_flight, spec.random_albedo, cuda),
         trace=make_trace(in_tree),
         cross=make_cross(spec, estimator.cross, deposit),
         collide=make_collide(spec, flies_on),
         scatter=make_scatter(spec, estimator.direct, flies_on),
-        finish=make_finish(spec),
+        finish=make_finish(spec.records, len(spec.derivatives)),
         flush=make_flush(not cuda and estimator.scores, spec.reflecting),
         ask_flight=ask_flight,
         ask_event=ask_event,
@@ -109,8 +107,22 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
         drains=scores and (two_requests or spec.points > 1),
         # Fewer where nothing is scored, in grids, and in a tree with `next_event`.
         start_lanes=4 if scores and not spec.grid and (flights or not in_tree) else 3,
-        max_registers=estimator.max_registers[in_tree],
+        max_registers=_max_registers(spec, estimator, in_tree),
     )
+
+
+def _max_registers(spec: TransportSpec, estimator: Estimator, in_tree: bool) -> int:
+    """Registers of a CUDA thread: fewer spill, more leave too few warps to hide latency. All measured."""
+    if estimator.score is None:
+        return 64 if in_tree or estimator.scores else 56
+    if estimator.request_flight is not None:
+        if spec.polarised:
+            return 128
+        return 96 if spec.grid is None else 72 if in_tree or spec.scores_collisions else 80
+    if spec.polarised:
+        return 96
+    # In a tree, 72 keep more warps ready while others wait for nodes of a large mesh.
+    return 64 if not in_tree else 80 if spec.derivatives or spec.grid is not None else 72
 
 
 def _make_serve_now(serve: wp.Function) -> wp.Function:
@@ -148,17 +160,12 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
     return ask_flight, ask_event
 
 
-@wp.func
-def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
-    """True: the map is of straight lines to the lens."""
-    return True
-
-
-def _make_is_seen(spec: TransportSpec, brute_force: bool) -> wp.Function:
-    """The Warp function ``(s, found, world) -> bool``: whether the lens sees a scored point for certain, without a walk
-    down the tree; of a handful of faces each is tried, and what they hide is set to 0."""
-    has_mesh, view_of = spec.mesh, spec.lens.view
-    may_hide = may_be_hidden if spec.port is None else _may_hide_behind_port
+def _make_serve(spec: TransportSpec, split: bool, deposit: wp.Function, waits: bool) -> wp.Function:
+    """See `Stages.serve`; with `waits` a contribution behind which a tree must be walked is left in the state, else the
+    ray is traced here, and what a face hides is set to 0."""
+    has_mesh, hides, reflects = spec.mesh, spec.faces.hides, spec.reflecting
+    view_of, may_hide = spec.sight.view, spec.sight.may_hide
+    score, score_images = make_estimator(spec).score, make_score_images(spec, split)
 
     @wp.func
     def is_seen(s: PhotonRef, found: wp.ref[Scored], world: WorldRef) -> bool:
@@ -167,41 +174,21 @@ def _make_is_seen(spec: TransportSpec, brute_force: bool) -> wp.Function:
             if may_hide(view_of(world.camera, world.camera.view), world.surfaces.near_depth, found.origin):
                 to = found.lens - found.origin
                 seen = not segment_meets_box(found.origin, to, 1.0, world.surfaces.lower, world.surfaces.upper)
-                if wp.static(brute_force):
+                if wp.static(not waits):
                     if not seen:
                         s.shadow_queries += 1
                         length = wp.length(to)
-                        hidden = meets_faces(world.surfaces, found.origin, to / length, length)
+                        hidden = hides(world.surfaces, found.origin, to / length, length)
                         found.contribution.value = wp.where(hidden, 0.0, found.contribution.value)
                         seen = True
         return seen
-
-    return is_seen
-
-
-def _make_serve(spec: TransportSpec, brute_force: bool, split: bool, deposit: wp.Function, waits: bool) -> wp.Function:
-    """See `Stages.serve`; with `waits` a contribution behind which a tree must be walked is left in the state, else the
-    ray is traced here."""
-    reflecting, traces = spec.reflecting, spec.mesh and not brute_force and not waits
-    score, is_seen = make_estimator(spec).score, _make_is_seen(spec, brute_force)
-    score_images = make_score_images(spec, brute_force, split)
 
     @wp.func
     def serve(s: PhotonRef, request: Request, world: WorldRef, sink: SinkRef):
         found = score(request, world)
         if request.wanted and not found.contribution.value <= 0.0:  # NaN is counted as such
             s.contributions += 1
-            seen = is_seen(s, found, world)
-            if wp.static(traces):
-                if not seen:
-                    s.shadow_queries += 1
-                    to = found.lens - found.origin
-                    length = wp.length(to)
-                    seen = intersect_surfaces(world.surfaces, found.origin, to / length, length, True).slot < 0
-                    if not seen:
-                        found.contribution.value = 0.0
-                    seen = True
-            if seen:
+            if is_seen(s, found, world):
                 if not found.contribution.value <= 0.0:
                     deposit(s.account, sink, world, found.contribution)
             else:
@@ -209,7 +196,7 @@ def _make_serve(spec: TransportSpec, brute_force: bool, split: bool, deposit: wp
                 s.origin = found.origin
                 s.lens = found.lens
                 s.pending = found.contribution
-        if wp.static(reflecting):
+        if wp.static(reflects):
             score_images(s, request, world, sink)
 
     return serve

@@ -61,6 +61,8 @@ def make_transport_kernel(spec: TransportSpec, cuda: bool = False, split_accumul
         ArgumentError: An estimator that is not one of ESTIMATORS, or confocal with the plain lens.
     """
     check_spec(spec)
+    if not cuda and spec != spec.on_cpu:
+        return make_transport_kernel(spec.on_cpu)
     stages = compose(spec, cuda, split_accumulators)
     options = {
         "module": "unique",

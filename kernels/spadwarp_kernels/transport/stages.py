@@ -18,7 +18,6 @@ from spadwarp_kernels.base.philox import (
 )
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
-from spadwarp_kernels.optics.laser import emit_along, emit_measured
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import (
     END,
@@ -39,7 +38,6 @@ from spadwarp_kernels.photon.state import (
     reweigh,
     shorten,
 )
-from spadwarp_kernels.riders.rider import NOTHING
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box
 from spadwarp_kernels.surface.patches import nearest_patch
@@ -57,10 +55,9 @@ from spadwarp_kernels.water import limits
 # ---- The begin and the end of a history, and the account of a thread.
 
 
-def make_prepare(spec: TransportSpec, cuda: bool) -> wp.Function:
+def make_prepare(stepped: bool, in_blocks: bool, cuda: bool) -> wp.Function:
     """The Warp function ``(draws, world, thread, launch) -> int``: readies the random numbers of a thread; its slot of
     the ledger."""
-    stepped, in_blocks = spec.stepped, bool(spec.blocks)
 
     @wp.func
     def prepare(draws: wp.ref[Draws], world: WorldRef, thread: int, launch: Launch) -> int:
@@ -79,28 +76,23 @@ def make_prepare(spec: TransportSpec, cuda: bool) -> wp.Function:
 
 def make_emit(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(world, id) -> spatial_vector``: start position [m], then unit direction."""
-    confocal = spec.confocal
-    emit_from = emit_measured if spec.measured_beam else emit_along
+    emit_photon = spec.beam.emit
 
     @wp.func
     def emit(world: WorldRef, id: wp.uint64) -> wp.spatial_vector:
-        axis = world.laser.axis
-        if wp.static(confocal):
-            axis = world.scan.axis[int(id % wp.uint64(world.scan.count))]
-        start, heading = emit_from(world.laser, axis, world.seed, id)
-        return wp.spatial_vector(start, heading)
+        return emit_photon(world.laser, world.scan, world.seed, id)
 
     return emit
 
 
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
-    confocal, has_port, begin_carried = spec.confocal, spec.laser_port is not None, make_rider(spec).begin
-    enter = spec.laser_port.enter if spec.laser_port is not None else None
+    scans, enter, begin_carried = spec.beam.scans, spec.beam.enter, make_rider(spec).begin
+    has_port = enter is not None
 
     @wp.func
     def begin(s: PhotonRef, world: WorldRef, sink: SinkRef, emitted: wp.spatial_vector, id: wp.uint64):
-        if wp.static(confocal):
+        if wp.static(scans):
             s.target = int(id % wp.uint64(world.scan.count))
             s.view = world.scan.view[s.target]
         s.x = wp.spatial_top(emitted)
@@ -125,10 +117,9 @@ def make_begin(spec: TransportSpec) -> wp.Function:
     return begin
 
 
-def make_finish(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, sink)``: writes the photon's record, and the ledger entry that takes the rest of its
-    weight."""
-    records, derivatives = spec.records, len(spec.derivatives)
+def make_finish(records: bool, derivatives: int) -> wp.Function:
+    """The Warp function ``(s, sink)``: writes the photon's record, with so many derivatives, and the ledger entry that
+    takes the rest of its weight."""
 
     @wp.func
     def finish(s: PhotonRef, sink: SinkRef):
@@ -179,18 +170,17 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
 # ---- Fly: how far the photon flies before it collides, and whether a surface stands before that.
 
 
-def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: bool, cuda: bool) -> wp.Function:
+def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, random_albedo: bool, cuda: bool) -> wp.Function:
     """The Warp function ``(s, world, draws, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
     in its way, to RAY.
 
     On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
-    several flights at once, so that it must be called for each flight of a photon in turn. `brute_force`: every face
-    is tried on the spot.
+    several flights at once, so that it must be called for each flight of a photon in turn.
     """
-    plans, random_albedo, water_free_path = plan_flight is not None, spec.random_albedo, spec.water.free_path
+    plans, water_free_path, tried = plan_flight is not None, spec.water.free_path, spec.faces.tried
     events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
-    has_bvh = spec.mesh and not brute_force
+    has_bvh = spec.faces.mesh and not tried
 
     @wp.func
     def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
@@ -225,7 +215,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, brute_force: 
         if wp.static(has_bvh):
             if segment_meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
                 s.stage = RAY
-        if wp.static(brute_force):
+        if wp.static(tried):
             # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
             met = nearest_patch(world.surfaces.patches, s.x, s.u, NOWHERE)
             s.surface_queries += 1
@@ -271,10 +261,9 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
 
     `flies_on`: see `make_continues`.
     """
-    has_mesh, reflecting, local_albedo = spec.mesh, spec.reflecting, spec.local_albedo
-    bounded = spec.bounded and not reflecting
+    domain, local_albedo = spec.domain, spec.local_albedo
+    reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
     water_at, fly_carried = spec.water.at, make_rider(spec).fly
-    domain = limits.make_domain(spec.rotated_domain)
     outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
 
     @wp.func
@@ -291,7 +280,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
                 leaves = exit_of(world.limits, s.x, s.u)
                 c.reason = ledger.EXIT + leaves.face
                 c.distance = wp.min(c.distance, leaves.distance)
-        if wp.static(reflecting):
+        if wp.static(reflects):
             # By distance: a photon that has been reflected may be outside by a rounding error.
             exit = to_exit(world.limits, s.x, s.u)
             if exit < c.distance:
@@ -305,7 +294,7 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
         if wp.static(flies_on):
             if s.collisions > 0 and s.reason >= 0:
                 c.reason = s.reason
-                if wp.static(reflecting):
+                if wp.static(reflects):
                     # The light of the last event ends at the next, or with the longest leg that may be scored.
                     c.mirror = wp.where(s.bounces.leg < world.limits.boundary.max_reflections, c.mirror, 0)
         return c
@@ -321,10 +310,9 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
         if c.reason < 0:
             if wp.static(local_albedo):
                 s.albedo = water_at(world.medium, world.layers, s.x).albedo
-            if wp.static(has_mesh):
-                if s.hit.face >= 0 and c.mirror == 0:
-                    s.x = offset_from_surface(s.x, s.hit.normal, c.distance)
-        if wp.static(reflecting):
+            if s.hit.face >= 0 and c.mirror == 0:
+                s.x = offset_from_surface(s.x, s.hit.normal, c.distance)
+        if wp.static(reflects):
             s.bounces.face = c.mirror
             s.bounces.leg = wp.where(c.mirror > 0, s.bounces.leg + 1, 0)
             s.bounces.count += wp.where(c.mirror > 0, 1, 0)
@@ -337,29 +325,22 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
 def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Function) -> wp.Function:
     """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
     estimator says so, with what rides along."""
-    crosses, reflecting, has_port = cross is not None, spec.reflecting, spec.port is not None
-    leave = spec.port.leave if spec.port is not None else None
+    crosses, leave = cross is not None, spec.sight.leave
     rider = make_rider(spec)
-    rides, (_begin, fork, fly, _event, _mirror, deliver) = rider is not NOTHING, rider
+    rides, (_begin, fork, fly, _event, _mirror, deliver) = rider.rides, rider
 
     @wp.func
     def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
         if wp.static(crosses):
             c = cross(s, world)
-            if wp.static(reflecting):
-                s.bounces.dropped += wp.where(c.index == TOO_LONG, 1, 0)
+            s.bounces.dropped += wp.where(c.index == TOO_LONG, 1, 0)
             if wp.static(rides):
                 if c.value > 0.0:
                     carried = s.carried
-                    to_lens = -s.x[2] / s.u[2]
-                    inside = s.u
-                    if wp.static(has_port):
-                        passage = leave(world.camera.port, s.x, s.u)
-                        to_lens = passage.water
-                        inside = passage.u
+                    passage = leave(world.camera, s.x, s.u)
                     fork(carried, world)
-                    fly(carried, world, s.x, s.u, to_lens)
-                    deliver(c, carried, world, s.x, s.u, inside)
+                    fly(carried, world, s.x, s.u, passage.water)
+                    deliver(c, carried, world, s.x, s.u, passage.u)
             if not c.value <= 0.0:
                 s.contributions += 1
                 deposit(s.account, sink, world, c)
@@ -371,40 +352,12 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
 
 
 @wp.struct
-class Survival:
-    """What an event leaves of a photon: the part of its weight, and at a surface the part of that which is specular."""
-
-    part: float
-    lobe: float
-
-
-@wp.struct
 class Outcome:
     """What an event makes of a photon: see `PhotonState`, which takes it over once nothing asks for the old weight."""
 
     weight: Weight
     analog_weight: float
     reason: int
-
-
-def make_survive(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, world) -> Survival``: albedo of the water, or reflectance of the face."""
-    has_mesh, specular, reflectance_at = spec.mesh, spec.specular, spec.reflectance_at
-
-    @wp.func
-    def survive(s: PhotonRef, world: WorldRef) -> Survival:
-        survival = Survival()
-        survival.part = s.albedo
-        if wp.static(has_mesh):
-            if s.hit.face >= 0:
-                survival.part = reflectance_at(world.surfaces, s.hit.face, s.x)
-                if wp.static(specular):
-                    specular_part = world.surfaces.specular[s.hit.face]
-                    survival.part += specular_part
-                    survival.lobe = specular_part / wp.max(survival.part, 1.0e-30)
-        return survival
-
-    return survive
 
 
 def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp.Function:
@@ -414,14 +367,12 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     """
     if direct is not None:
         return direct
-    has_mesh, specular, phase_sample, water_at = spec.mesh, spec.specular, spec.phase.sample, spec.water.at
+    specular, phase_sample, water_at = spec.faces.specular, spec.water.phase.sample, spec.water.at
 
     @wp.func
     def sample_direction(s: PhotonRef, reflected: wp.vec3, lobe: float, world: WorldRef, id: wp.uint64) -> Direction:
         new = Direction()
-        on_surface = False
-        if wp.static(has_mesh):
-            on_surface = s.hit.face >= 0
+        on_surface = s.hit.face >= 0
         axis = snap_from(s.u, world.medium.axis_threshold)
         t = phase_sample(u01_fine(s.flight.block[1]), water_at(world.medium, world.layers, s.x))
         if on_surface:
@@ -477,8 +428,8 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
 
     `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
     """
-    rotated, terminate, continues = spec.rotated_domain, make_terminate(spec), make_continues(flies_on)
-    turn, turn_back = limits.make_domain(rotated).turn, limits.make_domain(rotated).turn_back
+    rotated, turn, turn_back = spec.domain.rotated, spec.domain.turn, spec.domain.turn_back
+    terminate, continues = make_terminate(spec), make_continues(flies_on)
     mirror_carried = make_rider(spec).mirror
 
     @wp.func
@@ -515,8 +466,8 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
 
     `flies_on`: see `make_continues`.
     """
-    has_mesh, specular, reflecting, directed = spec.mesh, spec.specular, spec.reflecting, direct is not None
-    survive, sample_direction = make_survive(spec), make_sample_direction(spec, direct)
+    specular, reflects, directed = spec.faces.specular, spec.domain.reflects, direct is not None
+    survival_of, sample_direction = spec.faces.survival, make_sample_direction(spec, direct)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
     continues, turn_carried = make_continues(flies_on), make_rider(spec).event
 
@@ -556,19 +507,17 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         new = Outcome()
         new.reason = -1
         new.weight = s.weight
-        on_surface = False
-        if wp.static(has_mesh):
-            on_surface = s.hit.face >= 0
-        survival = survive(s, world)
+        on_surface = s.hit.face >= 0
+        survival = survival_of(world.surfaces, s.hit, s.x, s.albedo)
         if on_surface:
-            reweigh(new.weight, survival.part)
+            reweigh(new.weight, survival[0])
             s.absorbed_surface += new.weight.taken
         else:
-            new.weight.value *= survival.part
-        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival.part, new.weight.value)
+            new.weight.value *= survival[0]
+        new.analog_weight = wp.where(wp.static(directed), s.analog_weight * survival[0], new.weight.value)
         terminate(new, s, world, sink, id)
         if continues(new.reason):
-            turn(new, s, world, sink, id, on_surface, survival.lobe)
+            turn(new, s, world, sink, id, on_surface, survival[1])
         s.weight = new.weight
         s.analog_weight = new.analog_weight
         s.reason = new.reason
@@ -580,7 +529,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         s.collisions += 1
         id = draws.base + wp.uint64(s.photon)
         bounced = False
-        if wp.static(reflecting):
+        if wp.static(reflects):
             bounced = s.bounces.face > 0
             if bounced:
                 bounce(s, world, sink, id)

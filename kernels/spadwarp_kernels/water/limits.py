@@ -252,11 +252,15 @@ class Domain(NamedTuple):
     is_outside: wp.Function  # ``(limits, x) -> bool``, outside the domain or beyond the lateral limit
     exit: wp.Function  # ``(limits, x, u) -> Exit``, of what a ray meets first
     exit_distance: wp.Function  # ``(limits, x, u) -> float``, the distance of that [m]
+    within: wp.Function  # ``(limits, length, x, u) -> float``, the part of a flight in a bounded domain [m]
+    bounded: bool
+    rotated: bool
+    reflects: bool
 
 
 @memoised
-def make_domain(rotated: bool) -> Domain:
-    """The domain of a spec; `rotated`: it has axes of its own."""
+def make_domain(bounded: bool, rotated: bool, reflects: bool) -> Domain:
+    """The domain of a spec; `rotated`: it has axes of its own, `reflects`: its faces do."""
 
     @wp.func
     def point(limits: Limits, x: wp.vec3) -> wp.vec3:
@@ -299,4 +303,9 @@ def make_domain(rotated: bool) -> Domain:
     def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
         return wp.min(to_sides(limits, x, u), to_next_face(limits, point(limits, x), turn(limits, u)))
 
-    return Domain(point, point_back, turn, turn_back, is_outside, exit, exit_distance)
+    @wp.func
+    def within(limits: Limits, length: float, x: wp.vec3, u: wp.vec3) -> float:
+        return wp.min(length, exit_distance(limits, x, u)) if wp.static(bounded) else length
+
+    axes = (point, point_back, turn, turn_back)
+    return Domain(*axes, is_outside, exit, exit_distance, within, bounded, rotated, reflects)

@@ -8,7 +8,7 @@ straight on; one index holds for all water.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -252,11 +252,13 @@ class Water(NamedTuple):
     # exp(-extinction length) has the expectation of what passes
     extinction: wp.Function
     at: wp.Function  # ``(medium, layers, x) -> Medium``, the water at a point
-    profile: Profile | None = None  # how `guided` draws a point of a flight; None: with the mean extinction
+    profile: Profile | None = None  # how `guided` draws a point of a flight in a grid; None: with the mean extinction
+    layered: bool = False
+    phase: Any = None  # the phase function, of the water of a spec
 
 
 HOMOGENEOUS = Water(_free_path, _extinction, _water)
-LAYERED = Water(layered_free_path, layered_extinction, layered_water)
+LAYERED = Water(layered_free_path, layered_extinction, layered_water, layered=True)
 
 
 def make_layers(

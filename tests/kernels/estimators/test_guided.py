@@ -19,7 +19,8 @@ from spadwarp_kernels import (
     u01,
 )
 from spadwarp_kernels.base.philox import u01_fine
-from spadwarp_kernels.estimators.contribution import make_sample_flight, make_sample_lens
+from spadwarp_kernels.estimators.contribution import make_sample_flight
+from spadwarp_kernels.optics.visibility import make_sample_lens
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
 
 sample_lens = make_sample_lens(None)
