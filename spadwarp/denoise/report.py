@@ -9,15 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from spadwarp.denoise.evaluation import Evaluation
-from spadwarp.denoise.metrics import LARGER_IS_BETTER
-from spadwarp.denoise.scene_scores import SceneScores
+from spadwarp.denoise.evaluation import LARGER_IS_BETTER, Evaluation
+from spadwarp.denoise.evaluation_scenes import SceneScores
 from spadwarp.io.paths import atomic_path
 from spadwarp.io.text import json_text
 from spadwarp.viz.evaluation import SCORES, TITLES, draw_ranking, draw_reliability, draw_samples, draw_scores
 from spadwarp.viz.viewer import write_page
 
 __all__ = ["TITLES", "scene_table", "write_report", "write_scene_report"]
+
 
 _NBSP = "\N{NO-BREAK SPACE}"
 

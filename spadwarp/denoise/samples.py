@@ -17,8 +17,6 @@ from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, pro
 from spadwarp.device import physical_memory
 from spadwarp.values import DeviceError
 
-__all__ = ["Fresh", "Pool", "Samples", "Scenes", "Sizes"]
-
 PORTIONS = 24
 """Portions of which a pool consists; each is drawn at once."""
 

@@ -9,13 +9,15 @@ import torch
 from safetensors.torch import load_file
 
 from spadwarp import ConfigError, FileError
-from spadwarp.denoise import network_files, networks, pyramid, selection, training
+from spadwarp.denoise import network_files, networks, training
+from spadwarp.denoise import networks as pyramid
+from spadwarp.denoise import networks as selection
 from spadwarp.denoise.frames import POOLED
 from spadwarp.denoise.histogram_features import FEATURES
-from spadwarp.denoise.recipe import MODELS, Noise, TrainingRecipe, load_training_recipe
+from spadwarp.denoise.network_files import MODELS
+from spadwarp.denoise.recipe import Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoise.synthetic_noise import BINS, Batch, CleanScenes, draw_batch, procedural_scenes
-from spadwarp.denoise.training import fit
-from spadwarp.denoise.training_steps import Workers, loss_of
+from spadwarp.denoise.training import Workers, fit, loss_of
 
 
 def scenes(count=4, size=64):
