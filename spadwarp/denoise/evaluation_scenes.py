@@ -328,7 +328,14 @@ def evaluate_scenes(
         alike = [scene for scene in chosen if scene.setting == setting]
         for water in waters:
             for level in levels:
-                frames = [_frame(scene, water, level, seed + number) for number, scene in enumerate(alike)]
+                frames = [
+                    depth_frames(
+                        noisy_depth(scene, water=water, level=level, seed=seed + number),
+                        gate=scene.gate,
+                        profile=water_profile(water),
+                    )
+                    for number, scene in enumerate(alike)
+                ]
                 window = best[setting, water, level] = _best_window(alike, frames)
                 for scene, noisy in zip(alike, frames, strict=True):
                     for method in ("input", *models):
@@ -375,11 +382,6 @@ def score_frame(
         steps=steps.total,
         resolved=steps.resolved,
     )
-
-
-def _frame(scene: EvaluationScene, water: str, level: float, seed: int) -> DepthFrames:
-    noisy = noisy_depth(scene, water=water, level=level, seed=seed)
-    return depth_frames(noisy, gate=scene.gate, profile=water_profile(water))
 
 
 def _count_reliability(

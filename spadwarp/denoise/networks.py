@@ -21,15 +21,7 @@ from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
 from spadwarp.denoise.histogram_features import FEATURES, LIGHT, LIKENESS, MOST, SEEN
-from spadwarp.denoise.layers import (
-    GROUP,
-    SymmetricConv,
-    SymmetricWindow,
-    edge_padded,
-    enlarged,
-    symmetric_mean,
-    turned,
-)
+from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, symmetric_mean, turned
 from spadwarp.values import ArgumentError
 
 CHOICES = 1 + 2 + POOLED + 1

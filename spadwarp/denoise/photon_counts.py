@@ -1,7 +1,8 @@
-"""RMSE of histogram estimates against the best tuned classical estimate of the same data, point by point.
+"""RMSE against signal photons: denoisers on histograms of few photons.
 
-A point is a number of signal photons per pixel, a signal-to-background ratio (SBR), a flat or decaying background, and
-one or two returns in a pixel. The scenes are those of `spadwarp.denoise.evaluation_scenes`, which no training saw.
+Of drawn scenes, which no training saw, beside the best tuned classical estimate of the same counts; or of a Monte Carlo
+result with its own backscatter profile, beside the Cramér–Rao bound. SBR: signal-to-background ratio, signal counts
+over background counts in the gate.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS, classical_depth
-from spadwarp.denoise.evaluation_scenes import GATE, EvaluationScene, evaluation_scene
+from spadwarp.denoise.evaluation_scenes import EvaluationScene, evaluation_scene
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.histograms import features_of_histograms
 from spadwarp.denoise.inference import METHODS, denoise_frames
@@ -28,8 +29,10 @@ from spadwarp.scene.sight import depth_from_time, port_advance
 from spadwarp.values import SEED, SpadwarpError, check_choice, check_integer, check_real, range_from_time
 from spadwarp.viz import evaluation as drawing
 
-__all__ = ["HistogramScores", "PhotonSweep", "draw_photon_sweep", "evaluate_histograms", "photon_sweep"]
+if TYPE_CHECKING:
+    from spadwarp.result.result import Result
 
+__all__ = ["HistogramScores", "PhotonSweep", "draw_photon_sweep", "evaluate_histograms", "photon_sweep"]
 
 _BINS = 256
 _WIDTH = 1.0  # deviation of the response [bins]
@@ -46,10 +49,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class HistogramScores:
-    """RMSE [m] over the pixels that see a target, mean over scenes, by point and method.
-
-    `best` is the classical estimate, tuned, with the smallest RMSE of each point.
-    """
+    """RMSE [m] over the pixels that see a target, mean over scenes, by point and method."""
 
     rmse: dict[Point, dict[str, float]]
 
@@ -79,7 +79,7 @@ def evaluate_histograms(
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> HistogramScores:
-    """Scores the network for histograms and all classical estimates at every point.
+    """Scores the network for histograms and all classical estimates, with their best tuning, at every point.
 
     Args:
         photons, sbr, backgrounds, returns: See `Point`.
@@ -117,6 +117,8 @@ def draw_counts(
 
     Of two returns the weaker one has 35 % of the light, 25 cm before the scene, in half of the columns.
     """
+    from scipy.special import ndtr
+
     start, stop = scene.gate
     generator = np.random.Generator(np.random.Philox(seed))
     seen = np.isfinite(scene.clean)
@@ -124,12 +126,9 @@ def draw_counts(
     rows, columns = place.shape
     shade = 1.0 + 0.5 * np.sin(np.arange(columns) / 5.0) * np.sin(np.arange(rows) / 7.0)[:, None]
     signal = point.photons * shade * seen
-    edges = np.arange(_BINS + 1)
 
     def spread(depth: NDArray[Any]) -> NDArray[Any]:
-        from scipy.special import ndtr
-
-        return np.diff(ndtr((edges - (depth * _BINS)[..., None]) / _WIDTH), axis=-1)
+        return np.diff(ndtr((np.arange(_BINS + 1) - (depth * _BINS)[..., None]) / _WIDTH), axis=-1)
 
     rate = spread(place) * signal[..., None]
     if point.returns == 2:
@@ -138,8 +137,7 @@ def draw_counts(
     centres = (np.arange(_BINS) + 0.5) / _BINS
     profile = np.exp(-4.0 * centres) if point.background == "decaying" else np.ones(_BINS)
     background = point.photons / point.sbr * profile / profile.sum() + 1e-6
-    apart = np.arange(-5, 6)
-    response = np.exp(-0.5 * (apart / _WIDTH) ** 2)
+    response = np.exp(-0.5 * (np.arange(-5, 6) / _WIDTH) ** 2)
     return generator.poisson(rate + background), background, response / response.sum()
 
 
@@ -148,31 +146,23 @@ def _estimates(
 ) -> dict[tuple[str, float], NDArray[np.float32]]:
     """Depth [m] by method and tuning."""
     counts, background, response = draw_counts(scene, point, seed=seed)
+    given: dict[str, Any] = {"background": background, "response": response, "device": device}
     start, stop = scene.gate
-    found: dict[tuple[str, float], NDArray[np.float32]] = {}
 
     def metres(part: NDArray[Any]) -> NDArray[np.float32]:
         return (start + (stop - start) * part).astype(np.float32)
 
-    for method, tunings in TUNINGS.items():
-        for tuning in tunings:
-            part = classical_depth(
-                counts, background=background, response=response, method=method, tuning=tuning, device=device  # type: ignore[arg-type]
-            )  # fmt: skip
-            found[method, tuning] = metres(part[0])
-    features = features_of_histograms(counts, background=background, response=response, device=device, to_depth=metres)
-    frames = depth_frames(found["likelihood", 1], gate=GATE, profile=background, features=features)
+    found: dict[tuple[str, float], NDArray[np.float32]] = {
+        (method, tuning): metres(classical_depth(counts, method=method, tuning=tuning, **given)[0])  # type: ignore[arg-type]
+        for method, tunings in TUNINGS.items()
+        for tuning in tunings
+    }
+    features = features_of_histograms(counts, to_depth=metres, **given)
+    frames = depth_frames(found["likelihood", 1], gate=scene.gate, profile=background, features=features)
     for window in MEDIAN_WINDOWS:
         found["median", window] = denoise_frames(frames, model="median", window=window)[0][0]
     found["histograms", 0] = denoise_frames(frames, model="histograms", weights=weights, device=device)[0][0]
     return found
-
-
-# ---- RMSE against signal photons: denoisers on the frames of a camera that counts few of them.
-
-
-if TYPE_CHECKING:
-    from spadwarp.result.result import Result
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -182,11 +172,10 @@ class PhotonSweep:
     Attributes:
         summary: Scene, water and seed, as text.
         photons: Signal counts of the median pixel, `[P]`.
-        sbr: Signal-to-background ratio, signal counts over background counts in the gate, `[S]`.
+        sbr: Signal-to-background ratio, `[S]`.
         rmse: By method, `[S, P]` [m]; "input" is the likelihood estimate itself.
         bound: Root mean square over pixels of the Cramér–Rao bound, or of a uniform guess over the gate where that is
             smaller, `[S, P]` [m].
-        windows: Side of the median with the smallest RMSE, `[S, P]` [pixels].
     """
 
     summary: str
@@ -194,7 +183,6 @@ class PhotonSweep:
     sbr: tuple[float, ...]
     rmse: dict[str, NDArray[np.float64]]
     bound: NDArray[np.float64]
-    windows: NDArray[np.int64]
 
     def saving(self, method: str) -> NDArray[np.float64]:
         """Factor in photons at which the input reaches the method's RMSE, `[S, P]`; NaN beyond the sweep's counts."""
@@ -237,7 +225,7 @@ def photon_sweep(
     Args:
         result: Its ballistic and forward-scattered light is the signal, its backscatter the shape of the background.
         photons: Signal counts within the gate in the median pixel that sees a target, > 0, increasing.
-        sbr: Signal-to-background ratios: signal counts over background counts within the gate, > 0.
+        sbr: Signal-to-background ratios, > 0.
         models: From `spadwarp.denoise.METHODS`; the median has its best window at each point.
         frames: Drawn and averaged for each point.
         seed: Of the counts.
@@ -258,15 +246,9 @@ def photon_sweep(
             check_real(f"{name}: an item", value, "[1e-9, 1e9]")
     frames, seed = check_integer("frames", frames, "[1, 1000000]"), check_integer("seed", seed, SEED)
     own = own_weights(models, weights)
-    # A median of each window is tried; the other methods have one variant.
-    variants = [("input", 5)]
-    for name in models:
-        variants += [(name, window) for window in (MEDIAN_WINDOWS if name == "median" else (5,))]
-    shape = (len(sbr), len(photons))
-    squares = {variant: np.zeros(shape) for variant in variants}
+    shape, truth, done = (len(sbr), len(photons)), result.truth.depth, 0
+    squares = {name: np.zeros((len(MEDIAN_WINDOWS) if name == "median" else 1, *shape)) for name in ("input", *models)}
     bound = np.zeros(shape)
-    truth = result.truth.depth
-    done, total = 0, frames * bound.size
     for row, column in np.ndindex(shape):
         for _ in range(frames):
             point: dict[str, Any] = {"photons": photons[column], "sbr": sbr[row], "seed": seed * 1_000_003 + done}
@@ -275,31 +257,26 @@ def photon_sweep(
             seen = np.isfinite(truth) & np.isfinite(sigma) & (truth >= start) & (truth < stop)
             guess = (stop - start) / np.sqrt(12.0)
             bound[row, column] += float(np.mean(np.minimum(sigma[seen], guess) ** 2)) / frames
-            for name, window in variants:
-                found, _ = denoise_frames(noisy, model=name, window=window, weights=own.get(name), device=device)
-                squares[name, window][row, column] += float(np.mean((found[0][seen] - truth[seen]) ** 2)) / frames
+            for name, sums in squares.items():  # a median of each window is tried; the others have one variant
+                for total, window in zip(sums, MEDIAN_WINDOWS, strict=False):
+                    found, _ = denoise_frames(noisy, model=name, window=window, weights=own.get(name), device=device)
+                    total[row, column] += float(np.mean((found[0][seen] - truth[seen]) ** 2)) / frames
             done += 1
             if progress is not None:
-                progress("frames", done, total)
-    medians = [squares.get(("median", window), np.zeros(shape)) for window in MEDIAN_WINDOWS]
-    smallest = {name: np.min([squares[v] for v in variants if v[0] == name], axis=0) for name in ("input", *models)}
+                progress("frames", done, frames * bound.size)
+    scene, depth = result.scene, np.nanmedian(truth)
+    extinction = scene.medium.extinction
+    summary = (
+        f"Monte Carlo histograms of {result.photons:.2g} photons, water c = {extinction:.3g} 1/m, target at "
+        f"{depth:.3g} m ({depth * extinction:.2g} attenuation lengths), gate of {scene.gate.bins} bins of "
+        f"{1e12 * scene.gate.bin_width:.3g} ps; seed {seed}"
+    )
     return PhotonSweep(
-        summary=_summary(result, seed) + "".join(f"; {name} with weights {path}" for name, path in own.items()),
+        summary=summary + "".join(f"; {name} with weights {path}" for name, path in own.items()),
         photons=tuple(map(float, photons)),
         sbr=tuple(map(float, sbr)),
-        rmse={name: np.sqrt(values) for name, values in smallest.items()},
+        rmse={name: np.sqrt(sums.min(axis=0)) for name, sums in squares.items()},
         bound=np.sqrt(bound),
-        windows=np.array(MEDIAN_WINDOWS)[np.argmin(medians, axis=0)],
-    )
-
-
-def _summary(result: Result, seed: int) -> str:
-    scene, depth = result.scene, np.nanmedian(result.truth.depth)
-    extinction, bins, width = scene.medium.extinction, scene.gate.bins, 1e12 * scene.gate.bin_width
-    return (
-        f"Monte Carlo histograms of {result.photons:.2g} photons, water c = {extinction:.3g} 1/m, target at "
-        f"{depth:.3g} m ({depth * extinction:.2g} attenuation lengths), gate of {bins} bins of {width:.3g} ps; "
-        f"seed {seed}"
     )
 
 
@@ -324,29 +301,27 @@ def photon_frame(
     seen = np.isfinite(result.truth.depth) & (signal.sum(axis=-1) > 0)
     if not seen.any() or not back.sum() > 0:
         raise SpadwarpError("the result holds no return or no backscatter, so that no frames can be drawn")
-    scale = photons / np.median(signal.sum(axis=-1)[seen])
+    signal = signal * (photons / np.median(signal.sum(axis=-1)[seen]))
     # The same background in all pixels: otherwise the estimator would know its Monte Carlo noise.
     profile = back.reshape(-1, back.shape[-1]).sum(axis=0)
     profile = np.convolve(profile / profile.sum(), matrix, mode="same")
     background = np.broadcast_to(photons / sbr * profile + 1e-6, back.shape)
-    smeared = convolve1d(signal * scale, matrix, axis=-1, mode="constant")
+    smeared = convolve1d(signal, matrix, axis=-1, mode="constant")
     counts = np.random.Generator(np.random.Philox(seed)).poisson(smeared + background).astype(np.float32)
     time = arrival_time(
         counts, gate_start=gate.start, bin_width=gate.bin_width, method="likelihood",
         irf=response, background=background.astype(np.float32),
     )  # fmt: skip
     depth = depth_from_time(time.reshape(seen.shape), scene=scene)
-    sigma = crlb_from_histogram(signal * scale, background, bin_width=gate.bin_width, pulses=1.0, irf=response)
+    sigma = crlb_from_histogram(signal, background, bin_width=gate.bin_width, pulses=1.0, irf=response)
     index = scene.medium.group_index
     depth_gate = tuple(range_from_time(end, index) + port_advance(scene) for end in (gate.start, gate.stop))
+
+    def to_depth(part: NDArray[np.float32]) -> NDArray[Any]:
+        return depth_from_time(gate.start + part.astype(np.float64) * (gate.stop - gate.start), scene=scene)
+
     features = features_of_histograms(
-        counts,
-        background=background[0, 0],
-        response=matrix,
-        device=device,
-        to_depth=lambda part: depth_from_time(
-            gate.start + part.astype(np.float64) * (gate.stop - gate.start), scene=scene
-        ),
+        counts, background=background[0, 0], response=matrix, device=device, to_depth=to_depth
     )
     return depth_frames(depth, gate=depth_gate, profile=profile, features=features), range_from_time(sigma, index)
 

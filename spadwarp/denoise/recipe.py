@@ -1,4 +1,4 @@
-"""Training recipes: TOML in, frozen and validated out."""
+"""Training recipes, TOML in, frozen and validated out; and training from such a file and a dataset."""
 
 from __future__ import annotations
 
@@ -25,6 +25,10 @@ from spadwarp.viz import draw_learning_curves
 
 __all__ = ["TrainingRecipe", "load_training_recipe", "train"]
 
+
+if TYPE_CHECKING:
+    from spadwarp.denoise.synthetic_noise import CleanScenes
+    from spadwarp.denoise.training import Trained
 
 LEAST_CROP = 32
 """Side of the smallest crop that a network learns from [pixels]."""
@@ -158,11 +162,8 @@ class TrainingRecipe(Document):
         noise, mixture = _given(tables.get("noise", {})), tables.get("mixture")
         if not isinstance(noise, Mapping) or not isinstance(mixture, list | tuple):
             return tables
-        parts = [_given(part) for part in mixture]
-        return {
-            **tables,
-            "mixture": tuple({**noise, **part} if isinstance(part, Mapping) else part for part in parts),
-        }
+        parts = tuple({**noise, **part} if isinstance(part, Mapping) else part for part in map(_given, mixture))
+        return {**tables, "mixture": parts}
 
     @pydantic.model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -193,14 +194,6 @@ def load_training_recipe(path: str | os.PathLike[str], overrides: Sequence[str] 
     """
     path = example_or_path(path, "training")
     return TrainingRecipe.from_dict(read_toml(path), overrides=overrides, source=path)
-
-
-# ---- Training from files: a recipe and a dataset in, weights, log and learning curves out.
-
-
-if TYPE_CHECKING:
-    from spadwarp.denoise.synthetic_noise import CleanScenes
-    from spadwarp.denoise.training import Trained
 
 
 def train(

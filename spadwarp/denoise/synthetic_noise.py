@@ -1,14 +1,16 @@
-"""Procedural clean scenes for training, drawn on the training device.
+"""Training pairs drawn on the training device: clean scenes, crops of them, and what a SPAD camera reports of these.
 
 Each scene has open water, a wall or a slanted floor, and up to ten things before it: plates, ellipsoids, rods, ropes,
 nets, ladders, plants, chains, rocks and blocks, at depths of their own or close together as parts of one body, with a
 texture of reflectance. The shapes of `spadwarp.denoise.evaluation_scenes` and the built-in meshes are not among them.
+
+A noisy frame is never stored. Each step draws crops, gates, waters and photons anew, so no two frames of a training are
+alike. Depth is over the gate: 0 at its start, 1 at its end.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -51,17 +53,7 @@ class Random:
 
 
 def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-    """Clean scenes on the generator's device.
-
-    Args:
-        count: Number of scenes.
-        side: Rows and columns [pixels].
-        generator: Of all random numbers.
-
-    Returns:
-        Depth `[S, side, side]` [m], NaN where there is only water; the deviation of reported depths of the same shape
-        [m], NaN there too; and a gate around what is seen `[S, 2]` [m].
-    """
+    """Depth and its deviation `[S, side, side]`, NaN where there is only water, and gates around it `[S, 2]` [m]."""
     random = Random(count, generator)
     relief = random.log_between((0.08, 2.5), 1, 1)  # of the whole scene [m]
     depth = _background(side, random)
@@ -74,7 +66,7 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
         at = torch.where(together[:, None], centre + 0.35 * apart, apart)
         z = torch.where(together, place + 0.15 * (random.uniform() - 0.5), random.between((0.0, 0.95)))
         kind = random.integer(len(KINDS))
-        for index, draw in enumerate(KINDS.values()):
+        for index, draw in enumerate(KINDS):
             chosen = ((kind == index) & (slot < number)).nonzero()[:, 0]
             if len(chosen):
                 part = Random(len(chosen), generator)
@@ -241,22 +233,11 @@ def _blocks(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     return inside, -random.between((0.02, 0.5), 1, 1) * height
 
 
-KINDS: dict[str, Callable[[Tensor, Tensor, Random], tuple[Tensor, Tensor]]] = {
-    "plate": _plate,
-    "ellipsoid": _ellipsoid,
-    "rod": _rod,
-    "rope": _rope,
-    "net": _net,
-    "ladder": _ladder,
-    "plant": _plant,
-    "chain": _chain,
-    "rock": _rock,
-    "blocks": _blocks,
-}
-"""Things in the scenes, by name."""
+KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, _blocks)
+"""Things in the scenes."""
 
 
-# ---- Training pairs drawn on the training device: crops of clean scenes, and what a SPAD camera reports of them.
+# Crops, and the noise of a camera.
 
 
 BINS = 64
@@ -268,19 +249,12 @@ _TAPS = 9  # a response extends over this many bins to each side
 
 
 class CleanScenes(NamedTuple):
-    """Clean scenes on the training device.
+    """Clean scenes on the training device, float32."""
 
-    Attributes:
-        depth: float32 `[S, H, W]` [m]; NaN where nothing is hit.
-        sigma: Cramér–Rao bound of depth, float32 `[S, H, W]` [m]; NaN where there is none.
-        gate: (start, stop) in depth, float32 `[S, 2]` [m].
-        profile: Density of backscatter over the gate, mean 1, float32 `[S, BINS]`.
-    """
-
-    depth: Tensor
-    sigma: Tensor
-    gate: Tensor
-    profile: Tensor
+    depth: Tensor  # [S, H, W] [m]; NaN where nothing is hit
+    sigma: Tensor  # Cramér–Rao bound of depth, [S, H, W] [m]; NaN where there is none
+    gate: Tensor  # start and stop in depth, [S, 2] [m]
+    profile: Tensor  # density of backscatter over the gate, mean 1, [S, BINS]
 
     def to(self, device: torch.device | str) -> CleanScenes:
         """The same on another device."""
@@ -288,27 +262,23 @@ class CleanScenes(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Noisy frames as networks take them, `[B, 3, h, w]`, or `[B, 3 + FEATURES, h, w]` with histograms; clean depth
-    over the gate and where a target is seen, `[B, 1, h, w]`; and 1 where a crop counts for the target's probability,
-    else 0, `[B, 1, 1, 1]`."""
+    """Noisy frames and what they are of."""
 
-    frame: Tensor
-    clean: Tensor
-    hit: Tensor
-    judged: Tensor
+    frame: Tensor  # as networks take them, [B, 3, h, w], or [B, 3 + FEATURES, h, w] with histograms
+    clean: Tensor  # depth over the gate, [B, 1, h, w]
+    hit: Tensor  # where a target is seen, [B, 1, h, w]
+    judged: Tensor  # 1 where a crop counts for the target's probability, else 0, [B, 1, 1, 1]
 
 
 class _Crops(NamedTuple):
-    """Clean crops: depth and its bound over the gate, where a target is hit, `[B, h, w]`; the depth behind which no
-    backscatter comes from, `[B, h, w]`; the backscatter profile `[B, BINS]`, over the camera's gate; and start and
-    width of that gate, in widths of the one that the network is given, which is narrower, `[B, 2]`."""
+    """Clean crops; lengths are over the gate that the network is given."""
 
-    clean: Tensor
-    sigma: Tensor
-    hit: Tensor
-    reach: Tensor
-    profile: Tensor
-    camera: Tensor
+    clean: Tensor  # depth, [B, h, w]
+    sigma: Tensor  # its bound
+    hit: Tensor  # where there is a target
+    reach: Tensor  # depth behind which no backscatter comes from
+    profile: Tensor  # of backscatter over the camera's gate, [B, BINS]
+    camera: Tensor  # start and width of that gate, which is wider, [B, 2]
 
 
 def procedural_scenes(count: int, side: int, *, seed: int, device: torch.device | str) -> CleanScenes:
@@ -401,9 +371,8 @@ def _defects(reported: Tensor, present: Tensor, noise: Noise, random: Random) ->
 
 def log_density(profile: Tensor, depth: Tensor) -> Tensor:
     """ln of the profiles `[B, bins]` (mean 1) at depths over the gate `[B, H, W]`, within ±`LOG_DENSITY_LIMIT`."""
-    bins = profile.shape[1]
+    bins, limit = profile.shape[1], LOG_DENSITY_LIMIT
     place = (depth.flatten(1) * bins).long().clamp(0, bins - 1)
-    limit = LOG_DENSITY_LIMIT
     return profile.gather(1, place).clamp(math.exp(-limit), math.exp(limit)).log().view_as(depth)
 
 

@@ -1,4 +1,8 @@
-"""A training's processes, steps and files, and its loss: the error of depth, and of the network's other answers."""
+"""Training: one loop for every network, on a CPU, a GPU or several.
+
+Several GPUs: `torchrun --nproc-per-node 4 -m spadwarp train RECIPE --out DIR`. An interrupted run resumes from its last
+checkpoint when the command is repeated.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +33,8 @@ from spadwarp.io.paths import atomic_path
 from spadwarp.parallel.worker import interruptible
 from spadwarp.values import ConfigError, FileError, environment_integer
 
+# The loss: the error of depth, and of the network's other answers.
+
 _FLOOR = 3e-6  # mean square over the gate below which a crop is good enough: 55 dB
 _FINE_FLOOR = 1e-7  # the same for histograms, whose many photons give finer depths
 _WATER = 0.001  # weight of depth where nothing is hit
@@ -50,7 +56,9 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
     floor = _FINE_FLOOR if chosen.shape[1] else _FLOOR
 
     def error_of(square: Tensor) -> Tensor:
-        return _depth_error(square, batch.hit, weight, kind, floor)
+        """Mean over crops of their mean square, or of its logarithm."""
+        mean = (weight * square).flatten(1).sum(dim=1) / weight.flatten(1).sum(dim=1)
+        return _mean_with_target(mean if kind == "mse" else 0.1 * torch.log(mean + floor), batch.hit)
 
     error = error_of((depth - batch.clean).square())
     if logits.shape[1]:
@@ -71,13 +79,6 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
         error = error + error_of((last - batch.clean).square()) + _CHOICE * _choice_error(depths, weights, batch)
         error = error + _TARGET * _target_error(target, batch)
     return error
-
-
-def _depth_error(square: Tensor, hit: Tensor, weight: Tensor, kind: str, floor: float) -> Tensor:
-    """Mean over crops of their mean square, or of its logarithm."""
-    mean = (weight * square).flatten(1).sum(dim=1) / weight.flatten(1).sum(dim=1)
-    error = mean if kind == "mse" else 0.1 * torch.log(mean + floor)
-    return _mean_with_target(error, hit)
 
 
 def _mean_with_target(error: Tensor, hit: Tensor) -> Tensor:
@@ -110,32 +111,14 @@ _EAGER = 12  # steps before one is recorded as a CUDA graph
 
 @dataclass(frozen=True, kw_only=True)
 class Trained:
-    """Files and validation of a training.
+    """Files and validation of a training."""
 
-    Attributes:
-        weights: The network, safetensors.
-        log: JSON lines: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, pairs per second, seconds.
-        psnr: Validation PSNR, mean over the levels [dB].
-        seconds: Duration of all parts of the run together [s].
-    """
-
-    weights: Path
-    log: Path
-    psnr: float
-    seconds: float
-
-
-def save_weights(network: nn.Module, path: str | Path, metadata: dict[str, str]) -> Path:
-    """Weights as float16 safetensors, with metadata (text by name) in the file's header."""
-    from safetensors.torch import save
-
-    values = {
-        name: (value.half() if value.is_floating_point() else value).contiguous().cpu()
-        for name, value in network.state_dict().items()
-    }
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(values, metadata=metadata))
-    return Path(path)
+    weights: Path  # the network, safetensors
+    log: (
+        Path  # JSON lines: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, pairs per second, seconds
+    )
+    psnr: float  # of the validation, mean over the levels [dB]
+    seconds: float  # of all parts of the run together
 
 
 @torch.no_grad()
@@ -269,12 +252,11 @@ class Run:
         except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
         if rank == 0 and self.log.is_file():  # a line is written before its checkpoint
-            lines = self.log.read_text().splitlines(keepends=True)
             settings = self.recipe.optimiser
             reports = kept["step"] // settings.report_every
-            lines = lines[
-                : reports if kept["step"] < settings.steps else math.ceil(kept["step"] / settings.report_every)
-            ]
+            if kept["step"] == settings.steps:
+                reports = math.ceil(kept["step"] / settings.report_every)
+            lines = self.log.read_text().splitlines(keepends=True)[:reports]
             with atomic_path(self.log) as temporary:
                 temporary.write_text("".join(lines))
         self.loss_sum += kept.get("loss_sum", 0.0)
@@ -373,24 +355,26 @@ class Run:
                 torch.save(kept, temporary)
 
     def finish(self, psnr: dict[float, float]) -> Trained:
-        """Writes the weights, the running mean of the network."""
+        """Writes the weights, the running mean of the network, as float16 with metadata in the file's header."""
+        from safetensors.torch import save
+
         recipe, workers, seconds = self.recipe, self.workers, time.monotonic() - self.began
         weights = self.folder / f"{recipe.model}.safetensors"
         if workers.rank == 0:
-            metadata = {
-                "model": recipe.model,
-                "seed": str(recipe.seed),
-                "recipe": recipe.model_dump_json(),
-                "validation_psnr": json.dumps({f"{level:.3f}": round(value, 2) for level, value in psnr.items()}),
-                "hours": f"{seconds / 3600:.3f}",
-                "machine": f"{workers.size} x {torch.cuda.get_device_name()}" if workers.is_cuda else "CPU",
+            metadata = {"model": recipe.model, "seed": str(recipe.seed), "recipe": recipe.model_dump_json()}
+            levels = {f"{level:.3f}": round(value, 2) for level, value in psnr.items()}
+            metadata |= {"validation_psnr": json.dumps(levels), "hours": f"{seconds / 3600:.3f}"}
+            metadata["machine"] = f"{workers.size} x {torch.cuda.get_device_name()}" if workers.is_cuda else "CPU"
+            values = {
+                name: (value.half() if value.is_floating_point() else value).contiguous().cpu()
+                for name, value in self.average.state_dict().items()
             }
-            save_weights(self.average, weights, metadata)
+            with atomic_path(weights) as temporary:
+                temporary.write_bytes(save(values, metadata=metadata))
         return Trained(weights=weights, log=self.log, psnr=sum(psnr.values()) / len(psnr), seconds=seconds)
 
 
-# ---- Training: one loop for every network, on a CPU, a GPU or several.
-
+# The loop.
 
 PHOTONS = (1.0, 3.0, 10.0, 30.0, 100.0)
 """Signal photons per pixel, a third of the background, at which networks that read histograms are validated."""
@@ -412,24 +396,12 @@ def fit(
     progress: Callable[[str, int, int], None] | None = None,
     notify: Callable[[str], None] | None = None,
 ) -> Trained:
-    """Trains a network, or resumes an interrupted run of the same recipe.
-
-    Args:
-        recipe: Model, noise and optimiser.
-        training, validation: Clean scenes, on any device; without them, scenes are drawn.
-        out: Folder for `checkpoint.pt`, `log.jsonl` and the weights.
-        device: "cpu", "cuda" or "cuda:N"; default: the GPU of this process, else the CPU.
-        progress: Called with ("steps", done, total) after each step.
-        notify: Called with how long the training will take, once the first steps show it.
+    """`spadwarp.denoise.train` on clean scenes, on any device; without them, scenes are drawn.
 
     Each process draws crops and noise of its own. A run of N processes equals, to the rounding of sums, a run of a
     single process whose batches are the N parts together; only batch normalisation, in DnCNN, sees its own part alone.
-    Ctrl-C or SIGTERM end the run after the step at hand with a checkpoint and a KeyboardInterrupt that names it.
-
-    Raises:
-        ConfigError: The folder holds a run of another recipe, or a crop is larger than the scenes.
-        DeviceError: No such device.
-        FileError: The weights cannot be written.
+    Ctrl-C or SIGTERM end the run after the step at hand with a checkpoint and a KeyboardInterrupt that names it. Raises
+    `ConfigError`, also where a crop is larger than the scenes.
     """
     workers = Workers(device)
     settings = recipe.optimiser
@@ -524,16 +496,9 @@ def validation_psnr(network: nn.Module, scenes: CleanScenes, recipe: TrainingRec
     Mean over crops with a target; the same crops and photons every time.
     """
     network.eval()
-    device = scenes.depth.device
-    result = {}
-    counting = reads_histograms(network)
-    plain: dict[str, Any] = {
-        "own_gate": 1.0,
-        "own_profile": 1.0,
-        "dead": 0.0,
-        "slanted_gate": 0.0,
-        "unknown_water": 0.0,
-    }
+    device, counting, result = scenes.depth.device, reads_histograms(network), {}
+    plain: dict[str, Any] = {"own_gate": 1.0, "own_profile": 1.0}
+    plain |= dict.fromkeys(("dead", "slanted_gate", "unknown_water"), 0.0)
     for level in PHOTONS if counting else LEVELS:
         generator = torch.Generator(device).manual_seed(round(1e4 * level))
         if counting:
