@@ -43,23 +43,17 @@ LARGER_IS_BETTER = {
 class Scores:
     """Scores of one frame, over the pixels that see a target.
 
-    Attributes:
-        psnr: Of depth scaled to 8 bits over the gate [dB]; 100 where no pixel differs.
-        ssim: Structural similarity of the same, 11 × 11 Gaussian window of σ = 1.5 (Wang et al., IEEE TIP 13, 600,
-            2004); pixels without a target are white in both images.
-        entropy: Shannon entropy of the denoised image [bit].
-        rmse_mm: Root mean square error of depth [mm].
-        within_1cm, within_5cm: Part of the pixels whose error is below 1 cm and 5 cm.
-        edge_mm: Mean absolute error within two pixels of an edge of the truth, a jump over 5 cm [mm]; else NaN.
+    SSIM has an 11 × 11 Gaussian window of σ = 1.5 (Wang et al., IEEE TIP 13, 600, 2004); pixels without a target are
+    white in both images.
     """
 
-    psnr: float
-    ssim: float
-    entropy: float
-    rmse_mm: float
-    within_1cm: float
-    within_5cm: float
-    edge_mm: float
+    psnr: float  # of depth scaled to 8 bits over the gate [dB]; 100 where no pixel differs
+    ssim: float  # structural similarity of the same
+    entropy: float  # Shannon entropy of the denoised image [bit]
+    rmse_mm: float  # root mean square error of depth [mm]
+    within_1cm: float  # part of the pixels whose error is below 1 cm
+    within_5cm: float  # and below 5 cm
+    edge_mm: float  # mean absolute error within two pixels of an edge of the truth, a jump over 5 cm [mm]; else NaN
 
     @classmethod
     def mean(cls, scores: list[Scores]) -> Scores:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -324,31 +325,21 @@ def evaluate_scenes(
     best: dict[tuple[str, str, float], int] = {}
     reliability: dict[tuple[str, str], NDArray[np.int64]] = {}
     done, total = 0, len(chosen) * len(waters) * len(levels)
-    for setting in dict.fromkeys(scene.setting for scene in chosen):
-        alike = [scene for scene in chosen if scene.setting == setting]
-        for water in waters:
-            for level in levels:
-                frames = [
-                    depth_frames(
-                        noisy_depth(scene, water=water, level=level, seed=seed + number),
-                        gate=scene.gate,
-                        profile=water_profile(water),
-                    )
-                    for number, scene in enumerate(alike)
-                ]
-                window = best[setting, water, level] = _best_window(alike, frames)
-                for scene, noisy in zip(alike, frames, strict=True):
-                    for method in ("input", *models):
-                        found = estimate_frames(
-                            noisy, model=method, window=window, weights=own.get(method), device=device
-                        )
-                        seen = found.target_probability[0] >= target_threshold(method)
-                        scores = score_frame(scene, noisy, found.depth[0], seen)
-                        rows[method, setting, water, level, scene.shape] = scores
-                        _count_reliability(reliability, method, scene, found)
-                    done += 1
-                    if progress is not None:
-                        progress("frames", done, total)
+    settings = dict.fromkeys(scene.setting for scene in chosen)
+    for setting, water, level in product(settings, waters, levels):
+        alike, profile = [scene for scene in chosen if scene.setting == setting], water_profile(water)
+        drawn = [noisy_depth(scene, water=water, level=level, seed=seed + n) for n, scene in enumerate(alike)]
+        frames = [depth_frames(one, gate=scene.gate, profile=profile) for one, scene in zip(drawn, alike, strict=True)]
+        window = best[setting, water, level] = _best_window(alike, frames)
+        for scene, noisy in zip(alike, frames, strict=True):
+            for method in ("input", *models):
+                found = estimate_frames(noisy, model=method, window=window, weights=own.get(method), device=device)
+                seen = found.target_probability[0] >= target_threshold(method)
+                rows[method, setting, water, level, scene.shape] = score_frame(scene, noisy, found.depth[0], seen)
+                _count_reliability(reliability, method, scene, found)
+            done += 1
+            if progress is not None:
+                progress("frames", done, total)
     return SceneScores(methods=("input", *models), rows=rows, windows=best, reliability=reliability)
 
 

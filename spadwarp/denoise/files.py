@@ -40,25 +40,15 @@ _EXR_CHANNELS = ("Z", "depth", "range", "A", "Depth.Z", "Depth.V")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthReading:
-    """Depth from a file.
+    """Depth from a file; None for what the file does not give."""
 
-    Attributes:
-        depth: float32 `[N, H, W]` [m]; NaN where there is none.
-        frames: Whether the file held several frames.
-        gate: (start, stop) [m]; None where the file does not give it.
-        profile: Backscatter over the gate, `[bins]`; None where the file does not give it.
-        source: How the depth was obtained, as text.
-        histograms: What the depth was estimated from, if these are counts whose instrument response is known.
-        truth: True depth of the first frame, `[H, W]` [m]; None where the file does not give it.
-    """
-
-    depth: NDArray[np.float32]
-    frames: bool
-    gate: tuple[float, float] | None
-    profile: NDArray[np.float64] | None
-    source: str
-    histograms: Histograms | None = None
-    truth: NDArray[np.float32] | None = None
+    depth: NDArray[np.float32]  # [N, H, W] [m]; NaN where there is none
+    frames: bool  # whether the file held several
+    gate: tuple[float, float] | None  # start and stop [m]
+    profile: NDArray[np.float64] | None  # backscatter over the gate, [bins]
+    source: str  # how the depth was obtained
+    histograms: Histograms | None = None  # what it was estimated from: counts whose instrument response is known
+    truth: NDArray[np.float32] | None = None  # true depth of the first frame, [H, W] [m]
 
 
 def read_depth(
@@ -234,16 +224,15 @@ def backscatter_profile(histograms: Histograms) -> NDArray[np.float64] | None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Denoised:
-    """Output of `denoise_file`: depth `[N, H, W]` [m], probability that a pixel sees a target and from which one on it
-    counts as such, probability that its depth is right, gate [m], paths of the files, and notes for the user."""
+    """Output of `denoise_file`."""
 
-    depth: NDArray[np.float32]
-    target_probability: NDArray[np.float32]
-    threshold: float
-    confidence: NDArray[np.float32]
-    gate: tuple[float, float]
+    depth: NDArray[np.float32]  # [N, H, W] [m]
+    target_probability: NDArray[np.float32]  # that a pixel sees a target
+    threshold: float  # of this probability, from which on it counts as one
+    confidence: NDArray[np.float32]  # probability that its depth is right
+    gate: tuple[float, float]  # [m]
     files: tuple[Path, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # for the user
 
 
 def depth_files(path: str | Path) -> list[Path]:

@@ -38,21 +38,12 @@ SMALLEST_SIDE = 8
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthFrames:
-    """Depth frames with their gate.
+    """Depth frames `[N, H, W]` with their gate, and what is known of the water and of the histograms behind them."""
 
-    Attributes:
-        depth: float32 `[N, H, W]` [m]; NaN where nothing was reported, or nothing near the gate.
-        gate: (start, stop) in depth [m].
-        density: Density of the water's backscatter at each depth, relative to a flat one over the gate, float32 of
-            `depth`'s shape; 1 everywhere if it is not known.
-        features: Features of the histograms behind them, float32 `[N, FEATURES, H, W]` as
-            `spadwarp.denoise.histogram_features` makes them, but with its depths in metres; None without histograms.
-    """
-
-    depth: NDArray[np.float32]
-    gate: tuple[float, float]
-    density: NDArray[np.float32]
-    features: NDArray[np.float32] | None = None
+    depth: NDArray[np.float32]  # [m]; NaN where nothing was reported, or nothing near the gate
+    gate: tuple[float, float]  # start and stop in depth [m]
+    density: NDArray[np.float32]  # of the water's backscatter at each depth, relative to a flat one; 1 if not known
+    features: NDArray[np.float32] | None = None  # of `histogram_features`, but with its depths in metres
 
     @property
     def gate_middle(self) -> float:

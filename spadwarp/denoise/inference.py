@@ -171,7 +171,7 @@ def estimate_histograms(
     depth: NDArray[Any],
     counts: NDArray[Any],
     background: NDArray[np.float32],
-    response: NDArray[np.float32],
+    response: NDArray[Any],
     *,
     bins: slice,
     gate: tuple[float, float],

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
-from spadwarp.denoise.histogram_features import FEATURES, LIGHT, LIKENESS, MOST, SEEN
+from spadwarp.denoise.histogram_features import LIGHT, LIKENESS, MOST, SEEN
 from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, symmetric_mean, turned
 from spadwarp.values import ArgumentError
 
@@ -65,21 +65,18 @@ class USDN(nn.Module):
 class DnCNN(nn.Module):
     """Residual learning of the noise, 17 layers of 64 channels: Zhang et al., IEEE TIP 26, 3142 (2017); depth only."""
 
-    def __init__(self, *, layers: int = 17, channels: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        body: list[nn.Module] = [nn.Conv2d(1, channels, 3, padding=1), nn.ReLU(inplace=True)]
-        for _ in range(layers - 2):
-            body += [nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)]
-            body.append(nn.ReLU(inplace=True))
-        body.append(nn.Conv2d(channels, 1, 3, padding=1))
-        self.body = nn.Sequential(*body)
+        body: list[nn.Module] = [nn.Conv2d(1, 64, 3, padding=1), nn.ReLU(inplace=True)]
+        for _ in range(15):
+            body += [nn.Conv2d(64, 64, 3, padding=1, bias=False), nn.BatchNorm2d(64), nn.ReLU(inplace=True)]
+        self.body = nn.Sequential(*body, nn.Conv2d(64, 1, 3, padding=1))
         for layer in self.modules():
             if isinstance(layer, nn.Conv2d):
                 nn.init.kaiming_normal_(layer.weight)
 
     def forward(self, frame: Tensor) -> Tensor:
-        noise = self.body(frame[:, :1])
-        return frame[:, :1] - noise.to(frame.dtype)
+        return frame[:, :1] - self.body(frame[:, :1]).to(frame.dtype)
 
 
 # Votes of neighbours: which reported depths agree.
@@ -437,16 +434,13 @@ class PyramidNet(nn.Module):
 
     A pixel's depth is a convex combination of the 5×5 depths around it, of the mean depths of 3×3 wider windows (9 and
     36 pixels), of the depth that neighbours vote for, and of one value of the network's own; what is far from it is
-    then left out, so that two surfaces are not mixed. The weight of a depth is the product of two factors: one belongs
-    to the pixel that it comes from (the probability that it is the target's depth), the other to the pixel that it goes
-    to (whether the two belong together). Depths of signal photons are thereby used as they are, to the millimetre;
-    where there are none, the network's own value is used. Kernel prediction: Bako et al., ACM TOG 36, 97 (2017); means
+    then left out, so that two surfaces are not mixed. The weight of a depth is the product of two factors: the
+    probability that it is the target's, and whether it belongs to the pixel that it goes to. Depths of signal photons
+    are thereby used as they are, to the millimetre. Kernel prediction: Bako et al., ACM TOG 36, 97 (2017); means
     weighted by certainty: Knutsson & Westin, CVPR 1993. All its layers commute with turns and reflections of the image.
 
-    It sees depth, which pixels reported, how probable backscatter is at the reported depth, three order statistics of
-    each 3×3 neighbourhood, which leave out the scattered photons, and the votes, in the full size, then in blocks of 2,
-    4, 8 and 16 pixels. The output, `[batch, 4, height, width]`: depth over the gate; the logits of "the pixel sees a
-    target", of "the depth is right to `CLOSE`", and of "the reported depth is the target's".
+    The output, `[batch, 4, height, width]`: depth over the gate; the logits of "the pixel sees a target", of "the depth
+    is right to `CLOSE`", and of "the reported depth is the target's".
 
     With `histograms` it sees the channels of `spadwarp.denoise.histogram_features`, not the votes. Each pixel then
     first gets a depth from the candidates among them, which replaces the reported one in all that follows: the most
@@ -726,16 +720,3 @@ def build_network(name: str) -> nn.Module:
 def reads_histograms(network: nn.Module) -> bool:
     """Whether this network needs the channels of `spadwarp.denoise.histogram_features`."""
     return getattr(network, "histograms", False)
-
-
-def multiply_adds(network: nn.Module, height: int, width: int) -> int:
-    """Multiplications of all convolutions for one frame of `height` × `width`; other operations cost little."""
-    from torch.utils.flop_counter import FlopCounterMode
-
-    channels = 3 + FEATURES * reads_histograms(network)
-    frame = torch.zeros(1, channels, height, width, device=next(network.parameters()).device)
-    mode = network.training
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        network.eval()(frame)
-    network.train(mode)
-    return counter.get_total_flops() // 2

@@ -35,8 +35,8 @@ def write_report(evaluation: Evaluation, folder: str | Path) -> list[Path]:
     place = Path(folder)
     pictures = _draw(evaluation, place)
     tables = [_means(evaluation), _gains(evaluation), *([_steps(evaluation)] if evaluation.steps else [])]
-    texts = {"data": evaluation.data, "summary": evaluation.summary, "targets": evaluation.targets}
-    texts["frames"] = sum(evaluation.frames.values())
+    frames = sum(evaluation.frames.values())
+    texts = {"data": evaluation.data, "summary": evaluation.summary, "targets": evaluation.targets, "frames": frames}
     return _write(place, evaluation, pictures, tables, texts)
 
 

@@ -105,18 +105,18 @@ def _choice_error(depths: Tensor, scores: Tensor, batch: Batch) -> Tensor:
 
 # Steps
 
-
 _EAGER = 12  # steps before one is recorded as a CUDA graph
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trained:
-    """Files and validation of a training."""
+    """Files and validation of a training.
 
-    weights: Path  # the network, safetensors
-    log: (
-        Path  # JSON lines: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, pairs per second, seconds
-    )
+    A line of the log is JSON: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, pairs per second, s.
+    """
+
+    weights: Path
+    log: Path
     psnr: float  # of the validation, mean over the levels [dB]
     seconds: float  # of all parts of the run together
 
@@ -283,11 +283,8 @@ class Run:
     def update(self) -> None:
         """One step, whose samples are prepared. On a single GPU steps are replayed as a CUDA graph: launched faster."""
         rate = _learning_rate(self.step, self.recipe)
-        for group in self.optimiser.param_groups:
-            if isinstance(group["lr"], Tensor):
-                group["lr"].fill_(rate)
-            else:
-                group["lr"] = rate
+        (group,) = self.optimiser.param_groups
+        group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
         samples = self.samples.of(self.step)
         if samples in self.graphs:
             graph, loss = self.graphs[samples]
@@ -328,11 +325,10 @@ class Run:
 
     def _work(self, samples: Samples) -> Tensor:
         settings, workers = self.recipe.optimiser, self.workers
-        precision = torch.bfloat16 if settings.precision == "bfloat16" and workers.is_cuda else torch.float32
+        mixed = settings.precision == "bfloat16" and workers.is_cuda
         self.learner.train()
         batch = samples.batch()
-        mixed = precision != torch.float32
-        with torch.autocast(workers.device.type, dtype=precision, enabled=mixed, cache_enabled=False):
+        with torch.autocast(workers.device.type, dtype=torch.bfloat16, enabled=mixed, cache_enabled=False):
             output = self.learner(batch.frame.contiguous(memory_format=torch.channels_last))
         loss = loss_of(output.float(), batch, kind=settings.loss)
         self.optimiser.zero_grad(set_to_none=True)
