@@ -27,11 +27,10 @@ def unfiltered(frames: DepthFrames) -> Frames:
 
 def median_filter(frames: DepthFrames, *, window: int = 5) -> Frames:
     """Median of `window` × `window` pixels, `[N, H, W]` [m]; pixels without a depth take that of their nearest."""
-    from scipy.ndimage import median_filter as filtered
+    from scipy import ndimage
 
-    return np.stack(
-        [filtered(fill_missing(depth, frames.gate_middle), window, mode="nearest") for depth in frames.depth]
-    )
+    filled = (fill_missing(depth, frames.gate_middle) for depth in frames.depth)
+    return np.stack([ndimage.median_filter(image, window, mode="nearest") for image in filled])
 
 
 def gated_filter(frames: DepthFrames) -> Frames:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -22,7 +21,6 @@ from spadwarp.denoise.network_files import own_weights
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["Evaluation", "evaluate"]
-
 
 _EDGE = 0.05  # a jump of depth between neighbours that is an edge [m]
 _PHOTON_EDGES = (0.0, 3.0, 10.0, 30.0, 100.0, math.inf)  # levels of datasets that have no backscatter fractions
@@ -144,8 +142,7 @@ def staircase_steps(clean: NDArray[np.float32], estimate: NDArray[np.float32]) -
     for values, rows in ((filled, flat), (filled.T, flat.T)):
         rows[:-1] &= np.abs(np.diff(values, axis=0)) < 0.025
     faces, count = label(flat)
-    masks = [faces == number for number in range(1, count + 1)]
-    masks = [mask for mask in masks if mask.sum() >= 100]
+    masks = [mask for number in range(1, count + 1) if (mask := faces == number).sum() >= 100]
     grown = [binary_dilation(mask, iterations=4) for mask in masks]
     estimate = np.nan_to_num(estimate, nan=0.0)
     total = resolved = 0
@@ -203,13 +200,10 @@ class Evaluation:
 
     def mean(self, method: str, *, level: str | None = None, target: str | None = None) -> Scores:
         """Mean over targets and levels, or over those of one level or target; each counts once."""
-        return Scores.mean(
-            [
-                scores
-                for (name, subject, at), scores in self.scores.items()
-                if name == method and level in (None, at) and target in (None, subject)
-            ]
+        chosen = (
+            one for one in self.scores if one[0] == method and target in (None, one[1]) and level in (None, one[2])
         )
+        return Scores.mean([self.scores[one] for one in chosen])
 
     def ranking(self) -> list[str]:
         """Methods by mean rank over all scores that can be ranked, best first."""
@@ -228,12 +222,9 @@ class Evaluation:
             "ranking": self.ranking(),
             "median_windows": self.windows,
             "frames": [{"target": target, "level": level, "frames": n} for (target, level), n in self.frames.items()],
-            "steps": [
-                {"method": method, "level": level, **dataclasses.asdict(steps)}
-                for (method, level), steps in self.steps.items()
-            ],
+            "steps": [{"method": key[0], "level": key[1], **vars(steps)} for key, steps in self.steps.items()],
             "scores": [
-                {"method": method, "target": target, "level": level, **dataclasses.asdict(scores)}
+                {"method": method, "target": target, "level": level, **vars(scores)}
                 for (method, target, level), scores in self.scores.items()
             ],
         }

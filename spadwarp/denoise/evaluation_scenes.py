@@ -278,8 +278,7 @@ class SceneScores:
         return {
             "scores": [{**dict(zip(keys, key, strict=True)), **vars(scores)} for key, scores in self.rows.items()],
             "median_windows": [
-                {"setting": setting, "water": water, "level": level, "window": window}
-                for (setting, water, level), window in self.windows.items()
+                {**dict(zip(keys[1:4], key, strict=True)), "window": window} for key, window in self.windows.items()
             ],
             "reliability": [
                 {"method": method, "of": kind, "pixels": table[:, 0].tolist(), "true": table[:, 1].tolist()}
@@ -307,14 +306,7 @@ def evaluate_scenes(
         waters: From `evaluation_scenes.WATERS`.
         levels: Backscatter fractions.
         seed: Of the noise.
-        weights: File of `spadwarp train`, replacing the package's weights of the network that it names.
-        device: torch device of the networks.
-        progress: Called with ("frames", done, total).
-
-    Raises:
-        ArgumentError: An argument out of range; weights of a network that is not among the models.
-        FileError: Weights that cannot be read.
-        SpadwarpError: A package of the extra `denoise` is missing.
+        weights, device, progress: See `evaluate`, as for errors.
     """
     if unknown := [name for name in models if name not in METHODS or name in ("histograms", *CLASSICAL)]:
         raise ArgumentError(f"models: {unknown[0]!r} is not a method for depth frames")

@@ -135,12 +135,8 @@ def second_return(
 
     Args:
         depth: First return over the gate, 0 at its start and 1 at its end, `[H, W]` or `[N, H, W]`.
-        counts, background, response: See `spadwarp.denoise.estimate`.
+        counts, background, response, device: See `spadwarp.denoise.estimate`, as for errors.
         side: Of the window over which histograms are pooled; 1 for each pixel alone.
-        device: torch device.
-
-    Raises:
-        ArgumentError: Shapes or values that cannot be.
     """
     torch = require_torch()
     from spadwarp.denoise.histogram_features import highest, pooled, toeplitz
@@ -151,9 +147,8 @@ def second_return(
     frames = first.reshape(-1, *first.shape[-2:])
     found = []
     with torch.inference_mode():
-        for place, (cube, level, taps) in zip(
-            frames, histogram_tensors(cubes, background, response, device), strict=True
-        ):
+        tensors = histogram_tensors(cubes, background, response, device)
+        for place, (cube, level, taps) in zip(frames, tensors, strict=True):
             bins = cube.shape[-1]
             at = (torch.from_numpy(np.nan_to_num(place)).to(cube.device)[None] * bins).long().clamp(0, bins - 1)
             apart = torch.arange(taps.shape[1], device=cube.device) - taps.shape[1] // 2

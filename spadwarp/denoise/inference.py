@@ -262,18 +262,17 @@ def estimate_frames(
             depth = torch.from_numpy(frames.depth[some]).to(place)
             reported = ~torch.isnan(depth)
             if inputs is None:
-                given, start, width, share = narrowed_input(
-                    (depth - begin) / extent, torch.from_numpy(frames.density[some]).to(place)
-                )
-                output = network(given).float()
-                finite &= bool(output.isfinite().all())
-                output[:, 0].clamp_(0.0, 1.0).mul_(width[:, None, None]).add_(start[:, None, None])
-                output[:, 1] = corrected_target(output[:, 1], depth, given[:, 1], share)
+                density = torch.from_numpy(frames.density[some]).to(place)
+                given, start, width, share = narrowed_input((depth - begin) / extent, density)
             else:
-                output = network(torch.from_numpy(inputs[some]).to(place)).float()
-                finite &= bool(output.isfinite().all())
-                output[:, 0].clamp_(0.0, 1.0)
-            found = output[:, 0].mul_(extent).add_(begin)
+                given = torch.from_numpy(inputs[some]).to(place)
+            output = network(given).float()
+            finite &= bool(output.isfinite().all())
+            found = output[:, 0].clamp_(0.0, 1.0)
+            if inputs is None:
+                found.mul_(width[:, None, None]).add_(start[:, None, None])
+                output[:, 1] = corrected_target(output[:, 1], depth, given[:, 1], share)
+            found.mul_(extent).add_(begin)
             probability, confidence = reported.float(), torch.full_like(found, torch.nan)
             if output.shape[1] > 1:
                 probability, confidence = output[:, 1:3].sigmoid_().unbind(dim=1)

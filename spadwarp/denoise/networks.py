@@ -81,7 +81,7 @@ class DnCNN(nn.Module):
 
 # Votes of neighbours: which reported depths agree.
 
-VOTES = 4  # scalar channels among the votes: near, wide, depth and support
+_SCALARS = 4  # scalar channels among the votes: near, wide, depth and support
 _SAME, _ALIKE = 0.012, 0.04  # depths this far apart do not agree, among 3 × 3 and 5 × 5 pixels
 _FAR = 10.0  # behind any depth that is reported
 _BORDER = 3  # pixels of padding, more than those of a pair are apart
@@ -173,7 +173,7 @@ def _directions() -> tuple[tuple[int, int], ...]:
 
 _VOTERS = 3  # pixels around that vote
 _ONE_SURFACE, _APART = 0.01, 0.05  # depths this near are one surface, this far apart two
-_VOTES, _TIMES = 4, 3.0  # votes for a surface, and how many times the pixels that took the other one, that move to it
+_ENOUGH, _TIMES = 4, 3.0  # votes for a surface, and how many times the pixels that took the other one, that move to it
 _RETURN = 4.0  # log-likelihood from which on a return is one [nats]
 _PHOTON = 5.0  # log-likelihood of a photon, about the highest [nats]
 _CHANCE = 2.0  # deviations by which the two returns may differ
@@ -199,7 +199,7 @@ def follow_the_others(found: Tensor, features: Tensor) -> Tensor:
                 votes += alike & near
     more = light.flip(1) - light  # of the other return
     by_chance = more <= _CHANCE * (_PHOTON * light.sum(dim=1, keepdim=True)).clamp_min(0.0).sqrt()
-    outvoted = (votes >= _VOTES) & (votes >= _TIMES * taken.flip(1))
+    outvoted = (votes >= _ENOUGH) & (votes >= _TIMES * taken.flip(1))
     moves = outvoted & by_chance & ((found - pair).abs() > _APART)
     return torch.where(moves.any(dim=1, keepdim=True), torch.where(moves, pair, 0.0).sum(dim=1, keepdim=True), found)
 
@@ -460,7 +460,7 @@ class PyramidNet(nn.Module):
         votes, last = not histograms, 8
         widths = (4, 5, 8, 10, 12 if histograms else 14)  # features of the levels
         pairs, deep = list(pairwise(widths)), len(widths) - 1
-        self.enter = SymmetricConv(6 + VOTES * votes, widths[0], 3, lifts=True)
+        self.enter = SymmetricConv(6 + _SCALARS * votes, widths[0], 3, lifts=True)
         self.enter_agreement = SymmetricConv(2, widths[0], 3, bias=False) if votes else None
         self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
         self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
@@ -492,7 +492,7 @@ class PyramidNet(nn.Module):
                     layer.weight.mul_(0.1)
                 for layer in (self.enter_agreement, *self.up):
                     layer.weight.mul_(0.3)
-                self.enter.weight[:, -VOTES:].mul_(0.3)
+                self.enter.weight[:, -_SCALARS:].mul_(0.3)
         if histograms:
             self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay

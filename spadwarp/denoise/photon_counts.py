@@ -89,9 +89,7 @@ def evaluate_histograms(
         device: torch device.
         progress: Called with ("points", done, total).
 
-    Raises:
-        FileError: Weights that cannot be read.
-        SpadwarpError: A package of the extra `denoise` is missing.
+    Errors are those of `evaluate`.
     """
     if scenes is None:
         scenes = [evaluation_scene(shape, "wall", size=(64, 64)) for shape in ("stairs", "rings", "vase")]
@@ -229,13 +227,9 @@ def photon_sweep(
         models: From `spadwarp.denoise.METHODS`; the median has its best window at each point.
         frames: Drawn and averaged for each point.
         seed: Of the counts.
-        weights: File of `spadwarp train`, replacing the package's weights of the network that it names.
-        device: torch device of the networks.
-        progress: Called with ("frames", done, total).
+        weights, device, progress: See `evaluate`, as for errors.
 
     Raises:
-        ArgumentError: An argument out of range; weights of a network that is not among the models.
-        FileError: Weights that cannot be read.
         SpadwarpError: The result has no return, no backscatter or no instrument response.
     """
     for model in models:

@@ -160,23 +160,27 @@ def _rod(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     return inside, random.between((-0.5, 0.5), 1, 1) * x / 120.0 - bulge
 
 
+def _wave(along: Tensor, heights: tuple[float, float], lengths: tuple[float, float], random: Random) -> Tensor:
+    return random.between(heights, 1, 1) * torch.sin(along / random.between(lengths, 1, 1) + 6 * random.uniform(1, 1))
+
+
 def _rope(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
-    wave = random.between((0.0, 20.0), 1, 1) * torch.sin(
-        x / random.between((6.0, 40.0), 1, 1) + 6 * random.uniform(1, 1)
-    )
-    curve = wave + random.between((-0.004, 0.004), 1, 1) * x.square()
+    curve = _wave(x, (0.0, 20.0), (6.0, 40.0), random) + random.between((-0.004, 0.004), 1, 1) * x.square()
     slope = torch.gradient(curve, dim=2)[0].clamp(-3.0, 3.0)
     half = random.log_between((0.5, 3.0), 1, 1) * (1.0 + slope.square()).sqrt()
     return (y - curve).abs() < half, random.between((-0.4, 0.4), 1, 1) * x / 120.0
+
+
+def _from_lines(along: Tensor, pitch: Tensor) -> Tensor:
+    """Distance from the nearest of lines that are a pitch apart."""
+    return (along / pitch - (along / pitch).round()).abs() * pitch
 
 
 def _net(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     pitch, half = random.log_between((5.0, 36.0), 1, 1), random.log_between((0.5, 2.2), 1, 1)
     second = torch.where(random.coin(0.5, 1, 1), 1.0, random.between((0.4, 2.5), 1, 1)) * pitch
     bent = y + 3.0 * torch.sin(x / 17.0 + 6 * random.uniform(1, 1)) * random.coin(0.5, 1, 1)
-    lines = ((x / pitch - (x / pitch).round()).abs() * pitch < half) | (
-        (bent / second - (bent / second).round()).abs() * second < half
-    )
+    lines = (_from_lines(x, pitch) < half) | (_from_lines(bent, second) < half)
     extent = random.log_between((20.0, 120.0), 2, 1, 1)
     inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
     return lines & inside, random.between((-0.4, 0.4), 1, 1) * x / 120.0 + 0.03 * torch.sin(y / 23.0)
@@ -185,10 +189,9 @@ def _net(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
 def _ladder(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     half, apart, pitch = (random.log_between(limits, 1, 1) for limits in ((0.6, 4.0), (6.0, 30.0), (6.0, 24.0)))
     rails = (y.abs() - apart).abs() < half
-    rungs = ((x / pitch - (x / pitch).round()).abs() * pitch < 0.8 * half) & (y.abs() < apart)
-    return (rails | rungs) & (x.abs() < random.between((30.0, 110.0), 1, 1)), random.between(
-        (-0.5, 0.5), 1, 1
-    ) * x / 120.0
+    rungs = (_from_lines(x, pitch) < 0.8 * half) & (y.abs() < apart)
+    inside = (rails | rungs) & (x.abs() < random.between((30.0, 110.0), 1, 1))
+    return inside, random.between((-0.5, 0.5), 1, 1) * x / 120.0
 
 
 def _plant(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
@@ -196,9 +199,7 @@ def _plant(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     inside, depth = torch.zeros_like(x, dtype=torch.bool), torch.zeros_like(x)
     for _ in range(5):
         foot, length = random.between((-25.0, 25.0), 1, 1), random.between((15.0, 80.0), 1, 1)
-        bend = random.between((2.0, 14.0), 1, 1) * torch.sin(
-            y / random.between((8.0, 30.0), 1, 1) + 6 * random.uniform(1, 1)
-        )
+        bend = _wave(y, (2.0, 14.0), (8.0, 30.0), random)
         width = random.log_between((0.6, 5.0), 1, 1) * (1.0 - y.abs() / length).clamp_min(0.0)
         leaf = (x - foot - bend).abs() < width
         depth = torch.where(leaf, random.between((-0.15, 0.15), 1, 1) + 0.002 * y, depth)
