@@ -29,9 +29,10 @@ from spadwarp.denoise import baselines, files, network_files, photon_counts, sam
 from spadwarp.denoise import evaluation as metrics
 from spadwarp.denoise import files as reading
 from spadwarp.denoise import training as training_steps
+from spadwarp.denoise.files import read_scenes
 from spadwarp.denoise.frames import depth_frames, fill_missing
 from spadwarp.denoise.networks import build_network
-from spadwarp.denoise.recipe import load_training_recipe, read_scenes
+from spadwarp.denoise.recipe import load_training_recipe
 from spadwarp.denoise.synthetic_noise import Batch
 from spadwarp.denoise.training import fit
 from spadwarp.frames import instrument_response, record_frames
