@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.frames import DepthFrames, fill_missing
-from spadwarp.denoise.histogram_inputs import histogram_tensors
+from spadwarp.denoise.histograms import histogram_tensors
 from spadwarp.denoise.network_files import require_torch
 from spadwarp.values import ArgumentError, SpadwarpError, check_real
-
-__all__ = ["BASELINES", "CLASSICAL", "MEDIAN_WINDOWS", "TUNINGS", "Classical", "bm3d_filter", "classical_depth"]
-__all__ += ["gated_filter", "median_filter", "unfiltered"]
 
 Frames = NDArray[np.float32]
 
@@ -29,25 +27,21 @@ def unfiltered(frames: DepthFrames) -> Frames:
 
 def median_filter(frames: DepthFrames, *, window: int = 5) -> Frames:
     """Median of `window` × `window` pixels, `[N, H, W]` [m]; pixels without a depth take that of their nearest."""
-    from scipy.ndimage import median_filter as filtered
+    from scipy import ndimage
 
-    return np.stack(
-        [filtered(fill_missing(depth, frames.gate_middle), window, mode="nearest") for depth in frames.depth]
-    )
+    filled = (fill_missing(depth, frames.gate_middle) for depth in frames.depth)
+    return np.stack([ndimage.median_filter(image, window, mode="nearest") for image in filled])
 
 
-def gated_filter(frames: DepthFrames, *, window: int = 3) -> Frames:
+def gated_filter(frames: DepthFrames) -> Frames:
     """Backscatter gating: keep depths where a frame has more of them than the water explains, `[N, H, W]` [m].
 
     The histogram of a frame's depths is compared with the backscatter's density, scaled to the depths in the nearest
     part of the gate that holds a tenth of that density. The target's gate is where 99 % of the significant excess lies;
     depths outside it are replaced by the nearest pixel inside, and a small median follows.
     """
-    from scipy.ndimage import median_filter as filtered
-
-    bins = 100
-    out = np.empty_like(frames.depth)
-    for index, (depth, scaled, density) in enumerate(zip(frames.depth, frames.scaled, frames.density, strict=True)):
+    bins, out = 100, frames.depth.copy()
+    for depth, scaled, density in zip(out, frames.scaled, frames.density, strict=True):
         with np.errstate(invalid="ignore"):
             valid = (scaled >= 0) & (scaled < 1)
         place = (scaled[valid] * bins).astype(np.int64)
@@ -63,10 +57,8 @@ def gated_filter(frames: DepthFrames, *, window: int = 3) -> Frames:
             within = np.cumsum(excess) / excess.sum()
             first, last = np.searchsorted(within, (0.005, 0.995))
             with np.errstate(invalid="ignore"):
-                outside = (scaled < (first - 1) / bins) | (scaled > (last + 2) / bins)
-            depth = np.where(outside, np.float32(np.nan), depth)
-        out[index] = filtered(fill_missing(depth, frames.gate_middle), window, mode="nearest")
-    return out
+                depth[(scaled < (first - 1) / bins) | (scaled > (last + 2) / bins)] = np.nan
+    return median_filter(replace(frames, depth=out), window=3)
 
 
 def bm3d_filter(frames: DepthFrames) -> Frames:
@@ -83,11 +75,10 @@ def bm3d_filter(frames: DepthFrames) -> Frames:
         raise SpadwarpError("bm3d needs the package bmnd: pip install 'spadwarp[bm3d]'") from error
 
     start, stop = frames.gate
-    smooth = median_filter(frames, window=5)
     out = np.empty_like(frames.depth)
-    for index, depth in enumerate(frames.depth):
+    for index, (depth, smooth) in enumerate(zip(frames.depth, median_filter(frames), strict=True)):
         image = (fill_missing(depth, frames.gate_middle) - start) / (stop - start)
-        sigma = float(np.sqrt(np.mean((image - (smooth[index] - start) / (stop - start)) ** 2)))
+        sigma = float(np.sqrt(np.mean((image - (smooth - start) / (stop - start)) ** 2)))
         if sigma > 1e-4:
             image = np.asarray(bmnd(image.astype(np.float32), BM3DProfile(), sigma=sigma), np.float32)
         out[index] = start + (stop - start) * image
@@ -132,21 +123,12 @@ def classical_depth(
 ) -> NDArray[np.float32]:
     """Depth over the gate, `[N, H, W]`, 0 at its start and 1 at its end.
 
-    `"likelihood"`: of each pixel alone. `"pooled"`: of windows of pixels. `"semi-global"`:
-    `spadwarp.denoise.classical` on the likelihoods. `"total-variation"`: of the likelihood depth, each pixel weighted
-    by how far its likelihood stands out. `"belief-propagation"`: `spadwarp.denoise.classical` on the
-    likelihoods, the strongest of these in most cases.
+    `"likelihood"`: of each pixel alone. `"pooled"`: of windows of pixels. `"semi-global"`: matching of the likelihoods.
+    `"total-variation"`: of the likelihood depth, each pixel weighted by how far its likelihood stands out.
+    `"belief-propagation"`: on the likelihoods, the strongest of these in most cases.
 
-    Args:
-        counts: `[H, W, T]` or `[N, H, W, T]`, not negative.
-        background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
-        response: Instrument response per bin centred on its time zero, `[2 r + 1]`.
-        method: One of `CLASSICAL`.
-        tuning: Above 0, see `TUNINGS`; default: 7 pixels, `usual_jump`, strength 1, a penalty of 4 nats.
-        device: torch device.
-
-    Raises:
-        ArgumentError: A method that does not exist; shapes or values that cannot be.
+    Arguments and errors are those of `spadwarp.denoise.estimate`; `tuning`: above 0, see `TUNINGS`; default: 7 pixels,
+    `usual_jump`, strength 1, a penalty of 4 nats.
     """
     if method not in CLASSICAL:
         raise ArgumentError(f"method = {method!r} is not one of {', '.join(map(repr, CLASSICAL))}")

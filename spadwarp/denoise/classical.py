@@ -1,4 +1,7 @@
-"""Classical estimates on volumes of a value for each bin of each pixel: windows, guides, and smooth surfaces."""
+"""Classical estimates: windows, guides, and smooth surfaces.
+
+A `score` is the log-likelihood of a return in each bin of each pixel, `[B, H, W, T]` [nats].
+"""
 
 from __future__ import annotations
 
@@ -54,10 +57,7 @@ _EDGES, _TEXTURE = 0.1, 0.1  # parts of the neighbours between which depth jumps
 
 
 def guide_channels(total: Tensor) -> list[Tensor]:
-    """Counts of each pixel and of 3 × 3 pixels against those of 15 × 15, in deviations, `[B, H, W]`, as asinh.
-
-    `total`: counts of each pixel over all times, `[B, H, W]`.
-    """
+    """Counts of each pixel and of 3 × 3 pixels against those of 15 × 15, in deviations, `[B, H, W]`, as asinh."""
     level = counts_level(total)[..., None]
     around = pooled(level, 15)
     differences = 0.3 * (level - around), 0.6 * (pooled(level, 3) - around)
@@ -93,27 +93,19 @@ def counts_level(total: Tensor) -> Tensor:
 # Semi-global matching on a volume of log-likelihoods: Hirschmüller, IEEE TPAMI 30, 328 (2008).
 
 
-SLOPE = 1.0
-"""Penalty of the next bin [nats]."""
-
 _JUMPS = 12.0, 60.0  # limits of the usual penalty of any other depth [nats]
 
 
 def usual_jump(score: Tensor) -> Tensor:
-    """Penalty of any other depth: half the highest score of the median pixel, `[B, 1, 1, 1]`; `score` as below."""
+    """Penalty of any other depth: half the highest score of the median pixel, `[B, 1, 1, 1]`."""
     peaks = score.amax(dim=-1).flatten(1)
     return (0.5 * peaks.median(dim=1).values).clamp(*_JUMPS)[:, None, None, None]
 
 
-def aggregate(score: Tensor, *, jump: Tensor, slope: float = SLOPE) -> Tensor:
-    """Sum over four directions, `[B, H, W, T]`.
-
-    Args:
-        score: Log-likelihood of a return in each bin, of each pixel, `[B, H, W, T]` [nats].
-        jump: Penalty of any other depth `[B, 1, 1, 1]` [nats].
-        slope: Penalty of the next bin [nats].
-    """
-    rows, columns = rows_and_columns(partial(messages, slope=slope), (score, score.transpose(1, 2)), (jump, jump))
+def aggregate(score: Tensor, *, jump: Tensor) -> Tensor:
+    """Sum over four directions, `[B, H, W, T]`; `jump`: penalty of any other depth `[B, 1, 1, 1]` [nats]."""
+    send = partial(messages, slope=1.0)
+    rows, columns = rows_and_columns(send, (score, score.transpose(1, 2)), (jump, jump))
     return (rows + columns.transpose(1, 2)).add_(score, alpha=4.0)
 
 
@@ -130,7 +122,7 @@ def rows_and_columns(
 def messages(score: Tensor, jump: Tensor, *, slope: float) -> Tensor:
     """Messages of the pixels of a row before and behind each about its depth, the sum of both, `[B, H, W, T]`.
 
-    Arguments are those of `aggregate`; `jump` may differ between neighbours, `[B, H, W − 1, 1]`. The best depth
+    `jump` may differ between neighbours, `[B, H, W − 1, 1]`; `slope`: penalty of the next bin [nats]. The best depth
     has 0 in each of the two.
     """
     lines = score.flatten(0, 1)
@@ -172,10 +164,7 @@ _ROUNDS = 3  # more of them change little
 def beliefs(score: Tensor, jump: Tensor, more: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """Log-likelihood of each depth of each pixel together with the best depths of all others, `[B, H, W, T]`.
 
-    Args:
-        score: Log-likelihood of a return in each bin, of each pixel, `[B, H, W, T]` [nats].
-        jump: Penalty of any other depth `[B, 1, 1, 1]` [nats].
-        more: Added to it between neighbours in rows and in columns, see `spadwarp.denoise.classical`.
+    `jump`: penalty of any other depth `[B, 1, 1, 1]` [nats]; `more`: what `edge_penalties` adds to it.
     """
     ahead = beside = jump
     if more is not None:
@@ -196,15 +185,10 @@ def beliefs(score: Tensor, jump: Tensor, more: tuple[Tensor, Tensor] | None = No
 def total_variation(
     depth: Tensor, weight: Tensor, *, strength: float = 1.0, iterations: int = 300, isotropic: bool = True
 ) -> Tensor:
-    """The smoothed maps `[B, H, W]`.
+    """The smoothed maps `[B, H, W]` of d₀, finite, with w ≥ 0 of each pixel, and λ = `strength`.
 
-    Args:
-        depth: d₀ `[B, H, W]`, over the gate; finite.
-        weight: w of each pixel `[B, H, W]`, ≥ 0; 0 where nothing was reported.
-        strength: λ.
-        iterations: Primal-dual steps.
-        isotropic: Whether TV is the length of the gradient, else the sum of its two parts, which commutes with
-            reflections of the image.
+    TV is the length of the gradient, or without `isotropic` the sum of its two parts, which commutes with reflections
+    of the image.
     """
     found, ahead = depth.clone(), depth.clone()
     down, right = torch.zeros_like(depth), torch.zeros_like(depth)
@@ -240,12 +224,7 @@ _TEMPERATURE = 1.5  # loops make the sums too certain
 
 
 def mean_depth(score: Tensor, across: Tensor, down: Tensor) -> Tensor:
-    """Mean depth over the gate, `[B, H, W]`.
-
-    Args:
-        score: Log-likelihood of a return in each bin, of each pixel, `[B, H, W, T]` [nats].
-        across, down: Added to the penalty of a jump, see `spadwarp.denoise.classical`.
-    """
+    """Mean depth over the gate, `[B, H, W]`; `across`, `down`: see `edge_penalties`."""
     rows = columns = score.new_zeros(())
     odds = [torch.exp(-(_JUMP + more).clamp_min(0.5))[..., None] for more in (across, down.transpose(1, 2))]
     for _ in range(_SUM_ROUNDS):
@@ -266,7 +245,7 @@ def _messages(probability: Tensor, odds: Tensor) -> Tensor:
     lines, most = probability.flatten(0, 1), odds.flatten(0, 1)
     received, last = torch.ones_like(lines), lines.shape[1] - 1
     apart = torch.stack([most, most.flip(1)]).unbind(dim=2)  # forwards and backwards
-    # Views are made once, as in `spadwarp.denoise.classical`.
+    # Views are made once, as in `messages`.
     given, products = lines.unbind(dim=1), received.unbind(dim=1)
     known = lines.new_empty(2, len(lines), lines.shape[2])
     ahead = torch.ones_like(known)  # the message sent last, forwards and backwards

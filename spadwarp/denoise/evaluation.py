@@ -1,12 +1,12 @@
-"""Comparison of denoisers: scores of every method on the same frames of a dataset."""
+"""Comparison of denoisers: scores of a frame, as an image and as a measurement; of every method on a dataset."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,14 +17,145 @@ from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames
-from spadwarp.denoise.metrics import LARGER_IS_BETTER, Scores, Steps, score, staircase_steps
 from spadwarp.denoise.network_files import own_weights
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
-__all__ = ["Evaluation", "Sample", "evaluate"]
+__all__ = ["Evaluation", "evaluate"]
 
+_EDGE = 0.05  # a jump of depth between neighbours that is an edge [m]
 _PHOTON_EDGES = (0.0, 3.0, 10.0, 30.0, 100.0, math.inf)  # levels of datasets that have no backscatter fractions
 _STAIRCASE = "staircase"
+
+LARGER_IS_BETTER = {
+    "psnr": True,
+    "ssim": True,
+    "rmse_mm": False,
+    "within_1cm": True,
+    "within_5cm": True,
+    "edge_mm": False,
+}
+"""Scores in which methods can be ranked."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """Scores of one frame, over the pixels that see a target.
+
+    SSIM has an 11 × 11 Gaussian window of σ = 1.5 (Wang et al., IEEE TIP 13, 600, 2004); pixels without a target are
+    white in both images.
+    """
+
+    psnr: float  # of depth scaled to 8 bits over the gate [dB]; 100 where no pixel differs
+    ssim: float  # structural similarity of the same
+    entropy: float  # Shannon entropy of the denoised image [bit]
+    rmse_mm: float  # root mean square error of depth [mm]
+    within_1cm: float  # part of the pixels whose error is below 1 cm
+    within_5cm: float  # and below 5 cm
+    edge_mm: float  # mean absolute error within two pixels of an edge of the truth, a jump over 5 cm [mm]; else NaN
+
+    @classmethod
+    def mean(cls, scores: list[Scores]) -> Scores:
+        """Mean of each field, without NaN."""
+        means = {}
+        for field in fields(cls):
+            values = np.array([getattr(score, field.name) for score in scores])
+            means[field.name] = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+        return cls(**means)
+
+
+def score(clean: NDArray[np.float32], estimate: NDArray[np.float32], *, gate: tuple[float, float]) -> Scores:
+    """Scores of a depth `[H, W]` [m], NaN counts as the end of the gate, by the true one, NaN without a target.
+
+    Raises `ArgumentError` for shapes that differ, or no target in the frame within the gate.
+    """
+    from skimage.measure import shannon_entropy
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+    if clean.shape != estimate.shape or clean.ndim != 2:
+        raise ArgumentError(f"estimate has shape {estimate.shape}; {clean.shape} is needed")
+    start, stop = gate
+    seen = np.isfinite(clean) & (clean >= start) & (clean < stop)
+    if not seen.any():
+        raise ArgumentError(f"no pixel sees a target within {start:g} to {stop:g} m")
+    estimate = np.nan_to_num(estimate, nan=stop)
+
+    def eight_bits(depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+        scaled = np.clip((np.where(seen, depth, stop) - start) / (stop - start), 0.0, 1.0)
+        return np.round(255.0 * scaled).astype(np.uint8)
+
+    truth, image = eight_bits(clean), eight_bits(estimate)
+    same = np.array_equal(truth[seen], image[seen])
+    psnr = 100.0 if same else float(peak_signal_noise_ratio(truth[seen], image[seen], data_range=255))
+    side = min(truth.shape)
+    _, similarity = structural_similarity(
+        truth, image, data_range=255, full=True, sigma=1.5, gaussian_weights=side >= 11, use_sample_covariance=False,
+        **({} if side >= 11 else {"win_size": side - 1 + side % 2}),
+    )  # fmt: skip
+    error = np.abs(estimate.astype(np.float64) - clean)[seen]
+    edge = near_jumps(clean, seen, _EDGE)[seen]
+    return Scores(
+        psnr=psnr,
+        ssim=float(similarity[seen].mean()),
+        entropy=float(shannon_entropy(image)),
+        rmse_mm=1e3 * float(np.sqrt(np.mean(error**2))),
+        within_1cm=float(np.mean(error < 0.01)),
+        within_5cm=float(np.mean(error < 0.05)),
+        edge_mm=1e3 * float(error[edge].mean()) if edge.any() else float("nan"),
+    )
+
+
+def near_jumps(clean: NDArray[np.float32], seen: NDArray[np.bool_], jump: float) -> NDArray[np.bool_]:
+    """Pixels that see a target within two of the border of the target, or of a jump of its depth [m]."""
+    from scipy.ndimage import binary_dilation
+
+    filled = np.where(seen, clean, np.float32(1e3))
+    jumps = np.zeros(clean.shape, bool)
+    for values, rows in ((filled, jumps), (filled.T, jumps.T)):
+        step = np.abs(np.diff(values, axis=0)) > jump
+        rows[:-1] |= step
+        rows[1:] |= step
+    return np.asarray(binary_dilation(jumps) & seen)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """Steps of about 10 cm between neighbouring faces: their number, and how many a frame resolves to ± 3 cm."""
+
+    total: int = 0
+    resolved: int = 0
+
+    def __add__(self, other: Steps) -> Steps:
+        return Steps(total=self.total + other.total, resolved=self.resolved + other.resolved)
+
+
+def staircase_steps(clean: NDArray[np.float32], estimate: NDArray[np.float32]) -> Steps:
+    """Counts neighbouring faces whose medians differ by 10 ± 3 cm in the truth, and by that ± 3 cm in the estimate.
+
+    Faces are the connected parts of the true depth between jumps of more than 2.5 cm, of at least 100 pixels; two are
+    neighbours if they are within eight pixels of each other.
+    """
+    from scipy.ndimage import binary_dilation, label
+
+    seen = np.isfinite(clean)
+    filled = np.where(seen, clean, np.float32(-1e3))
+    flat = seen.copy()
+    for values, rows in ((filled, flat), (filled.T, flat.T)):
+        rows[:-1] &= np.abs(np.diff(values, axis=0)) < 0.025
+    faces, count = label(flat)
+    masks = [mask for number in range(1, count + 1) if (mask := faces == number).sum() >= 100]
+    grown = [binary_dilation(mask, iterations=4) for mask in masks]
+    estimate = np.nan_to_num(estimate, nan=0.0)
+    total = resolved = 0
+    for (first, near), (second, also_near) in combinations(zip(masks, grown, strict=True), 2):
+        true_step = float(np.median(clean[first]) - np.median(clean[second]))
+        if 0.07 <= abs(true_step) <= 0.13 and (near & also_near).any():
+            step = float(np.median(estimate[first]) - np.median(estimate[second]))
+            total += 1
+            resolved += abs(step - true_step) <= 0.03
+    return Steps(total=total, resolved=resolved)
+
+
+# Of a dataset.
 
 
 class Sample(NamedTuple):
@@ -69,13 +200,10 @@ class Evaluation:
 
     def mean(self, method: str, *, level: str | None = None, target: str | None = None) -> Scores:
         """Mean over targets and levels, or over those of one level or target; each counts once."""
-        return Scores.mean(
-            [
-                scores
-                for (name, subject, at), scores in self.scores.items()
-                if name == method and level in (None, at) and target in (None, subject)
-            ]
+        chosen = (
+            one for one in self.scores if one[0] == method and target in (None, one[1]) and level in (None, one[2])
         )
+        return Scores.mean([self.scores[one] for one in chosen])
 
     def ranking(self) -> list[str]:
         """Methods by mean rank over all scores that can be ranked, best first."""
@@ -94,12 +222,9 @@ class Evaluation:
             "ranking": self.ranking(),
             "median_windows": self.windows,
             "frames": [{"target": target, "level": level, "frames": n} for (target, level), n in self.frames.items()],
-            "steps": [
-                {"method": method, "level": level, **dataclasses.asdict(steps)}
-                for (method, level), steps in self.steps.items()
-            ],
+            "steps": [{"method": key[0], "level": key[1], **vars(steps)} for key, steps in self.steps.items()],
             "scores": [
-                {"method": method, "target": target, "level": level, **dataclasses.asdict(scores)}
+                {"method": method, "target": target, "level": level, **vars(scores)}
                 for (method, target, level), scores in self.scores.items()
             ],
         }
@@ -139,46 +264,37 @@ def evaluate(
         FileError: No dataset, or no frames in the split; weights that cannot be read.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
-    comparison = _Comparison(data, models, split, frames, bm3d_frames, crop, weights, device)
-    done, total = 0, sum(map(len, comparison.chosen.values()))
-    for (target, level), indices in comparison.chosen.items():
-        for index in indices:
-            comparison.score_frame(index, target, level)
-            done += 1
-            if progress is not None:
-                progress("frames", done, total)
-    return comparison.collect()
+    for name in models:
+        check_choice("models: an item", name, METHODS)
+    wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
+    if counting := [name for name in wanted if name in ("histograms", *CLASSICAL)]:
+        raise ArgumentError(
+            f"models: {counting[0]!r} needs histograms with their background, which datasets do not keep; "
+            "evaluate a result"
+        )
+    frames = check_integer("frames", frames, "[1, 1000000000]")
+    bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
+    own = own_weights(wanted, None if weights is None else Path(weights))
+    comparison = _Comparison(data, split, frames, crop, ("input", *wanted), own, device)
+    return comparison.scored(bm3d_frames, progress)
 
 
 class _Comparison:
-    """Which frames are scored by which methods, and their scores, with the keys of `Evaluation`."""
+    """Which frames of a dataset are scored by which methods, and their scores, with the keys of `Evaluation`."""
 
     def __init__(
         self,
         data: str | os.PathLike[str],
-        models: Sequence[str],
         split: str,
         frames: int,
-        bm3d_frames: int,
         crop: tuple[int, int] | None,
-        weights: str | os.PathLike[str] | None,
+        methods: tuple[str, ...],
+        weights: dict[str, Path],
         device: str | None,
     ) -> None:
-        wanted = [name for name in dict.fromkeys(models) if name != "bm3d"] + ["bm3d"] * (bm3d_frames > 0)
-        for name in models:
-            check_choice("models: an item", name, METHODS)
-        if counting := [name for name in wanted if name in ("histograms", *CLASSICAL)]:
-            raise ArgumentError(
-                f"models: {counting[0]!r} needs histograms with their background, which datasets do not keep; "
-                "evaluate a result"
-            )
-        frames = check_integer("frames", frames, "[1, 1000000000]")
-        bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
-        self.data, self.split, self.device, self.methods = data, split, device, ("input", *wanted)
-        self.weights = own_weights(wanted, None if weights is None else Path(weights))
+        self.data, self.split, self.methods, self.weights, self.device = data, split, methods, weights, device
         self.chosen, self.photons, self.summary = _choose(data, split, frames)
         self.reader = FrameReader(data, split, fields=("noisy", "clean", "bound", "prior"))
-        self.bm3d_frames = math.ceil(bm3d_frames / len({target for target, _ in self.chosen}))  # of a target and level
         rows, columns = self.reader.shape
         width, height = crop or (columns, rows)
         if not (8 <= width <= columns and 8 <= height <= rows):
@@ -192,7 +308,7 @@ class _Comparison:
         self.steps: dict[tuple[str, str], Steps] = {}
         self.frames: dict[tuple[str, str], int] = {}
         self.samples: dict[tuple[str, str], Sample] = {}
-        self.windows = self._best_windows() if "median" in wanted else {}
+        self.windows = self._best_windows() if "median" in methods else {}
 
     def _frame(self, index: int) -> tuple[dict[str, Any], DepthFrames, NDArray[np.float32], NDArray[np.bool_] | None]:
         """The item, its noisy frame, true depth where its light is within the gate, and which pixels see the target."""
@@ -216,7 +332,7 @@ class _Comparison:
         levels = dict.fromkeys(level for level, _ in quality)
         return {level: max(MEDIAN_WINDOWS, key=lambda window: np.mean(quality[level, window])) for level in levels}
 
-    def score_frame(self, index: int, target: str, level: str) -> None:
+    def _score_frame(self, index: int, target: str, level: str, bm3d_frames: int) -> None:
         """Scores a frame by every method; a frame in which less than 1 % of the pixels see a target is left out."""
         item, noisy, clean, seen = self._frame(index)
         if seen is None:
@@ -224,7 +340,7 @@ class _Comparison:
         count = self.frames[target, level] = self.frames.get((target, level), 0) + 1
         images: dict[str, NDArray[np.float32]] = {}
         for method in self.methods:
-            if method == "bm3d" and count > self.bm3d_frames:
+            if method == "bm3d" and count > bm3d_frames:
                 continue
             window, weights = self.windows.get(level, 5), self.weights.get(method)
             found, seen_by = denoise_frames(noisy, model=method, window=window, weights=weights, device=self.device)
@@ -241,8 +357,16 @@ class _Comparison:
             )
             self.samples[target, level] = Sample(clean, noisy.gate, {**images, "input": noisy.depth[0]}, caption)
 
-    def collect(self) -> Evaluation:
-        """Means over the frames."""
+    def scored(self, bm3d_frames: int, progress: Callable[[str, int, int], None] | None) -> Evaluation:
+        """Means over all frames; BM3D has as many of each level."""
+        targets = {target for target, _ in self.chosen}
+        done, total = 0, sum(map(len, self.chosen.values()))
+        for (target, level), indices in self.chosen.items():
+            for index in indices:
+                self._score_frame(index, target, level, math.ceil(bm3d_frames / len(targets)))
+                done += 1
+                if progress is not None:
+                    progress("frames", done, total)
         if not self.scores:
             raise FileError(f"{self.data}: no frame of {self.split} sees a target")
         return Evaluation(

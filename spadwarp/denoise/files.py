@@ -1,46 +1,247 @@
-"""Denoising of files: depth or histograms in, denoised depth out."""
+"""Files: depth, stored or estimated from the histograms in them, its denoising, and training."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.baselines import CLASSICAL, classical_depth
-from spadwarp.denoise.frames import MARGIN, depth_frames
-from spadwarp.denoise.histogram_inputs import features_of_histograms, target_bins
-from spadwarp.denoise.inference import Estimate, estimate_frames, target_threshold
-from spadwarp.denoise.network_files import Precision, weights_metadata
-from spadwarp.denoise.reading import ENDINGS, DepthReading, backscatter_profile, depth_at, read_depth
-from spadwarp.denoise.second_return import second_return
-from spadwarp.files import holds_own_file, locate
-from spadwarp.frames.measured import Histograms
-from spadwarp.io.arrays import write_exr
-from spadwarp.io.paths import atomic_path
-from spadwarp.values import ArgumentError, FileError, check_real, percent
-from spadwarp.viz import draw_denoised
+from spadwarp.dataset import FrameReader, read_manifest
+from spadwarp.dataset.shards import SceneFile
+from spadwarp.denoise.baselines import CLASSICAL
+from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
+from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins
+from spadwarp.denoise.inference import Estimate, estimate_frames, estimate_histograms, target_threshold
+from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
+from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
+from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
+from spadwarp.frames.depth import Method, depth_of
+from spadwarp.frames.file import SequenceFile
+from spadwarp.frames.measured import Histograms, read_histograms, stored_images
+from spadwarp.io.arrays import read_exr, write_exr
+from spadwarp.io.paths import atomic_path, existing_file
+from spadwarp.result import Result
+from spadwarp.scene.sight import depth_from_time
+from spadwarp.transport import PhotonRecords
+from spadwarp.values import ArgumentError, FileError, check_real, environment_integer, percent, range_from_time
+from spadwarp.viz import draw_denoised, draw_learning_curves
 
-__all__ = ["Denoised", "denoise_file", "depth_files"]
+__all__ = ["denoise_file", "depth_files", "read_depth", "train"]
+
+if TYPE_CHECKING:
+    from spadwarp.denoise.synthetic_noise import CleanScenes
+    from spadwarp.denoise.training import Trained
+
+
+ENDINGS = (".h5", ".hdf5", ".exr", ".npy", ".mat", ".ptu")
+
+_EXR_CHANNELS = ("Z", "depth", "range", "A", "Depth.Z", "Depth.V")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DepthReading:
+    """Depth from a file; None for what the file does not give."""
+
+    depth: NDArray[np.float32]  # [N, H, W] [m]; NaN where there is none
+    frames: bool  # whether the file held several
+    gate: tuple[float, float] | None  # start and stop [m]
+    profile: NDArray[np.float64] | None  # backscatter over the gate, [bins]
+    source: str  # how the depth was obtained
+    histograms: Histograms | None = None  # what it was estimated from: counts whose instrument response is known
+    truth: NDArray[np.float32] | None = None  # true depth of the first frame, [H, W] [m]
+
+
+def read_depth(
+    path: str | Path,
+    *,
+    as_depth: bool = False,
+    channel: str | None = None,
+    scale: float = 1.0,
+    method: Method | None = None,
+    gate: tuple[float, float] | None = None,
+    group_index: float | None = None,
+    device: str | None = None,
+    **measured: Any,
+) -> DepthReading:
+    """Depth from a file.
+
+    `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
+    depth in `channel`. `.npy`, `.mat`, `.h5` of others: one frame `[H, W]` of depth, or histograms, see
+    `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
+
+    Args:
+        path: The file.
+        as_depth: Three dimensions in `.npy`, `.mat` and `.h5` are frames `[N, H, W]` of depth, not a histogram.
+        channel: Of an EXR; default: the first of Z, depth, range, A that it has. Of a result of polarised light: "I",
+            "co" or "cross", see `spadwarp.result.analyser_channel`; default: "I", all light.
+        scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
+        method: Estimator for histograms; default: `"likelihood"` for counts, `"matched"` for rates, and `"centroid"`
+            where the response is not known.
+        gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
+        group_index: Of measured histograms, see `depth_of`.
+        device: Warp device of the estimator.
+        measured: What a file of measured histograms does not say, as `read_histograms` takes it.
+
+    Raises:
+        FileError: No such file, not readable, or without depth.
+        ArgumentError: An argument out of range, or missing for what the file holds.
+    """
+    if gate is not None:
+        gate = checked_gate(gate)
+    place = locate(path)
+    if place.suffix.lower() not in ENDINGS and not place.is_dir():
+        raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
+    if not (np.isfinite(scale) and scale > 0):
+        raise ArgumentError(f"scale = {scale} is outside (0, inf)")
+    truth: NDArray[np.float32] | None = None
+    of_result: dict[str, Any] = {}
+    if is_own_file(place):
+        held = load(place)
+        own, truth = stored_depth(held), _truth(held)
+        of_result = {"channel": channel or "I"} if isinstance(held, Result) else {}
+        if own is not None:
+            frames = own.values.astype(np.float32)
+            source = f"depth as it is{_unused(held)}"
+            return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source=source, truth=truth)
+    found = _stored_depth(place, channel, measured.get("dataset"), as_depth)
+    if found is not None:
+        stored, chosen = found
+        if stored.dtype.kind not in "iuf":
+            raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
+        if given := [name.replace("_", " ") for name in measured if name != "dataset"]:
+            raise ArgumentError(f"{place} holds depth: {', '.join(given)} are of histograms")
+        depth = stored.astype(np.float32)
+        below = np.count_nonzero(depth < 0)
+        depth[~np.isfinite(depth) | (depth >= 65504.0) | (depth <= 0)] = np.nan  # 65504: the sky in float16
+        frames = depth.reshape(-1, *depth.shape[-2:]) * np.float32(scale)
+        source = "depth as it is" + (f": {chosen}" if chosen else "")
+        source += f"; {below} values below 0 count as not reported" if below else ""
+        return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
+    histograms = read_histograms(place, **measured, **of_result)
+    counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
+    if counted and histograms.background is None:  # a flat one
+        bins = histograms.values.shape[-1]
+        # At the median bin of all pixels and frames together: that of sparse counts would be 0.
+        total = histograms.values.reshape(-1, bins).sum(axis=0, dtype=np.float64)
+        level = np.median(total) * bins / histograms.values.size
+        histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32))
+    if counted and gate is not None:
+        histograms = _within(histograms, gate, float(group_index or 1.0))
+    return dataclasses.replace(_estimate_depth(histograms, counted, method, group_index, device), truth=truth)
+
+
+def _unused(held: Held) -> str:
+    """Why histograms that a file holds beside its depth are not used; "" where there are none."""
+    if isinstance(held, FrameReader) and held.histogram_bins:
+        return "; its histograms are not used, since a dataset does not keep their background"
+    if isinstance(held, SequenceFile):
+        return "; its histograms are not used, since each frame is of another scene"
+    return ""
+
+
+def _truth(held: Held) -> NDArray[np.float32] | None:
+    """True depth of the first frame, where one of our files has it."""
+    if isinstance(held, Result):
+        return held.truth.depth
+    if isinstance(held, PhotonRecords):
+        return None
+    depth = sequence(held).at(0).depth
+    return None if depth is None else depth.astype(np.float32)
+
+
+def _stored_depth(
+    path: Path, channel: str | None, dataset: str | None, as_depth: bool
+) -> tuple[NDArray[Any], str] | None:
+    """Depth `[H, W]` or `[N, H, W]` as the file has it, and a text if it is one of several; None for histograms."""
+    ending = path.suffix.lower()
+    if ending == ".exr":
+        channels, _ = read_exr(path)
+        wanted: Sequence[str] = _EXR_CHANNELS if channel is None else (channel,)
+        found = next((channels[name] for name in wanted if name in channels), None)
+        if found is None:
+            raise FileError(f"{path}: no channel {' or '.join(map(repr, wanted))}; it has {', '.join(channels)}")
+        return found, ""
+    return stored_images(path, dataset, several=as_depth)
+
+
+def _estimate_depth(
+    histograms: Histograms, counted: bool, method: Method | None, group_index: float | None, device: str | None
+) -> DepthReading:
+    method = method or ("likelihood" if counted else "matched")
+    if method in ("matched", "likelihood") and histograms.response is None:
+        method = "centroid"
+    reduced = depth_of(histograms, method=method, group_index=group_index, device=device)
+    scene = histograms.scene
+    index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
+    gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)
+    depth = reduced.values.astype(np.float32)
+    depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
+    dim = [] if counted else dim_pixels(histograms)
+    return DepthReading(
+        depth=depth,
+        frames=reduced.frames > 1,
+        gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
+        profile=backscatter_profile(histograms),
+        source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim]),
+        histograms=histograms if counted else None,
+    )
+
+
+def depth_at(time: NDArray[np.float64], histograms: Histograms, group_index: float) -> NDArray[np.float64]:
+    """Depth [m] at times of flight `[..., H, W]` [s]; range where the camera is not known."""
+    if histograms.scene is None:
+        return range_from_time(time, group_index)
+    return depth_from_time(time, scene=histograms.scene)
+
+
+def _within(held: Histograms, gate: tuple[float, float], group_index: float) -> Histograms:
+    """Those bins alone whose depth lies in a gate [m] in some pixel."""
+    bins, width = held.values.shape[-1], float(held.bin_width or 0.0)
+    times = [np.full(held.values.shape[-3:-1], held.gate_start + width * edge) for edge in (0, bins)]
+    near, far = (depth_at(time, held, group_index) for time in times)
+    first = max(0, int(np.floor(np.min((gate[0] - near) / (far - near)) * bins + 1e-6)))
+    stop = min(bins, int(np.ceil(np.max((gate[1] - near) / (far - near)) * bins - 1e-6)))
+    if stop <= first:
+        extent = f"{near.min():.4g} to {far.max():.4g} m"
+        raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m lies outside the histograms, {extent}")
+    known = held.background if held.background_per_bin is None else held.background_per_bin[..., first:stop]
+    return dataclasses.replace(
+        held, values=held.values[..., first:stop], gate_start=held.gate_start + first * width, background=known
+    )
+
+
+def backscatter_profile(histograms: Histograms) -> NDArray[np.float64] | None:
+    """Backscatter of all pixels together over the bins; None where the file does not give it."""
+    background = histograms.background_per_bin
+    if background is None:
+        return None
+    total = np.asarray(background, np.float64).reshape(-1, background.shape[-1]).sum(axis=0)
+    return total if total.sum() > 0 else None
+
+
+# Denoising: depth or histograms in, denoised depth out.
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Denoised:
-    """Output of `denoise_file`: depth `[N, H, W]` [m], probability that a pixel sees a target and from which one on it
-    counts as such, probability that its depth is right, gate [m], paths of the files, and notes for the user."""
+    """Output of `denoise_file`."""
 
-    depth: NDArray[np.float32]
-    target_probability: NDArray[np.float32]
-    threshold: float
-    confidence: NDArray[np.float32]
-    gate: tuple[float, float]
+    depth: NDArray[np.float32]  # [N, H, W] [m]
+    target_probability: NDArray[np.float32]  # that a pixel sees a target
+    threshold: float  # of this probability, from which on it counts as one
+    confidence: NDArray[np.float32]  # probability that its depth is right
+    gate: tuple[float, float]  # [m]
     files: tuple[Path, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # for the user
 
 
 def depth_files(path: str | Path) -> list[Path]:
@@ -93,15 +294,18 @@ def denoise_file(
     mask = None if mask is None else check_real("mask", mask, "[0, 1]")
     read = read_depth(path, gate=gate, **reading)
     notes, gate = [read.source], gate or read.gate
+    valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
     if gate is None:
-        valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
         if valid.size == 0:
             raise FileError(f"{path}: no pixel has a depth")
         low, high = float(valid.min()), float(valid.max())
         gate = (low, high if high > low else 1.001 * low)
         notes.append(f"gate {gate[0]:.4g} to {gate[1]:.4g} m, from the nearest to the farthest depth of the file")
-    else:
-        _check_gate(gate, read.depth)
+    elif valid.size and gate[0] < gate[1]:  # a file without any depth stays empty
+        slack = MARGIN * (gate[1] - gate[0])
+        if not ((valid >= gate[0] - slack) & (valid <= gate[1] + slack)).any():
+            extent = f"{valid.min():.4g} to {valid.max():.4g} m"
+            raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m holds none of the depths of the file, {extent}")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         counts = read.histograms if model in ("pyramid", "histograms", *CLASSICAL) else None
@@ -109,9 +313,8 @@ def denoise_file(
         if counts is not None and counting:
             model = "histograms" if model == "pyramid" else model
             notes.append("denoised with its histograms")
-            found, second = _from_counts(
-                read, counts, profile, model, weights, float(reading.get("group_index") or 1.0), device
-            )
+            index = float(reading.get("group_index") or 1.0)
+            found, second = _from_counts(read, counts, profile, model, weights, index, device)
         else:
             second = None
             frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile)
@@ -132,15 +335,6 @@ def denoise_file(
         depth=depth, target_probability=found.target_probability, threshold=threshold, confidence=found.confidence,
         gate=gate, files=tuple(files), notes=tuple(notes),
     )  # fmt: skip
-
-
-def _check_gate(gate: tuple[float, float], depth: NDArray[np.float32]) -> None:
-    """Refuses a gate that no depth of the file lies in or near; a file without any depth stays empty."""
-    slack = MARGIN * (gate[1] - gate[0])
-    valid = depth[np.isfinite(depth) & (depth > 0)]
-    if valid.size and gate[0] < gate[1] and not ((valid >= gate[0] - slack) & (valid <= gate[1] + slack)).any():
-        extent = f"{valid.min():.4g} to {valid.max():.4g} m"
-        raise ArgumentError(f"gate = ({gate[0]:g}, {gate[1]:g}) m holds none of the depths of the file, {extent}")
 
 
 def _write(
@@ -169,42 +363,89 @@ def _from_counts(
     device: str | None,
 ) -> tuple[Estimate, NDArray[np.float32]]:
     """The estimate of a method that uses counts, in the bins that hold the target; and second returns [m]."""
-    width = float(histograms.bin_width or 0.0)
+    width, counts = float(histograms.bin_width or 0.0), histograms.values
     known = np.asarray(histograms.background, np.float32)
-    shape = histograms.values.shape
-    known = np.broadcast_to(known, shape[-3:] if known.ndim == 3 else shape[-1:])
+    known = np.broadcast_to(known, counts.shape[-3:] if known.ndim == 3 else counts.shape[-1:])
     assert histograms.response is not None and read.gate is not None
     response = histograms.response.per_bin(width)
-    first, stop, part = target_bins(histograms.values, known, response, read.gate)
-    values, start = histograms.values[..., first:stop], histograms.gate_start + first * width
+    first, stop, part = target_bins(counts, known, response, read.gate)
+    some, level = counts[..., first:stop], known[..., first:stop]
+    start = histograms.gate_start + first * width
 
     def to_depth(place: NDArray[np.float32]) -> NDArray[np.float64]:
-        time = start + place.astype(np.float64) * (values.shape[-1] * width)
+        time = start + place.astype(np.float64) * (some.shape[-1] * width)
         return depth_at(time, histograms, group_index)
 
-    given: dict[str, Any] = {
-        "counts": values, "background": known[..., first:stop], "response": response, "device": device,
-    }  # fmt: skip
-    if model in CLASSICAL:
-        place = classical_depth(method=model, **given)  # type: ignore[arg-type]
-        depth = to_depth(place).astype(np.float32).reshape(read.depth.shape)
-        found = Estimate(depth, np.ones_like(depth), np.full_like(depth, np.nan))
-        return found, _second(found.depth, to_depth, given)
-    features = features_of_histograms(**given, total=histograms.values.sum(axis=-1), to_depth=to_depth)
-    if profile is None or values.shape[-1] < shape[-1]:
-        profile = backscatter_profile(dataclasses.replace(histograms, values=values, background=known[..., first:stop]))
-    with warnings.catch_warnings():
-        if values.shape[-1] < shape[-1]:
-            warnings.simplefilter("ignore")  # depths outside this part are false peaks
-        frames = depth_frames(read.depth, gate=part, profile=profile, features=features)
-    found = estimate_frames(frames, model=model, weights=weights, device=device)
-    return found, _second(found.depth, to_depth, given)
+    if profile is None or some.shape[-1] < counts.shape[-1]:
+        profile = backscatter_profile(dataclasses.replace(histograms, values=some, background=level))
+    found = estimate_histograms(
+        read.depth, counts, known, response, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
+        profile=profile, weights=weights, device=device,
+    )  # fmt: skip
+    near, far = (to_depth(np.full_like(found.depth, place)) for place in (0.0, 1.0))
+    place = ((found.depth - near) / (far - near)).reshape(some.shape[:-1])  # depth is linear in the place
+    second = second_return(place, some, background=level, response=response, device=device)
+    return found, to_depth(second.reshape(found.depth.shape)).astype(np.float32)
 
 
-def _second(
-    depth: NDArray[np.float32], to_depth: Callable[[NDArray[np.float32]], NDArray[Any]], given: dict[str, Any]
-) -> NDArray[np.float32]:
-    """Depth of second returns [m]; depth is linear in the place over the gate."""
-    start, stop = (to_depth(np.full_like(depth, place)) for place in (0.0, 1.0))
-    place = ((depth - start) / (stop - start)).reshape(given["counts"].shape[:-1])
-    return to_depth(second_return(place, **given).reshape(depth.shape)).astype(np.float32)
+# Training: a recipe and a dataset in, weights, log and learning curves out.
+
+
+def train(
+    recipe: TrainingRecipe | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    device: str | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+    notify: Callable[[str], None] | None = None,
+) -> Trained:
+    """Trains a denoiser, or resumes an interrupted training.
+
+    Writes `MODEL.safetensors`, `log.jsonl`, `curves.png` and `checkpoint.pt` to the folder `out`. Ctrl-C or SIGTERM
+    keep a checkpoint of the last step and raise KeyboardInterrupt.
+
+    Args:
+        recipe: From `spadwarp.denoise.load_training_recipe`, or the recipe's path.
+        out: The run's folder; new, or with an interrupted run of the same recipe.
+        device: torch device; default: the GPU of this process (torchrun gives one each), else the CPU.
+        progress: Called with ("steps", done, total) after every step.
+        notify: Called with how long the training will take, once the first steps show it.
+
+    Raises:
+        ConfigError: A recipe that cannot be used, or a run of another recipe in the folder.
+        FileError: The dataset cannot be read, or a file cannot be read or written.
+        SpadwarpError: A package of the extra `denoise` is missing.
+    """
+    require_torch()
+    from spadwarp.denoise.training import fit
+
+    if not isinstance(recipe, TrainingRecipe):
+        recipe = load_training_recipe(recipe)
+    training = validation = None
+    if recipe.data is not None:
+        training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
+    trained = fit(recipe, training, validation, Path(out), device=device, progress=progress, notify=notify)
+    if environment_integer("RANK", 0) == 0:
+        log = [json.loads(line) for line in trained.log.read_text().splitlines()]
+        draw_learning_curves(log, Path(out) / "curves.png", title=f"{recipe.model}, seed {recipe.seed}")
+    return trained
+
+
+def read_scenes(folder: str | os.PathLike[str], split: str) -> CleanScenes:
+    """The clean scenes of a split of a dataset. Raises `FileError`."""
+    import torch
+
+    from spadwarp.denoise.synthetic_noise import CleanScenes
+
+    parts: list[list[Any]] = []
+    manifest = read_manifest(folder)
+    for name in manifest["splits"][split]["shards"]:
+        scenes = SceneFile(Path(folder), name, (manifest["height"], manifest["width"]))
+        with closing(scenes.file):
+            columns = [scenes.array(column) for column in ("depth", "bound", "backscatter_profile")]
+            parts.append([*columns[:2], scenes.gate(), columns[2]])
+    if not parts:
+        raise FileError(f"{folder}: the dataset has no scenes for {split}")
+    depth, bound, gate, profile = (np.concatenate(arrays).astype(np.float32) for arrays in zip(*parts, strict=True))
+    profile /= np.maximum(profile.mean(axis=1, keepdims=True), 1e-12)
+    return CleanScenes(*map(torch.from_numpy, (depth, bound, gate, profile)))

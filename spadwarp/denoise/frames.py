@@ -1,10 +1,12 @@
-"""Depth frames as denoisers take them: scaled over a gate, with what is known of the water."""
+"""Depth frames as denoisers take them: over a gate, or the part of it that holds the target, with what is known of
+the water."""
 
 from __future__ import annotations
 
 import math
 import warnings
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,20 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.arrays import on_host, real_array
 from spadwarp.values import ArgumentError, check_real, shown
 
-__all__ = [
-    "LOG_DENSITY_LIMIT",
-    "MARGIN",
-    "POOLED",
-    "SCORED",
-    "SIDES",
-    "SMALLEST_SIDE",
-    "DepthFrames",
-    "checked_gate",
-    "checked_profile",
-    "depth_frames",
-    "depth_values",
-    "fill_missing",
-]
+if TYPE_CHECKING:
+    from torch import Tensor
 
 LOG_DENSITY_LIMIT = 4.0
 """The logarithm of a backscatter density is clipped at ± this."""
@@ -40,7 +30,7 @@ SCORED = 4
 """Volumes whose log-likelihood of each of these depths is among the features: of three windows, and beliefs."""
 
 SIDES = 8
-"""Number of depths that are the last of these features: see `spadwarp.denoise.sides`."""
+"""Number of depths that are the last of these features: see `spadwarp.denoise.histogram_features`."""
 
 SMALLEST_SIDE = 8
 """Fewest rows or columns of a frame."""
@@ -48,21 +38,12 @@ SMALLEST_SIDE = 8
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthFrames:
-    """Depth frames with their gate.
+    """Depth frames `[N, H, W]` with their gate, and what is known of the water and of the histograms behind them."""
 
-    Attributes:
-        depth: float32 `[N, H, W]` [m]; NaN where nothing was reported, or nothing near the gate.
-        gate: (start, stop) in depth [m].
-        density: Density of the water's backscatter at each depth, relative to a flat one over the gate, float32 of
-            `depth`'s shape; 1 everywhere if it is not known.
-        features: Features of the histograms behind them, float32 `[N, FEATURES, H, W]` as
-            `spadwarp.denoise.histogram_features` makes them, but with its depths in metres; None without histograms.
-    """
-
-    depth: NDArray[np.float32]
-    gate: tuple[float, float]
-    density: NDArray[np.float32]
-    features: NDArray[np.float32] | None = None
+    depth: NDArray[np.float32]  # [m]; NaN where nothing was reported, or nothing near the gate
+    gate: tuple[float, float]  # start and stop in depth [m]
+    density: NDArray[np.float32]  # of the water's backscatter at each depth, relative to a flat one; 1 if not known
+    features: NDArray[np.float32] | None = None  # of `histogram_features`, but with its depths in metres
 
     @property
     def gate_middle(self) -> float:
@@ -76,28 +57,26 @@ class DepthFrames:
         return ((self.depth - start) / (stop - start)).astype(np.float32)
 
     def network_input(self, *, histograms: bool = False, fills: bool = False) -> NDArray[np.float32]:
-        """Channels for a network, `[N, 3, H, W]`, and with `histograms` also their features.
+        """Channels for a network (see `spadwarp.denoise.networks`), with `histograms` also their features.
 
-        `spadwarp.denoise.networks` describes the channels. `fills`: for networks that do not see which pixels reported:
-        missing ones get the nearest depth where those around them report nearly as often as elsewhere.
+        `fills`: for networks that do not see which pixels reported: missing ones get the nearest depth where those
+        around them report nearly as often as elsewhere.
         """
         scaled = self.scaled
         if fills:
             for depth, level in zip(scaled, self.density, strict=True):
                 depth[:] = depth[_fill_source(depth, level)]
         reported = ~np.isnan(scaled)
-        limit = LOG_DENSITY_LIMIT
-        log_density = np.log(np.clip(self.density, math.exp(-limit), math.exp(limit)))
+        log_density = np.log(np.clip(self.density, math.exp(-LOG_DENSITY_LIMIT), math.exp(LOG_DENSITY_LIMIT)))
         channels = (np.where(reported, scaled, 1.0), reported, np.where(reported, log_density, 0.0))
         frame = np.stack([channel.astype(np.float32) for channel in channels], axis=1)
         if not histograms:
             return frame
         assert self.features is not None
         start, stop = self.gate
-        pooled, sides = (
-            (part - start) / (stop - start) for part in (self.features[:, :POOLED], self.features[:, -SIDES:])
-        )
-        return np.concatenate([frame, pooled - 0.5, self.features[:, POOLED:-SIDES], sides], axis=1, dtype=np.float32)
+        pooled, rest, sides = np.split(self.features, [POOLED, -SIDES], axis=1)
+        pooled, sides = ((part - start) / (stop - start) for part in (pooled, sides))
+        return np.concatenate([frame, pooled - 0.5, rest, sides], axis=1, dtype=np.float32)
 
 
 def checked_gate(gate: tuple[float, float]) -> tuple[float, float]:
@@ -134,19 +113,12 @@ def depth_frames(
     density: ArrayLike | None = None,
     features: NDArray[np.float32] | None = None,
 ) -> DepthFrames:
-    """Checks depth and brings it into the form that denoisers take.
+    """Checks depth `[H, W]` or `[N, H, W]` [m] and brings it into the form that denoisers take.
 
-    Args:
-        depth: `[H, W]` or `[N, H, W]` [m]; NaN, 0 and infinity mean that nothing was reported.
-        gate: (start, stop) in depth [m].
-        profile: Backscatter over the gate in any number of equal bins, `[bins]`, ≥ 0, in any unit.
-        density: Replaces `profile`: its density [1/m] at each depth, of `depth`'s shape; NaN where it is not known.
-        features: Features of the histograms, `[N, FEATURES, H, W]`, pooled depths in metres.
-
-    Depths farther than `MARGIN` outside the gate count as not reported, with a warning that gives their number.
-
-    Raises:
-        ArgumentError: Shapes, sizes or values that cannot be, or a gate without width.
+    NaN, 0 and infinity mean that nothing was reported. Depths farther than `MARGIN` outside the gate count as not
+    reported, with a warning that gives their number. `profile`: backscatter over the gate in any number of equal bins,
+    in any unit; or its `density` [1/m] at each depth, of `depth`'s shape, NaN where it is not known. Raises
+    `ArgumentError`.
     """
     values = depth_values(depth)
     if values.ndim not in (2, 3):
@@ -194,10 +166,6 @@ def _fill_source(depth: NDArray[np.float32], density: NDArray[np.float32]) -> tu
     So a missing pixel is filled only where, of the pixels in a window around it, at least half as many report as in the
     window that holds the most. The window has 15 × 15 pixels, or as many as hold 64 reports. No pixel is filled
     unless successive depths agree more often than backscatter would.
-
-    Args:
-        depth: Over the gate, NaN where nothing was reported, `[H, W]`.
-        density: Of backscatter at these depths, relative to a flat one, `[H, W]`.
     """
     from scipy.ndimage import distance_transform_edt, uniform_filter
 
@@ -226,3 +194,140 @@ def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.flo
         return image
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
     return image[tuple(nearest)]
+
+
+# The part of a gate that holds the target: networks are more accurate in a gate that is not much wider than that.
+
+_BINS = 20  # into which a gate is divided
+_NEAR = 0.01  # part of the gate within which two depths agree
+_NEAR_SQUARE = float(np.float32(_NEAR) ** 2)  # in float32, whose squares tell all numbers about _NEAR apart
+_AGREEING = 4  # of the 24 pixels around a pixel
+_ROUNDS = 3
+_KEPT = 0.7  # a gate is narrowed only to less than this part of its width
+
+
+def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of the gate in which depths agree with those around them more often than backscatter would.
+
+    Of depth over the gate, NaN where nothing was reported, and the density of backscatter there, each `[N, H, W]`: its
+    start and width, with a margin, each `[N]`; 0 and 1, the whole gate, where nothing agrees, or where little would be
+    gained. And the largest part of the frame that a target can take, `[N]`: 1, unless depths agree only as often as
+    those of backscatter would by chance, and more would be noticed.
+    """
+    import torch
+
+    start, width = depth.new_zeros(len(depth)), depth.new_ones(len(depth))
+    frames = torch.arange(len(depth), device=depth.device)
+    part = torch.ones_like(start)
+    for turn in range(_ROUNDS):
+        begin, extent = start[frames], width[frames]
+        scaled = (depth - begin[:, None, None]) / extent[:, None, None]
+        low, high, most = _narrowed(scaled, density * extent[:, None, None])
+        part = most if turn == 0 else part  # by the whole gate
+        narrower = high - low < _KEPT
+        start[frames] = torch.where(narrower, begin + low * extent, begin)
+        width[frames] = torch.where(narrower, (high - low) * extent, extent)
+        frames, depth, density = (values[narrower] for values in (frames, depth, density))
+        if len(frames) == 0:
+            break
+    return start, width, part
+
+
+def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Input of PyramidNet `[N, 3, H, W]` over `gates_of_target`, beyond whose `MARGIN` nothing counts as reported, and
+    what that gives."""
+    import torch
+
+    start, width, part = gates_of_target(depth, density)
+    scaled = (depth - start[:, None, None]) / width[:, None, None]
+    reported = (scaled >= -MARGIN) & (scaled <= 1.0 + MARGIN)
+    log_density = density.log().clamp(-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT)
+    channels = torch.where(reported, scaled, 1.0), reported.to(scaled.dtype), torch.where(reported, log_density, 0.0)
+    return torch.stack(channels, dim=1), start, width, part
+
+
+def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Start and stop as parts of the gate, and the largest part of the frame that a target can take, `[N]`."""
+    import torch
+
+    reported = (scaled >= 0.0) & (scaled < 1.0)
+    share = reported.flatten(1).float().mean(dim=1)
+    agreeing = _agreeing(torch.where(reported, scaled, torch.nan))
+    # Backscatter of this density, in as many pixels as report, agrees by chance.
+    chance = (2.0 * _NEAR * share[:, None, None] * density).clamp(0.0, 1.0)
+    place = torch.where(reported, scaled * _BINS, _BINS).long()
+    one = torch.ones((), device=scaled.device)
+    pixels, by_chance, observed = (_sums(each, place) for each in (one, chance, (agreeing >= _AGREEING).float()))
+    part = by_chance / pixels.clamp_min(1.0)
+    fewer = sum(math.comb(24, n) * part**n * (1.0 - part) ** (24 - n) for n in range(_AGREEING))
+    expected = pixels * (1.0 - fewer)
+    significant = observed > expected + 4.0 * expected.clamp_min(0.0).sqrt() + 6.0
+    found = significant.any(dim=1) & (reported.flatten(1).sum(dim=1) >= 50)
+    first, last = significant.int().argmax(dim=1), _BINS - 1 - significant.int().flip(1).argmax(dim=1)
+    low, high = ((first - 1.5) / _BINS).clamp_min(0.0), ((last + 2.5) / _BINS).clamp_max(1.0)
+    # Pairs of pixels within two of each other, those that chance makes agree, and how many more would be noticed.
+    rows, columns = scaled.shape[1:]
+    around = ((y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0))
+    pairs = sum(max(0, rows - abs(y)) * max(0, columns - abs(x)) for y, x in around)
+    expected = by_chance.sum(dim=1) * (pairs / (rows * columns))
+    noticed = 4.0 * (2.0 * expected).sqrt() + 12.0
+    agrees = agreeing.flatten(1).sum(dim=1) > expected + noticed
+    most = torch.where(agrees, 1.0, (noticed / (pairs * share.square() + 1.0)).clamp_max(1.0))
+    return torch.where(found, low, 0.0), torch.where(found, high, 1.0), most.to(scaled.dtype)
+
+
+def _agreeing(values: Tensor) -> Tensor:
+    """How many of the 24 pixels around each pixel agree with it, uint8 `[N, H, W]`; none where either is NaN."""
+    import torch
+    import torch.nn.functional as F
+
+    # With two missing pixels after each row, and two such rows after each frame, all are one line in which a neighbour
+    # is a fixed number of places away. Pieces of a line take a GPU half the time of parts cut out of images.
+    padded = F.pad(values, (0, 2, 0, 2), value=torch.nan)
+    line, row = padded.flatten(), padded.shape[2]
+    agreeing = torch.zeros_like(line, dtype=torch.uint8)
+    for apart in (1, 2, *(row * down + right for down in (1, 2) for right in range(-2, 3))):
+        # A square is one pass over memory less than a difference and its absolute value; this one is exact.
+        near = (F.mse_loss(line[:-apart], line[apart:], reduction="none") < _NEAR_SQUARE).view(torch.uint8)
+        agreeing[:-apart] += near
+        agreeing[apart:] += near
+    return agreeing.view_as(padded)[:, : values.shape[1], : values.shape[2]]
+
+
+def _sums(values: Tensor, place: Tensor) -> Tensor:
+    """Sums `[N, _BINS]` of values `[N, H, W]`, or one value, by the bin of each pixel; `_BINS` is in none.
+
+    Column by column, and then of all columns: on a GPU, sums by index into few places wait for each other, and those
+    of neighbouring pixels into neighbouring places do not.
+    """
+    frames, rows, columns = place.shape
+    sums = values.new_zeros(frames, _BINS + 1, columns)
+    sums.scatter_add_(1, place, values.expand(frames, rows, columns))
+    return sums[:, :_BINS].sum(dim=2).double()
+
+
+def bins_of_target(
+    counts: NDArray[np.float32], background: NDArray[np.float32], response: NDArray[np.float32]
+) -> tuple[int, int]:
+    """(first, stop) of the bins that hold the excess of all pixels together over the background, with a margin.
+
+    (0, T) where little would be gained, or where the excess is not significant. Arguments are those of
+    `spadwarp.denoise.estimate`.
+    """
+    bins = counts.shape[-1]
+    total = counts.reshape(-1, bins).sum(axis=0, dtype=np.float64)
+    pixels = counts.size // bins
+    level = np.asarray(background, np.float64).reshape(-1, bins).mean(axis=0) * pixels
+    window = np.ones(max(len(response), bins // 64) | 1)
+    above = total - level
+    excess = np.convolve(above, window, mode="same")
+    spread = np.sqrt(np.convolve(np.maximum(level, 1.0), window, mode="same"))
+    significant = np.flatnonzero(excess > 5.0 * spread)
+    if len(significant) == 0:
+        return 0, bins
+    first, stop = int(significant[0]), int(significant[-1]) + 1
+    if above[:first].sum() + above[stop:].sum() > 0.02 * above[first:stop].sum() + 3.0 * np.sqrt(level.sum()):
+        return 0, bins
+    margin = len(window) + (stop - first) // 8
+    first, stop = max(0, first - margin), min(bins, stop + margin)
+    return (first, stop) if stop - first < _KEPT * bins else (0, bins)

@@ -3,7 +3,7 @@
 A single pixel with one photon among twenty of the background says little; nine pixels, or 225, say more. Pooling blurs
 sharp edges, so depth is estimated over windows of several sizes, by belief propagation and by total variation, and a
 network chooses. The log-likelihoods let many photons of a pixel outweigh its neighbours. The shape of the return shows
-how late the light arrives that water scattered forward.
+how late the light arrives that water scattered forward. Depths, `place` and `anchor` are over the gate, `[B, H, W]`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch import Tensor
 from spadwarp.denoise.classical import (
     GUIDES,
     JUMPS,
+    aggregate,
     beliefs,
     counts_level,
     edge_penalties,
@@ -28,11 +29,159 @@ from spadwarp.denoise.classical import (
     total_variation,
 )
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
-from spadwarp.denoise.scattered_light import LIGHT, light_channels
-from spadwarp.denoise.sides import LIKENESS, beside_edges
 
-__all__ = ["EDGES", "FEATURES", "MOST", "SEEN", "TAIL", "WINDOWS", "extract_features", "highest"]
-__all__ += ["log_likelihood", "pooled", "toeplitz"]
+# What tells light that water scattered forward, beside a bright target, from a dim target. Both have the depth of a
+# target and far more counts than backscatter. The scattered light is a few per cent as bright as the target beside it,
+# and later: less of it arrives within the instrument response around its peak.
+
+LIGHT = 14
+"""Number of channels of `light_channels`."""
+
+_NEAR, _FAR = 10, 30  # pixels within which the brightest neighbourhood is looked for
+_WINDOWS = 3, 7  # sides of the windows whose counts are summed [pixels]
+_REACHES = 2.0, 8.0  # half widths around the peak, in deviations of the instrument response
+
+
+def light_channels(above: Tensor, background: Tensor, place: Tensor, response: Tensor) -> list[Tensor]:
+    """Brightness and lateness of the light of each pixel, `LIGHT` times `[B, H, W]`.
+
+    Logarithms of the excess over the background: of 3 × 3 pixels, relative to the background, and relative to the
+    brightest 3 × 3 pixels around; the same of the pixel alone. Then the parts of the excess near the peak, in a wider
+    interval around it, and after that, over 3 × 3 and 7 × 7 pixels; and the differences of these from the means around
+    the pixel, in which bright pixels count most.
+
+    `above`: counts less the expected background, `[B, H, W, T]`; `background`: of each bin, mean over the frame,
+    `[B, T]`; `place`: of each pixel's peak; `response`: as in `extract_features`.
+    """
+    level = background.sum(dim=-1)[:, None, None]
+    excess = above.sum(dim=-1)
+    bright = _around(excess, 3).clamp_min(0.0)
+    most = [_brightest(bright, reach) for reach in (_NEAR, _FAR)]
+    parts = _parts(above, place, response)
+    wide = [_around(part, side) for side in _WINDOWS for part in (excess, *parts)]
+    shares = []
+    for number, side in enumerate(_WINDOWS):
+        whole, *some = wide[4 * number : 4 * number + 4]
+        noise = (whole.clamp_min(0.0) + level + 0.5).sqrt() / side
+        shares += [(part / (whole.clamp_min(0.0) + noise)).clamp(-1.0, 2.0) for part in some]
+    weight = bright.square() + 1e-6
+    far = 2 * _FAR + 1
+    total = _around(weight, far)
+    typical = [_around(weight * share, far) / total for share in shares[3:]]
+    own = excess.clamp_min(0.0)
+    return [
+        0.2 * (bright + 0.1).log(),
+        0.2 * ((bright + 0.3) / (level + 0.3)).log(),
+        *(0.3 * ((bright + 0.2) / (one + 0.2)).log() for one in most),
+        0.3 * ((own + 1.0) / (most[1] + 1.0)).log(),
+        *shares,
+        *(share - one for share, one in zip(shares[3:], typical, strict=True)),
+    ]
+
+
+def _parts(above: Tensor, place: Tensor, response: Tensor) -> list[Tensor]:
+    """Excess within the nearer and the farther of `_REACHES` around the peak, and after the farther, `[B, H, W]`."""
+    bins, radius = above.shape[-1], response.shape[-1] // 2
+    offset = torch.arange(-radius, radius + 1, device=above.device)
+    deviation = (response * offset.square()).sum(dim=1).clamp_min(0.25).sqrt()[:, None, None]
+    cumulative, centre = above.cumsum(dim=-1), place * bins
+    edges = [centre + sign * (reach * deviation + 0.5) for reach in _REACHES for sign in (-1.0, 1.0)]
+    first, last, start, stop = _counts_before(cumulative, torch.stack(edges, dim=-1)).unbind(dim=-1)
+    return [last - first, stop - start, cumulative[..., -1] - stop]
+
+
+def _brightest(image: Tensor, reach: int) -> Tensor:
+    """The highest value up to `reach` pixels away in rows and columns."""
+    side = 2 * reach + 1
+    highest = F.max_pool2d(image[:, None], (side, 1), 1, (reach, 0))
+    return F.max_pool2d(highest, (1, side), 1, (0, reach))[:, 0]
+
+
+def _around(image: Tensor, side: int) -> Tensor:
+    return pooled(image[..., None], side)[..., 0]
+
+
+# The two surfaces beside a depth edge. Nearly all of the squared error at few photons comes from pixels beside edges
+# that are given to the wrong side. Named as two depths for each pixel, with the log-likelihood of each, the question
+# becomes one of segmentation, at which a network is good.
+
+REACHES = (2, 5)
+"""Pixels up to which a side is looked for."""
+
+LIKENESS = 3 * len(REACHES)
+"""Channels that tell whose counts those of a pixel are like: for each reach the nearer side's, the farther one's."""
+
+_RIGID = 40.0  # penalty of a jump in semi-global matching that keeps to one of two returns [nats]
+
+
+def beside_edges(score: Tensor, usual: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
+    """`SIDES` depths over the gate, `[B, H, W, SIDES]`, and how like the counts are to those of both sides.
+
+    For each of `REACHES` the nearer and the farther surface; then, by the photons of the pixel, the most probable depth
+    from the one to the other of the shorter reach, and the mean depth for each reach. Last, the depth of semi-global
+    matching with a penalty that keeps a pixel to one of its two returns. The likeness, `[B, H, W, LIKENESS]`: the
+    difference from the mean of the nearer side, from that of the farther one, and which of the two squares is larger.
+
+    `usual`: depth by belief propagation; `level`: counts of each pixel, with noise of deviation 1, `[B, H, W]`.
+    """
+    found, like = _nearer_and_farther(usual, level)
+    inside = [_between(score, *found[place : place + 2]) for place in range(0, len(found), 2)]
+    rigid = aggregate(score, jump=score.new_full((len(score), 1, 1, 1), _RIGID))
+    depths = torch.stack([*found, inside[0][0], *(mean for _, mean in inside), highest(rigid)], dim=-1)
+    return depths, torch.stack(like, dim=-1)
+
+
+def _nearer_and_farther(depth: Tensor, level: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """For each of `REACHES` the depths of the nearer and of the farther surface around a pixel, and the likeness.
+
+    The depths `depth` `[B, H, W]` of a window are parted at the middle between its least and its largest; each part has
+    the mean of its depths, of which the next to the pixel count most.
+    """
+    height, width = depth.shape[-2:]
+    both, found, like = torch.stack([depth, level], dim=1), [], []
+    for reach in REACHES:
+        image = F.pad(both, (reach,) * 4, mode="replicate")
+        side = 2 * reach + 1
+        places = image[:, :1]
+        low = -F.max_pool2d(F.max_pool2d(-places, (side, 1), 1), (1, side), 1)
+        middle = 0.5 * (low + F.max_pool2d(F.max_pool2d(places, (side, 1), 1), (1, side), 1))
+        # Sums of weights, weighted depths, weights and weighted counts; those of counts leave the pixel itself out.
+        nearer, farther = both.new_zeros(2, len(both), 4, height, width)
+        unit = torch.ones_like(middle)
+        for y in range(side):
+            for x in range(side):
+                apart = (y - reach) ** 2 + (x - reach) ** 2
+                one = image[..., y : y + height, x : x + width]
+                near = (one[:, :1] <= middle).to(one.dtype)
+                wide = (apart > 0) / (1.0 + apart)
+                known = torch.cat([unit, one[:, :1], wide * unit, wide * one[:, 1:]], dim=1)
+                known[:, :2] *= (1.0 + apart) ** -2
+                nearer += near * known
+                farther += known - near * known
+        front, front_level = nearer[:, 1::2].div(nearer[:, ::2].clamp_min(1e-6)).unbind(dim=1)
+        back, back_level = farther[:, 1::2].div(farther[:, ::2].clamp_min(1e-6)).unbind(dim=1)
+        alone = farther[:, 0] <= 1e-6  # one depth everywhere
+        back, back_level = torch.where(alone, front, back), torch.where(alone, front_level, back_level)
+        found += [front, back]
+        from_front, from_back = level - front_level, level - back_level
+        like += [torch.asinh(0.3 * from_front), torch.asinh(0.3 * from_back)]
+        like.append(0.3 * torch.asinh(from_back.square() - from_front.square()))
+    return found, like
+
+
+def _between(score: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+    """Highest place and mean place of a return that lies from `near` to `far`, by the photons of the pixel.
+
+    Depth maps that were scaled down, and steep slopes, have depths between the surfaces on both sides.
+    """
+    bins = score.shape[-1]
+    place = torch.arange(bins, device=score.device) + 0.5
+    inside = (place >= near[..., None] * bins - 1.0) & (place <= far[..., None] * bins + 1.0)
+    score = torch.where(inside, score, -1e4)
+    return highest(score), torch.softmax(score, dim=-1) @ place / bins
+
+
+# All features.
 
 WINDOWS = (3, 7, 15)
 """Sides of the windows over which histograms are pooled [pixels]."""
@@ -77,13 +226,13 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
     Returns:
         `[B, FEATURES, H, W]`. `POOLED` depths over the gate: of the highest score of the pixel, of its highest score
         elsewhere, of belief propagation with the usual penalty, of the highest scores over `WINDOWS`, of belief
-        propagation with the other `JUMPS`, the total
-        variation of the first, and the mean of sum-product beliefs. Then `SCORED` times `POOLED` scores at
-        these depths less the highest one, and the `SCORED` highest ones, a tenth of each, down and up to `MOST`: of the
-        pixel, of 3 × 3 and of 7 × 7 pixels, and beliefs. Then the excess over the background between `EDGES` around the
-        depth of the largest window, as shares over 7 × 7 pixels; and how significant the excess is, in the pixel and in
-        7 × 7; and `GUIDES` channels of the counts. Last,
-        beyond `SEEN`, the pixel's own scores at the depths, a tenth of them, which are not clipped.
+        propagation with the other `JUMPS`, the total variation of the first, and the mean of sum-product beliefs. Then
+        `SCORED` times `POOLED` scores at these depths less the highest one, and the `SCORED` highest ones, a tenth of
+        each, down and up to `MOST`: of the pixel, of 3 × 3 and of 7 × 7 pixels, and beliefs. Then the excess over the
+        background between `EDGES` around the depth of the largest window, as shares over 7 × 7 pixels; and how
+        significant the excess is, in the pixel and in 7 × 7; and `GUIDES` channels of the counts. Last, beyond `SEEN`,
+        the pixel's own scores at the depths, a tenth of them, which are not clipped; and of `beside_edges` the scores,
+        the likeness, `light_channels` and the depths.
     """
     total = counts.sum(dim=-1) if total is None else total
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]
@@ -129,8 +278,7 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
 
 
 def log_likelihood(counts: Tensor, background: Tensor, response: Tensor) -> Tensor:
-    """Score of a return in each bin, as `extract_features` describes it, but in frames of every size with the mean
-    signal of the whole frame, `[B, H, W, T]`; arguments as there."""
+    """Scores as in `extract_features`, `[B, H, W, T]`, but in every frame with the mean signal of the whole."""
     above = counts - background
     narrow = toeplitz(response, counts.shape[-1])
     return _correlated(above, background.mean(dim=(1, 2)), narrow, above.sum(dim=-1).mean(dim=(1, 2)))
@@ -145,7 +293,7 @@ def _signal(above: Tensor) -> Tensor:
     excess = above.sum(dim=-1)
     if max(excess.shape[1:]) <= _WHOLE:
         return excess.mean(dim=(1, 2))
-    return pooled(excess[..., None], 2 * _SURROUNDING + 1)[..., 0]
+    return _around(excess, 2 * _SURROUNDING + 1)
 
 
 def _correlated(above: Tensor, background: Tensor, response: Tensor, signal: Tensor) -> Tensor:
@@ -204,11 +352,12 @@ def _edges(device: torch.device) -> Tensor:
 
 
 def _shape(above: Tensor, background: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
-    """Shares of the excess between `EDGES` around the anchor over the gate `[B, H, W]`, and its significances."""
-    edges = anchor[..., None] + _edges(above.device)
-    level = _within(background[:, None, None, :].cumsum(dim=-1), edges[..., :: len(EDGES) - 1])[..., 0]
-    pixel = _within(above.cumsum(dim=-1), edges[..., :: len(EDGES) - 1])[..., 0] / (level + 1.0).sqrt()
-    excess = 49.0 * _within(pooled(above, 7).cumsum(dim=-1), edges)
+    """Shares of the excess between `EDGES` around the anchor, and its significances."""
+    edges = (anchor[..., None] + _edges(above.device)) * above.shape[-1]
+    ends = edges[..., :: len(EDGES) - 1]
+    level = _counts_before(background[:, None, None, :].cumsum(dim=-1), ends).diff(dim=-1)[..., 0]
+    pixel = _counts_before(above.cumsum(dim=-1), ends).diff(dim=-1)[..., 0] / (level + 1.0).sqrt()
+    excess = 49.0 * _counts_before(pooled(above, 7).cumsum(dim=-1), edges).diff(dim=-1)
     spread = ((excess.sum(dim=-1) + 49.0 * level).clamp_min(0.0) + 1.0).sqrt()
     shares = excess / (excess.abs().sum(dim=-1) + spread)[..., None]
     window = excess.sum(dim=-1) / (49.0 * level + 1.0).sqrt()
@@ -236,11 +385,10 @@ def toeplitz(response: Tensor, bins: int) -> Tensor:
     return torch.where(inside, response[:, (distance + radius).clamp(0, 2 * radius)], 0.0)
 
 
-def _within(cumulative: Tensor, edges: Tensor) -> Tensor:
-    """Counts between edges over the gate `[B, H, W, E]`, from cumulative counts; `[B, H, W, E − 1]`."""
+def _counts_before(cumulative: Tensor, place: Tensor) -> Tensor:
+    """Of cumulative counts, those before places `[B, H, W, E]` [bins]."""
     bins = cumulative.shape[-1]
-    cumulative = F.pad(cumulative, (1, 0)).expand(*edges.shape[:-1], bins + 1)
-    place = edges.clamp(0.0, 1.0) * bins
+    cumulative = F.pad(cumulative, (1, 0)).expand(*place.shape[:-1], bins + 1)
+    place = place.clamp(0.0, float(bins))
     below = place.long().clamp(max=bins - 1)
-    values = torch.lerp(cumulative.gather(-1, below), cumulative.gather(-1, below + 1), place - below)
-    return values.diff(dim=-1)
+    return torch.lerp(cumulative.gather(-1, below), cumulative.gather(-1, below + 1), place - below)

@@ -11,14 +11,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
-from spadwarp.denoise.frames import MARGIN, DepthFrames, checked_gate, checked_profile, depth_frames, depth_values
-from spadwarp.denoise.gates import narrowed_input
-from spadwarp.denoise.histogram_inputs import checked_histograms, features_of_histograms, target_bins
-from spadwarp.denoise.network_files import Precision, fast_precision, load_network, require_torch, torch_device
-from spadwarp.denoise.recipe import MODELS
+from spadwarp.denoise.frames import (
+    MARGIN,
+    DepthFrames,
+    checked_gate,
+    checked_profile,
+    depth_frames,
+    depth_values,
+    narrowed_input,
+)
+from spadwarp.denoise.histograms import checked_histograms, features_of_histograms, target_bins
+from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.values import ArgumentError, check_choice, check_real
 
-__all__ = ["METHODS", "Estimate", "apply", "denoise_frames", "estimate", "estimate_frames", "target_threshold"]
+__all__ = ["METHODS", "Estimate", "apply", "estimate"]
+
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -142,44 +149,49 @@ def estimate(
             raise ArgumentError(f"depth has shape {depth.shape}; {cubes.shape[:-1]} is needed, that of counts")
         if model in CLASSICAL and weights is not None:
             raise ArgumentError(f"weights are for a network, not for {model!r}")
-        found = _from_histograms(depth, gate, model, profile, cubes, levels, taps, weights, device)
+        first, stop, part = target_bins(cubes, levels, taps, gate)
+        if model not in CLASSICAL and _leaves_frames_empty(depth, gate, part):
+            first, stop, part = 0, cubes.shape[-1], gate
+        if profile is not None and (first, stop) != (0, cubes.shape[-1]):
+            bins = checked_profile(profile)
+            begin, end = (int(edge / cubes.shape[-1] * len(bins)) for edge in (first, stop))
+            profile = bins[begin : max(1, end)]
+
+        def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
+            return part[0] + (part[1] - part[0]) * place
+
+        found = estimate_histograms(
+            depth, cubes, levels, taps, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
+            profile=profile, weights=weights, device=device,
+        )  # fmt: skip
     return Estimate(*(values.reshape(np.shape(depth)) for values in found))
 
 
-def _from_histograms(
+def estimate_histograms(
     depth: NDArray[Any],
-    gate: tuple[float, float],
-    model: str,
-    profile: ArrayLike | None,
     counts: NDArray[Any],
     background: NDArray[np.float32],
-    response: NDArray[np.float32],
+    response: NDArray[Any],
+    *,
+    bins: slice,
+    gate: tuple[float, float],
+    model: str,
+    to_depth: Callable[[NDArray[np.float32]], NDArray[Any]],
+    profile: ArrayLike | None,
     weights: str | Path | None,
     device: str | None,
 ) -> Estimate:
-    """`estimate` for the methods that use counts, in the bins that hold the target."""
-    first, stop, part = target_bins(counts, background, response, gate)
-    if model not in CLASSICAL and _leaves_frames_empty(depth, gate, part):
-        first, stop, part = 0, counts.shape[-1], gate
-
-    def to_depth(place: NDArray[np.float32]) -> NDArray[np.float32]:
-        return part[0] + (part[1] - part[0]) * place
-
-    given: dict[str, Any] = {
-        "counts": counts[..., first:stop], "background": background[..., first:stop], "response": response,
-        "device": device,
-    }  # fmt: skip
+    """`estimate` for the methods that use counts, in the bins that hold the target; `gate` and `profile` are theirs."""
+    some = counts[..., bins]
+    given: dict[str, Any] = {"background": background[..., bins], "response": response, "device": device}
     if model in CLASSICAL:
-        found = to_depth(classical_depth(method=model, **given)).astype(np.float32)  # type: ignore[arg-type]
-        return Estimate(found, np.ones_like(found), np.full_like(found, np.nan))
-    features = features_of_histograms(**given, total=counts.sum(axis=-1), to_depth=to_depth)
-    if profile is not None and (first, stop) != (0, counts.shape[-1]):
-        bins = checked_profile(profile)
-        profile = bins[int(first / counts.shape[-1] * len(bins)) : max(1, int(stop / counts.shape[-1] * len(bins)))]
+        found = to_depth(classical_depth(some, method=model, **given)).astype(np.float32)  # type: ignore[arg-type]
+        return Estimate(found.reshape(depth.shape), np.ones_like(depth), np.full_like(depth, np.nan))
+    features = features_of_histograms(some, **given, total=counts.sum(axis=-1), to_depth=to_depth)
     with warnings.catch_warnings():
-        if (first, stop) != (0, counts.shape[-1]):
+        if some.shape[-1] < counts.shape[-1]:
             warnings.simplefilter("ignore")  # depths outside this part are false peaks
-        frames = depth_frames(depth, gate=part, profile=profile, features=features)
+        frames = depth_frames(depth, gate=gate, profile=profile, features=features)
     return estimate_frames(frames, model=model, weights=weights, device=device)
 
 
@@ -201,10 +213,7 @@ def target_threshold(model: str) -> float:
 
 
 def denoise_frames(frames: DepthFrames, *, model: str, **options: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Depth of every pixel [m], and where a target is seen (`target_threshold`): float32 and bool `[N, H, W]`.
-
-    Arguments and errors are those of `estimate_frames`.
-    """
+    """Depth of every pixel [m], and where a target is seen (`target_threshold`): float32 and bool `[N, H, W]`."""
     found = estimate_frames(frames, model=model, **options)
     return found.depth, found.target_probability >= target_threshold(model)
 
@@ -253,18 +262,17 @@ def estimate_frames(
             depth = torch.from_numpy(frames.depth[some]).to(place)
             reported = ~torch.isnan(depth)
             if inputs is None:
-                given, start, width, share = narrowed_input(
-                    (depth - begin) / extent, torch.from_numpy(frames.density[some]).to(place)
-                )
-                output = network(given).float()
-                finite &= bool(output.isfinite().all())
-                output[:, 0].clamp_(0.0, 1.0).mul_(width[:, None, None]).add_(start[:, None, None])
-                output[:, 1] = corrected_target(output[:, 1], depth, given[:, 1], share)
+                density = torch.from_numpy(frames.density[some]).to(place)
+                given, start, width, share = narrowed_input((depth - begin) / extent, density)
             else:
-                output = network(torch.from_numpy(inputs[some]).to(place)).float()
-                finite &= bool(output.isfinite().all())
-                output[:, 0].clamp_(0.0, 1.0)
-            found = output[:, 0].mul_(extent).add_(begin)
+                given = torch.from_numpy(inputs[some]).to(place)
+            output = network(given).float()
+            finite &= bool(output.isfinite().all())
+            found = output[:, 0].clamp_(0.0, 1.0)
+            if inputs is None:
+                found.mul_(width[:, None, None]).add_(start[:, None, None])
+                output[:, 1] = corrected_target(output[:, 1], depth, given[:, 1], share)
+            found.mul_(extent).add_(begin)
             probability, confidence = reported.float(), torch.full_like(found, torch.nan)
             if output.shape[1] > 1:
                 probability, confidence = output[:, 1:3].sigmoid_().unbind(dim=1)
@@ -301,13 +309,8 @@ def corrected_target(logit: Tensor, depth: Tensor, reported: Tensor, share: Tens
     mostly water, from those that reported backscatter outside that part. How often pixels of the target, and of the
     water, do one or the other is counted in the frame where the network is sure, and Bayes' rule does the rest. Nor
     does it see the whole of a large frame: where few pixels report and their depths agree no more often than those of
-    backscatter, a target can take only a small part of the frame, and its pixels are as much less probable.
-
-    Args:
-        logit: Of the network, `[N, H, W]`.
-        depth: NaN where nothing was reported, `[N, H, W]`.
-        reported: Which pixels reported a depth that the network was given, 1 or 0, `[N, H, W]`.
-        share: The largest part of the frame that a target can take, of `gates_of_target`, `[N]`.
+    backscatter, a target can take only a `share` of the frame, `[N]`, and its pixels are as much less probable.
+    `reported`: which pixels reported a depth that the network was given, 1 or 0.
     """
     import torch
 

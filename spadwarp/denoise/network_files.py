@@ -9,16 +9,18 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
-from spadwarp.denoise.recipe import MODELS
 from spadwarp.io.paths import existing_file
 from spadwarp.io.text import parse_json
 from spadwarp.values import ArgumentError, DeviceError, FileError, SpadwarpError, need_memory, shown
 
-__all__ = ["WEIGHTS", "Precision", "fast_precision", "load_network", "own_weights", "require_torch", "torch_device"]
-__all__ += ["weights_metadata"]
+__all__ = ["weights_metadata"]
+
 
 Precision = Literal["float16", "bfloat16", "float32"]
 """Of numbers in the layers of a network."""
+
+MODELS = ("pyramid", "histograms", "dncnn", "usdn")
+"""Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the package's weights."""
@@ -53,44 +55,13 @@ def load_network(
     try:
         network: Any = build_network(model)
         values = {name: value.float() for name, value in load_file(path).items()}  # counters are cast back
-        if model == "histograms" and not any(name.startswith("context.") for name in values):
-            network.context = None  # older files have none
-        network.load_state_dict(_in_present_shapes(values, network.state_dict()))
+        network.load_state_dict(values)
         if wrong := [name for name, value in values.items() if not torch.isfinite(value).all()]:
             raise ValueError(f"{wrong[0]} is not finite")
     except Exception as error:  # safetensors and torch have errors of their own
         raise FileError(f"{path}: not weights of {model!r}: {error}") from error
     network = network.to(torch.device(device), getattr(torch, precision)).to(memory_format=torch.channels_last)
     return network.eval().requires_grad_(False)
-
-
-def _in_present_shapes(values: dict[str, Any], present: dict[str, Any]) -> dict[str, Any]:
-    """Weights of the network for histograms with the layers and inputs that older files lack; others as they are.
-
-    New layers begin as they do in a training, where they change nothing. Files from before the last candidate, the mean
-    of beliefs, and the two channels of the counts give that candidate the weights of belief propagation.
-    """
-    new = "context.light.", "context.target."
-    values = {**{name: value for name, value in present.items() if name.startswith(new)}, **values}
-    entering = values.get("enter_features.weight")
-    if entering is None or entering.shape[1] != 59:
-        return values
-    channels = present["enter_features.weight"].new_zeros(len(entering), 66, entering.shape[2])
-    kept = [place for place in range(64) if place not in (9, 19, 29, 39, 49)]  # without the scores of the candidate
-    channels[:, kept] = entering
-    values["enter_features.weight"] = channels
-    pixel = values["select.pixel.weight"]
-    wider = pixel.new_zeros(len(pixel), 25)
-    wider[:, :18], wider[:, 20:] = pixel[:, :18], pixel[:, 18:]
-    values["select.pixel.weight"] = wider
-    for layer, alike, at, less in (
-        ("choose.weight", 3, 10, 0.0), ("choose.bias", 3, 10, 2.0),
-        ("select.kind", 5, 12, 0.0), ("select.bias", 5, 12, 1.0),
-    ):  # fmt: skip
-        rows = values[layer][[*range(at), alike, *range(at, len(values[layer]))]]
-        rows[at] -= less  # chosen more seldom than what it is like
-        values[layer] = rows
-    return values
 
 
 def fast_precision(device: str) -> Precision:

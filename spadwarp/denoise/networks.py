@@ -4,31 +4,41 @@ All take `[batch, 3, height, width]`: depth over the gate (0 at its start, 1 at 
 1 where the pixel reported something, and the logarithm of the backscatter's density at the reported depth (0 for a flat
 profile, see `spadwarp.denoise.synthetic_noise.log_density`). PyramidNet for histograms also takes the channels of
 `spadwarp.denoise.histogram_features`, with 0.5 subtracted from the depths among them. They return denoised depth over
-the gate, `[batch, 1, height, width]`; PyramidNet also the logits of `spadwarp.denoise.pyramid.OUTPUTS`.
+the gate, `[batch, 1, height, width]`; PyramidNet also three logits. Lengths in depth are in gate widths.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
+from itertools import pairwise
+from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spadwarp.denoise.histogram_features import FEATURES
-from spadwarp.denoise.pyramid import PyramidNet
-from spadwarp.denoise.repeatable import edge_padded
+from spadwarp.denoise.frames import POOLED, SCORED, SIDES
+from spadwarp.denoise.histogram_features import LIGHT, LIKENESS, MOST, SEEN
+from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, symmetric_mean, turned
 from spadwarp.values import ArgumentError
 
-__all__ = ["NETWORKS", "USDN", "DnCNN", "PyramidNet", "build_network", "multiply_adds", "reads_histograms"]
+CHOICES = 1 + 2 + POOLED + 1
+"""Candidates of `Selection`: the network's answer, its medians over 3 × 3 and 5 × 5 pixels, the depths among the
+features, and the median of belief propagation over 3 × 3 pixels."""
+
+ANSWERS = 1 + POOLED + SIDES
+"""Candidates of `Context`: the answer before, the depths among the features, and those of both sides."""
+
+CLOSE = 0.01
+"""Two depths this near belong to one return, and a depth this near to the truth is right."""
 
 
 class USDN(nn.Module):
-    """DehazeNet made fully convolutional: 5×5 convolution, maxout, three scales, 7×7 maximum, one map, bounded ReLU.
+    """DehazeNet (Cai et al., IEEE TIP 25, 5187, 2016) made fully convolutional, as the paper describes its denoiser.
 
-    After Cai et al., IEEE TIP 25, 5187 (2016), as the paper describes its denoiser. DehazeNet's 8 240 weights are for
-    three input channels; this network has one, depth.
+    5×5 convolution, maxout, three scales, 7×7 maximum, one map, bounded ReLU; of one channel, depth.
     """
 
     def __init__(self) -> None:
@@ -55,28 +65,647 @@ class USDN(nn.Module):
 class DnCNN(nn.Module):
     """Residual learning of the noise, 17 layers of 64 channels: Zhang et al., IEEE TIP 26, 3142 (2017); depth only."""
 
-    def __init__(self, *, layers: int = 17, channels: int = 64) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        body: list[nn.Module] = [nn.Conv2d(1, channels, 3, padding=1), nn.ReLU(inplace=True)]
-        for _ in range(layers - 2):
-            body += [nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels)]
-            body.append(nn.ReLU(inplace=True))
-        body.append(nn.Conv2d(channels, 1, 3, padding=1))
-        self.body = nn.Sequential(*body)
+        body: list[nn.Module] = [nn.Conv2d(1, 64, 3, padding=1), nn.ReLU(inplace=True)]
+        for _ in range(15):
+            body += [nn.Conv2d(64, 64, 3, padding=1, bias=False), nn.BatchNorm2d(64), nn.ReLU(inplace=True)]
+        self.body = nn.Sequential(*body, nn.Conv2d(64, 1, 3, padding=1))
         for layer in self.modules():
             if isinstance(layer, nn.Conv2d):
                 nn.init.kaiming_normal_(layer.weight)
 
     def forward(self, frame: Tensor) -> Tensor:
-        noise = self.body(frame[:, :1])
-        return frame[:, :1] - noise.to(frame.dtype)
+        return frame[:, :1] - self.body(frame[:, :1]).to(frame.dtype)
+
+
+# Votes of neighbours: which reported depths agree.
+
+_SCALARS = 4  # scalar channels among the votes: near, wide, depth and support
+_SAME, _ALIKE = 0.012, 0.04  # depths this far apart do not agree, among 3 × 3 and 5 × 5 pixels
+_FAR = 10.0  # behind any depth that is reported
+_BORDER = 3  # pixels of padding, more than those of a pair are apart
+_RING = tuple((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0))
+_SHARPNESS = 6.0  # a depth with one vote more counts exp(_SHARPNESS) times as much
+
+
+class Votes(NamedTuple):
+    """Agreement of reported depths, `[B, n, H, W]`: 1 where two are equal, falling to 0, and 0 where one is missing."""
+
+    near: Tensor  # mean over the 8 pixels around
+    wide: Tensor  # mean over the 24 pixels around
+    depth: Tensor  # of the eight, with which most of them agree; 1 where none reports
+    support: Tensor  # how many of the eight agree with it, over 8
+    agreement: Tensor  # with each of the eight, as two features whose channels turn with the image, `[B, 16, H, W]`
+
+
+@torch.no_grad()
+def neighbour_votes(depth: Tensor, reported: Tensor) -> Votes:
+    """Votes of frames of depth over the gate and of which pixels reported, `[B, 1, H, W]`."""
+    height, width = depth.shape[-2:]
+    # Pixels that are missing, or beyond the border, agree with none: each has a depth of its own far behind the gate.
+    image = F.pad(torch.where(reported > 0.5, depth, torch.nan), (_BORDER,) * 4, value=torch.nan)
+    image = torch.where(torch.isnan(image), _apart(*image.shape[-2:], image.device), image)
+
+    def beside(values: Tensor, place: tuple[int, int]) -> Tensor:
+        y, x = (_BORDER + step for step in place)
+        return values[..., y : y + height, x : x + width]
+
+    agreeing: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}  # of all pixels with those so many rows, columns away
+    # All images as one line, in which a neighbour is a fixed number of places away; what crosses a border is not used.
+    line, row, pixels = image.flatten(), image.shape[3], image.numel()
+    line = torch.cat([line, line[: 2 * row + 2]])
+    for step in ((y, x) for y in range(3) for x in range(-2, 3) if (y, x) > (0, 0)):
+        places = step[0] * row + step[1]
+        apart = (line[:pixels] - line[places : places + pixels]).abs_().view_as(image)
+        fine, coarse = (torch.rsub(apart, 1.0, alpha=1.0 / most).clamp_min_(0.0) for most in (_SAME, _ALIKE))
+        agreeing[step] = fine, coarse
+
+    def pair(one: tuple[int, int], other: tuple[int, int], kind: int = 0) -> Tensor:
+        """Agreement of the pixels at two places beside each pixel."""
+        first, second = sorted((one, other))
+        return beside(agreeing[second[0] - first[0], second[1] - first[1]][kind], first)
+
+    around = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0)]
+    single = {place: pair((0, 0), place) for place in _RING}
+    near = sum(single.values(), torch.zeros_like(depth)) / 8.0
+    wide = sum((pair((0, 0), place, 1) for place in around), torch.zeros_like(depth)) / 24.0
+    depths = [beside(image, place) for place in _RING]
+    counts = [(value < _FAR).float() for value in depths]
+    for first, one in enumerate(_RING):
+        for second in range(first + 1, 8):
+            agree = pair(one, _RING[second])
+            counts[first].add_(agree)
+            counts[second].add_(agree)
+    count = torch.cat(counts, dim=1)
+    most = count.amax(dim=1, keepdim=True)
+    weight = torch.exp(_SHARPNESS * (count - most)) * (count > 0.0)
+    ring = torch.cat(depths, dim=1)
+    total = weight.sum(dim=1, keepdim=True)
+    voted = torch.where(total > 0.0, (weight * ring).sum(dim=1, keepdim=True) / total.clamp_min(1e-9), 1.0)
+    agreement = torch.cat([single[place] for place in _directions()], dim=1)
+    return Votes(near, wide, voted, most / 8.0, agreement)
+
+
+@lru_cache(maxsize=4)
+def _apart(rows: int, columns: int, device: torch.device) -> Tensor:
+    """Depths behind the gate of which no two within five rows and columns are equal, `[rows, columns]`."""
+    with torch.inference_mode(False):
+        row, column = torch.arange(rows, device=device) % 5, torch.arange(columns, device=device) % 5
+        return _FAR + 5.0 * row[:, None] + column
+
+
+@lru_cache(maxsize=1)
+def _directions() -> tuple[tuple[int, int], ...]:
+    """The neighbour beside a pixel, and the one at its corner, turned by each element of `GROUP`."""
+    places = []
+    for start in ((1, 2), (2, 2)):
+        for element in range(GROUP):
+            probe = np.zeros((3, 3), np.int64)
+            probe[start] = 1
+            row, column = np.argwhere(turned(probe, element))[0]
+            places.append((int(row) - 1, int(column) - 1))
+    return tuple(places)
+
+
+# Pixels that see the same two surfaces: the one that nearly all of them take is that of each.
+
+
+_VOTERS = 3  # pixels around that vote
+_ONE_SURFACE, _APART = 0.01, 0.05  # depths this near are one surface, this far apart two
+_ENOUGH, _TIMES = 4, 3.0  # votes for a surface, and how many times the pixels that took the other one, that move to it
+_RETURN = 4.0  # log-likelihood from which on a return is one [nats]
+_PHOTON = 5.0  # log-likelihood of a photon, about the highest [nats]
+_CHANCE = 2.0  # deviations by which the two returns may differ
+
+
+@torch.no_grad()
+def follow_the_others(found: Tensor, features: Tensor) -> Tensor:
+    """The answers `[B, 1, H, W]`, some of them moved to a return of their pixel that is far away."""
+    pair, order = (0.5 + features[:, :2]).sort(dim=1)  # the highest return of a pixel and the second, the nearer first
+    light = (10.0 * features[:, SEEN : SEEN + 2]).gather(1, order)
+    two = (light > _RETURN).all(dim=1, keepdim=True) & (pair.diff(dim=1) > _APART)
+    pair = torch.where(two, pair, torch.nan)  # near to none
+    height, width = found.shape[-2:]
+    around = F.pad(torch.cat([pair, found], dim=1), (_VOTERS,) * 4, value=torch.nan)
+    votes, taken = torch.zeros_like(pair), torch.zeros_like(pair)
+    for y in range(2 * _VOTERS + 1):
+        for x in range(2 * _VOTERS + 1):
+            if (y, x) != (_VOTERS, _VOTERS):
+                other, answer = around[..., y : y + height, x : x + width].split([2, 1], dim=1)
+                alike = ((pair - other).abs() < _ONE_SURFACE).all(dim=1, keepdim=True)
+                near = (answer - pair).abs() < _ONE_SURFACE
+                taken += near
+                votes += alike & near
+    more = light.flip(1) - light  # of the other return
+    by_chance = more <= _CHANCE * (_PHOTON * light.sum(dim=1, keepdim=True)).clamp_min(0.0).sqrt()
+    outvoted = (votes >= _ENOUGH) & (votes >= _TIMES * taken.flip(1))
+    moves = outvoted & by_chance & ((found - pair).abs() > _APART)
+    return torch.where(moves.any(dim=1, keepdim=True), torch.where(moves, pair, 0.0).sum(dim=1, keepdim=True), found)
+
+
+# The last choices of the network for histograms: its answer, or another depth that the photons make more probable.
+
+_REACH = 2  # pixels around a pixel that its choice depends on
+_PIXELS_AT_ONCE = 1 << 14  # of which candidates are held in memory
+_SPREAD = 0.004  # candidates this near to the one chosen count, too
+_OF_CHOICE = 19  # what is known of a candidate
+_OF_PIXEL = 2 * SCORED + (SEEN - POOLED - SCORED * POOLED - SCORED) + 3 + 2  # and of its pixel
+
+
+class Selection(nn.Module):
+    """Scores of `CHOICES` for every pixel. With new weights the network's own answer has the highest.
+
+    A few pixels with a wrong surface cost more than all the others together: a thin handle that its surroundings
+    outvote, a weaker second return that by chance has more photons. For each candidate a small network, the same for
+    all pixels, sees what speaks for it: the photons of the pixel and of those around it, how far it is from the other
+    candidates, and whether pixels around have the same depth.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        hidden = 24
+        self.choice, self.pixel = nn.Linear(_OF_CHOICE, hidden), nn.Linear(_OF_PIXEL, hidden, bias=False)
+        self.kind = nn.Parameter(0.3 * torch.randn(CHOICES, hidden))
+        self.middle, self.last = nn.Linear(hidden, hidden), nn.Linear(hidden, 1)
+        self.bias = nn.Parameter(torch.zeros(CHOICES))
+        with torch.no_grad():
+            self.bias[0] = 3.0
+            self.last.weight.mul_(0.3)
+
+    def forward(
+        self, found: Tensor, logits: Tensor, features: Tensor, typical: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Candidates over the gate and their scores, each `[B, CHOICES, H, W]`.
+
+        Of the network's answer `[B, 1, H, W]`, its three logits and the features; `typical`: of the whole frames that
+        these are parts of, `[B, 1 + SCORED, 1, 1]`.
+        """
+        typical = _typical(features) if typical is None else typical
+        candidates, of_choice, of_pixel = _evidence(found, logits, features, typical)
+        known = self.choice(of_choice.movedim(2, -1)) + self.pixel(of_pixel.movedim(1, -1))[:, None]
+        known = F.relu(known + self.kind[:, None, None])
+        return candidates, self.last(F.relu(self.middle(known)))[..., 0] + self.bias[:, None, None]
+
+
+def selected_depth(selection: Selection, found: Tensor, logits: Tensor, features: Tensor) -> Tensor:
+    """`selected` of frames, strip by strip, which takes less memory, `[B, 1, H, W]`."""
+    height, width = found.shape[-2:]
+    rows = max(1, _PIXELS_AT_ONCE // width)
+    answer = torch.empty_like(found)
+    for frame in range(len(found)):
+        whole = [image[frame : frame + 1] for image in (found, logits, features)]
+        typical = _typical(whole[2])
+        for top in range(0, height, rows):
+            first, last = max(0, top - _REACH), top + rows + _REACH
+            strip = selected(*selection(*(image[:, :, first:last] for image in whole), typical))
+            answer[frame, :, top : top + rows] = strip[0, :, top - first : top - first + rows]
+    return answer
+
+
+def selected(candidates: Tensor, scores: Tensor, spread: float | Tensor = _SPREAD) -> Tensor:
+    """The candidate with the highest score, and what is near to it, `[B, 1, H, W]`; never the mean of two surfaces."""
+    weight = torch.softmax(scores, dim=1)
+    best = candidates.gather(1, weight.argmax(dim=1, keepdim=True))
+    weight = weight * torch.exp(-((candidates - best) / spread).square())
+    return (weight * candidates).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
+
+
+def _typical(features: Tensor) -> Tensor:
+    """Medians over a frame of the second return's log-likelihood and of the highest scores, `[B, 1 + SCORED, 1, 1]`."""
+    tops = features[:, POOLED + SCORED * POOLED : POOLED + SCORED * POOLED + SCORED]
+    values = torch.cat([features[:, SEEN + 1 : SEEN + 2], tops], dim=1)
+    return values.flatten(2).median(dim=2).values[:, :, None, None]
+
+
+def _evidence(found: Tensor, logits: Tensor, features: Tensor, typical: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Candidates `[B, K, H, W]`, what is known of each `[B, K, C, H, W]`, and of the pixel `[B, P, H, W]`."""
+    depths, own = 0.5 + features[:, :POOLED], features[:, SEEN : SEEN + POOLED]
+    scores = features[:, POOLED : POOLED + SCORED * POOLED].unflatten(1, (SCORED, POOLED))
+    tops, rest = features[:, POOLED + SCORED * POOLED : SEEN].tensor_split([SCORED], dim=1)
+    near, wide = _around(found, 3), _around(found, 5)
+    matched, first, second = (_around(depths[:, place : place + 1], 3) for place in (2, 0, 1))
+    inner, outer = (around.median(dim=1, keepdim=True).values for around in (near, wide))
+    candidates = torch.cat([found, inner, outer, depths, matched.median(dim=1, keepdim=True).values], dim=1)
+    beside = (candidates[:, :, None] - depths[:, None]).abs() < CLOSE
+
+    def at(values: Tensor, otherwise: float) -> Tensor:
+        """The highest value of the pooled depths near each candidate."""
+        return torch.where(beside, values[:, None], otherwise).amax(dim=2)
+
+    def agreeing(around: Tensor, reach: float) -> Tensor:
+        """Part of the depths around that agree with each candidate."""
+        agreeing = torch.zeros_like(candidates)
+        for one in around.split(1, dim=1):
+            agreeing += (candidates - one).abs_().mul_(-1.0 / reach).exp_()
+        return agreeing / around.shape[1]
+
+    usual, top, mine = typical[:, :1], own[:, :1], at(own, -1.0)
+    apart = (candidates - found).abs()
+    of_choice = [
+        *(at(scores[:, window], -0.1 * MOST) for window in range(SCORED)),
+        torch.asinh(mine - usual), torch.asinh(top - usual).expand_as(mine),
+        *(torch.tanh(apart / reach) for reach in (0.003, 0.01, 0.1)),
+        agreeing(wide, 0.004), agreeing(wide, 0.02), agreeing(matched, 0.004),
+        agreeing(depths, 0.004), agreeing(depths, 0.02),
+        torch.asinh(top - mine), (at(own, 0.0) / top.clamp_min(0.05)).clamp(-1.0, 1.5),
+        agreeing(first, 0.006), agreeing(_around(depths[:, :1], 5), 0.006),
+        agreeing(torch.cat([first, second], dim=1), 0.006),
+    ]  # fmt: skip
+    rough = [20.0 * (around - one).abs().mean(dim=1, keepdim=True) for around, one in ((wide, outer), (near, inner))]
+    of_pixel = [tops, typical[:, 1:].expand_as(tops), rest, 0.25 * logits, *rough]
+    return candidates, torch.stack(of_choice, dim=2), torch.cat(of_pixel, dim=1)
+
+
+def _around(image: Tensor, side: int) -> Tensor:
+    return torch.cat(_windows(image, side, 1), dim=1)
+
+
+_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + LIKENESS + 3 + 3 + 2
+_LEAST_WAY = 0.01  # added to the way between both sides
+_SURE = 12.0  # from such a highest log-likelihood of a pixel on, its answer is one surface [nats]
+
+
+class _Residual(nn.Module):
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.first = SymmetricConv(features, features, 3)
+        self.second = SymmetricConv(features, features, 3)
+        nn.init.zeros_(self.second.weight)  # begins as the identity
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.second(F.relu(self.first(F.relu(x)), inplace=True)).add_(x)
+
+
+class Context(nn.Module):
+    """Weights of `ANSWERS` depths for every pixel. With new weights the answer before keeps nearly all of it.
+
+    Where photons are few, nearly all of the squared error comes from pixels beside edges of depth. Which surface such a
+    pixel sees, the pixel and its nearest neighbours do not tell; the course of the edge does, and that of the counts.
+    So depths are written as parts of the way from the nearer to the farther surface around each pixel, with the
+    log-likelihoods of all, and a pyramid of features weighs them.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths, hidden = (8, 12, 16, 24), 64
+        self.pixel = nn.Sequential(nn.Conv2d(_SEEN, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 1), nn.ReLU())
+        self.light = nn.Conv2d(LIGHT, hidden, 1, bias=False)
+        self.enter = SymmetricConv(hidden, widths[0], 3, lifts=True)
+        pairs = list(pairwise(widths))
+        self.first = _Residual(widths[0])
+        self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
+        self.before = nn.ModuleList(_Residual(width) for width in widths[1:])
+        self.deep = _Residual(widths[-1])
+        self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
+        self.after = nn.ModuleList(_Residual(width) for width in widths[:-1])
+        self.last = SymmetricConv(widths[0], 8, 1)
+        self.head = nn.Sequential(nn.Conv2d(16 + hidden, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, ANSWERS, 1))
+        self.target = nn.Sequential(nn.Conv2d(16 + hidden, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, 1, 1))
+        self.stride = 2 ** len(pairs)
+        final, target = self.head[-1], self.target[-1]
+        with torch.no_grad():
+            for one in (self.light.weight, target.weight, target.bias):
+                one.zero_()  # type: ignore[operator]
+            final.weight.mul_(0.1)  # type: ignore[operator]
+            final.bias.zero_()  # type: ignore[operator]
+            final.bias[0] = 3.0  # type: ignore[index, operator]
+
+    def forward(self, found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Depths and their scores, each `[B, ANSWERS, H, W]`; what is added to the target's logit.
+
+        Of the answer before `[B, 1, H, W]`, the network's three logits and the features.
+        """
+        depths, *images = _seen(found, logits, features)
+        height, width = found.shape[-2:]
+        seen, light = (_filled_up(image, self.stride) for image in images)
+        pixel = self.pixel[1:](self.pixel[0](seen) + self.light(light))
+        x = self.first(self.enter(pixel))
+        skipped = []
+        for down, before in zip(self.down, self.before, strict=True):
+            skipped.append(x)
+            x = before(down(F.relu(x)))
+        x = self.deep(x)
+        for up, after, skip in reversed(list(zip(self.up, self.after, skipped, strict=True))):
+            x = after(skip + enlarged(up(x), 2))
+        x = F.relu(self.last(F.relu(x))).unflatten(1, (-1, GROUP))
+        x = torch.cat([x.mean(dim=2), x.amax(dim=2), pixel], dim=1)
+        scores, target = (head(x).float()[..., :height, :width] for head in (self.head, self.target))
+        return depths, scores, target
+
+
+def answer(depths: Tensor, scores: Tensor, features: Tensor) -> Tensor:
+    """Mean of the depths where photons are few; else the one with the highest score, `[B, 1, H, W]`."""
+    peak = 10.0 * features[:, POOLED + SCORED * POOLED :][:, :1]
+    return selected(depths, scores, _SPREAD + torch.sigmoid(_SURE - peak))
+
+
+def _seen(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Candidates, and what the layers see; the last part of it apart."""
+    rest, own = features[:, POOLED:SEEN], features[:, SEEN : SEEN + POOLED]
+    beside, light, sides = features[:, SEEN + POOLED :].tensor_split([-SIDES - LIGHT, -SIDES], dim=1)
+    depths = torch.cat([found, 0.5 + features[:, :POOLED], sides], dim=1)
+    front, back = sides[:, 2:3], sides[:, 3:4]
+    parts = ((depths - front) / (back - front + _LEAST_WAY)).clamp(-1.0, 2.0)
+    steps = 0.3 * torch.log(torch.cat([back - front, sides[:, 1:2] - sides[:, :1]], dim=1).clamp_min(0.0) + 0.003) + 1.0
+    scores = torch.cat([torch.asinh(own), torch.asinh(beside[:, :SIDES]), beside[:, SIDES:]], dim=1)
+    places = 2.0 * torch.cat([found, front, back], dim=1) - 1.0
+    peak = rest[:, SCORED * POOLED : SCORED * POOLED + 2]
+    level = peak.mean(dim=(2, 3), keepdim=True).expand_as(peak)
+    return depths, torch.cat([parts, steps, rest, scores, 0.25 * logits, places, level], dim=1), light
+
+
+def _filled_up(image: Tensor, stride: int) -> Tensor:
+    """With rows and columns that repeat the last, up to multiples of `stride`."""
+    bottom, right = (-length % stride for length in image.shape[-2:])
+    return F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
+
+
+LONGEST_DELAY = 0.2
+"""Largest delay of forward-scattered light that the network can correct."""
+
+_WIDEST = 0.1  # depths this far from the first answer still count for the second
+_NEAR = 5  # side of the window whose depths are taken as they are
+_BOXES = (9, 6), (36, 24)  # sides of the wider windows whose means are taken, and the pixels between them
+
+
+class PyramidNet(nn.Module):
+    """Weighted means of depths that come from the target, with weights from a pyramid of features.
+
+    A pixel's depth is a convex combination of the 5×5 depths around it, of the mean depths of 3×3 wider windows (9 and
+    36 pixels), of the depth that neighbours vote for, and of one value of the network's own; what is far from it is
+    then left out, so that two surfaces are not mixed. The weight of a depth is the product of two factors: the
+    probability that it is the target's, and whether it belongs to the pixel that it goes to. Depths of signal photons
+    are thereby used as they are, to the millimetre. Kernel prediction: Bako et al., ACM TOG 36, 97 (2017); means
+    weighted by certainty: Knutsson & Westin, CVPR 1993. All its layers commute with turns and reflections of the image.
+
+    The output, `[batch, 4, height, width]`: depth over the gate; the logits of "the pixel sees a target", of "the depth
+    is right to `CLOSE`", and of "the reported depth is the target's".
+
+    With `histograms` it sees the channels of `spadwarp.denoise.histogram_features`, not the votes. Each pixel then
+    first gets a depth from the candidates among them, which replaces the reported one in all that follows: the most
+    probable one, never the mean of two returns. The delay of scattered light, which the shape of the return shows, is
+    subtracted from the result. Last, `Selection` takes the answer or another candidate, and `Context` weighs them with
+    the view of a wide surrounding; then pixels with two returns follow those around that have the same two. A fifth
+    output is the depth of the candidates, and one for each candidate its logit. While it learns, there are also the
+    candidates of the selection and their scores, those of the wide view, its answer and its logit of "sees a target";
+    depth and logits are those before the selection.
+    """
+
+    stride = 16  # sizes are filled up to multiples of it
+
+    def __init__(self, *, histograms: bool = False) -> None:
+        super().__init__()
+        self.histograms = histograms
+        votes, last = not histograms, 8
+        widths = (4, 5, 8, 10, 12 if histograms else 14)  # features of the levels
+        pairs, deep = list(pairwise(widths)), len(widths) - 1
+        self.enter = SymmetricConv(6 + _SCALARS * votes, widths[0], 3, lifts=True)
+        self.enter_agreement = SymmetricConv(2, widths[0], 3, bias=False) if votes else None
+        self.down = nn.ModuleList(SymmetricConv(wide, narrow, 4, stride=2) for wide, narrow in pairs)
+        self.up = nn.ModuleList(SymmetricConv(narrow, wide, 1, bias=False) for wide, narrow in pairs)
+        self.before = nn.ModuleList(
+            nn.Sequential(*(_Residual(width) for _ in range(1 + (level == deep - 1))))
+            for level, width in enumerate(widths[1:])
+        )
+        self.after = nn.ModuleList(_Residual(width) for width in widths[1:-1])
+        self.finish = SymmetricConv(widths[0], widths[0], 3)
+        self.polish = nn.ModuleList(_Residual(widths[0]) for _ in range(votes))
+        self.spread = SymmetricConv(widths[0], last, 1)
+        self.near = SymmetricWindow(last, _NEAR)
+        self.wide = nn.ModuleList(SymmetricWindow(last, 3) for _ in _BOXES)
+        # Weight and value of the network's own depth; logits; reach of refining; weight of the depth voted for.
+        self.scalars = nn.Conv2d(last, 5 + 2 * votes, 1)
+        with torch.no_grad():  # begins near the identity
+            assert self.scalars.bias is not None
+            self.near.bias[0] = 3.0  # of the pixel itself
+            for window in self.wide:
+                for bias in window.parameters(recurse=False):
+                    if bias.ndim == 1:
+                        bias.fill_(-2.0)
+            self.scalars.weight.mul_(0.3)
+            self.scalars.bias.copy_(torch.tensor([-2.0, 0.0, 2.0, 0.0, 2.0, *[-1.0, 3.0] * votes]))
+            if self.enter_agreement is not None:
+                # Begins with the depth voted for, and with features that count little: noise in the weights would at
+                # first teach the features to vanish, after which they learn no more.
+                for layer in (self.scalars, self.near, *self.wide):
+                    layer.weight.mul_(0.1)
+                for layer in (self.enter_agreement, *self.up):
+                    layer.weight.mul_(0.3)
+                self.enter.weight[:, -_SCALARS:].mul_(0.3)
+        if histograms:
+            self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
+            self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
+            self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1, 0.3]))  # weights of scores in these logits
+            self.select, self.context = Selection(), Context()
+            with torch.no_grad():
+                assert self.choose.bias is not None
+                self.enter_features.weight.mul_(0.3)
+                self.choose.weight.mul_(0.3)
+                self.choose.bias.zero_()
+                self.choose.bias[-1] = -5.0
+
+    def forward(self, frame: Tensor) -> Tensor:
+        """See the class; `frame` as the head of this file describes it."""
+        height, width = frame.shape[-2:]
+        frame = _filled_up(frame, self.stride)
+        depth, reported, features = frame[:, :1].float(), frame[:, 1:2].float(), frame[:, 3:].float()
+        votes = None if self.histograms else neighbour_votes(depth, reported)
+        x = self._features(frame, votes)
+        delay: Tensor | None = None
+        extra: list[Tensor] = []
+        if self.histograms:
+            depth, delay, extra = self._chosen(depth, features, x)
+            reported = torch.ones_like(depth)
+        weights, own, others, reach = self._heads(x)
+        values, trusts = _candidates(depth, reported, others[:, 2:])
+        values, trusts = [*values, 0.5 + own], [*trusts, torch.zeros_like(depth)]
+        if votes is not None:
+            values, trusts = [*values, votes.depth], [*trusts, 1e4 * (votes.support > 0.0) - 1e4]
+        parts = weights, torch.cat(trusts, dim=1), torch.cat(values, dim=1), reach
+        if torch.is_grad_enabled():
+            found = _answer(*parts)
+        elif x.is_cuda:
+            found = _answer_in_place(*parts)
+        else:  # strips of a few rows stay in a CPU's cache
+            strips = zip(*(part.split(8, 2) for part in parts), strict=True)
+            found = torch.cat([_answer_in_place(*strip) for strip in strips], 2)
+        if delay is not None:
+            before, logits = found.detach(), others.detach()  # what comes after learns from its own answer alone
+            if torch.is_grad_enabled():
+                extra += self._learnt(before, logits, features, delay.detach())
+            else:
+                before = selected_depth(self.select, before, logits, features)
+                depths, scores, target = self.context(before, logits, features)
+                found = answer(depths, scores, features)
+                inside = ..., slice(height), slice(width)
+                found[inside] = follow_the_others(found[inside], features[inside])
+                others = torch.cat([others[:, :1] + target, others[:, 1:]], dim=1)
+            found = found - delay
+        return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
+
+    def _learnt(self, found: Tensor, logits: Tensor, features: Tensor, delay: Tensor) -> list[Tensor]:
+        """Candidates of the selection and their scores; those of the wide view, its answer and its logit "target"."""
+        candidates, scores = self.select(found, logits, features)
+        depths, weights, target = self.context(selected(candidates, scores).detach(), logits, features)
+        last = answer(depths, weights, features)
+        return [candidates - delay, scores, depths - delay, weights, last - delay, logits[:, :1] + target]
+
+    def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
+        """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""
+        depth, reported, density = (channel.contiguous() for channel in frame[:, :3].split(1, dim=1))
+        ranked = [rank - depth for rank in ranks(depth)]
+        scalars = [(depth - 0.5) * reported, reported, 0.25 * density, *ranked]
+        if votes is not None:
+            scalars += [votes.near, votes.wide, votes.depth - depth, votes.support]
+        entering = [(self.enter, torch.cat(scalars, dim=1))]
+        if votes is not None and self.enter_agreement is not None:
+            entering.append((self.enter_agreement, votes.agreement))
+        if self.histograms:
+            entering.append((self.enter_features, frame[:, 3 : 3 + SEEN]))
+        x = self._entered(entering)
+        skipped = []
+        for down, before in zip(self.down, self.before, strict=True):
+            skipped.append(x)
+            x = before(down(F.relu(x)))
+        for level in reversed(range(len(skipped))):
+            finer = enlarged(self.up[level](x), 2)
+            x = finer.add_(skipped[level])
+            x = self.after[level - 1](x) if level else x + self.finish(F.relu(x))
+        for layer in self.polish:
+            x = layer(x)
+        return F.relu(self.spread(F.relu(x)), inplace=True)
+
+    def _entered(self, parts: list[tuple[SymmetricConv, Tensor]]) -> Tensor:
+        """The sum of convolutions of several images, as one; channels are filled up to a multiple of eight."""
+        filters = torch.cat([layer.expanded() for layer, _ in parts], dim=1)
+        images = [image.to(filters.dtype) for _, image in parts]
+        missing = -filters.shape[1] % 8
+        images.append(images[0].new_zeros(()).expand(len(images[0]), missing, *images[0].shape[2:]))
+        filters = F.pad(filters, (0, 0, 0, 0, 0, missing)).contiguous(memory_format=torch.channels_last)
+        assert self.enter.bias is not None
+        bias = self.enter.bias.repeat_interleave(GROUP)
+        # In the precision of the layers, and with the channels of a pixel side by side.
+        image = torch.cat(images, dim=1).to(self.enter.weight.dtype, memory_format=torch.channels_last)
+        return F.conv2d(image, filters, bias, padding=self.enter.padding)
+
+    def _heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Weights of all depths, the network's own depth, the three logits and the reach of refining, `[B, n, H, W]`.
+
+        The layers that these come from are applied as one.
+        """
+        layers, votes = [window.filters() for window in (self.near, *self.wide)], not self.histograms
+        # Weights of the own depth and of the one voted for; then what is no weight. Slices, not a list of rows, which
+        # would have to be copied to the GPU.
+        order = [slice(0, 1), *[slice(-1, None)] * votes, slice(1, 5), *[slice(5, 6)] * votes]
+        assert self.scalars.bias is not None
+        for rows in order:
+            weight = self.scalars.weight[rows, :, 0, 0].repeat_interleave(GROUP, 1) / GROUP
+            layers.append((weight, self.scalars.bias[rows]))
+        filters, biases = (torch.cat(parts) for parts in zip(*layers, strict=True))
+        # The product of matrices gives rows of images, which what follows is faster with than with rows of channels.
+        pixels = x.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)
+        found = torch.baddbmm(biases[:, None], filters.expand(len(x), -1, -1), pixels).float()
+        found = found.unflatten(2, x.shape[2:])
+        weights, own, logits, reach = found.split([found.shape[1] - 4 - votes, 1, 3, int(votes)], dim=1)
+        return weights, own, logits, reach
+
+    def _chosen(self, depth: Tensor, features: Tensor, x: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """A depth for each pixel, the delay of its light; and that depth and the candidates' logits as outputs."""
+        candidates = torch.cat([depth, 0.5 + features[:, :POOLED]], dim=1)
+        scores = features[:, POOLED : POOLED + SCORED * POOLED].unflatten(1, (SCORED, POOLED))
+        scores = torch.cat([scores[:, :, :1], scores], dim=2)  # the reported depth has those of the own return
+        head = self.choose(symmetric_mean(x)).float()
+        logits = head[:, :-1] + 10.0 * (scores * self.evidence[:, None, None, None]).sum(dim=1)
+        chosen = selected(candidates, logits, CLOSE)
+        return chosen, LONGEST_DELAY * torch.sigmoid(head[:, -1:]), [chosen, logits]
+
+
+def _answer(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> Tensor:
+    """Weighted mean of the values, then, where `reach` has a channel, one in which those far from it count less.
+
+    What comes from another surface keeps little part in the answer. The fall with distance is a power, not an
+    exponential: a depth that is not trusted stays so where it is near. At `_WIDEST` sigmoid(reach) it is a quarter.
+    """
+    weight = torch.softmax(weights + trusts, dim=1)
+    found = (weight * values).sum(dim=1, keepdim=True)
+    if reach.shape[1]:
+        near = (values - found) * (1.0 / (0.002 + _WIDEST * torch.sigmoid(reach)))
+        near = weight / torch.addcmul(torch.ones_like(reach), near, near).square()
+        found = (near * values).sum(dim=1, keepdim=True) / (near.sum(dim=1, keepdim=True) + 1e-12)
+    return found
+
+
+def _answer_in_place(weights: Tensor, trusts: Tensor, values: Tensor, reach: Tensor) -> Tensor:
+    """The same as `_answer` in less time, without derivatives."""
+    weight = weights + trusts
+    weight.sub_(weight.amax(dim=1, keepdim=True)).exp_()
+    part = weight * values
+    found = part.sum(dim=1, keepdim=True).div_(weight.sum(dim=1, keepdim=True))
+    if reach.shape[1]:
+        near = torch.sub(values, found, out=part).mul_(reach.sigmoid().mul_(_WIDEST).add_(0.002).reciprocal_())
+        weight.div_(near.square_().add_(1.0).square_())
+        found = torch.mul(weight, values, out=part).sum(dim=1, keepdim=True)
+        found.div_(weight.sum(dim=1, keepdim=True).add_(1e-12))
+    return found
+
+
+def _candidates(depth: Tensor, reported: Tensor, true: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """Depths around each pixel and the logarithms of their certainty, each `[B, 1, H, W]`."""
+    certainty = torch.sigmoid(true) * reported
+    values = _windows(depth, _NEAR, 1)
+    trusts = _windows(F.logsigmoid(true) + 1e4 * (reported - 1.0), _NEAR, 1)
+    both = torch.cat([certainty * depth, certainty], dim=1)
+    for box, step in _BOXES:
+        coarse = 1 if box < 16 else 4
+        mean = F.avg_pool2d(both, coarse) if coarse > 1 else both
+        side = box // coarse
+        mean = F.avg_pool2d(mean, (side, 1), 1, (side // 2, 0))
+        mean = F.avg_pool2d(mean, (1, side), 1, (0, side // 2))
+        if coarse > 1:
+            mean = enlarged(mean, coarse)
+        share = mean[:, 1:] + 1e-6
+        values += _windows(mean[:, :1] / share, 3, step)
+        trusts += _windows(torch.log(share), 3, step)
+    return values, trusts
+
+
+def _windows(image: Tensor, side: int, step: int) -> list[Tensor]:
+    """The values of an image `[B, 1, H, W]` at `side`² places `step` pixels apart around each pixel."""
+    height, width = image.shape[-2:]
+    reach = side // 2 * step
+    padded = edge_padded(image, reach)
+    starts = range(0, 2 * reach + 1, step)
+    return [padded[..., y : y + height, x : x + width] for y in starts for x in starts]
+
+
+def ranks(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The third, fifth and seventh of the nine sorted values of each 3×3 neighbourhood.
+
+    Columns are sorted, then rows, after which columns are still so: what can be third is the second in size of two
+    sorted pairs, and the fifth is the middle one of the diagonal (Paeth, Graphics Gems, 1990).
+    """
+    height, width = depth.shape[-2:]
+    padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")
+    column = _sorted(*(padded[..., row : row + height, :] for row in range(3)))
+    least, middle, most = (_sorted(*(line[..., first : first + width] for first in range(3))) for line in column)
+    third = torch.minimum(torch.maximum(least[1], middle[0]), torch.minimum(least[2], most[0]))
+    fifth = _sorted(least[2], middle[1], most[0])[1]
+    seventh = torch.maximum(torch.minimum(middle[2], most[1]), torch.maximum(least[2], most[0]))
+    return third, fifth, seventh
+
+
+def _sorted(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    a, b = torch.minimum(a, b), torch.maximum(a, b)
+    b, c = torch.minimum(b, c), torch.maximum(b, c)
+    return torch.minimum(a, b), torch.maximum(a, b), c
 
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {
     "usdn": USDN,
     "dncnn": DnCNN,
     "pyramid": PyramidNet,
-    "histograms": partial(PyramidNet, widths=(4, 5, 8, 10, 12), fine=0, refines=False, votes=False, histograms=True),
+    "histograms": partial(PyramidNet, histograms=True),
 }
 """Networks by the name that recipes and commands use."""
 
@@ -90,17 +719,4 @@ def build_network(name: str) -> nn.Module:
 
 def reads_histograms(network: nn.Module) -> bool:
     """Whether this network needs the channels of `spadwarp.denoise.histogram_features`."""
-    return getattr(network, "enter_features", None) is not None
-
-
-def multiply_adds(network: nn.Module, height: int, width: int) -> int:
-    """Multiplications of all convolutions for one frame of `height` × `width`; other operations cost little."""
-    from torch.utils.flop_counter import FlopCounterMode
-
-    channels = 3 + FEATURES * reads_histograms(network)
-    frame = torch.zeros(1, channels, height, width, device=next(network.parameters()).device)
-    mode = network.training
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        network.eval()(frame)
-    network.train(mode)
-    return counter.get_total_flops() // 2
+    return getattr(network, "histograms", False)

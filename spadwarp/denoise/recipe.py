@@ -13,13 +13,14 @@ from spadwarp.io.paths import example_or_path
 from spadwarp.io.text import read_toml
 from spadwarp.scene.sections import Document, Section, Whole
 
-__all__ = ["LEAST_CROP", "MODELS", "Noise", "Optimiser", "Part", "TrainingRecipe", "load_training_recipe"]
+__all__ = ["TrainingRecipe", "load_training_recipe"]
+
 
 LEAST_CROP = 32
 """Side of the smallest crop that a network learns from [pixels]."""
 
-MODELS = ("pyramid", "histograms", "dncnn", "usdn")
-"""Names of the networks; "histograms" is PyramidNet for frames whose histograms are known."""
+LEVELS = (0.042, 0.183, 0.264, 0.337, 0.394, 0.480)
+"""The paper's backscatter fractions, at which denoisers are compared and validated."""
 
 
 def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
@@ -147,11 +148,8 @@ class TrainingRecipe(Document):
         noise, mixture = _given(tables.get("noise", {})), tables.get("mixture")
         if not isinstance(noise, Mapping) or not isinstance(mixture, list | tuple):
             return tables
-        parts = [_given(part) for part in mixture]
-        return {
-            **tables,
-            "mixture": tuple({**noise, **part} if isinstance(part, Mapping) else part for part in parts),
-        }
+        parts = tuple({**noise, **part} if isinstance(part, Mapping) else part for part in map(_given, mixture))
+        return {**tables, "mixture": parts}
 
     @pydantic.model_validator(mode="after")
     def _is_consistent(self) -> Self:

@@ -9,15 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from spadwarp.denoise.evaluation import Evaluation
-from spadwarp.denoise.metrics import LARGER_IS_BETTER
-from spadwarp.denoise.scene_scores import SceneScores
+from spadwarp.denoise.evaluation import LARGER_IS_BETTER, Evaluation
+from spadwarp.denoise.evaluation_scenes import SceneScores
 from spadwarp.io.paths import atomic_path
 from spadwarp.io.text import json_text
 from spadwarp.viz.evaluation import SCORES, TITLES, draw_ranking, draw_reliability, draw_samples, draw_scores
 from spadwarp.viz.viewer import write_page
 
 __all__ = ["TITLES", "scene_table", "write_report", "write_scene_report"]
+
 
 _NBSP = "\N{NO-BREAK SPACE}"
 
@@ -34,20 +34,10 @@ def write_report(evaluation: Evaluation, folder: str | Path) -> list[Path]:
     """
     place = Path(folder)
     pictures = _draw(evaluation, place)
-    with atomic_path(place / "scores.json") as temporary:
-        temporary.write_text(json_text(evaluation.to_dict(), indent=1))
     tables = [_means(evaluation), _gains(evaluation), *([_steps(evaluation)] if evaluation.steps else [])]
-    write_page(
-        place / "report.html",
-        "evaluation.html",
-        data=evaluation.data,
-        frames=sum(evaluation.frames.values()),
-        targets=evaluation.targets,
-        summary=evaluation.summary,
-        tables=tables,
-        pictures=[(title, base64.b64encode(path.read_bytes()).decode()) for title, path in pictures.items()],
-    )
-    return [place / "report.html", *pictures.values(), place / "scores.json"]
+    frames = sum(evaluation.frames.values())
+    texts = {"data": evaluation.data, "summary": evaluation.summary, "targets": evaluation.targets, "frames": frames}
+    return _write(place, evaluation, pictures, tables, texts)
 
 
 def scene_table(scores: SceneScores, setting: str, water: str) -> tuple[list[str], list[list[str]]]:
@@ -76,31 +66,35 @@ def write_scene_report(scores: SceneScores, folder: str | Path) -> list[Path]:
 
     A table for each scene type, and how often the probabilities were true. Raises `FileError`.
     """
-    place = Path(folder)
     note = "scenes of spadwarp.denoise.evaluation_scenes"
-    pictures = {
-        "Probabilities given, and how often they were true": draw_reliability(
-            scores.reliability, place / "reliability.png", note=note
-        )
-    }
-    with atomic_path(place / "scores.json") as temporary:
-        temporary.write_text(json_text(scores.to_dict(), indent=1))
+    picture = draw_reliability(scores.reliability, Path(folder) / "reliability.png", note=note)
     tables: list[_Table] = []
     for setting, water in scores.types():
         names, rows = scene_table(scores, setting, water)
         cells = [(name, [(text, False) for text in texts]) for name, *texts in rows]
         tables.append((f"{setting.capitalize()}, backscatter {water}: PSNR of the input, gains [dB]", names, cells))
     worse = ", ".join(f"{TITLES[name]} {scores.worse_than_input(name)}" for name in scores.methods[1:])
-    write_page(
-        place / "report.html",
-        "evaluation.html",
-        data="Scenes that no training saw",
-        frames=len(scores.rows) // len(scores.methods),
-        targets=list(dict.fromkeys(key[4] for key in scores.rows)),
-        summary=f"All pixels count; frames whose PSNR is below the input's: {worse}",
-        tables=tables,
-        pictures=[(title, base64.b64encode(path.read_bytes()).decode()) for title, path in pictures.items()],
-    )
+    texts = {
+        "data": "Scenes that no training saw",
+        "frames": len(scores.rows) // len(scores.methods),
+        "targets": list(dict.fromkeys(key[4] for key in scores.rows)),
+        "summary": f"All pixels count; frames whose PSNR is below the input's: {worse}",
+    }
+    return _write(Path(folder), scores, {"Probabilities given, and how often they were true": picture}, tables, texts)
+
+
+def _write(
+    place: Path,
+    scores: Evaluation | SceneScores,
+    pictures: dict[str, Path],
+    tables: list[_Table],
+    texts: dict[str, Any],
+) -> list[Path]:
+    """Writes the page and `scores.json`; the paths of all files."""
+    with atomic_path(place / "scores.json") as temporary:
+        temporary.write_text(json_text(scores.to_dict(), indent=1))
+    encoded = [(title, base64.b64encode(path.read_bytes()).decode()) for title, path in pictures.items()]
+    write_page(place / "report.html", "evaluation.html", tables=tables, pictures=encoded, **texts)
     return [place / "report.html", *pictures.values(), place / "scores.json"]
 
 
@@ -135,13 +129,10 @@ def _means(evaluation: Evaluation) -> _Table:
         field: (max if larger else min)(values[field] for values in means.values())
         for field, larger in LARGER_IS_BETTER.items()
     }
-    rows = [
-        (
-            TITLES[method],
-            [(text.format(values[field]), values[field] == best.get(field)) for field, (_, text) in SCORES.items()],
-        )
-        for method, values in means.items()
-    ]
+    rows = []
+    for method, values in means.items():
+        cells = [(text.format(values[name]), values[name] == best.get(name)) for name, (_, text) in SCORES.items()]
+        rows.append((TITLES[method], cells))
     title = "Ranking: means over targets and levels (the paper's table 4)"
     return title, ["method", *(name for name, _ in SCORES.values())], rows
 

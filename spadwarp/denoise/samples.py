@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,8 +17,6 @@ from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, pro
 from spadwarp.device import physical_memory
 from spadwarp.values import DeviceError
 
-__all__ = ["Fresh", "Pool", "Samples", "Scenes", "Sizes"]
-
 PORTIONS = 24
 """Portions of which a pool consists; each is drawn at once."""
 
@@ -28,14 +26,9 @@ _WATER = (0.03, 0.85)  # part of a scene that is target, where it counts as a ta
 
 
 class Scenes:
-    """The clean scenes of each step: those of a dataset, or new ones drawn every so many steps.
+    """The clean scenes of each step: those `given`, of a dataset, or new ones that each process draws for itself.
 
-    Args:
-        recipe: Seed, size of the crops, number of scenes and steps between two drawings.
-        rank: Number of this process, each of which draws its own.
-        device: Of the scenes.
-        given: Those of a dataset, which are the same in every step.
-        crop: Side of the crops that are cut from them [pixels]; default: the recipe's.
+    `crop`: side of the crops that are cut from them [pixels]; default: the recipe's.
     """
 
     def __init__(
@@ -64,30 +57,12 @@ class Scenes:
         return self.drawn[1]
 
 
-class Samples(Protocol):
-    """Samples of a step: `batch` is recorded in a CUDA graph, `prepare` is gone through before each step."""
-
-    scenes: Scenes
-    seconds: float
-    """Time of `prepare`, on average over the steps."""
-
-    def due(self, step: int) -> int:
-        """Samples that are still to be drawn before the step."""
-
-    def prepare(self, step: int) -> Iterator[tuple[int, int]]:
-        """Draws what the step needs, piece by piece, and yields how many samples of how many are drawn.
-
-        What was drawn of an unfinished one is drawn again by the next.
-        """
-
-    def hold(self) -> None:
-        """From now on `batch` reads the same memory in every step."""
-
-    def batch(self) -> Batch: ...
-
-
 class Fresh:
-    """Samples that are drawn anew in each step."""
+    """Samples that are drawn anew in each step.
+
+    `batch` is recorded in a CUDA graph; `prepare` is gone through before each step, and `seconds` is the time that it
+    takes, on average over the steps.
+    """
 
     def __init__(
         self, recipe: TrainingRecipe, scenes: Scenes, size: int, generator: torch.Generator, *, histograms: bool
@@ -99,9 +74,14 @@ class Fresh:
         self.seconds = 0.0  # scenes are few, and drawn rarely
 
     def due(self, step: int) -> int:
+        """Samples that are still to be drawn before the step."""
         return 0
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
+        """Draws what the step needs, piece by piece, and yields how many samples of how many are drawn.
+
+        What was drawn of an unfinished one is drawn again by the next.
+        """
         now = self.scenes.at(step)
         if self.held is not None and now is not self.now:
             for kept, new in zip(self.held, now, strict=True):
@@ -110,6 +90,7 @@ class Fresh:
         yield from ()
 
     def hold(self) -> None:
+        """From now on `batch` reads the same memory in every step."""
         assert self.now is not None
         self.held = CleanScenes(*(values.clone() for values in self.now))
 
@@ -130,13 +111,8 @@ class Pool:
     portion depends on its number and on the seed alone: a resumed run draws those again that it had. On a GPU portions
     are drawn in a stream of their own: thousands of short launches, which need not wait for the steps before them.
 
-    Args:
-        recipe: See `spadwarp.denoise.recipe`.
-        scenes: Clean scenes of each step, and the side of their crops.
-        size: Samples of a batch.
-        generator: Chooses the samples of each batch.
-        share: Part of the recipe's number of samples that this pool has.
-        turns: Part of the steps that take a batch of this pool.
+    `generator` chooses the samples of each batch, of `size`; `share`: part of the recipe's number of samples that this
+    pool has; `turns`: part of the steps that take a batch of it. Its methods are those of `Fresh`.
     """
 
     def __init__(
@@ -175,7 +151,7 @@ class Pool:
         return range(max(self.drawn, stop - PORTIONS), stop)
 
     def hold(self) -> None:
-        """The memory is the same from the start."""
+        """Does nothing: the memory is the same from the start."""
 
     def batch(self) -> Batch:
         chosen = torch.rand(self.size, generator=self.generator, device=self.generator.device)
@@ -227,22 +203,15 @@ class Pool:
             kept[first : first + len(values)] = values
 
 
+Samples = Fresh | Pool
+
+
 class Sizes:
     """The samples of a training by the size of their crops: each step takes a batch of one size.
 
     In `optimiser.wide` of the steps, drawn at random, it is a quarter as many crops of twice the recipe's side: with
-    small crops alone, the network would never see a pixel far from the border of its image.
-
-    Args:
-        recipe: See `spadwarp.denoise.recipe`.
-        rank: Number of this process.
-        processes: That share the batches.
-        generator: Of random numbers on the training's device.
-        given: Scenes of a dataset; without them, scenes are drawn.
-        histograms: Samples are of histograms.
-
-    Raises:
-        DeviceError: A pool is larger than the memory of the device.
+    small crops alone, the network would never see a pixel far from the border of its image. Raises `DeviceError` where
+    a pool is larger than the memory of the device.
     """
 
     def __init__(
@@ -265,7 +234,7 @@ class Sizes:
                 )
 
     def prepare(self, step: int) -> Iterator[tuple[int, int]]:
-        """See `Samples`; of all sizes, a crop of twice the side counted as four."""
+        """See `Fresh`; of all sizes, a crop of twice the side counted as four."""
         due = [(kind.scenes.crop // self.recipe.optimiser.crop) ** 2 * kind.due(step) for kind in self.kinds]
         for place, kind in enumerate(self.kinds):
             for drawn, all_drawn in kind.prepare(step):
@@ -273,7 +242,7 @@ class Sizes:
 
     @property
     def seconds(self) -> float:
-        """See `Samples`; of all sizes together."""
+        """See `Fresh`; of all sizes together."""
         return sum(kind.seconds for kind in self.kinds)
 
     def of(self, step: int) -> Samples:

@@ -25,13 +25,16 @@ from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.cli import app
 from spadwarp.dataset import Plan
-from spadwarp.denoise import baselines, files, metrics, network_files, photon_counts, reading, samples, training_steps
+from spadwarp.denoise import baselines, files, network_files, photon_counts, samples
+from spadwarp.denoise import evaluation as metrics
+from spadwarp.denoise import files as reading
+from spadwarp.denoise import training as training_steps
+from spadwarp.denoise.files import read_scenes
 from spadwarp.denoise.frames import depth_frames, fill_missing
 from spadwarp.denoise.networks import build_network
 from spadwarp.denoise.recipe import load_training_recipe
 from spadwarp.denoise.synthetic_noise import Batch
 from spadwarp.denoise.training import fit
-from spadwarp.denoise.training_run import read_scenes
 from spadwarp.frames import instrument_response, record_frames
 from spadwarp.io.arrays import write_exr
 

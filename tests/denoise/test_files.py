@@ -7,7 +7,7 @@ pytest.importorskip("torch")
 from helpers.datasets import make, recipe
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file
-from spadwarp.denoise.reading import read_depth
+from spadwarp.denoise.files import read_depth
 from spadwarp.frames import instrument_response
 from spadwarp.values import ArgumentError
 

@@ -10,7 +10,8 @@ from scipy.stats import exponnorm, norm
 
 from helpers.stepped_frames import denoised
 from spadwarp import ArgumentError, DeviceError
-from spadwarp.denoise import apply, estimate, histogram_inputs, synthetic_noise
+from spadwarp.denoise import apply, estimate, synthetic_noise
+from spadwarp.denoise import histograms as histogram_inputs
 from spadwarp.denoise.classical import GUIDES
 from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features, log_likelihood
 from spadwarp.denoise.recipe import Noise

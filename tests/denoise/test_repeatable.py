@@ -5,8 +5,9 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file
 
-from spadwarp.denoise.recipe import MODELS, TrainingRecipe
-from spadwarp.denoise.repeatable import edge_padded, enlarged, fixed_order, permuted
+from spadwarp.denoise.layers import edge_padded, enlarged, fixed_order, permuted
+from spadwarp.denoise.network_files import MODELS
+from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.denoise.training import fit
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

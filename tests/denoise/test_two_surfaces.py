@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from spadwarp.denoise import estimate
 from spadwarp.denoise.histogram_features import FEATURES, SEEN
-from spadwarp.denoise.pyramid import follow_the_others
+from spadwarp.denoise.networks import follow_the_others
 
 NEAR, FAR = 0.4, 0.5
 

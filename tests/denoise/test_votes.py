@@ -5,7 +5,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from spadwarp.denoise.pyramid import neighbour_votes  # noqa: E402
+from spadwarp.denoise.networks import neighbour_votes  # noqa: E402
 
 RING = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from spadwarp.denoise import apply, metrics
+from spadwarp.denoise import apply
+from spadwarp.denoise import evaluation as metrics
 
 GATE = (13.5, 16.0)
 

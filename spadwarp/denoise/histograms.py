@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -9,13 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
-from spadwarp.denoise.frames import POOLED, SIDES
-from spadwarp.denoise.gates import bins_of_target
+from spadwarp.denoise.frames import POOLED, SIDES, bins_of_target
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.frames.measured import Histograms
 from spadwarp.values import ArgumentError, percent
 
-__all__ = ["checked_histograms", "dim_pixels", "features_of_histograms", "histogram_tensors", "target_bins"]
+__all__ = ["second_return"]
 
 
 def features_of_histograms(
@@ -29,19 +29,9 @@ def features_of_histograms(
 ) -> NDArray[np.float32]:
     """Features of histograms over the gate, as `spadwarp.denoise.histogram_features` makes them, frame by frame.
 
-    Args:
-        counts: `[H, W, T]` or `[N, H, W, T]`, not negative.
-        background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
-        response: Instrument response per bin centred on its time zero, `[2 r + 1]`.
-        device: torch device.
-        total: Counts of each pixel, also beyond the bins given here, `[H, W]` or `[N, H, W]`.
-        to_depth: Converts parts of the gate `[N, n, H, W]` to depths [m].
-
-    Returns:
-        float32 `[N, FEATURES, H, W]`; first the pooled depths, as parts of the gate where `to_depth` is not given.
-
-    Raises:
-        ArgumentError: Shapes or values that cannot be.
+    float32 `[N, FEATURES, H, W]`; depths among them as parts of the gate, or as what `to_depth` makes of those
+    `[N, n, H, W]`. Arguments and errors are those of `spadwarp.denoise.estimate`; `total`: counts of each pixel, also
+    beyond the bins given here, `[H, W]` or `[N, H, W]`.
     """
     torch = require_torch()
     from spadwarp.denoise.histogram_features import extract_features
@@ -63,10 +53,7 @@ def features_of_histograms(
 def histogram_tensors(
     counts: ArrayLike, background: ArrayLike, response: ArrayLike, device: str | None
 ) -> Iterator[tuple[Any, Any, Any]]:
-    """Counts `[1, H, W, T]`, background and response of each frame as `extract_features` takes them.
-
-    Arguments and errors are those of `features_of_histograms`.
-    """
+    """Counts `[1, H, W, T]`, background and response of each frame as `extract_features` takes them."""
     torch = require_torch()
     cubes, levels, taps = checked_histograms(counts, background, response)
     place = torch_device(device)
@@ -80,7 +67,7 @@ def histogram_tensors(
 def checked_histograms(
     counts: ArrayLike, background: ArrayLike, response: ArrayLike
 ) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32]]:
-    """Counts, background and response as arrays. Arguments and errors are those of `features_of_histograms`."""
+    """Counts, background and response as arrays. Raises `ArgumentError`."""
     cubes = np.asarray(on_host(counts))
     if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
         raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
@@ -124,3 +111,59 @@ def dim_pixels(histograms: Histograms) -> list[str]:
         f"{percent(dim)} % of the pixels receive less than 5 % of the light of the bright ones: a depth there may be "
         "that of light scattered from beside, and count as a target; spadwarp detect draws the counts of a camera"
     ]
+
+
+_BY_CHANCE = 6.0  # log of the false second returns that are accepted, one in e^6 pixels
+
+
+def second_return(
+    depth: ArrayLike,
+    counts: ArrayLike,
+    *,
+    background: ArrayLike,
+    response: ArrayLike,
+    side: int = 3,
+    device: str | None = None,
+) -> NDArray[np.float32]:
+    """Depth over the gate of a second return `[N, H, W]`; NaN where there is no significant one.
+
+    The first return is taken off each histogram: as many counts as lie in it, in the shape of the response. In what
+    remains, beyond the response, the counts of `side` × `side` pixels within the response's width have to exceed the
+    background by more than happens by chance in one of 400 pixels (Poisson likelihood ratio). Light that the water
+    scatters into a pixel from a brighter part of the target is such an excess, too: with hundreds of detections a pixel
+    most pixels have a second return.
+
+    Args:
+        depth: First return over the gate, 0 at its start and 1 at its end, `[H, W]` or `[N, H, W]`.
+        counts, background, response, device: See `spadwarp.denoise.estimate`, as for errors.
+        side: Of the window over which histograms are pooled; 1 for each pixel alone.
+    """
+    torch = require_torch()
+    from spadwarp.denoise.histogram_features import highest, pooled, toeplitz
+
+    first, cubes = real_array("depth", depth), np.asarray(on_host(counts))
+    if first.shape != cubes.shape[:-1]:
+        raise ArgumentError(f"depth has shape {first.shape}; {cubes.shape[:-1]} is needed")
+    frames = first.reshape(-1, *first.shape[-2:])
+    found = []
+    with torch.inference_mode():
+        tensors = histogram_tensors(cubes, background, response, device)
+        for place, (cube, level, taps) in zip(frames, tensors, strict=True):
+            bins = cube.shape[-1]
+            at = (torch.from_numpy(np.nan_to_num(place)).to(cube.device)[None] * bins).long().clamp(0, bins - 1)
+            apart = torch.arange(taps.shape[1], device=cube.device) - taps.shape[1] // 2
+            width = float((taps[0] * apart.square()).sum().clamp_min(0.1).sqrt())
+            shape = toeplitz(taps, bins)[0].t()[at]  # of the first return in each pixel
+            near = (torch.arange(bins, device=cube.device) - at[..., None]).abs() <= 3.0 * width + 1.0
+            signal = ((cube - level) * near).sum(dim=-1, keepdim=True).clamp_min(0.0)
+            rest = torch.where(near, level.expand_as(cube), cube - signal * shape).clamp_min(0.0)
+            reach = 2 * round(1.5 * width) + 1
+            image = torch.cat([rest, level.expand_as(cube)])
+            image = pooled(image, side) * side**2
+            sums = torch.nn.functional.avg_pool1d(image.flatten(0, 2)[:, None], reach, 1, reach // 2)
+            found_counts, expected = (sums.view_as(image) * reach).split(1)
+            excess = torch.xlogy(found_counts, found_counts / expected) - (found_counts - expected)
+            score = torch.where(near | (found_counts <= expected), 0.0, excess)
+            significant = score.amax(dim=-1) > math.log(bins) + _BY_CHANCE
+            found.append(torch.where(significant, highest(score), math.nan)[0].cpu().numpy())
+    return np.stack(found).astype(np.float32)

@@ -1,11 +1,18 @@
-"""Convolutions that commute with the eight turns and reflections of a square.
+"""Layers: derivatives summed in a fixed order, and convolutions that commute with turns and reflections of a square.
 
-A feature has eight channels, one for each turn or reflection of its filter: turning the image turns the channels and
-permutes them. Cohen & Welling, ICML 2016 (group-equivariant convolutional networks, p4m).
+PyTorch adds the derivatives of interpolation, padding and indexing on a GPU with atomic operations, in the order in
+which threads happen to arrive. The values of the functions here are PyTorch's own; their derivatives are sums in a
+fixed order, so that a seed gives the same weights on a GPU, too.
+
+A feature of the convolutions has eight channels, one for each turn or reflection of its filter: turning the image turns
+the channels and permutes them. Cohen & Welling, ICML 2016 (group-equivariant convolutional networks, p4m).
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -15,9 +22,98 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from spadwarp.denoise.repeatable import permuted
 
-__all__ = ["GROUP", "SymmetricConv", "SymmetricWindow", "symmetric_mean", "turned"]
+@contextmanager
+def fixed_order() -> Iterator[None]:
+    """Convolutions and products of matrices on a GPU by algorithms that give the same bits each time.
+
+    cuDNN otherwise tries several at the first call and keeps the fastest, which differs from one process to the next.
+    TF32 stays allowed in products.
+    """
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when a process first multiplies matrices
+    cudnn, products = torch.backends.cudnn, torch.backends.cuda.matmul
+    before = cudnn.benchmark, cudnn.deterministic, products.allow_tf32
+    cudnn.benchmark, cudnn.deterministic, products.allow_tf32 = False, True, True
+    try:
+        yield
+    finally:
+        cudnn.benchmark, cudnn.deterministic, products.allow_tf32 = before
+
+
+def enlarged(image: Tensor, factor: int) -> Tensor:
+    """Bilinear interpolation of `[B, C, H, W]` to `factor` times as many pixels, an even number."""
+    return _Enlarged.apply(image, factor)  # type: ignore[no-any-return, no-untyped-call]
+
+
+def edge_padded(image: Tensor, reach: int) -> Tensor:
+    """`[B, C, H, W]` with `reach` more pixels on each side, which have the values of the nearest."""
+    return _EdgePadded.apply(image, reach)  # type: ignore[no-any-return, no-untyped-call]
+
+
+def permuted(values: Tensor, places: Tensor, inverse: Tensor) -> Tensor:
+    """`values[..., places]`, for g permutations of n places `[g n]` with their inverses `[g, n]`."""
+    return _Permuted.apply(values, places, inverse)  # type: ignore[no-any-return, no-untyped-call]
+
+
+class _Enlarged(torch.autograd.Function):
+    @staticmethod
+    def forward(context: Any, image: Tensor, factor: int) -> Tensor:
+        context.factor = factor
+        return F.interpolate(image, scale_factor=float(factor), mode="bilinear", align_corners=False)
+
+    @staticmethod
+    def backward(context: Any, *derivatives: Tensor) -> tuple[Tensor, None]:
+        (found,), factor = derivatives, context.factor
+        kind, half = found.dtype, factor // 2
+        # A pixel has a part in `2 factor` of the larger image. Beyond a border the image is mirrored: what the mirrored
+        # ones would add is what those at the border have more.
+        parts = [(min(k, 2 * factor - 1 - k) + 0.5) / factor for k in range(2 * factor)]
+        found = found.to(torch.promote_types(kind, torch.float32))
+        for dim in (2, 3):
+            length = found.shape[dim]
+            first, last = found.narrow(dim, 0, half).flip(dim), found.narrow(dim, length - half, half).flip(dim)
+            mirrored = torch.cat([first, found, last], dim)
+            pieces = mirrored.unflatten(dim, (-1, factor))  # the parts of pixel i are in pieces i and i + 1
+            pieces = pieces.movedim(dim + 1, 0)
+            count, total = length // factor, None
+            for k, part in enumerate(parts):
+                one = pieces[k % factor].narrow(dim, k // factor, count)
+                total = one * part if total is None else torch.add(total, one, alpha=part, out=total)
+            assert total is not None
+            found = total
+        return found.to(kind), None
+
+
+class _EdgePadded(torch.autograd.Function):
+    @staticmethod
+    def forward(context: Any, image: Tensor, reach: int) -> Tensor:
+        context.reach = reach
+        return F.pad(image, (reach,) * 4, mode="replicate")
+
+    @staticmethod
+    def backward(context: Any, *derivatives: Tensor) -> tuple[Tensor, None]:
+        (found,), reach = derivatives, context.reach
+        for dim in (2, 3):
+            length = found.shape[dim] - 2 * reach
+            inner = found.narrow(dim, reach, length).clone()
+            inner.narrow(dim, 0, 1).add_(found.narrow(dim, 0, reach).sum(dim, keepdim=True))
+            inner.narrow(dim, length - 1, 1).add_(found.narrow(dim, reach + length, reach).sum(dim, keepdim=True))
+            found = inner
+        return found, None
+
+
+class _Permuted(torch.autograd.Function):
+    @staticmethod
+    def forward(context: Any, values: Tensor, places: Tensor, inverse: Tensor) -> Tensor:
+        context.save_for_backward(inverse)
+        return values.index_select(-1, places)
+
+    @staticmethod
+    def backward(context: Any, *derivatives: Tensor) -> tuple[Tensor, None, None]:
+        (inverse,) = context.saved_tensors
+        found = derivatives[0].unflatten(-1, inverse.shape)
+        return found.gather(-1, inverse.expand_as(found)).sum(dim=-2), None, None
+
 
 GROUP = 8
 """Turns and reflections of a square."""
@@ -59,13 +155,7 @@ def _remember(module: nn.Module, places: Tensor) -> None:
 class SymmetricConv(nn.Module):
     """Convolution of features, or of an image's scalar channels with `lifts`, that commutes with `GROUP`.
 
-    Args:
-        inputs: Features, each of eight channels; scalar channels with `lifts`.
-        outputs: Features.
-        size: Side of the filters [pixels].
-        stride: Only with filters and images of even sides is the symmetry kept for a stride of 2.
-        lifts: Whether the input is scalar channels.
-        bias: Whether each feature has a bias.
+    With a stride of 2 the symmetry is kept only for filters and images of even sides.
     """
 
     def __init__(
@@ -112,12 +202,7 @@ class SymmetricConv(nn.Module):
 
 
 class SymmetricWindow(nn.Module):
-    """Values for the places of a `side` × `side` window around each pixel, which turn with the image.
-
-    Args:
-        inputs: Features, each of eight channels.
-        side: Of the window.
-    """
+    """Values for the places of a `side` × `side` window around each pixel, which turn with the image."""
 
     def __init__(self, inputs: int, side: int) -> None:
         super().__init__()
