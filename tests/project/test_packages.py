@@ -53,17 +53,10 @@ def imported(node):
 
 def imports(tree):
     """Names that a file imports, inside functions too, but not in the one-line methods."""
-    methods = [
-        item
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ClassDef)
-        for item in node.body
-        if isinstance(item, ast.FunctionDef) and item.name in ONE_LINE_METHODS
-    ]
+    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    methods = [item for node in classes for item in node.body if getattr(item, "name", None) in ONE_LINE_METHODS]
     excepted = {inner for method in methods for inner in ast.walk(method) if imported(inner) == ["spadwarp"]}
-    for node in ast.walk(tree):
-        if node not in excepted:
-            yield from imported(node)
+    return [name for node in ast.walk(tree) if node not in excepted for name in imported(node)]
 
 
 def statements(function):
@@ -88,9 +81,7 @@ def test_arrows_point_down(path):
                 module = SPADWARP.joinpath(*parts[1:]).with_suffix(".py")
                 assert there == "cli" or (len(parts) <= 3 and not module.exists()), f"{name} is not of the public API"
                 continue
-            assert there != "spadwarp", (
-                "`import spadwarp` is for one-line methods of data classes, and for the commands"
-            )
+            assert there != "spadwarp", "`import spadwarp` is for one-line methods of data classes, and for commands"
             assert there in LEVEL or there == "__version__", f"{name} goes by way of the top"
             if there != here and there in LEVEL:
                 assert LEVEL[here] < LEVEL[there], f"{here} imports {name}"
@@ -106,30 +97,19 @@ def cycles(folder, package):
     }
     arrows = {}
     for name, path in names.items():
-        found = set()
+        here, found = name.split(".")[: None if path.name == "__init__.py" else -1], set()
         tree = ast.parse(path.read_text())
-        hints = {
-            inner
-            for node in ast.walk(tree)
-            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-            for inner in ast.walk(node)
-        }
-        for node in ast.walk(tree):
-            if node in hints:
-                continue
-            base = node.module if isinstance(node, ast.ImportFrom) and node.level == 0 else None
-            if isinstance(node, ast.ImportFrom) and node.level:
-                here = name if path.name == "__init__.py" else name.rpartition(".")[0]
-                for _ in range(node.level - 1):
-                    here = here.rpartition(".")[0]
-                base = f"{here}.{node.module}" if node.module else here
-            if base is not None:
-                for alias in node.names:
-                    full = f"{base}.{alias.name}"
-                    found.add(full if full in names else base)
+        conditions = [node for node in ast.walk(tree) if isinstance(node, ast.If)]
+        hints = {x for node in conditions if ast.unparse(node.test) == "TYPE_CHECKING" for x in ast.walk(node)}
+        for node in set(ast.walk(tree)) - hints:
+            if isinstance(node, ast.ImportFrom):
+                above = here[: len(here) - node.level + 1] if node.level else []
+                base = ".".join([*above, *filter(None, [node.module])])
+                full = [f"{base}.{alias.name}" for alias in node.names]
+                found.update(one if one in names else base for one in full)
             elif isinstance(node, ast.Import):
                 found.update(alias.name for alias in node.names)
-        arrows[name] = {other for other in found if other in names and other not in {name, package}}
+        arrows[name] = (found & set(names)) - {name, package}
     done, circles = set(), []
 
     def visit(name, trail):
