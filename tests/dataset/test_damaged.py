@@ -1,11 +1,11 @@
 """Manifests and records of shards that are not as they should be: an error that names file and entry."""
 
+import functools
 import json
 import shutil
 
 import pytest
 
-import spadwarp
 from helpers.cli import run
 from helpers.datasets import make, recipe
 from spadwarp.dataset import FrameReader, read_manifest, verify_dataset
@@ -26,48 +26,43 @@ def folder(whole, tmp_path):
     return shutil.copytree(whole, tmp_path / "data")
 
 
-def changed(manifest, path, value):
-    """The manifest with another value at a path such as "splits.train.frames"; `...` removes it."""
+def change(folder, path, value):
+    """Writes the manifest with another value at a path such as "splits.train.frames"; `...` removes it."""
+    manifest = json.loads((folder / "manifest.json").read_text())
     *outer, last = path.split(".")
-    table = manifest
-    for name in outer:
-        table = table[name]
+    table = functools.reduce(dict.get, outer, manifest)
     if value is ...:
         del table[last]
     else:
         table[last] = value
-    return manifest
+    (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
 @pytest.mark.parametrize(
-    ("path", "value"),
+    ("path", "value", "named"),
     [
-        ("splits", ...),
-        ("splits", []),
-        ("splits.train", ...),
-        ("splits.test.shards", ["../../../etc/passwd"]),
-        ("splits.test.shards", ["/etc/passwd"]),
-        ("splits.test.frames", -1),
-        ("targets", "staircase"),
-        ("height", 10**9),
-        ("width", None),
-        ("depth_step", float("inf")),
-        ("files", {"../secret": {"bytes": 3, "sha256": "0" * 64}}),
-        ("files", {"frames-00000.h5": {"bytes": 3}}),
-        ("format_version", "one"),
-        ("format_version", 99),
-        ("format", "another"),
+        ("splits", ..., "splits"),
+        ("splits", [], "splits"),
+        ("splits.train", ..., "train"),
+        ("splits.test.shards", ["../../../etc/passwd"], "shards"),
+        ("splits.test.shards", ["/etc/passwd"], "shards"),
+        ("splits.test.frames", -1, "frames"),
+        ("targets", "staircase", "targets"),
+        ("targets", ["boat"], "not a whole manifest: the target 'boat' is in no split"),
+        ("height", 10**9, "height"),
+        ("width", None, "width"),
+        ("depth_step", float("inf"), "depth_step"),
+        ("files", {"../secret": {"bytes": 3, "sha256": "0" * 64}}, "files"),
+        ("files", {"frames-00000.h5": {"bytes": 3}}, "files"),
+        ("format_version", "one", ""),
+        ("format_version", 99, ""),
+        ("format", "another", ""),
     ],
 )
-def test_a_manifest_that_is_not_whole_is_refused(path, value, folder):
-    manifest = json.loads((folder / "manifest.json").read_text())
-    (folder / "manifest.json").write_text(json.dumps(changed(manifest, path, value)))
-    with pytest.raises(FileError, match=r"manifest\.json: ") as caught:
-        read_manifest(folder)
-    name = path.split(".")[-1]
-    assert name in str(caught.value) or name.startswith("format")
-    for read in (FrameReader, verify_dataset):
-        with pytest.raises(FileError, match=r"manifest\.json: "):
+def test_a_manifest_that_is_not_whole_is_refused(path, value, named, folder):
+    change(folder, path, value)
+    for read in (read_manifest, FrameReader, verify_dataset):
+        with pytest.raises(FileError, match=rf"manifest\.json: .*{named}"):
             read(folder)
 
 
@@ -82,14 +77,6 @@ def test_a_manifest_that_is_no_table_is_refused(text, folder):
         assert "manifest.json" in run(*words, code=1).stderr
 
 
-def test_a_target_that_is_in_no_split_is_refused(folder):
-    manifest = json.loads((folder / "manifest.json").read_text())
-    manifest["targets"][0] += "x"
-    (folder / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(FileError, match=r"manifest\.json: not a whole manifest: the target .*x' is in no split"):
-        read_manifest(folder)
-
-
 @pytest.mark.parametrize(
     "text", ["[]", "{", '{"../x.h5": {"bytes": 1, "sha256": "0"}}', '{"frames-00000.h5": 3}', "9" * 5000]
 )
@@ -102,9 +89,10 @@ def test_a_record_that_is_not_whole_is_made_again(text, whole, folder):
     assert read_manifest(folder) == read_manifest(whole)
 
 
-def test_a_manifest_whose_numbers_are_not_those_of_the_files_is_noticed(folder):
-    manifest = json.loads((folder / "manifest.json").read_text())
-    for name, value, word in (("height", 25, "depth"), ("targets", [], "target"), ("scenes", 0, "scene")):
-        (folder / "manifest.json").write_text(json.dumps(changed(json.loads(json.dumps(manifest)), name, value)))
-        with pytest.raises(spadwarp.FileError, match=rf"frames-00000\.h5: not a whole spadwarp frames: {word}"):
-            FrameReader(folder, "test")[0]
+@pytest.mark.parametrize(
+    ("name", "value", "word"), [("height", 25, "depth"), ("targets", [], "target"), ("scenes", 0, "scene")]
+)
+def test_a_manifest_whose_numbers_are_not_those_of_the_files_is_noticed(name, value, word, folder):
+    change(folder, name, value)
+    with pytest.raises(FileError, match=rf"frames-00000\.h5: not a whole spadwarp frames: {word}"):
+        FrameReader(folder, "test")[0]

@@ -24,13 +24,8 @@ def folder(tmp_path_factory):
     """Half of its scenes traced photon by photon."""
     place = tmp_path_factory.mktemp("dataset") / "data"
     traced = {"monte_carlo.share": 0.5, "monte_carlo.photons": 20_000, "gate.bins": 32, "license": "CC-BY-4.0"}
-    small = {
-        "scene.camera.width": 12,
-        "scene.camera.height": 8,
-        "frames.per_scene": 2,
-        "scene.laser.half_angle_deg": 8.0,
-    }
-    make(recipe(**traced, **small), place)
+    small = {"scene.camera.width": 12, "scene.camera.height": 8, "frames.per_scene": 2}
+    make(recipe(**traced, **small, **{"scene.laser.half_angle_deg": 8.0}), place)
     return place
 
 
@@ -98,28 +93,22 @@ def test_croissant_metadata_is_valid(folder, parquet):
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_webdataset_reads_archives(folder, tmp_path):
-    webdataset = pytest.importorskip("webdataset")
-    out = export_dataset(folder, tmp_path / "tar", "webdataset", frames_per_file=3)
+def test_archives_are_read_by_webdataset_and_without_a_library(folder, tmp_path):
+    out = export_dataset(folder, tmp_path / "tar", "webdataset", fields=(*FIELDS, "counts"), frames_per_file=3)
     archives = sorted(map(str, out.glob("train-*.tar")))
+    reader = FrameReader(folder, "train", fields=FIELDS)
+    with tarfile.open(archives[0]) as file:
+        key, names = f"{reader[0]['sample']:09}", {name.partition(".")[2] for name in file.getnames()}
+        assert names == {"json", "counts.npy", *(f"{field}.npy" for field in FIELDS)}
+        stored = np.load(io.BytesIO(file.extractfile(f"{key}.noisy.npy").read()))
+        np.testing.assert_array_equal(stored, reader[0]["noisy"][0])
+        assert json.loads(file.extractfile(f"{key}.json").read())["sample"] == reader[0]["sample"]
+    webdataset = pytest.importorskip("webdataset")
     assert len(archives) == 2
     rows = list(webdataset.WebDataset(archives, shardshuffle=False).decode())
-    reader = FrameReader(folder, "train", fields=FIELDS)
     for row, item in zip(rows, reader, strict=True):
         assert_is_frame(row, item, reader.manifest, "{}.npy")
     gc.collect()  # it leaves archives open
-
-
-def test_archives_need_no_library(folder, tmp_path):
-    out = export_dataset(folder, tmp_path / "tar", "webdataset", fields=("noisy", "counts"))
-    item = FrameReader(folder, "test", fields=("noisy",))[0]
-    with tarfile.open(out / "test-00000.tar") as file:
-        key = f"{item['sample']:09}"
-        assert {name.partition(".")[2] for name in file.getnames()} == {"noisy.npy", "counts.npy", "json"}
-        np.testing.assert_array_equal(
-            np.load(io.BytesIO(file.extractfile(f"{key}.noisy.npy").read())), item["noisy"][0]
-        )
-        assert json.loads(file.extractfile(f"{key}.json").read())["sample"] == item["sample"]
 
 
 def test_xarray_opens_zarr(folder, tmp_path):
@@ -138,45 +127,36 @@ def test_xarray_opens_zarr(folder, tmp_path):
 
 def test_features_find_the_return_and_a_second_one(folder):
     scene = FrameReader(folder, "train").scene(0)
-    gate = scene.gate
-    counts = np.zeros((gate.bins, 8, 12))
+    gate, counts = scene.gate, np.zeros((scene.gate.bins, 8, 12))
     counts[10], counts[11], counts[25], counts[2] = 7, 2, 4, 1
     counts[:, 3, 4] = 0
     features = dict(zip(FEATURE_NAMES, histogram_features(counts, scene), strict=True))
     assert np.isnan(features["peak_depth"][3, 4]) and features["peak_counts"][3, 4] == 0
     assert features["second_counts"][0, 0] == 4 and features["peak_counts"][0, 0] in (7, 9)
-
-    def depth(bin):
-        return spadwarp.scene.sight.depth_from_time(
-            np.full((8, 12), gate.start + (bin + 0.5) * gate.bin_width), scene=scene
-        )
-
-    narrow = features["peak_counts"][0, 0] == 7
-    expected = {
-        "peak_depth": 10 if narrow else (70 + 22) / 9,
-        "second_depth": 25,
-        "first_depth": 2,
-        "mean_depth": 194 / 14,
-    }
-    for name, bin in expected.items():
-        np.testing.assert_allclose(np.delete(features[name], 3, axis=0), np.delete(depth(bin), 3, axis=0), rtol=1e-5)
+    peak = 10 if features["peak_counts"][0, 0] == 7 else (70 + 22) / 9
+    for name, bin in {"peak": peak, "second": 25, "first": 2, "mean": 194 / 14}.items():
+        time = np.full((8, 12), gate.start + (bin + 0.5) * gate.bin_width)
+        depth = spadwarp.scene.sight.depth_from_time(time, scene=scene)
+        found = features[f"{name}_depth"]
+        np.testing.assert_allclose(np.delete(found, 3, axis=0), np.delete(depth, 3, axis=0), rtol=1e-5)
 
 
 def test_what_cannot_be_exported_is_named(folder, tmp_path):
-    with pytest.raises(ArgumentError, match="'depth' is not one of 'noisy'"):
-        export_dataset(folder, tmp_path / "a", fields=("depth",))
-    with pytest.raises(ArgumentError, match="'csv' is not"):
-        export_dataset(folder, tmp_path / "a", "csv")
+    make(recipe(**{"frames.per_scene": 1}), tmp_path / "analytic")
+    for dataset, arguments, problem in (
+        (folder, {"fields": ("depth",)}, "'depth' is not one of 'noisy'"),
+        (folder, {"format": "csv"}, "'csv' is not"),
+        (tmp_path / "analytic", {"fields": ("counts",)}, "it has no histograms"),
+    ):
+        with pytest.raises(ArgumentError, match=problem):
+            export_dataset(dataset, tmp_path / "a", **arguments)
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "mine").write_text("")
     with pytest.raises(FileError, match="exists"):
         export_dataset(folder, tmp_path / "b", "webdataset")
-    assert "exists" in run("export", folder, "--format", "parquet", "--out", tmp_path / "b", code=2).output
-    assert (
-        "holds the dataset"
-        in run("export", folder, "--format", "parquet", "--out", folder, "--overwrite", code=2).output
-    )
-    make(recipe(**{"frames.per_scene": 1}), tmp_path / "analytic")
-    with pytest.raises(ArgumentError, match="it has no histograms"):
-        export_dataset(tmp_path / "analytic", tmp_path / "a", fields=("counts",))
+    for words, problem in (
+        (("--out", tmp_path / "b"), "exists"),
+        (("--out", folder, "--overwrite"), "holds the dataset"),
+    ):
+        assert problem in run("export", folder, "--format", "parquet", *words, code=2).output
     assert not (tmp_path / "a").exists() and [path.name for path in (tmp_path / "b").iterdir()] == ["mine"]

@@ -31,21 +31,14 @@ def test_part_of_the_scenes_have_a_plume_of_the_optical_depth_that_was_drawn(sma
     assert 0.49 < min(found) < max(found) < 2.01
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
+def test_plumes_that_cannot_be_are_refused(small):
+    tables = small.to_dict()
+    layers = {"layers": [{"start": 1.0, "extinction": 1.0, "albedo": 0.5}]}
+    layered = {**tables["scene"], "medium": tables["scene"]["medium"] | layers}
+    for change, problem in (
         ({"plume": {**PLUME, "shape": ["fog"]}}, "plume.shape"),
         ({"plume": {**PLUME, "probability": 1.5}}, "plume.probability = 1.5 is outside"),
-    ],
-)
-def test_plumes_that_cannot_be_are_refused(small, change, text):
-    with pytest.raises(spadwarp.ConfigError, match=text):
-        Recipe.from_dict({**small.to_dict(), **change}, source=small.source)
-
-
-def test_plumes_and_layers_exclude_each_other(small):
-    tables = small.to_dict()
-    layers = [{"start": 1.0, "extinction": 1.0, "albedo": 0.5}]
-    tables["scene"] = {**tables["scene"], "medium": {**tables["scene"]["medium"], "layers": layers}}
-    with pytest.raises(spadwarp.ConfigError, match="cannot be combined with layers"):
-        Recipe.from_dict({**tables, "plume": PLUME}, source=small.source)
+        ({"plume": PLUME, "scene": layered}, "cannot be combined with layers"),
+    ):
+        with pytest.raises(spadwarp.ConfigError, match=problem):
+            Recipe.from_dict({**tables, **change}, source=small.source)

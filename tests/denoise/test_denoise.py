@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import os
 import re
 import subprocess
@@ -11,23 +10,19 @@ import time
 import warnings
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import torch
-from scipy.io import savemat
 from skimage.metrics import structural_similarity
-from typer.testing import CliRunner
 
 import spadwarp
+from helpers.cli import run
 from helpers.datasets import recipe
 from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
-from spadwarp.cli import app
 from spadwarp.dataset import Plan
 from spadwarp.denoise import baselines, files, network_files, photon_counts, samples
 from spadwarp.denoise import evaluation as metrics
-from spadwarp.denoise import files as reading
 from spadwarp.denoise import training as training_steps
 from spadwarp.denoise.files import read_scenes
 from spadwarp.denoise.frames import depth_frames, fill_missing
@@ -35,15 +30,7 @@ from spadwarp.denoise.networks import build_network
 from spadwarp.denoise.recipe import load_training_recipe
 from spadwarp.denoise.synthetic_noise import Batch
 from spadwarp.denoise.training import fit
-from spadwarp.frames import instrument_response, record_frames
-from spadwarp.io.arrays import write_exr
-
-
-def invoke(*arguments, code=0):
-    """Runs a command; its output."""
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return result.output
+from spadwarp.frames import record_frames
 
 
 def names(folder):
@@ -124,143 +111,6 @@ def test_steps_of_a_staircase():
     assert metrics.staircase_steps(clean, flat).resolved < 3
 
 
-# Files
-
-
-def test_files_of_every_kind(tmp_path):
-    noisy = noisy_frame(np.nan_to_num(scene(), nan=15.0))
-    folder, out = tmp_path / "in", tmp_path / "out"
-    folder.mkdir()
-    np.save(folder / "one.npy", noisy)
-    write_exr(folder / "engine.exr", {"A": np.ascontiguousarray(100.0 * noisy)})
-    savemat(folder / "matlab.mat", {"depth": noisy, "name": "a text", "scalar": 3.0})
-    common = ["--model", "median", "--gate", "13.5:16", "--out", out]
-    invoke("denoise", folder / "engine.exr", "--input", "scale=0.01", *common)
-    invoke("denoise", folder / "matlab.mat", *common, "--overwrite")
-    invoke("denoise", folder / "one.npy", "--json", tmp_path / "one.json", *common, "--overwrite")
-    found = np.load(out / "one.npy")
-    for name in ("engine", "matlab"):
-        assert np.nanmax(np.abs(np.load(out / f"{name}.npy") - found)) < 1e-4
-    assert (out / "one.png").stat().st_size > 10_000
-    assert json.loads((tmp_path / "one.json").read_text())["files"][0]["gate"] == [13.5, 16.0]
-
-
-def test_the_only_array_of_a_file_needs_no_name(tmp_path):
-    noisy = noisy_frame(scene())
-    several, flags = np.stack([noisy, noisy]), np.ones(noisy.shape, np.uint8)
-    for name, arrays in {
-        "one": {"camera/depth": noisy, "exposure": 3.0},
-        "two": {"depth": noisy, "flags": flags},
-        "frames": {"depth": several, "flags": flags},
-        "none": {"exposure": np.ones(4)},
-    }.items():
-        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
-            file.update(arrays)
-    assert np.array_equal(reading.read_depth(tmp_path / "one.h5").depth[0], noisy, equal_nan=True)
-    assert np.array_equal(reading.read_depth(tmp_path / "two.h5", dataset="depth").depth[0], noisy, equal_nan=True)
-    assert reading.read_depth(tmp_path / "frames.h5", as_depth=True).depth.shape == several.shape
-    with pytest.raises(FileError, match=r"none.h5: no array of 3 or 4 dimensions; it holds exposure \(4,\)"):
-        reading.read_depth(tmp_path / "none.h5")
-    out = tmp_path / "new" / "out"
-    output = invoke("denoise", tmp_path / "two.h5", "--model", "median", "--out", out, code=2)
-    assert output.count("two.h5") == 1 and "(dataset); the file holds depth (" in output
-    assert not out.parent.exists()
-    invoke("denoise", tmp_path / "one.h5", "--model", "median", "--out", out)
-    output = invoke("depth", tmp_path / "one.h5", "--out", tmp_path / "depth", code=1)
-    assert re.search(r"no array of 3 or 4 dimensions; it holds .*camera/depth \(48, 64\)", output)
-
-
-def test_a_folder_is_denoised_file_by_file(tmp_path):
-    folder = tmp_path / "in"
-    folder.mkdir()
-    for name in ("first", "second"):
-        np.save(folder / f"{name}.npy", noisy_frame(scene()))
-    invoke("denoise", folder, "--model", "median", "--out", tmp_path / "both")
-    (folder / "bad.npy").write_bytes(b"junk")
-    output = invoke("denoise", folder, "--model", "median", "--out", tmp_path / "rest", code=1)
-    assert "1 of 3 files could not be denoised" in output
-    for out in ("both", "rest"):
-        found = {path.stem for path in (tmp_path / out).glob("*.npy")}
-        assert found == {stem + part for stem in ("first", "second") for part in ("", "_target", "_confidence")}
-
-
-def test_histograms_become_depth_first(tmp_path):
-    """Gaussian returns at 2.0 m of water in bins of 100 ps."""
-    index, width = 1.3566, 100e-12
-    time = 2 * 2.0 * index / 299_792_458
-    generator = np.random.default_rng(5)
-    arrivals = generator.normal(time, 150e-12, (32, 32, 50))
-    edges = np.arange(257) * width + 10e-9
-    counts = np.apply_along_axis(lambda one: np.histogram(one, edges)[0], -1, arrivals)
-    np.save(tmp_path / "counts.npy", counts.astype(np.uint16))
-    options = {"bin_width": 100e-12, "gate_start": 10e-9, "group_index": index}
-    found = files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", model="median", **options)
-    assert abs(np.median(found.depth) - 2.0) < 0.005
-    assert found.gate == pytest.approx((299_792_458 / index / 2 * 10e-9, 299_792_458 / index / 2 * 35.6e-9))
-    with pytest.raises(ArgumentError, match="another is needed"):
-        files.denoise_file(tmp_path / "counts.npy", tmp_path)
-    with pytest.raises(ArgumentError, match="bin width is missing"):
-        reading.read_depth(tmp_path / "counts.npy", group_index=index, gate_start=0.0)
-
-
-def test_a_peak_before_the_pulse_is_no_depth(tmp_path):
-    """Noise in the first bin of a gate that opens with the pulse: its centre may lie before it."""
-    counts = np.random.default_rng(2).poisson(0.05, (16, 16, 128)).astype(np.uint16)
-    counts[..., 60:63] += 3
-    counts[4, 5], counts[4, 5, 0] = 0, 30
-    np.save(tmp_path / "counts.npy", counts)
-    known = {"bin_width": 80e-12, "gate_start": 0.0, "group_index": 1.0}
-    response = instrument_response(pulse_fwhm=0.0, jitter_fwhm=350e-12)
-    found = files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", irf=response, **known)
-    assert np.median(found.depth) == pytest.approx(61.5 * 80e-12 * 299_792_458 / 2, abs=0.01)
-
-
-def test_a_gate_limits_the_bins_of_counts_and_depth_is_estimated_once(tmp_path, monkeypatch):
-    counts = np.random.default_rng(2).poisson(0.05, (16, 16, 128)).astype(np.uint16)
-    counts[..., 60:63] += 3
-    counts[..., 20:23] += 9  # nearer and brighter than the target
-    np.save(tmp_path / "counts.npy", counts)
-    metres = 80e-12 * 299_792_458 / 2
-    estimated, depth_of = [], reading.depth_of
-    monkeypatch.setattr(reading, "depth_of", lambda held, **rest: estimated.append(held) or depth_of(held, **rest))
-    given = {
-        "bin_width": 80e-12, "gate_start": 0.0, "group_index": 1.0, "model": "likelihood", "device": "cpu",
-        "irf": instrument_response(pulse_fwhm=0.0, jitter_fwhm=200e-12),
-    }  # fmt: skip
-    gate = (40.5 * metres, 90.5 * metres)
-    found = files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", gate=gate, **given)
-    assert [held.values.shape for held in estimated] == [(16, 16, 51)] and found.gate == gate
-    assert np.median(found.depth) == pytest.approx(61.5 * metres, abs=0.5 * metres)
-    for wrong in ((math.nan, 1.0), (1.0, 0.5), 3.0):
-        with pytest.raises(ArgumentError, match="gate = "):
-            files.denoise_file(tmp_path / "counts.npy", tmp_path / "out", gate=wrong, **given)
-
-
-def test_what_cannot_be_read(tmp_path):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "bad.npy").write_bytes(b"junk")
-    (tmp_path / "text.txt").write_text("1")
-    np.save(tmp_path / "complex.npy", np.full((16, 16), 15.0 + 1.0j))
-    savemat(tmp_path / "scalar.mat", {"scalar": 3.0})
-    for name, message in (
-        ("none.npy", "no such file"),
-        ("bad.npy", "damaged"),
-        ("complex.npy", r"complex128 \(16, 16\); depth is real numbers"),
-        ("text.txt", r"'.txt' is not one of"),
-        ("scalar.mat", r"no array of 3 or 4 dimensions, sparse matrix or cells; it holds scalar \(1, 1\)"),
-    ):
-        with pytest.raises(FileError, match=message):
-            reading.read_depth(tmp_path / name)
-    with pytest.raises(FileError, match="no file that ends in"):
-        files.depth_files(tmp_path / "empty")
-
-
-def test_depths_below_zero_count_as_not_reported(tmp_path):
-    np.save(tmp_path / "marked.npy", np.where(np.eye(16) > 0, -1.0, 15.0))
-    marked = reading.read_depth(tmp_path / "marked.npy")
-    assert "16 values below 0" in marked.source and np.isnan(marked.depth).sum() == 16
-
-
 # Evaluation on a dataset
 
 
@@ -286,7 +136,7 @@ def test_evaluation_and_report(dataset, tmp_path):
     middle = spadwarp.denoise.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
     assert "the middle 32 x 24 pixels" in middle.summary
     assert middle.samples["staircase", "0.480"].clean.shape == (24, 32)
-    invoke("evaluate", dataset, "--models", "median", "--frames", 1, "--report", tmp_path)
+    run("evaluate", dataset, "--models", "median", "--frames", 1, "--report", tmp_path)
     page = (tmp_path / "report.html").read_text()
     page, pictures = re.subn(r"data:image/png;base64,[\w+/=]+", "", page)  # any letters may follow there
     assert pictures == 5 and "http" not in page
@@ -299,30 +149,24 @@ def test_evaluation_and_report(dataset, tmp_path):
     ("options", "message"),
     [
         ({"models": ("unet",)}, "'unet' is not one of"),
-        (
-            {"models": ("histograms",)},
-            "'histograms' needs histograms with their background, which datasets do not keep",
-        ),
+        ({"models": ("histograms",)}, "needs histograms with their background, which datasets do not keep"),
         ({"models": ("median",), "crop": (65, 48)}, r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"),
         ({"models": ("dncnn",), "weights": network_files.WEIGHTS / "usdn.safetensors"}, "not among models: dncnn"),
     ],
 )
-def test_evaluation_refuses_what_it_cannot_do(dataset, options, message):
+def test_evaluation_refuses_what_it_cannot_do(dataset, options, message, tmp_path):
     with pytest.raises(ArgumentError, match=message):
         spadwarp.denoise.evaluate(dataset, **options)
-
-
-def test_evaluation_needs_a_dataset(tmp_path):
     with pytest.raises(FileError, match="no dataset there"):
         spadwarp.denoise.evaluate(tmp_path)
 
 
 @pytest.mark.slow
 def test_training_from_a_dataset(dataset, tmp_path):
-    file, run, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
+    file, out, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
     file.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
-    invoke("train", file, "--out", run, "--device", "cpu")
-    assert names(run) >= {"usdn.safetensors", "log.jsonl", "curves.png"}
+    run("train", file, "--out", out, "--device", "cpu")
+    assert names(out) >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert network_files.weights_metadata("usdn", own)["seed"] == "0"
     trained, shipped = (
         spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, weights=weights, device="cpu")
@@ -348,11 +192,11 @@ def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, m
     command += ["-m", "spadwarp", "train", str(place), "--out", str(out), "--device", "cpu"]
     paths = os.pathsep.join([str(Path(spadwarp.__file__).parents[1]), *filter(None, sys.path)])
     options = {"env": {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}, "text": True}
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options) as run:
-        while run.poll() is None and not (out / "checkpoint.pt").is_file():
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options) as first:
+        while first.poll() is None and not (out / "checkpoint.pt").is_file():
             time.sleep(0.02)
-        run.terminate()
-        errors = run.communicate(timeout=240)[1]
+        first.terminate()
+        errors = first.communicate(timeout=240)[1]
     assert (out / "checkpoint.pt").is_file(), errors
     assert not (out / "usdn.safetensors").exists()
     with (out / "log.jsonl").open("a") as file:

@@ -28,24 +28,18 @@ def recipe(**changes):
     return TrainingRecipe.from_dict({**tables, "optimiser": {**OPTIMISER, **changes}})
 
 
-@pytest.mark.parametrize("sequence", [list, tuple])
 @pytest.mark.parametrize("noise", [{"counting": 1.0, "ambient": 0.4}, Noise(counting=1.0, ambient=0.4)])
-def test_parts_have_the_noise_of_the_recipe_from_python_too(sequence, noise):
+def test_parts_have_the_noise_of_the_recipe_from_python_too(noise):
     """As tables, as objects, and as a recipe again; what a part gives itself stays."""
-    optimiser = Optimiser(pool=PORTIONS)
-    expected = recipe().mixture
     objects = [Part(**{name: tuple(x) if isinstance(x, list) else x for name, x in one.items()}) for one in MIXTURE]
-    for mixture in (MIXTURE, objects):
-        found = TrainingRecipe(model="histograms", noise=noise, mixture=sequence(mixture), optimiser=optimiser)
-        assert found.mixture == expected
+    for mixture in (MIXTURE, tuple(MIXTURE), objects, tuple(objects)):
+        found = TrainingRecipe(model="histograms", noise=noise, mixture=mixture, optimiser=Optimiser(pool=PORTIONS))
+        assert found.mixture == recipe().mixture
         assert TrainingRecipe.model_validate(found) == found
         assert TrainingRecipe.from_dict(found.model_dump()) == found
-
-
-@pytest.mark.parametrize("tables", [3, [], "histograms"])
-def test_what_is_no_table_is_refused(tables):
-    with pytest.raises(ValidationError):
-        TrainingRecipe.model_validate(tables)
+    for tables in (3, [], "histograms"):
+        with pytest.raises(ValidationError):
+            TrainingRecipe.model_validate(tables)
 
 
 @pytest.fixture
@@ -91,7 +85,7 @@ def test_a_resumed_pool_holds_what_it_would_have_held(drawn):
 
 def test_a_sample_is_used_as_often_as_asked(drawn):
     """Once the pool is full: samples taken over samples drawn."""
-    ours = pool()
+    ours = pool(redraw=10**6)
     first, steps = 200, 300
     prepare(ours, first)
     before = len(drawn)
@@ -102,18 +96,17 @@ def test_a_sample_is_used_as_often_as_asked(drawn):
 
 
 def test_a_part_of_the_steps_learns_from_fewer_crops_of_twice_the_side(drawn):
-    """As often as asked, with as many pixels a step, and with samples that are used as often as the others."""
-    ours, steps = sizes(batch=16, wide=0.25, pool=16 * PORTIONS), 800
-    narrow, wide = ours.kinds
-    assert (narrow.size, wide.size) == (16, 4)
-    assert (narrow.scenes.crop, wide.scenes.crop) == (32, 64)
-    first, before, taken = 300, 0, {32: 0, 64: 0}
-    for step in range(first, first + steps + 1):
+    """As often as asked, with as many pixels a step, and with samples that are used as often as the others; none of
+    the steps, or all of them."""
+    assert [[kind.scenes.crop for kind in sizes(wide=part).kinds] for part in (0.0, 1.0)] == [[32], [64]]
+    ours, steps = sizes(batch=16, wide=0.25, pool=16 * PORTIONS, redraw=10**6), 800
+    assert [(kind.size, kind.scenes.crop) for kind in ours.kinds] == [(16, 32), (4, 64)]
+    first, taken = 300, {32: 0, 64: 0}
+    prepare(ours, first)
+    before = len(drawn)
+    for step in range(first + 1, first + steps + 1):
         prepare(ours, step)
-        if step == first:
-            before = len(drawn)
-        else:
-            taken[ours.of(step).scenes.crop] += ours.of(step).size
+        taken[ours.of(step).scenes.crop] += ours.of(step).size
     assert abs(taken[64] / 4 / steps - 0.25) < 4 * np.sqrt(0.25 * 0.75 / steps)
     for crop, some in taken.items():
         new = sum(size for scenes, _, size in drawn[before:] if scenes.depth.shape[-1] == crop + 32)
@@ -121,21 +114,14 @@ def test_a_part_of_the_steps_learns_from_fewer_crops_of_twice_the_side(drawn):
 
 
 def test_how_many_samples_are_due_is_told_of_both_sizes_together(drawn):
-    """A crop of twice the side counts as four."""
+    """A crop of twice the side counts as four; 8 portions of each before the first step."""
     ours = sizes(batch=16, wide=0.25, pool=16 * PORTIONS)
     narrow, wide = ours.kinds
-    total = 8 * (narrow.portion + 4 * wide.portion)  # 8 portions of each before the first step
-    pieces = prepare(ours, 0)
-    assert {whole for _, whole in pieces} == {total}
-    numbers = [drawn for drawn, _ in pieces]
-    assert numbers == sorted(numbers) and numbers[-1] == total
+    total = 8 * (narrow.portion + 4 * wide.portion)
+    numbers, wholes = zip(*prepare(ours, 0), strict=True)
+    assert set(wholes) == {total}
+    assert list(numbers) == sorted(numbers) and numbers[-1] == total
     assert prepare(ours, 0) == []
-
-
-def test_without_them_all_steps_learn_from_the_same_size(drawn):
-    assert len(sizes().kinds) == 1
-    whole = sizes(wide=1.0).kinds
-    assert [kind.scenes.crop for kind in whole] == [64]
 
 
 def test_a_pool_takes_only_samples_that_were_drawn(drawn):
@@ -147,9 +133,8 @@ def test_a_pool_takes_only_samples_that_were_drawn(drawn):
 
 
 def test_parts_have_their_shares_and_their_noise(drawn):
-    ours = pool()
-    count = 600
-    for step in range(0, count * ours.interval, ours.interval):
+    ours = pool(redraw=10**6)
+    for step in range(0, 600 * ours.interval, ours.interval):
         prepare(ours, step)
     photons = np.array([noise.photons[0] for _, noise, _ in drawn])
     for part, share in enumerate(SHARES):
@@ -172,20 +157,15 @@ def test_crowded_samples_do_not_judge_the_target(drawn):
 def test_of_two_scenes_a_pixel_sees_the_nearer():
     scenes = procedural_scenes(12, 48, seed=3, device="cpu")
     both = crowded(scenes)
-    for place in range(12):
-        pair = torch.stack([scenes.depth[place], scenes.depth[place - 1]]).nan_to_num(torch.inf)
-        assert torch.equal(both.depth[place].nan_to_num(torch.inf), pair.amin(dim=0))
-        sigma = torch.stack([scenes.sigma[place], scenes.sigma[place - 1]])
-        nearer = sigma.gather(0, pair.argmin(dim=0)[None])[0]
-        seen = both.depth[place].isfinite()
-        assert torch.equal(both.sigma[place][seen], nearer[seen])
+    pair = torch.stack([scenes.depth, scenes.depth.roll(1, 0)]).nan_to_num(torch.inf)
+    assert torch.equal(both.depth.nan_to_num(torch.inf), pair.amin(dim=0))
+    sigma = torch.stack([scenes.sigma, scenes.sigma.roll(1, 0)]).gather(0, pair.argmin(dim=0)[None])[0]
+    seen = both.depth.isfinite()
+    assert torch.equal(both.sigma[seen], sigma[seen])
     low, high = both.gate[:, 0, None, None], both.gate[:, 1, None, None]
-    assert (((both.depth > low) & (both.depth < high)) | both.depth.isnan()).all()
-
-
-def test_without_open_water_all_scenes_are_taken():
+    assert (((both.depth > low) & (both.depth < high)) | ~seen).all()
     wall = CleanScenes(torch.ones(3, 8, 8), torch.ones(3, 8, 8), torch.ones(3, 2), torch.ones(3, 64))
-    assert in_open_water(wall) is wall
+    assert in_open_water(wall) is wall  # which has no open water
 
 
 def test_drawing_goes_on_in_pieces_and_an_abandoned_one_begins_again(drawn):
@@ -212,37 +192,27 @@ def test_samples_drawn_on_a_cpu_leave_the_gpu_alone(drawn, monkeypatch):
 
 
 def test_a_pool_beyond_the_memory_is_refused():
-    with pytest.raises(
-        DeviceError, match=r"optimiser\.pool = 9000000 with optimiser\.crop = 64 needs \d+\.\d GiB on cpu"
-    ):
+    problem = r"optimiser\.pool = 9000000 with optimiser\.crop = 64 needs \d+\.\d GiB on cpu"
+    with pytest.raises(DeviceError, match=problem):
         sizes(pool=9_000_000, crop=64)
 
 
 @pytest.mark.parametrize(
-    ("seconds", "count", "left"),
-    [(1.6, 4, ["2 of 4 samples are still to be drawn before the next step, about 3 s"]), (0.8, 4, [])],
+    ("clock", "count", "rests"),
+    [
+        # More than three seconds after the start, and not at the last piece.
+        (itertools.count(0.0, 1.6), 4, [(2, 3)]),
+        (itertools.count(0.0, 0.8), 4, []),
+        # Every half minute; the first piece, which here takes twenty times as long as the others, does not count.
+        (itertools.chain([0.0], itertools.count(20.0, 1.0)), 100, [(rest, rest) for rest in (98, 67, 36, 5)]),
+    ],
 )
-def test_how_long_samples_take_is_said_only_if_some_are_left(monkeypatch, seconds, count, left):
-    """More than three seconds after the start, and not at the last piece."""
-    clock, heard = itertools.count(0.0, seconds), []
+def test_how_long_samples_take_is_said(monkeypatch, clock, count, rests):
+    """Of a run whose next step needs so many samples."""
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
-    assert training._prepared(unprepared(count), threading.Event(), heard.append)
-    assert heard == left
-
-
-def test_how_long_samples_take_is_said_again(monkeypatch):
-    """Every half minute; the first piece, which here takes twenty times as long as the others, does not count."""
-    clock, heard = itertools.chain([0.0], itertools.count(20.0, 1.0)), []
-    monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
-    assert training._prepared(unprepared(100), threading.Event(), heard.append)
-    assert [text.partition(",")[0] for text in heard] == [
-        f"{rest} of 100 samples are still to be drawn before the next step" for rest in (98, 67, 36, 5)
-    ]
-    assert [text.partition("about ")[2] for text in heard] == ["98 s", "67 s", "36 s", "5 s"]
-
-
-def unprepared(count):
-    """A run whose next step needs so many samples."""
     pieces = SimpleNamespace(prepare=lambda step: ((drawn, count) for drawn in range(1, count + 1)))
     workers = SimpleNamespace(rank=0, is_cuda=True, any=bool)
-    return SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces)
+    run, heard = SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces), []
+    assert training._prepared(run, threading.Event(), heard.append)
+    line = "{} of {} samples are still to be drawn before the next step, about {} s"
+    assert heard == [line.format(rest, count, seconds) for rest, seconds in rests]

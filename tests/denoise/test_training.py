@@ -10,15 +10,14 @@ from safetensors.torch import load_file
 from torch.utils.flop_counter import FlopCounterMode
 
 from spadwarp import ConfigError, FileError
-from spadwarp.denoise import network_files, networks, training
+from spadwarp.denoise import network_files, networks
 from spadwarp.denoise import networks as pyramid
 from spadwarp.denoise import networks as selection
 from spadwarp.denoise.frames import POOLED
 from spadwarp.denoise.histogram_features import FEATURES
-from spadwarp.denoise.network_files import MODELS
 from spadwarp.denoise.recipe import Noise, TrainingRecipe, load_training_recipe
 from spadwarp.denoise.synthetic_noise import BINS, Batch, CleanScenes, draw_batch, procedural_scenes
-from spadwarp.denoise.training import Workers, fit, loss_of
+from spadwarp.denoise.training import fit, loss_of
 
 
 def scenes(count=4, size=64):
@@ -42,50 +41,30 @@ def draw(plain, *, size=64, crop=64, seed=3, **options):
     return draw_batch(scenes(), plain, size=size, crop=crop, generator=generator, always_replaced=True, **options)
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("shape", [(32, 32), (33, 57), (192, 256)])
-def test_networks_keep_the_size(model, shape):
-    network = networks.build_network(model).eval()
-    with torch.inference_mode():
-        output = network(torch.rand(1, 3 + FEATURES * networks.reads_histograms(network), *shape))
-    assert output.shape == (1, {"pyramid": 4, "histograms": 4 + 2 + POOLED}.get(model, 1), *shape)
-    assert torch.isfinite(output).all()
-
-
-def test_usdn_has_the_weights_of_dehazenet():
-    """8 240 for three channels of input; two of the three are not there."""
+def test_networks_have_the_weights_and_the_cost_that_they_state():
+    """DehazeNet has 8 240 weights for three channels of input, of which USDN has one."""
     layers = [one for one in networks.USDN().modules() if isinstance(one, torch.nn.Conv2d)]
     assert sum(one.weight.numel() for one in layers) + 2 * 5 * 5 * 16 == 8240
-
-
-def test_pyramid_costs_less_than_a_sixth_of_dncnn():
     multiply_adds = []
     for name in ("pyramid", "dncnn"):
         with torch.no_grad(), FlopCounterMode(display=False) as counter:
             networks.build_network(name).eval()(torch.zeros(1, 3, 64, 64))
         multiply_adds.append(counter.get_total_flops() // 2)
     ours, theirs = multiply_adds
-    assert theirs == 64 * 64 * (9 * 64 * 2 + 15 * 9 * 64 * 64)
-    assert ours < theirs / 6
-
-
-def windows(image, radius):
-    """`[B, 1, H, W]` to `[B, H, W, (2 radius + 1)²]`, beyond the border too."""
-    size = 2 * radius + 1
-    padded = torch.nn.functional.pad(image, (radius,) * 4, mode="replicate")[:, 0]
-    return padded.unfold(1, size, 1).unfold(2, size, 1).flatten(3)
+    assert theirs == 64 * 64 * (9 * 64 * 2 + 15 * 9 * 64 * 64) and ours < theirs / 6
 
 
 def test_order_statistics_are_those_of_a_sort():
     image = torch.rand(2, 1, 11, 9, generator=torch.Generator().manual_seed(1))
-    expected = windows(image, 1).sort(dim=-1).values
+    padded = torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate")[:, 0]
+    expected = padded.unfold(1, 3, 1).unfold(2, 3, 1).flatten(3).sort(dim=-1).values
     for rank, values in zip((2, 4, 6), pyramid.ranks(image), strict=True):
         assert torch.equal(values[:, 0], expected[..., rank])
 
 
 @pytest.mark.parametrize("model", ["pyramid", "histograms"])
 def test_pyramid_turns_with_its_frame(model):
-    """All eight turns and reflections, with weights drawn at random."""
+    """All eight turns and reflections, with weights drawn at random; and the way with derivatives gives the same."""
     torch.manual_seed(3)
     network = networks.build_network(model).eval()
     with torch.no_grad():
@@ -93,8 +72,11 @@ def test_pyramid_turns_with_its_frame(model):
             values.add_(0.02 * torch.randn(values.shape))
     frame = torch.rand(1, 3 + FEATURES * networks.reads_histograms(network), 32, 32)
     frame[:, 1] = (frame[:, 1] > 0.2).float()
+    learning = network(frame).detach()
     with torch.inference_mode():
         found = network(frame)
+        if model == "pyramid":
+            assert torch.allclose(found, learning, atol=1e-5)
         for turn in range(8):
             turned = [torch.rot90(x.flip(-1) if turn >= 4 else x, turn % 4, (-2, -1)) for x in (frame, found)]
             close = torch.isclose(network(turned[0]), turned[1], atol=1e-3)
@@ -109,25 +91,6 @@ def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
     with torch.no_grad():
         network.scalars.weight.zero_()
         assert torch.allclose(network(frame)[:, 0], torch.tensor(0.5), atol=1e-4)
-
-
-def test_the_answer_in_place_is_the_answer():
-    generator = torch.Generator().manual_seed(4)
-    weights, trusts, values = (torch.randn(1, 7, 5, 6, generator=generator) for _ in range(3))
-    for channels in (0, 1):
-        reach = torch.randn(1, channels, 5, 6, generator=generator)
-        parts = weights, trusts, values, reach
-        kept = [part.clone() for part in parts]
-        assert torch.allclose(pyramid._answer_in_place(*parts), pyramid._answer(*parts), atol=1e-5)
-        assert all(torch.equal(part, before) for part, before in zip(parts, kept, strict=True))
-
-
-def test_a_new_selection_takes_the_answer_of_the_network():
-    generator = torch.Generator().manual_seed(6)
-    found, logits = torch.rand(2, 1, 8, 9, generator=generator), torch.randn(2, 3, 8, 9, generator=generator)
-    candidates, scores = selection.Selection()(found, logits, torch.randn(2, FEATURES, 8, 9, generator=generator))
-    assert candidates.shape == scores.shape == (2, selection.CHOICES, 8, 9)
-    assert (scores.argmax(dim=1) == 0).float().mean() > 0.95
 
 
 def test_the_selection_of_strips_is_that_of_whole_frames(monkeypatch):
@@ -158,6 +121,9 @@ def test_drawn_scenes_are_varied_and_repeatable():
     low, high = first.gate[:, 0, None, None], first.gate[:, 1, None, None]
     assert (((first.depth > low) & (first.depth < high)) | ~seen).all()
     assert (first.sigma[seen] > 0).all() and torch.isnan(first.sigma[~seen]).all()
+    one, same, other = (draw(Noise(), size=8, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(one.frame, same.frame) and torch.equal(one.clean, same.clean)
+    assert not torch.equal(one.frame, other.frame)
 
 
 @pytest.mark.parametrize("level", [0.042, 0.48])
@@ -203,21 +169,21 @@ def test_frames_of_counts_reach_the_bound_where_background_is_rare(photons):
     assert 0.7 * median < float(error.median()) < 1.7 * median
 
 
-def test_one_seed_gives_one_batch():
-    first, again, other = (draw(Noise(), size=8, seed=seed) for seed in (1, 1, 2))
-    assert torch.equal(first.frame, again.frame) and torch.equal(first.clean, again.clean)
-    assert not torch.equal(first.frame, other.frame)
-
-
-def test_crops_without_a_target_do_not_count_for_depth():
+def test_crops_count_for_what_they_can_judge():
+    """Those without a target not for the depth, crowded ones not for the target's probability."""
     frame, clean, hit = torch.rand(2, 3, 32, 32), torch.full((2, 1, 32, 32), 0.4), torch.ones(2, 1, 32, 32)
-    hit[1] = 0.0
-    clean[1] = 1.0
-    output = torch.full((2, 1, 32, 32), 0.5)
+    hit[1], clean[1] = 0.0, 1.0
     both = Batch(frame, clean, hit, torch.ones(2, 1, 1, 1))
-    alone = loss_of(output[:1], Batch(*(values[:1] for values in both)), kind="mse")
-    assert alone == pytest.approx(0.01, rel=1e-5)
-    assert loss_of(output, both, kind="mse") == pytest.approx(0.01, rel=1e-5)
+    for batch in (both, Batch(*(values[:1] for values in both))):
+        output = torch.full((len(batch.hit), 1, 32, 32), 0.5)
+        assert loss_of(output, batch, kind="mse") == pytest.approx(0.01, rel=1e-5)
+    hit = (torch.rand(1, 1, 32, 32) > 0.5).float()
+    depth = torch.full((1, 1, 32, 32), 0.5)
+    wrong, right = (torch.cat([depth, 9 * sign * (2 * hit - 1), depth, depth], dim=1) for sign in (-1, 1))
+    for judged in (0.0, 1.0):
+        batch = Batch(frame[:1], depth, hit, torch.full((1, 1, 1, 1), judged))
+        more = loss_of(wrong, batch, kind="mse") - loss_of(right, batch, kind="mse")
+        assert more == pytest.approx(0.3 * 9 * judged, rel=1e-4, abs=1e-6)
 
 
 def test_the_chosen_depth_decides_what_counts_as_the_targets():
@@ -247,16 +213,6 @@ def test_the_wide_view_and_the_selection_learn_from_their_own_answers_alone():
             learns = values.grad is not None and bool((values.grad != 0).any())
             assert not (learns and late != own), name
     assert learns  # the last of the wide view's
-
-
-def test_crowded_crops_do_not_count_for_the_targets_probability():
-    hit = (torch.rand(1, 1, 32, 32) > 0.5).float()
-    frame, depth = torch.rand(1, 3, 32, 32), torch.full((1, 1, 32, 32), 0.5)
-    wrong, right = (torch.cat([depth, 9 * sign * (2 * hit - 1), depth, depth], dim=1) for sign in (-1, 1))
-    for judged in (0.0, 1.0):
-        batch = Batch(frame, depth, hit, torch.full((1, 1, 1, 1), judged))
-        more = loss_of(wrong, batch, kind="mse") - loss_of(right, batch, kind="mse")
-        assert more == pytest.approx(0.3 * 9 * judged, rel=1e-4, abs=1e-6)
 
 
 OPTIMISER = {"steps": 6, "batch": 2, "crop": 32, "report_every": 3, "warm_up": 2}
@@ -320,7 +276,8 @@ def test_crops_that_no_scene_holds_are_refused(tmp_path, size, wide, problem):
 def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
     noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
     once = {**OPTIMISER, "steps": 2, "report_every": 2}
-    done = train(tmp_path, model="histograms", start="histograms", noise=noise, optimiser=once)
+    tables = {**RECIPE, "model": "histograms", "start": "histograms", "noise": noise, "optimiser": once}
+    done = fit(TrainingRecipe.from_dict(tables), scenes(), scenes(count=1, size=32), tmp_path, device="cpu")
     learnt = load_file(done.weights)
     for name, values in network_files.load_network("histograms").state_dict().items():
         assert torch.allclose(learnt[name].float(), values, atol=0.01), name  # two steps
@@ -329,30 +286,11 @@ def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
     assert set(validation) == {"1.000", "3.000", "10.000", "30.000", "100.000"}
 
 
-def test_training_says_how_long_it_takes_and_what_to_do_instead(tmp_path):
-    said = []
-    fit(TrainingRecipe.from_dict(RECIPE), scenes(), scenes(), tmp_path, device="cpu", notify=said.append)
-    assert "1 step to go, about 1 s" in said[0] and "Ctrl-C keeps a checkpoint" in said[0]
-
-
-@pytest.mark.parametrize(
-    ("steps", "text"),
-    [
-        (50, "about 50 s"),
-        (119, "about 119 s"),
-        (120, "about 2 minutes"),
-        (7199, "about 120 minutes"),
-        (7200, "2 hours"),
-    ],
-)
-def test_how_long_a_training_takes_in_words(steps, text):
-    assert text in training._duration(Workers("cpu"), 1.0, steps)
-
-
-def test_scenes_are_drawn_where_there_is_no_dataset(tmp_path):
-    optimiser = {**OPTIMISER, "steps": 2, "scenes": 4, "redraw": 1}
+def test_training_without_a_dataset_draws_scenes_and_says_how_long_it_takes(tmp_path):
+    said, optimiser = [], {**OPTIMISER, "scenes": 4, "redraw": 1}
     recipe = TrainingRecipe.from_dict({"model": "usdn", "seed": 4, "optimiser": optimiser})
-    assert fit(recipe, None, None, tmp_path, device="cpu").weights.is_file()
+    assert fit(recipe, None, None, tmp_path, device="cpu", notify=said.append).weights.is_file()
+    assert "1 step to go, about 1 s" in said[0] and "Ctrl-C keeps a checkpoint" in said[0]
 
 
 def test_a_folder_holds_one_recipe(tmp_path):

@@ -44,14 +44,18 @@ def test_pyramid_beats_the_median_and_knows_where_no_target_is():
 
 @pytest.mark.parametrize("shape", [(32, 32), (41, 67), (8, 100)])
 @of_depth
-def test_any_size(model, shape):
-    found = denoised(np.full((2, *shape), 15.0, np.float32), model=model)
+def test_frames_of_any_size_are_denoised_independently(model, shape):
+    frames = np.stack([noisy_frame(np.full(shape, 15.0), seed=seed) for seed in range(2)])
+    found = denoised(frames, model=model)
     assert found.shape == (2, *shape) and found.dtype == np.float32
+    for frame, one in zip(frames, found, strict=True):
+        assert np.nanmax(np.abs(denoised(frame, model=model) - one)) < 1e-4
 
 
 def test_a_large_frame():
-    found = denoised(np.full((768, 1024), 15.0, np.float32))
-    assert found.shape == (768, 1024) and abs(np.nanmedian(found) - 15.0) < 0.01
+    """Of more pixels than are computed at once."""
+    found = denoised(np.full((400, 512), 15.0, np.float32))
+    assert found.shape == (400, 512) and abs(np.nanmedian(found) - 15.0) < 0.01
 
 
 @pytest.mark.parametrize("missing", [0.5, 0.9])
@@ -122,13 +126,11 @@ def test_every_pixel_has_a_depth_and_the_mask_is_a_choice():
     found = estimate(np.where(np.isnan(clean), np.nan, noisy_frame(clean, 0.55)), gate=GATE, device="cpu")
     right = np.abs(found.depth - clean) < 0.01 * 2.5
     assert found.confidence[right].mean() > found.confidence[np.isfinite(clean) & ~right].mean()
-    with pytest.raises(ArgumentError, match=r"mask = 1\.5"):
-        denoised(noisy, mask=1.5)
 
 
-@pytest.mark.parametrize("turn", range(1, 8))
+@pytest.mark.parametrize("turn", [1, 4, 6])
 def test_turns_and_reflections_of_a_frame_are_those_of_the_answer(turn):
-    """Sizes are multiples of 16; only rounding differs."""
+    """Sizes are multiples of 16; only rounding differs. A turn and a reflection make all others."""
 
     def turned(image):
         return np.ascontiguousarray(np.rot90(image[:, ::-1] if turn >= 4 else image, turn % 4))
@@ -194,27 +196,26 @@ def test_a_line_one_pixel_wide_is_kept_where_backscatter_is_rare():
 
 
 def test_the_gate_is_narrowed_to_where_depths_agree():
-    target = evaluation_scene("spiral", "open water")
-    water = evaluation_scene("nothing", "open water")
+    def gates(frames):
+        return gates_of_target(torch.from_numpy(frames.scaled), torch.from_numpy(frames.density))
+
+    target, water = evaluation_scene("spiral", "open water"), evaluation_scene("nothing", "open water")
     noisy = [noisy_depth(scene, water="uniform", level=0.264, seed=1) for scene in (target, water)]
-    frames = depth_frames(np.stack(noisy), gate=(12.0, 20.0))
-    starts, widths, parts = gates_of_target(torch.from_numpy(frames.scaled), torch.from_numpy(frames.density))
+    starts, widths, parts = gates(depth_frames(np.stack(noisy), gate=(12.0, 20.0)))
     start, stop = 12.0 + 8.0 * starts[0], 12.0 + 8.0 * (starts[0] + widths[0])
     assert 13.5 < start < np.nanmin(target.clean) and np.nanmax(target.clean) < stop < 16.0
-    assert (starts[1], widths[1]) == (0.0, 1.0)
-    assert parts[0] == 1.0
-    frames = depth_frames(noisy[1], gate=GATE)
-    _, _, parts = gates_of_target(torch.from_numpy(frames.scaled), torch.from_numpy(frames.density))
-    assert parts[0] < 0.01  # no target takes more than this part of a frame of water
+    assert (starts[1], widths[1], parts[0]) == (0.0, 1.0, 1.0)
+    assert gates(depth_frames(noisy[1], gate=GATE))[2][0] < 0.01  # of water, no target takes more than this part
 
 
 def test_the_bins_of_the_target_are_those_of_the_excess():
-    generator = np.random.default_rng(2)
+    generator, level = np.random.default_rng(2), np.full(512, 0.1)
     rate = np.full((24, 24, 512), 0.1)
+    water = generator.poisson(rate)
     rate[..., 200:240] += 0.05
-    first, stop = bins_of_target(generator.poisson(rate), np.full(512, 0.1), np.ones(5))
+    first, stop = bins_of_target(generator.poisson(rate), level, np.ones(5))
     assert 170 < first <= 200 and 240 <= stop < 270
-    assert bins_of_target(generator.poisson(np.full((24, 24, 512), 0.1)), np.full(512, 0.1), np.ones(5)) == (0, 512)
+    assert bins_of_target(water, level, np.ones(5)) == (0, 512)
 
 
 @pytest.mark.parametrize("model", [*OF_DEPTH, "median", "gating"])
@@ -229,13 +230,6 @@ def test_pyramid_fills_what_the_camera_missed():
     found = denoised(np.where(dead, np.nan, clean))
     assert np.isfinite(found[dead]).mean() > 0.99
     assert np.nanpercentile(np.abs(found - clean), 99) < 0.01
-
-
-@of_depth
-def test_frames_are_denoised_independently(model):
-    frames = np.stack([noisy_frame(scene(), seed=seed) for seed in range(2)])
-    for frame, found in zip(frames, denoised(frames, model=model), strict=True):
-        assert np.nanmax(np.abs(denoised(frame, model=model) - found)) < 1e-4
 
 
 def test_distance_does_not_matter_but_the_place_in_the_gate_does():
@@ -253,22 +247,38 @@ def test_depth_outside_the_gate_is_left_out_with_a_warning():
     assert np.nanmax(found) <= 16.0
 
 
+HISTOGRAMS = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "response": np.ones(3)}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"depth": np.zeros(5)}, r"depth has shape \(5,\)"),
-        ({"depth": np.full((32, 32), "a")}, "depth is <U1"),
+        ({"depth": np.full((16, 16), "a")}, "depth is <U1"),
         ({"depth": np.ones((4, 40))}, "4 x 40 pixels"),
-        ({"depth": -np.ones((32, 32))}, "outside"),
-        ({"gate": (16.0, 13.5)}, "gate"),
+        ({"depth": -np.ones((16, 16))}, "outside"),
+        ({"gate": (16.0, 13.5)}, r"gate = \(16.0, 13.5\) m is not \(start, stop\)"),
         ({"gate": (1.0, np.inf)}, "gate"),
+        ({"gate": (np.nan, 14.0)}, "gate = nan is outside"),
         ({"model": "unet"}, "model = 'unet'"),
         ({"profile": [-1.0, 2.0]}, "profile"),
+        ({"mask": 1.5}, r"mask = 1\.5"),
+        ({"precision": "float8"}, "precision = 'float8' is not one of"),
+        (HISTOGRAMS | {"counts": np.zeros((16, 16))}, "counts are float64"),
+        (HISTOGRAMS | {"background": np.zeros(5)}, "background has shape"),
+        (HISTOGRAMS | {"background": None}, "needs counts, background and response"),
+        (HISTOGRAMS | {"response": np.ones(4)}, "response has shape"),
+        (HISTOGRAMS | {"counts": np.zeros((20, 16, 8))}, r"depth has shape \(16, 16\); \(20, 16\) is needed"),
+        (HISTOGRAMS | {"counts": -np.ones((16, 16, 8))}, r"counts = -1.0 … -1.0 are outside \[0, inf\)"),
+        (HISTOGRAMS | {"counts": np.full((16, 16, 8), np.nan)}, "counts = nan"),
+        (HISTOGRAMS | {"counts": np.zeros((16, 16, 8), complex)}, "counts are complex128"),
+        (HISTOGRAMS | {"background": np.ones(8, complex)}, "background = .* is not an array of real numbers"),
+        (HISTOGRAMS | {"response": "gaussian"}, "response = 'gaussian' is not an array of real numbers"),
     ],
 )
 def test_errors_name_what_is_wrong(arguments, message):
     with pytest.raises(ArgumentError, match=message):
-        denoised(**{"depth": np.full((32, 32), 15.0), **arguments})
+        denoised(**{"depth": np.full((16, 16), 15.0), **arguments})
 
 
 def test_weights_must_be_weights(tmp_path):

@@ -1,6 +1,7 @@
 """What is run on damaged files: a case is a folder of files, one of them damaged, and a command on it."""
 
 import random
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,9 @@ from fuzz import command_lines, mutations
 from fuzz.corpus import Corpus
 
 CPU = ("--device", "cpu")
+QUIETLY = ("--out", "out", "--quiet", *CPU)
+_MEDIAN = ("--model", "median", "--out", "out", *CPU)
+CALIBRATED = ("phase.csv", "beam.npy", "camera.yaml", "irf.csv", "target.obj", "target.mtl", "target.png")
 
 
 @dataclass(frozen=True)
@@ -33,22 +37,15 @@ def _scene(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("scene.toml", "scene.toml", "calibrated.toml"))
     injected = r.random() < 0.25
     damaged = (mutations.non_finite if injected else mutations.in_text)(r, corpus[name])
-    others = {} if name == "scene.toml" else _calibrated()
-    command = r.choice(
-        (
-            ("check", name),
-            ("check", name, "--json", "out.json"),
-            ("simulate", name, "--photons", "200", "--out", "out", "--quiet", *CPU),
-            ("sweep", name, "--vary", "range=1,2", "--out", "out", *CPU),
-            ("load_scene", name),
-        )
-    )
+    others = {} if name == "scene.toml" else dict.fromkeys(CALIBRATED)
+    command = r.choice((
+        ("check", name),
+        ("check", name, "--json", "out.json"),
+        ("simulate", name, "--photons", "200", *QUIETLY),
+        ("sweep", name, "--vary", "range=1,2", "--out", "out", *CPU),
+        ("load_scene", name),
+    ))  # fmt: skip
     return Case(command, {name: damaged, **others}, ("out", "out.json"), injected)
-
-
-def _calibrated() -> dict[str, None]:
-    names = ("phase.csv", "beam.npy", "camera.yaml", "irf.csv", "target.obj", "target.mtl", "target.png")
-    return dict.fromkeys(names)
 
 
 def _beside_a_scene(*names: str) -> Callable[[random.Random, Corpus], Case]:
@@ -56,27 +53,25 @@ def _beside_a_scene(*names: str) -> Callable[[random.Random, Corpus], Case]:
 
     def case(r: random.Random, corpus: Corpus) -> Case:
         name = r.choice(names)
-        damage = (
-            mutations.in_text
-            if name.rpartition(".")[2] in ("csv", "yaml", "json", "xml", "obj", "mtl")
-            else mutations.in_bytes
-        )
+        damage = mutations.in_bytes if name.rpartition(".")[2] in ("npy", "png") else mutations.in_text
         scene = corpus["calibrated.toml"]
         if name.startswith("camera"):
             scene = scene.replace(b"camera.yaml", name.encode())
-        files = {**_calibrated(), "calibrated.toml": scene, name: damage(r, corpus[name])}
-        run = ("simulate", "calibrated.toml", "--photons", "100", "--out", "out", "--quiet", *CPU)
-        return Case(r.choice((("check", "calibrated.toml"), run)), files, ("out",))
+        files = {**dict.fromkeys(CALIBRATED), "calibrated.toml": scene, name: damage(r, corpus[name])}
+        return Case(_check_or_run(r, "calibrated.toml"), files, ("out",))
 
     return case
+
+
+def _check_or_run(r: random.Random, *words: str) -> tuple[str, ...]:
+    return r.choice((("check", *words), ("simulate", *words, "--photons", "100", *QUIETLY)))
 
 
 def _grid(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("cells.npz", "cells.h5"))
     files = {"grid.toml": corpus["grid.toml"].replace(b"cells.npz", name.encode())}
     files[name] = mutations.in_bytes(r, corpus[name])
-    run = ("simulate", "grid.toml", "--photons", "100", "--out", "out", "--quiet", *CPU)
-    return Case(r.choice((("check", "grid.toml"), run)), files, ("out",))
+    return Case(_check_or_run(r, "grid.toml"), files, ("out",))
 
 
 def _recipe(r: random.Random, corpus: Corpus) -> Case:
@@ -90,19 +85,14 @@ def _mesh(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("box.stl", "box.ascii.stl", "box.ply", "box.off", "box.glb", "target.obj"))
     is_text = name in ("box.ascii.stl", "box.off", "target.obj")
     damaged = (mutations.in_text if is_text or r.random() < 0.3 else mutations.in_bytes)(r, corpus[name])
-    run = ("simulate", "scene.toml", "--mesh", name, "--photons", "100", "--out", "out", "--quiet", *CPU)
-    command = r.choice((("check", "scene.toml", "--mesh", name), ("info", name), run))
-    return Case(command, {name: damaged, "scene.toml": None, "target.mtl": None, "target.png": None}, ("out",))
+    command = ("info", name) if r.random() < 0.3 else _check_or_run(r, "scene.toml", "--mesh", name)
+    return Case(command, {name: damaged, **dict.fromkeys(("scene.toml", "target.mtl", "target.png"))}, ("out",))
 
 
 def _exr(r: random.Random, corpus: Corpus) -> Case:
-    albedo = r.choice(("0.5", "depth.exr"))
-    rendered = f"depth=depth.exr,depth_channel=Z,depth_scale=1,albedo={albedo}"
+    rendered = "depth=depth.exr,depth_channel=Z,depth_scale=1,albedo=" + r.choice(("0.5", "depth.exr"))
     command = r.choice(
-        (
-            ("analytic", "scene.toml", "--rendered", rendered, "--out", "out", "--quiet", *CPU),
-            ("denoise", "depth.exr", "--model", "median", "--out", "out", *CPU),
-        )
+        (("analytic", "scene.toml", "--rendered", rendered, *QUIETLY), ("denoise", "depth.exr", *_MEDIAN))
     )
     return Case(command, {"depth.exr": mutations.in_bytes(r, corpus["depth.exr"]), "scene.toml": None}, ("out",))
 
@@ -133,15 +123,13 @@ def _hdf5(r: random.Random, corpus: Corpus) -> Case:
 def _dataset(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("manifest.json", "frames-00000.h5", "scenes.h5", "scenes/scenes-00001.h5", "recipe.toml"))
     damage = mutations.in_hdf5 if name.endswith(".h5") else mutations.in_text
-    command = r.choice(
-        (
-            ("info", "data"),
-            ("info", "data", "--verify"),
-            ("view", "data", "--out", "out.png"),
-            ("export", "data", "--format", "npy", "--out", "out"),
-            ("load", "data"),
-        )
-    )
+    command = r.choice((
+        ("info", "data"),
+        ("info", "data", "--verify"),
+        ("view", "data", "--out", "out.png"),
+        ("export", "data", "--format", "npy", "--out", "out"),
+        ("load", "data"),
+    ))  # fmt: skip
     return Case(command, {"data": None, f"data/{name}": damage(r, corpus[f"data/{name}"])}, ("out", "out.png"))
 
 
@@ -151,29 +139,15 @@ _KNOWN = ("--input", "bin_width=200ps,gate_start=10ns,group_index=1.3")
 def _measured(*names: str) -> Callable[[random.Random, Corpus], Case]:
     def case(r: random.Random, corpus: Corpus) -> Case:
         name = r.choice(names)
-        method = ("--input", "irf=300ps", "--method", r.choice(("peak", "centroid", "likelihood")))
         tags = ("--input", "tag_unit=200ps") if name == "tags.mat" else ()
-        command = r.choice(
-            (
-                ("depth", name, "--out", "out", *_KNOWN, *tags, *method, *CPU),
-                ("denoise", name, "--model", "median", "--out", "out", *_KNOWN, *tags, *CPU),
-            )
-        )
+        method = ("--input", "irf=300ps", "--method", r.choice(("peak", "centroid", "likelihood")))
+        depth = ("depth", name, "--out", "out", *_KNOWN, *tags, *method, *CPU)
+        command = r.choice((depth, ("denoise", name, *_MEDIAN, *_KNOWN, *tags)))
         if name == "depth.npy":
-            command = ("denoise", name, "--model", "median", "--out", "out", *CPU)
+            command = ("denoise", name, *_MEDIAN)
         if name in ("response.npy", "irf.csv"):
-            command = (
-                "depth",
-                "counts.npy",
-                "--out",
-                "out",
-                *_KNOWN,
-                "--input",
-                f"irf={name}",
-                "--method",
-                "matched",
-                *CPU,
-            )
+            method = ("--input", f"irf={name}", "--method", "matched")
+            command = ("depth", "counts.npy", "--out", "out", *_KNOWN, *method, *CPU)
         damage = mutations.in_text if name.endswith(".csv") else mutations.in_bytes
         return Case(command, {"counts.npy": None, name: damage(r, corpus[name])}, ("out",))
 
@@ -219,8 +193,6 @@ def draw(number: int, corpus: Corpus, category: str) -> Case:
 
 def write(case: Case, folder: Path, corpus: Path) -> None:
     """The files of a case."""
-    import shutil
-
     for name, content in case.files.items():
         place, source = folder / name, corpus / name
         place.parent.mkdir(parents=True, exist_ok=True)

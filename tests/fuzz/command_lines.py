@@ -59,11 +59,8 @@ def options() -> dict[tuple[str, ...], list[tuple[str, bool]]]:
         for name, one in getattr(command, "commands", {}).items():
             walk(one, (*path, name))
         if not hasattr(command, "commands") and path not in _LEFT_OUT:
-            found[path] = [
-                (parameter.opts[-1], not getattr(parameter, "is_flag", False))
-                for parameter in command.params
-                if parameter.param_type_name == "option" and parameter.opts[-1] not in _SETTINGS
-            ]
+            named = [one for one in command.params if one.param_type_name == "option" and one.opts[-1] not in _SETTINGS]
+            found[path] = [(one.opts[-1], not getattr(one, "is_flag", False)) for one in named]
 
     walk(program(), ())
     return found

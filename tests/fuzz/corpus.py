@@ -6,10 +6,15 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import ptufile
+import scipy.io
+import scipy.sparse
 import trimesh
+from PIL import Image
 
 import spadwarp
 from helpers.datasets import recipe
+from spadwarp.frames import record_frames
 from spadwarp.io.arrays import write_exr
 from spadwarp.transport import save_records, trace
 
@@ -128,15 +133,14 @@ COUNTS = np.random.default_rng(1).poisson(1.0, (8, 10, 30)).astype(np.uint16)
 
 def make_corpus(folder: Path) -> None:
     """Writes all files; takes a few seconds."""
-    for name, content in {
-        "scene.toml": SCENE, "grid.toml": GRID, "calibrated.toml": CALIBRATED, "camera.yaml": CAMERA,
-        "training.toml": TRAINING,
-        "camera.xml": CAMERA_XML, "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
-    }.items():  # fmt: skip
-        (folder / name).write_bytes(content)
     matrix = [[17.0, 0.0, 3.0], [0.0, 17.0, 2.0], [0.0, 0.0, 1.0]]
     camera = {"image_width": 10, "image_height": 8, "camera_matrix": matrix, "distortion_coefficients": [-0.01] * 5}
-    (folder / "camera.json").write_text(json.dumps(camera))
+    for name, content in {
+        "scene.toml": SCENE, "grid.toml": GRID, "calibrated.toml": CALIBRATED, "training.toml": TRAINING,
+        "camera.yaml": CAMERA, "camera.xml": CAMERA_XML, "camera.json": json.dumps(camera).encode(),
+        "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
+    }.items():  # fmt: skip
+        (folder / name).write_bytes(content)
     _meshes(folder)
     _ours(folder)
     _theirs(folder)
@@ -153,8 +157,6 @@ def _meshes(folder: Path) -> None:
         "mtllib target.mtl\nv -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 -1\n"
         "usemtl one\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"
     )
-    from PIL import Image
-
     Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(folder / "target.png")
 
 
@@ -163,8 +165,6 @@ def _ours(folder: Path) -> None:
     scene = spadwarp.load_scene(folder / "scene.toml")
     result = spadwarp.simulate(scene, photons=2000, seed=3, device="cpu", uncertainty=True)
     result.save(folder / "result.h5")
-    from spadwarp.frames import record_frames
-
     record_frames(result, folder / "frames.h5", pulses=300, frames=2, seed=1, tags=True, device="cpu")
     spadwarp.simulate_analytic(scene, frames=2, seed=1, device="cpu").save(folder / "analytic.h5")
     save_records(trace(scene, photons=20, device="cpu"), folder / "records.h5", scene=scene)
@@ -173,10 +173,6 @@ def _ours(folder: Path) -> None:
 
 
 def _theirs(folder: Path) -> None:
-    import ptufile
-    import scipy.io
-    import scipy.sparse
-
     np.save(folder / "counts.npy", COUNTS)
     cells = {"density": np.linspace(0.0, 2.0, 60).reshape(3, 4, 5), "cell_size": np.full(3, 0.1)}
     np.savez(folder / "cells.npz", **cells)

@@ -12,14 +12,19 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import spadwarp
 from fuzz import command_lines
 from fuzz.cases import Case, write
 from fuzz.isolation import Outcome, run_isolated
+from spadwarp.dataset.recipe import load_recipe
+from spadwarp.denoise.recipe import load_training_recipe
+from spadwarp.values import SpadwarpError
 
 BUG = 70  # exit code of a command that met an error nobody thought of
 # Fields in which infinity has a meaning.
 UNBOUNDED = re.compile(
-    r"(transport\.lateral_limit|scan\.distance|camera\.(focus_distance|analyser_extinction_ratio)|domain\.(lower|upper)|.*\.(lower|upper)|medium\.layers.*|.*max_path)"
+    r"transport\.lateral_limit|scan\.distance|camera\.(focus_distance|analyser_extinction_ratio)|"
+    r".*\.(lower|upper)|medium\.layers.*|.*max_path"
 )
 
 
@@ -40,17 +45,14 @@ def _judge(case: Case, outcome: Outcome, before: dict[str, str], after: dict[str
     if outcome.kind != "done":
         return outcome.kind, f"{outcome.value} after {outcome.seconds:.1f} s\n{outcome.text[-1500:]}"
     code, errors, unbounded = outcome.value
-    changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
-    allowed = [one.rstrip("/") for one in case.outputs]
-    anywhere = bool({"", "."} & set(allowed))  # the folder itself
-    within = [(f"{name}/", f"{one}/") for name in changed for one in allowed]  # and the folders on the way to an output
-    fine = {name[:-1] for name, one in within if name.startswith(one) or one.startswith(name)}
-    strange = [name for name in changed if name not in fine]
-    strange = [] if anywhere else strange
     if code == BUG or "Traceback (most recent call last)" in errors:
         return "traceback", errors[-1500:]
-    if strange:
-        return "output", f"{strange} changed"
+    allowed = [f"{one.rstrip('/')}/" for one in case.outputs]
+    changed = {f"{name}/" for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
+    # An output, what is in it, and the folders on the way to it.
+    fine = {name for name in changed for one in allowed if name.startswith(one) or one.startswith(name)}
+    if changed > fine and not {"/", "./"} & set(allowed):  # the folder itself
+        return "output", f"{sorted(changed - fine)} changed"
     if unbounded:
         return "non-finite", f"{unbounded} accepted"
     return ("done" if code == 0 else "refused"), errors[-300:]
@@ -60,10 +62,9 @@ def _digests(folder: Path) -> dict[str, str]:
     found = {}
     for place in folder.rglob("*"):
         with contextlib.suppress(OSError):
-            if place.is_file() and not place.is_symlink():
-                found[place.relative_to(folder).as_posix()] = hashlib.md5(place.read_bytes()).hexdigest()
-            else:
-                found[place.relative_to(folder).as_posix()] = "folder"
+            is_file = place.is_file() and not place.is_symlink()
+            content = hashlib.md5(place.read_bytes()).hexdigest() if is_file else "folder"
+            found[place.relative_to(folder).as_posix()] = content
     return found
 
 
@@ -97,24 +98,14 @@ def _child(case: Case, folder: Path) -> tuple[int, str, list[str]]:
 
 def _load(what: str, path: str) -> tuple[int, str, list[str]]:
     """A loader called from Python: its errors are those of spadwarp, and what it returns is finite."""
-    import spadwarp
-    from spadwarp.dataset.recipe import load_recipe
-    from spadwarp.denoise.recipe import load_training_recipe
-    from spadwarp.values import SpadwarpError
-
-    loaders = {
-        "load": spadwarp.load,
-        "load_scene": spadwarp.load_scene,
-        "load_recipe": load_recipe,
-        "load_training": load_training_recipe,
-    }
+    loaders = {"load": spadwarp.load, "load_scene": spadwarp.load_scene}
+    loaders |= {"load_recipe": load_recipe, "load_training": load_training_recipe}
     try:
         found = loaders[what](path)
     except (SpadwarpError, MemoryError) as error:
         return 1, str(error), []
-    if what == "load":
-        return 0, "", []
-    return 0, "", [name for name, value in _numbers(found.model_dump(), "") if not _is_fine(name, value)]
+    numbers = () if what == "load" else _numbers(found.model_dump(), "")
+    return 0, "", [name for name, value in numbers if not _is_fine(name, value)]
 
 
 def _numbers(value: Any, name: str):

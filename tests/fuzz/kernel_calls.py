@@ -53,10 +53,6 @@ def _one(number: int) -> tuple[str, str]:
     return "done", name
 
 
-def _filled(*shape, dtype=float):
-    return wp.full(shape, 0.01, dtype=dtype, device="cpu")
-
-
 def _lidar():
     one = sk.Lidar()
     one.photons, one.pde, one.extinction, one.scattering, one.speed = 1e9, 0.2, 0.3, 0.2, 2.2e8
@@ -67,154 +63,95 @@ def _lidar():
 
 
 def _valid_calls():
+    def floats(*shape, value=0.01, dtype=float):
+        return wp.full(shape, value, dtype=dtype, device="cpu")
+
+    def four(value=3.0):
+        return floats(4, value=value, dtype=wp.float64)
+
+    def tallies():
+        return wp.zeros(12, dtype=wp.int64, device="cpu")
+
     box = trimesh.creation.box((1, 1, 1))
     box.apply_translation((0, 0, 5))
     points = wp.array(box.vertices, dtype=wp.vec3, device="cpu")
     mesh = wp.Mesh(points, wp.array(box.faces.ravel(), dtype=int, device="cpu"))
     model = sk.Model(device="cpu", mesh=mesh, surfaces=sk.make_surfaces(mesh, 0.5), scale=2.0**50, **lit_box())
-    textures = sk.make_textures(np.zeros(12, int), np.zeros((12, 3, 2)), [np.ones((2, 2))], device="cpu")
-    sight = wp.full(4, wp.vec3(0, 0, 1), dtype=wp.vec3, device="cpu")
-    view = wp.full(4, wp.vec3d(0, 0, 1), dtype=wp.vec3d, device="cpu")
-    rows, counts = _filled(6, 8), wp.full((6, 8), 2, dtype=int, device="cpu")
-    phase = wp.full(9, 0.08, dtype=wp.float64, device="cpu")
+    tiles = dict(face=np.zeros(12, int), coordinates=np.zeros((12, 3, 2)), images=[np.ones((2, 2))], device="cpu")
+    sight = floats(4, value=wp.vec3(0, 0, 1), dtype=wp.vec3)
+    view = floats(4, value=wp.vec3d(0, 0, 1), dtype=wp.vec3d)
+    rows, counts = floats(6, 8), floats(6, 8, value=2, dtype=int)
     coding = analytic.FrameCoding()
     coding.nearest, coding.farthest, coding.width, coding.pixels = 1.0, 3.0, 2, 4
     coding.depth_step, coding.intensity_step, coding.pulses = 0.001, 1.0, 100.0
-
-    def four(value=3.0):
-        return wp.full(4, value, dtype=wp.float64, device="cpu")
-
-    def tallies():
-        return wp.zeros(12, dtype=wp.int64, device="cpu")
-
-    maps = {name: _filled(4) for name in ("depth", "sigma_depth", "probability", "flat_share")}
-    tables = {"paths": _filled(1, 5), "cumulative": _filled(1, 5)}
-    drawn = {"pulses": 10, "frames": 2, "first_frame": 0, "counter_depth": 0, "seed": 1, "counts": None}
-    events = {"edges": np.linspace(0, 1e-7, 9), "recorded": 8, "period": 1e-6, "dead_time": 1e-8, "tags": True}
-    matrix = {
-        "row_start": np.array([0, 1, 2]),
-        "source_bin": np.array([0, 1]),
-        "weight": np.ones(2),
-        "width": np.ones(2),
-    }
-    bins = {"background": _filled(1, 8), "response": np.ones((16, 3)) / 3, "lowest_tap": -1, "first": 0, "stop": 8}
-    scatter = {"lidar": _lidar(), "phase": phase, "view": view}
-    statistics = {"profile": _filled(1, 8), "signal": four(), "arrival": four(5e-8), "backscatter": four()}
-    ours = {"device": "cpu", "mesh": mesh, "surfaces": model.surfaces, "scale": 1.0, **lit_box()}
-    faces = {"mesh": mesh, "reflectance": _filled(12), "textures": textures, "specular": 0.1, "roughness": 0.2}
-    layers = {"start": [0.0, 1.0], "extinction": [1.0, 1.0], "albedo": [0.5, 0.5], "anisotropy": [0.1, 0.1]}
+    maps = {name: floats(4) for name in ("depth", "sigma_depth", "probability", "flat_share")}
+    maps |= dict(view=sight, paths=floats(1, 5), cumulative=floats(1, 5))
+    drawn = dict(hazard=rows, pulses=10, frames=2, first_frame=0, counter_depth=0, seed=1, counts=None)
+    bins = dict(background=floats(1, 8), response=np.ones((16, 3)) / 3, lowest_tap=-1, first=0, stop=8)
+    scatter = dict(lidar=_lidar(), phase=floats(9, value=0.08, dtype=wp.float64), view=view)
+    taps = wp.ones(3, dtype=wp.float64)
     calls = {
-        "tally rates": (
-            sk.tally_rates,
-            {
-                "tally": tallies(),
-                "scale": wp.ones(2, dtype=wp.float64, device="cpu"),
-                "bins": 2,
-                "components": (0, 3),
-                "parameters": 1,
-                "parameter": 0,
-            },
-        ),
-        "launch": (
-            sk.launch_transport,
-            {
-                "spec": sk.TransportSpec("next_event"),
-                "model": model,
-                "data": sk.make_data(model),
-                "seed": 1,
-                "first_id": 0,
-            }
-            | {"photon_count": 20},
-        ),
-        "make_data": (sk.make_data, {"model": model, "tally": None, "record_count": 3, "histogram": True}),
-        "Model": (sk.Model, ours),
-        "make_surfaces": (sk.make_surfaces, faces | {"camera": lit_box()["camera"], "corner_reflectance": None}),
-        "make_textures": (
-            sk.make_textures,
-            {
-                "face": np.zeros(12, int),
-                "coordinates": np.zeros((12, 3, 2)),
-                "images": [np.ones((2, 2))],
-                "device": "cpu",
-            },
-        ),
-        "make_grid": (
-            sk.make_grid,
-            {"extinction": np.ones((2, 3, 4)), "albedo": np.full((2, 3, 4), 0.5), "anisotropy": None, "size": (1, 1, 2)}
-            | {"centre": (0, 0, 1.0), "rotation": np.eye(3), "block_edge": 2, "device": "cpu"},
-        ),
-        "make_layers": (sk.make_layers, layers | {"axis": (0, 0, 1.0), "device": "cpu"}),
-        "make_records": (sk.make_records, {"count": 3, "device": "cpu"}),
-        "phase_tables": (sk.make_phase_tables, {"density": np.ones_like, "device": "cpu"}),
-        "profile_tables": (sk.profile_tables, {"image": np.ones((3, 4))}),
-        "interpolated": (sk.interpolated_density, {"angles": [0.0, 1.0, 2.0], "values": [3.0, 2.0, 1.0]}),
-        "fournier_forand": (sk.fournier_forand_density, {"t": 0.5, "particle_index": 1.1, "junge_slope": 3.6}),
-        "henyey_greenstein": (sk.henyey_greenstein_density, {"t": 0.5, "g": 0.5}),
-        "two_term": (sk.two_term_henyey_greenstein_density, {"t": 0.5, "g1": 0.5, "g2": -0.1, "alpha": 0.9}),
-        "near_depth_map": (near_depth_map, {"mesh": mesh, "camera": lit_box()["camera"]}),
-        "load_kernel": (
-            sk.load_transport_kernel,
-            {"spec": sk.TransportSpec("next_event"), "device": "cpu", "model": model, "photon_count": 20},
-        ),
-        "add_tallies": (sk.add_tallies, {"total": tallies(), "more": tallies()}),
-        "batches": (
-            lambda close, **rest: sk.Batches(**rest).close(close),
-            {"tally": tallies(), "component_count": 3, "total": None, "close": tallies()},
-        ),
-        "read_ledger": (sk.read_ledger, {"data": sk.make_data(model)}),
-        "first_photon": (sk.first_photon_counts, {"hazard": rows, "summed": False, **drawn}),
-        "events": (
-            sk.event_counts,
-            {"hazard": rows, **drawn, **events, "gated": False, "afterpulsing_probability": 0.1}
-            | {"afterpulsing_time_constant": 1e-7},
-        ),
-        "expected": (sk.expected_detections, {"source": rows, **matrix, "noise_rate": _filled(6)}),
-        "dark_counts": (
-            sk.dark_count_rates,
-            {
-                "pixels": 6,
-                "median": 100.0,
-                "spread": 0.1,
-                "hot_fraction": 0.1,
-                "hot_rate": 1e4,
-                "seed": 0,
-                "device": "cpu",
-            },
-        ),
-        "crosstalk": (
-            detection.add_crosstalk,
-            {"hazard": rows, "detections": _filled(6, 8), "image_width": 3, "probability": 0.1},
-        ),
-        "first_law": (detection.first_photon_probabilities, {"hazard": rows}),
-        "free_running": (detection.free_running_probabilities, {"hazard": rows, "dead_time": 1e-8, "period": 1e-6}),
-        "coates": (detection.coates, {"counts": counts, "pulses": 100}),
-        "signal_map": (
-            sk.signal_map,
-            {"lidar": _lidar(), "view": view, "distance": four(), "normal": view, "reflectance": four()},
-        ),
-        "scatter_table": (sk.single_scatter_table, scatter | {"distance": four()}),
-        "statistics": (
-            sk.statistics_maps,
-            scatter | statistics | {"count_law": "per_pulse", "acquisitions": 100.0, "pulses_per_frame": 1.0},
-        ),
-        "information": (
-            analytic.histogram_information,
-            {"signal": rows, "background": _filled(1, 8), "taps": wp.ones(3, dtype=wp.float64), "first_photon": True}
-            | {"slope_taps": wp.ones(3, dtype=wp.float64)},
-        ),
-        "outliers": (analytic.outlier_probabilities, {"signal_count": four(), "level": four(), "window": four()}),
-        "sample_frames": (
-            sk.sample_frames,
-            {"view": sight, **maps, **tables, "laser": (0, 0, 0), "gate_paths": (1.0, 3.0), "first_frame": 0}
-            | {"frames": 3, "seed": 1, "out": None},
-        ),
-        "draw_frames": (
-            analytic.draw_frames,
-            {"coding": coding, "view": sight, **maps, **tables, "alpha": _filled(4), "fraction": _filled(2)},
-        ),
-    }
+        "tally rates": (sk.tally_rates, dict(
+            tally=tallies(), scale=wp.ones(2, dtype=wp.float64, device="cpu"), bins=2, components=(0, 3), parameters=1,
+            parameter=0)),
+        "launch": (sk.launch_transport, dict(
+            spec=sk.TransportSpec("next_event"), model=model, data=sk.make_data(model), seed=1, first_id=0,
+            photon_count=20)),
+        "make_data": (sk.make_data, dict(model=model, tally=None, record_count=3, histogram=True)),
+        "Model": (sk.Model, dict(device="cpu", mesh=mesh, surfaces=model.surfaces, scale=1.0, **lit_box())),
+        "make_surfaces": (sk.make_surfaces, dict(
+            mesh=mesh, reflectance=floats(12), textures=sk.make_textures(**tiles), specular=0.1, roughness=0.2,
+            camera=lit_box()["camera"], corner_reflectance=None)),
+        "make_textures": (sk.make_textures, tiles),
+        "make_grid": (sk.make_grid, dict(
+            extinction=np.ones((2, 3, 4)), albedo=np.full((2, 3, 4), 0.5), anisotropy=None, size=(1, 1, 2),
+            centre=(0, 0, 1.0), rotation=np.eye(3), block_edge=2, device="cpu")),
+        "make_layers": (sk.make_layers, dict(
+            start=[0.0, 1.0], extinction=[1.0, 1.0], albedo=[0.5, 0.5], anisotropy=[0.1, 0.1], axis=(0, 0, 1.0),
+            device="cpu")),
+        "make_records": (sk.make_records, dict(count=3, device="cpu")),
+        "phase_tables": (sk.make_phase_tables, dict(density=np.ones_like, device="cpu")),
+        "profile_tables": (sk.profile_tables, dict(image=np.ones((3, 4)))),
+        "interpolated": (sk.interpolated_density, dict(angles=[0.0, 1.0, 2.0], values=[3.0, 2.0, 1.0])),
+        "fournier_forand": (sk.fournier_forand_density, dict(t=0.5, particle_index=1.1, junge_slope=3.6)),
+        "henyey_greenstein": (sk.henyey_greenstein_density, dict(t=0.5, g=0.5)),
+        "two_term": (sk.two_term_henyey_greenstein_density, dict(t=0.5, g1=0.5, g2=-0.1, alpha=0.9)),
+        "near_depth_map": (near_depth_map, dict(mesh=mesh, camera=lit_box()["camera"])),
+        "load_kernel": (sk.load_transport_kernel, dict(
+            spec=sk.TransportSpec("next_event"), device="cpu", model=model, photon_count=20)),
+        "add_tallies": (sk.add_tallies, dict(total=tallies(), more=tallies())),
+        "batches": (lambda close, **rest: sk.Batches(**rest).close(close), dict(
+            tally=tallies(), component_count=3, total=None, close=tallies())),
+        "read_ledger": (sk.read_ledger, dict(data=sk.make_data(model))),
+        "first_photon": (sk.first_photon_counts, dict(**drawn, summed=False)),
+        "events": (sk.event_counts, dict(
+            **drawn, edges=np.linspace(0, 1e-7, 9), recorded=8, period=1e-6, dead_time=1e-8, tags=True, gated=False,
+            afterpulsing_probability=0.1, afterpulsing_time_constant=1e-7)),
+        "expected": (sk.expected_detections, dict(
+            source=rows, row_start=np.array([0, 1, 2]), source_bin=np.array([0, 1]), weight=np.ones(2),
+            width=np.ones(2), noise_rate=floats(6))),
+        "dark_counts": (sk.dark_count_rates, dict(
+            pixels=6, median=100.0, spread=0.1, hot_fraction=0.1, hot_rate=1e4, seed=0, device="cpu")),
+        "crosstalk": (detection.add_crosstalk, dict(
+            hazard=rows, detections=floats(6, 8), image_width=3, probability=0.1)),
+        "first_law": (detection.first_photon_probabilities, dict(hazard=rows)),
+        "free_running": (detection.free_running_probabilities, dict(hazard=rows, dead_time=1e-8, period=1e-6)),
+        "coates": (detection.coates, dict(counts=counts, pulses=100)),
+        "signal_map": (sk.signal_map, dict(
+            lidar=_lidar(), view=view, distance=four(), normal=view, reflectance=four())),
+        "scatter_table": (sk.single_scatter_table, scatter | dict(distance=four())),
+        "statistics": (sk.statistics_maps, scatter | dict(
+            profile=floats(1, 8), signal=four(), arrival=four(5e-8), backscatter=four(), count_law="per_pulse",
+            acquisitions=100.0, pulses_per_frame=1.0)),
+        "information": (analytic.histogram_information, dict(
+            signal=rows, background=floats(1, 8), taps=taps, slope_taps=taps, first_photon=True)),
+        "outliers": (analytic.outlier_probabilities, dict(signal_count=four(), level=four(), window=four())),
+        "sample_frames": (sk.sample_frames, maps | dict(
+            laser=(0, 0, 0), gate_paths=(1.0, 3.0), first_frame=0, frames=3, seed=1, out=None)),
+        "draw_frames": (analytic.draw_frames, maps | dict(coding=coding, alpha=floats(4), fraction=floats(2))),
+    }  # fmt: skip
     for method in ("peak", "centroid", "matched", "likelihood"):
-        calls[f"arrival_{method}"] = (sk.arrival_bins, {"histogram": counts, "method": method, **bins, "half_width": 2})
+        calls[f"arrival_{method}"] = (sk.arrival_bins, dict(histogram=counts, method=method, half_width=2, **bins))
     return calls | world_calls.valid_calls(mesh) | optics_calls.valid_calls(mesh)
 
 
@@ -236,11 +173,8 @@ def _changed(r, value):
         return dataclasses.replace(value, **{name: _changed(r, getattr(value, name))})
     if isinstance(value, sk.TransportSpec):
         name = r.choice(value._fields)
-        others = {
-            "estimator": ("none", "analog", "guided", "x", 3),
-            "phase": (sk.TABULATED, "x", None),
-            "lens": (sk.CALIBRATED, None, "x"),
-        }
+        others = {"estimator": ("none", "analog", "guided", "x", 3), "phase": (sk.TABULATED, "x", None)}
+        others["lens"] = (sk.CALIBRATED, None, "x")
         return value._replace(**{name: r.choice(others.get(name, (not getattr(value, name), "yes", None)))})
     if isinstance(value, PortKind):
         return r.choice((sk.DOME_PORT, None, *JUNK))
@@ -254,9 +188,7 @@ def _changed(r, value):
     if value is None:
         return r.choice((_array(r), _array(r), wp.zeros(288, dtype=wp.int64, device="cpu"), 3))
     if callable(value):
-        return r.choice(
-            (lambda t: np.full_like(t, np.nan), lambda t: 3, lambda t: -np.ones_like(t), lambda t: None, None)
-        )
+        return r.choice((lambda t: t * np.nan, lambda t: 3, lambda t: -np.ones_like(t), lambda t: None, None))
     return r.choice(NUMBERS + JUNK)
 
 
@@ -276,19 +208,15 @@ def _numpy(r, like, *, always=False):
     if always and not like.size:
         return np.array(like)
     if not like.size or (not always and r.random() < 0.4):
-        return r.choice(
-            (np.zeros(0), np.zeros((0, 3)), np.zeros(3), np.zeros((2, 3, 4)), np.array(["a"]), np.full(9, np.nan))
-        )
+        others = (np.zeros(0), np.zeros((0, 3)), np.zeros(3), np.zeros((2, 3, 4)), np.array(["a"]), np.full(9, np.nan))
+        return r.choice(others)
     changed = np.array(like)
     flat = changed.reshape(-1)
     for _ in range(r.choice((1, 2, flat.size))):
         odd = r.choice((np.nan, np.inf, -1, 0, 1e30, 2**31 - 1, 100, -(2**31)))
         if flat.dtype.kind in "iub":
-            odd = int(
-                np.clip(
-                    np.nan_to_num(odd), -(2**31) if flat.dtype.kind == "i" else 0, 2**31 - 1 if flat.itemsize > 2 else 1
-                )
-            )
+            lowest, highest = -(2**31) if flat.dtype.kind == "i" else 0, 2**31 - 1 if flat.itemsize > 2 else 1
+            odd = int(np.clip(np.nan_to_num(odd), lowest, highest))
         flat[r.randrange(flat.size)] = odd
     return changed
 

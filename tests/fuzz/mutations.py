@@ -55,15 +55,13 @@ def _line(r, data):
     k, j = r.randrange(len(lines)), r.randrange(len(lines))
     match r.randrange(5):
         case 0:
-            del lines[k]
+            del lines[k:]
         case 1:
             lines.insert(j, lines[k])
         case 2:
             lines[k], lines[j] = lines[j], lines[k]
-        case 3:
-            lines[k:] = []
-        case 4:
-            lines[k] = lines[k] * r.choice((2, 50))
+        case _:
+            lines[k] = lines[k] * r.choice((0, 2, 50))
     return b"\n".join(lines)
 
 
@@ -100,9 +98,8 @@ def _word(r, data):
     if len(data) < size:
         return data
     k = r.randrange(min(len(data) - size, r.choice((128, 1024, 10**9, 10**9))) + 1)
-    value = r.choice(
-        (0, 1, 2 ** (8 * size) - 1, 2 ** (8 * size - 1), 2 ** (8 * size - 1) - 1, r.randrange(2 ** (8 * size)))
-    )
+    whole, half = 2 ** (8 * size), 2 ** (8 * size - 1)
+    value = r.choice((0, 1, whole - 1, half, half - 1, r.randrange(whole)))
     return data[:k] + value.to_bytes(size, r.choice(("little", "big"))) + data[k + size :]
 
 
@@ -110,13 +107,7 @@ def _block(r, data):
     if len(data) < 8:
         return data
     k, n = r.randrange(len(data)), r.choice((1, 4, 16, 200))
-    match r.randrange(3):
-        case 0:
-            return data[:k] + data[k + n :]
-        case 1:
-            return data[:k] + data[k : k + n] * 2 + data[k + n :]
-        case _:
-            return data[:k] + bytes(n) + data[k + n :]
+    return data[:k] + r.choice((b"", data[k : k + n] * 2, bytes(n))) + data[k + n :]
 
 
 _TEXT = (_number, _number, _number, _number, _line, _key, _key, _junk, _cut, _flip)
@@ -155,16 +146,14 @@ def _remove(r, file, name):
 def _shape(r, file, name):
     value = file[name][()]
     if np.ndim(value) == 0:
-        _replace(file, name, np.zeros(3))
-        return
+        return _replace(file, name, np.zeros(3))
     other = r.choice((value[..., :0], value[:1], value[None], np.concatenate([value, value]), value.ravel(), value.T))
-    _replace(file, name, other)
+    return _replace(file, name, other)
 
 
 def _kind(r, file, name):
-    value = file[name][()]
     kind = r.choice(("f2", "f8", "i1", "u8", "c16", "S5", "bool"))
-    _replace(file, name, np.zeros(np.shape(value), kind))
+    _replace(file, name, np.zeros(np.shape(file[name][()]), kind))
 
 
 def _values(r, file, name):

@@ -6,7 +6,9 @@ Each case runs in a child process of its own, forked from this one in which ever
 
 import argparse
 import collections
+import contextlib
 import gc
+import io
 import json
 import os
 import sys
@@ -19,10 +21,11 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 sys.path[:0] = [str(Path(__file__).parents[1])]
 
 from fuzz import kernel_calls
-from fuzz.cases import CATEGORIES, Case, draw
+from fuzz.cases import CATEGORIES, draw
 from fuzz.command_lines import program
 from fuzz.corpus import Corpus, make_corpus
 from fuzz.executed import run_case
+from helpers.cli import run as run_command
 from helpers.coarse_pictures import coarse_pictures
 
 FINE = ("done", "refused")
@@ -30,34 +33,28 @@ FINE = ("done", "refused")
 
 def warm_up(corpus: Path) -> None:
     """Loads what the commands load, and compiles or loads the kernels."""
-    files = ("scene.toml", "calibrated.toml", "result.h5", "frames.h5", "counts.npy", "counts.ptu", "depth.exr")
-    options = ("--input", "bin_width=200ps,gate_start=1ns,group_index=1,irf=300ps")
-    sys.stderr.flush()
-    import contextlib
-    import io
-
-    from typer.testing import CliRunner
-
-    import spadwarp.cli
-
+    counts = ("--input", "bin_width=200ps,gate_start=1ns,group_index=1,irf=300ps")
+    cpu = ("--device", "cpu")
     with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(io.StringIO()):
-        place = dict(zip(files, (str(corpus / name) for name in files), strict=True))
-        for number, arguments in enumerate(
-            (
-                ("simulate", place["calibrated.toml"], "--photons", "50"),
-                ("analytic", place["scene.toml"], "--frames", "1"),
-                ("detect", place["result.h5"], "--pulses", "9"),
-                ("depth", place["counts.npy"], *options, "--method", "likelihood"),
-                ("depth", place["counts.ptu"], *options, "--method", "peak"),
-                ("denoise", str(corpus / "depth.npy"), "--model", "usdn"),
-                ("export", place["frames.h5"], "--format", "mat"),
-                ("view", place["result.h5"]),
-            )
-        ):
-            where = f"{out}/v.html" if arguments[0] == "view" else f"{out}/{number}"
-            device = () if arguments[0] == "export" else ("--device", "cpu")
-            done = CliRunner().invoke(spadwarp.cli.app, [*arguments, "--out", where, *device])
-            assert done.exit_code == 0, (arguments, done.output, done.exception)
+        for number, (command, name, *rest) in enumerate((
+            ("simulate", "calibrated.toml", "--photons", "50", *cpu),
+            ("analytic", "scene.toml", "--frames", "1", *cpu),
+            ("detect", "result.h5", "--pulses", "9", *cpu),
+            ("depth", "counts.npy", *counts, "--method", "likelihood", *cpu),
+            ("depth", "counts.ptu", *counts, "--method", "peak", *cpu),
+            ("denoise", "depth.npy", "--model", "usdn", *cpu),
+            ("export", "frames.h5", "--format", "mat"),
+            ("view", "result.h5", *cpu),
+        )):  # fmt: skip
+            run_command(command, corpus / name, *rest, "--out", f"{out}/{number}{'.html' * (command == 'view')}")
+
+
+def verdict_of(category: str, number: int, corpus: Corpus) -> tuple[str, str, str]:
+    """Verdict, text and what was run."""
+    if category == "kernels":
+        return *kernel_calls.run(number), "kernels"
+    case = draw(number, corpus, category)
+    return *run_case(case, corpus.folder), " ".join(case.arguments)[:300]
 
 
 def main() -> int:
@@ -67,10 +64,8 @@ def main() -> int:
     parser.add_argument("--only", default=",".join([*CATEGORIES, "kernels"]), help="categories, separated by commas")
     parser.add_argument("--out", help="findings as JSON lines")
     options = parser.parse_args()
-    names = options.only.split(",")
+    names, findings, began = options.only.split(","), 0, time.monotonic()
     counts = {name: collections.Counter() for name in names}
-    findings = []
-    began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="corpus-") as folder:
         corpus = Corpus(Path(folder))
         make_corpus(corpus.folder)
@@ -83,24 +78,20 @@ def main() -> int:
         gc.freeze()  # else the first collection of every child copies this process's memory
         for number in range(options.first, options.first + options.cases):
             category = names[number % len(names)]
-            if category == "kernels":
-                about, (verdict, text) = "kernels", kernel_calls.run(number)
-            else:
-                case: Case = draw(number, corpus, category)
-                about, (verdict, text) = " ".join(case.arguments)[:300], run_case(case, corpus.folder)
+            verdict, text, about = verdict_of(category, number, corpus)
             counts[category][verdict] += 1
             if verdict not in FINE:
-                finding = {"case": number, "category": category, "verdict": verdict, "about": about, "text": text}
-                findings.append(finding)
+                findings += 1
                 print(f"{category} {number}: {verdict}: {about}\n{text}\n", file=sys.stderr, flush=True)
                 if options.out:
+                    finding = dict(case=number, category=category, verdict=verdict, about=about, text=text)
                     with open(options.out, "a") as file:
                         file.write(json.dumps(finding) + "\n")
     verdicts = sorted({verdict for one in counts.values() for verdict in one}, key=lambda one: (one not in FINE, one))
     print(f"{'':12}" + "".join(f"{verdict:>12}" for verdict in verdicts))
     for name, one in counts.items():
         print(f"{name:12}" + "".join(f"{one[verdict]:12}" for verdict in verdicts))
-    print(f"{options.cases} cases, {len(findings)} findings, {time.monotonic() - began:.0f} s")
+    print(f"{options.cases} cases, {findings} findings, {time.monotonic() - began:.0f} s")
     return 1 if findings else 0
 
 

@@ -12,19 +12,19 @@ from fuzz.isolation import run_isolated
 RUN = Path(__file__).with_name("run.py")
 
 
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="cases run in forked processes")
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="cases run in forked processes")
 def test_damaged_files_and_odd_commands(request, tmp_path):
     """`--fuzz N` runs N cases. Each is the same every time: `run.py 1 --first NUMBER` repeats one."""
-    count, findings = request.config.getoption("--fuzz"), tmp_path / "findings.jsonl"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, str(RUN), str(count), "--out", str(findings)]
+    command = [sys.executable, str(RUN), str(request.config.getoption("--fuzz"))]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     print(done.stdout)
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr[-6000:]}"
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="cases run in forked processes")
 @pytest.mark.parametrize(
     ("call", "kind", "value"),
     [
@@ -40,6 +40,5 @@ def test_the_harness_sees_how_a_call_ends(call, kind, value):
     assert (outcome.kind, outcome.value) == (kind, value), outcome
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="cases run in forked processes")
 def test_the_harness_ends_what_hangs():
     assert run_isolated(lambda: os.read(os.pipe()[0], 1), seconds=0.3).kind == "hang"

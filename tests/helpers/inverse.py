@@ -11,7 +11,7 @@ TABLES = {
     "laser": {
         "preset": "picoquant-visuv-532",
         "half_angle_deg": 14.0,
-        "position": [-0.05, 0.0, 0.0],
+        "position": [-0.05, 0, 0],
         "pulse_energy": 1e-13,
     },
     "camera": {"width": 8, "height": 8, "horizontal_fov_deg": 22.0, "aperture_diameter": 0.02},

@@ -9,10 +9,6 @@ from helpers.launch import on_device
 
 def mesh_and_surfaces(shape, device, *, builder=None, leaf_size=1):
     """The mesh, which has to outlive its surfaces, and these."""
-    mesh = wp.Mesh(
-        on_device(shape.vertices, device),
-        on_device(np.ravel(shape.faces), device, int),
-        bvh_constructor=builder,
-        bvh_leaf_size=leaf_size,
-    )
+    arrays = on_device(shape.vertices, device), on_device(np.ravel(shape.faces), device, int)
+    mesh = wp.Mesh(*arrays, bvh_constructor=builder, bvh_leaf_size=leaf_size)
     return mesh, sk.make_surfaces(mesh)

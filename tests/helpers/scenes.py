@@ -18,17 +18,8 @@ LAYERS = [
     {"start": 1.2, "extinction": 1.5, "albedo": 0.6, "anisotropy": 0.5},
     {"start": 1.7, "extinction": 0.2, "albedo": 0.9},
 ]
-PLUME = {
-    "shape": "plume",
-    "size": [1.4, 1.4, 1.2],
-    "cells": 24,
-    "extinction": 6.0,
-    "albedo": 0.7,
-    "anisotropy": 0.6,
-    "turbulence": 0.5,
-    "seed": 5,
-    "translation": [0.0, 0.0, 1.2],
-}
+PLUME = {"shape": "plume", "size": [1.4, 1.4, 1.2], "cells": 24, "extinction": 6.0, "albedo": 0.7, "anisotropy": 0.6}
+PLUME |= {"turbulence": 0.5, "seed": 5, "translation": [0.0, 0.0, 1.2]}
 PENCIL = {"profile": "collimated", "position": [0.0, 0.0, 0.0]}
 
 

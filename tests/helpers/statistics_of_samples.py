@@ -27,8 +27,7 @@ def equal_means_p(a, b, converged=0.2):
     """Family-wise p-value that two estimators have the same mean in every cell in which both have converged.
 
     a, b: `[seeds, cells]`. Converged: the standard error from the spread between seeds is below that part of the mean
-        (a cell
-    that hardly ever scores has no normal mean). Welch's t a cell, Bonferroni over the cells.
+    (a cell that hardly ever scores has no normal mean). Welch's t a cell, Bonferroni over the cells.
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     known = [x.std(axis=0, ddof=1) / np.sqrt(len(x)) < converged * np.abs(x.mean(axis=0)) for x in (a, b)]

@@ -1,11 +1,8 @@
 """Results made from closed forms, without transport, for tests of what comes after it."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-from spadwarp.mesh import TriangleMesh, build_mesh
+from spadwarp.mesh import build_mesh
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import pixel_directions
@@ -13,56 +10,44 @@ from spadwarp.scene.sight import pixel_directions
 UNIT = 2.0**-60
 
 
-def make_scene(
-    *, width: int = 16, height: int = 12, bins: int = 48, distance: float = 14.89, **sections: dict
-) -> Scene:
+def make_scene(*, width=16, height=12, bins=48, distance=14.89, **sections):
     """The staircase with its plate at `distance` [m], the gate on it, the laser 10 cm beside the lens."""
-    start_path = 2 * (distance - 1.0)
+    nanoseconds = 1.3638 / 0.299792458  # of a metre
+    gate = {"start_ns": 2 * (distance - 1.0) * nanoseconds, "bin_width_ps": 2.6e3 / bins * nanoseconds, "bins": bins}
     tables = {
         "medium": {"extinction": 0.3, "albedo": 0.8},
         "laser": {"position": [0.1, 0.0, 0.0]},
         "camera": {"width": width, "height": height, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
-        "gate": {
-            "start_ns": start_path * 1.3638 / 0.299792458,
-            "bin_width_ps": 2.6 / bins * 1.3638 / 0.299792458e-3,
-            "bins": bins,
-        },
+        "gate": gate,
         "targets": [{"builtin": "staircase", "translation": [0.0, 0.0, distance]}],
     }
     return Scene.from_dict(tables | sections)
 
 
-def make_result(scene: Scene, *, photons: int = 10**9, seed: int = 7, empty: bool = False) -> Result:
+def make_result(scene, *, photons=10**9, seed=7, empty=False):
     """Ballistic returns by the lidar equation with shot noise, a tail behind them, single backscatter before them."""
-    mesh = build_mesh(scene)
-    truth = cast_truth(scene, mesh)
-    tallies = np.zeros((3, scene.camera.height, scene.camera.width, scene.gate.bins), dtype=np.int64)
+    lost = {"absorbed_water": 3 * photons << 20, "weight_cutoff": 2 * photons << 20, "roulette": -(photons << 20)}
     result = Result(
         scene=scene,
-        tallies=tallies,
+        tallies=np.zeros((3, scene.camera.height, scene.camera.width, scene.gate.bins), dtype=np.int64),
         unit=UNIT,
         photons=photons,
         seed=seed,
-        energy_balance={
-            "absorbed_water": 3 * photons << 20,
-            "weight_cutoff": 2 * photons << 20,
-            "roulette": -(photons << 20),
-        },
+        energy_balance=lost,
         energy_balance_unit=2.0**-22,
         counters={"water_collisions": 13 * photons, "after_gate": 5},
-        truth=truth,
+        truth=cast_truth(scene, build_mesh(scene)),
         timing={"transport": 1.25},
         provenance={"device": "cpu", "versions": {"spadwarp": "0.1.0"}},
     )
-    if not empty:
-        rng = np.random.default_rng(seed)
-        for index, expected in enumerate(_components(result)):
-            samples = rng.poisson(expected * photons * 1e8)  # stands for an estimator's noise
-            tallies[index] = np.round(samples / 1e8 / UNIT)
+    rng = np.random.default_rng(seed)
+    for index, expected in enumerate([] if empty else _components(result)):
+        samples = rng.poisson(expected * photons * 1e8)  # stands for an estimator's noise
+        result.tallies[index] = np.round(samples / 1e8 / UNIT)
     return result
 
 
-def _components(result: Result) -> list[NDArray[np.float64]]:
+def _components(result):
     scene = result.scene
     c, area = scene.medium.extinction, scene.camera.aperture_area
     edges, path = result.path_edges, result.true_path()
@@ -71,29 +56,21 @@ def _components(result: Result) -> list[NDArray[np.float64]]:
     weight = 0.05 * result.truth.reflectance * cosine * np.exp(-c * path) * area / (path / 2) ** 2
     weight = np.nan_to_num(weight) / path.size * 25
     first = np.searchsorted(edges, np.nan_to_num(path), side="right") - 1
-    inside = (first >= 0) & (first < len(centres))
-    ballistic = np.zeros((*path.shape, len(centres)))
-    rows, columns = np.nonzero(inside)
-    ballistic[rows, columns, first[inside]] = weight[inside]
+    ballistic = weight[..., None] * (np.arange(len(centres)) == first[..., None])
     delay = centres - path[..., None]
     tail = np.where(delay > 0, np.exp(-np.clip(delay, 0, None) / 0.3), 0.0)
-    forward = 0.05 * np.nan_to_num(tail) * weight[..., None]
     back = 0.01 * area * np.exp(-c * centres) / centres**2 / path.size
-    back = np.where(~(delay > 0), back, 0.1 * back)
-    return [ballistic, forward, back]
+    return [ballistic, 0.05 * np.nan_to_num(tail) * weight[..., None], np.where(delay > 0, 0.1 * back, back)]
 
 
-def cast_truth(scene: Scene, mesh: TriangleMesh | None) -> Truth:
+def cast_truth(scene, mesh=None):
     """Truth maps by trying every triangle (Möller and Trumbore 1997), float64."""
     rays = pixel_directions(scene.camera)
     shape = rays.shape[:2]
-    nearest = np.full(shape, np.inf)
-    face = np.full(shape, -1)
-    normals = np.zeros((0, 3))
+    nearest, face = np.full(shape, np.inf), np.full(shape, -1)
+    normal, reflectance = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
     if mesh is not None:
         corners = mesh.vertices[mesh.faces].astype(np.float64)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         for index, (a, b, c) in enumerate(corners):
             p = np.cross(rays, c - a)
             det = p @ (b - a)
@@ -104,14 +81,12 @@ def cast_truth(scene: Scene, mesh: TriangleMesh | None) -> Truth:
                 inside = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9)
             hit = inside & (np.abs(det) > 1e-12) & (t > 0) & (t < nearest)
             nearest[hit], face[hit] = t[hit], index
-    seen = face >= 0
-    normal = np.full((*shape, 3), np.nan)
-    reflectance = np.full(shape, np.nan)
-    distance = np.where(seen, nearest, np.nan)
-    if mesh is not None:
-        towards = normals[face[seen]]
+        seen = face >= 0
+        towards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[face[seen]]
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         facing = (towards * rays[seen]).sum(-1, keepdims=True) > 0
         normal[seen] = np.where(facing, -towards, towards)
         reflectance[seen] = mesh.reflectance[face[seen]]
+    distance = np.where(face >= 0, nearest, np.nan)
     maps = {"depth": distance * rays[..., 2], "range": distance, "normal": normal, "reflectance": reflectance}
     return Truth(**{name: array.astype(np.float32) for name, array in maps.items()})

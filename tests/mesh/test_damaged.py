@@ -1,5 +1,6 @@
 """Mesh files that somebody has changed: an error that names the file, whether their colours count or not."""
 
+import io
 import json
 import struct
 
@@ -32,6 +33,16 @@ def refused(path, words=""):
         assert path.name in str(caught.value) and words in str(caught.value), caught.value
 
 
+def coloured(folder, material, coordinates="0 0", lines="mtllib box.mtl", image=None):
+    """The target of a triangle with such a material, and an image beside it."""
+    text = f"{lines}\n{TRIANGLE}vt {coordinates}\nvt 1 0\nvt 0 1\nusemtl one\nf 1/1 2/2 3/3\n"
+    (folder / "box.obj").write_text(text)
+    (folder / "box.mtl").write_text(f"newmtl one\n{material}\n")
+    if image is not None:
+        (folder / "box.png").write_bytes(image)
+    return Target(mesh=str(folder / "box.obj"), reflectance="from_file")
+
+
 @pytest.mark.parametrize("name", TEXTS)
 def test_text_with_wrong_numbers(name, tmp_path):
     text, words = TEXTS[name]
@@ -39,43 +50,35 @@ def test_text_with_wrong_numbers(name, tmp_path):
     refused(tmp_path / name, words)
 
 
-def test_mtllib_without_a_name(tmp_path):
-    for line in ("mtllib", "mtllib   "):
-        (tmp_path / "box.obj").write_text(f"{line}\n{TRIANGLE}f 1 2 3\n")
-        with pytest.raises(MeshError, match="mtllib stands without"):
-            load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
-
-
 @pytest.mark.parametrize(
     "colour", ["0.4 0.3", "0.4 0.3 0.2 0.1 0", "spectral file.rfl", "0.4 x 0.3", "1e999 0 0", "", "0", "0.5"]
 )
 def test_material_colours_that_are_none(colour, tmp_path):
-    (tmp_path / "box.obj").write_text(f"mtllib box.mtl\n{TRIANGLE}vt 0 0\nusemtl one\nf 1/1 2/1 3/1\n")
-    (tmp_path / "box.mtl").write_text(f"newmtl one\nKd {colour}\n")
     with pytest.raises(MeshError, match=r"box\.obj.*(red, green and blue|colour component)"):
-        load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
+        load_target(coloured(tmp_path, f"Kd {colour}"))
 
 
-def test_an_image_of_a_material_that_is_none(tmp_path):
-    """trimesh passes over it, and would leave the material's plain colour."""
-    (tmp_path / "box.obj").write_text(f"mtllib box.mtl\n{TRIANGLE}vt 0 0\nusemtl one\nf 1/1 2/1 3/1\n")
-    (tmp_path / "box.mtl").write_text("newmtl one\nKd 0.4 0.4 0.4\nmap_Kd box.png\n")
-    (tmp_path / "box.png").write_bytes(b"\x89PNG and no more")
+def test_materials_that_are_not_there(tmp_path):
+    for line in ("mtllib", "mtllib   "):
+        with pytest.raises(MeshError, match="mtllib stands without"):
+            load_target(coloured(tmp_path, "Kd 0.4 0.4 0.4", lines=line))
+    # trimesh passes over such an image, and would leave the material's plain colour.
     with pytest.raises(MeshError, match=r"box\.png.*no image"):
-        load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
+        load_target(coloured(tmp_path, "Kd 0.4 0.4 0.4\nmap_Kd box.png", image=b"\x89PNG and no more"))
 
 
-@pytest.mark.parametrize("coordinates", ["0", "nan 0", "0 inf", "0 0 0"])
-def test_texture_coordinates_are_two_finite_numbers(coordinates, tmp_path):
-    Image.new("RGB", (2, 2)).save(tmp_path / "box.png")
-    (tmp_path / "box.obj").write_text(f"mtllib box.mtl\n{TRIANGLE}vt {coordinates}\nusemtl one\nf 1/1 2/1 3/1\n")
-    (tmp_path / "box.mtl").write_text("newmtl one\nmap_Kd box.png\n")
-    target = Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file")
-    if coordinates == "0 0 0":  # a third one is allowed by the format
-        assert load_target(target)
-        return
-    with pytest.raises(MeshError, match="texture coordinates"):
-        load_target(target)
+def png(values):
+    stream = io.BytesIO()
+    Image.fromarray(values).save(stream, "png")
+    return stream.getvalue()
+
+
+def test_texture_coordinates_are_two_finite_numbers(tmp_path):
+    options = {"material": "map_Kd box.png", "image": png(np.zeros((2, 2, 3), np.uint8))}
+    assert load_target(coloured(tmp_path, coordinates="0 0 0", **options))  # a third one is allowed by the format
+    for coordinates in ("0", "nan 0", "0 inf"):
+        with pytest.raises(MeshError, match="texture coordinates"):
+            load_target(coloured(tmp_path, coordinates=coordinates, **options))
 
 
 @pytest.fixture
@@ -130,12 +133,7 @@ def test_a_broken_image_in_glb(glb, tmp_path, damage):
 
 def test_a_broken_image_beside_obj(tmp_path, capfd):
     """Pillow opens it and fails when the pixels are read; trimesh's own warnings do not reach the terminal."""
-    Image.fromarray(np.random.default_rng(1).integers(255, size=(64, 64, 3), dtype=np.uint8)).save(tmp_path / "a.png")
-    content = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
-    (tmp_path / "box.mtl").write_text("newmtl one\nmap_Kd a.png\n")
-    lines = "mtllib box.mtl\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl one\n"
-    (tmp_path / "box.obj").write_text(TRIANGLE + lines + "f 1/1 2/2 3/3\n")
+    content = png(np.random.default_rng(1).integers(255, size=(64, 64, 3), dtype=np.uint8))
     with pytest.raises(MeshError, match=r"box\.obj"):
-        load_target(Target(mesh=str(tmp_path / "box.obj"), reflectance="from_file"))
+        load_target(coloured(tmp_path, "map_Kd box.png", image=content[: len(content) // 2]))
     assert "Traceback" not in capfd.readouterr().err

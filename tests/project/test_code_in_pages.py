@@ -1,8 +1,10 @@
-"""Code in the documentation runs: Python as it stands, commands at a small size, or a reason why not."""
+"""Code in the documentation runs, at a small size, or there is a reason why not."""
 
+import os
 import re
 import runpy
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -28,7 +30,9 @@ SMALLER = {
     r"^(spadwarp fit .*)": r"\1 --set camera.width=16 --set camera.height=12",
     r"^(spadwarp plan .*)": r"\1 --photons 5e3 --no-range",
     r"--pulses 20000": "--pulses 500",
-    r"--steps 24": "--steps 9",
+    r"--steps 24": "--steps 3",
+    r"=1:40:40": "=1:40:3",
+    r"(view .*\.gif)$": r"\1 --pictures 3",
     r"--size 320 240": "--size 64 48",
     r"spadwarp dataset \S+": "spadwarp dataset small --set scenes_per_target=1 --set frames.per_scene=2",
     r"dataset small --set": "dataset small --set scenes_per_shard=1 --set",
@@ -36,6 +40,8 @@ SMALLER = {
     r"^spadwarp evaluate ": "spadwarp evaluate --frames 1 ",
     r"--device cuda:\w+": "--device cpu",
 }
+
+SMALLER_PYTHON = {r"photons=[12]00_000, (frame|seed)": r"photons=20_000, \1", r"range\(60\)": "range(3)"}
 
 # What does not run here, and why.
 LEFT_OUT = {
@@ -62,16 +68,15 @@ def blocks(page):
 
 def lines(code):
     """Commands of a shell block, one each, without comments."""
-    for line in code.replace("\\\n", " ").splitlines():
-        yield re.sub(r"\s+#.*", "", line).strip()
+    return [re.sub(r"\s+#.*", "", line).strip() for line in code.replace("\\\n", " ").splitlines()]
 
 
-WITH_PYTHON = [
-    page for page in PAGES[1:] if page != TUTORIAL and any(language == "python" for language, _ in blocks(page))
-]
-WITH_COMMANDS = [
-    page for page in PAGES if page != TUTORIAL and any(language in ("sh", "bash") for language, _ in blocks(page))
-]
+def commands(page):
+    return [line for language, code in blocks(page) if language in ("sh", "bash") for line in lines(code)]
+
+
+WITH_PYTHON = [page for page in PAGES if page != TUTORIAL and "python" in dict(blocks(page))]
+WITH_COMMANDS = [page for page in PAGES if page != TUTORIAL and commands(page)]
 
 
 @pytest.fixture
@@ -84,16 +89,18 @@ def checkout(tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     coarse_pictures(monkeypatch.setattr)
     yield folder
-    left = {path.name for path in folder.iterdir()} - {
-        "configs",
-        "kernels",
-        "out",
-        "data",
-        "runs",
-        "bust.stl",
-        "poses.csv",
-    }
+    left = {path.name for path in folder.iterdir()}
+    left -= {"configs", "kernels", "out", "data", "runs", "bust.stl", "poses.csv"}
     assert not left, f"{left} would be left in the checkout"
+
+
+def program_of(page, folder):
+    """The Python blocks of a page, one after the other, as a file: Warp reads the source of kernels."""
+    code = "\n".join(code for language, code in blocks(page) if language == "python")
+    for pattern, smaller in SMALLER_PYTHON.items():
+        code = re.sub(pattern, smaller, code)
+    (folder / "program.py").write_text(code, encoding="utf-8")
+    return str(folder / "program.py")
 
 
 def run_small(line):
@@ -112,12 +119,18 @@ def run_small(line):
         run(*arguments)
 
 
+@pytest.mark.filterwarnings("ignore:Monte Carlo noise")
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=by_name)
 def test_python_in_the_text_runs(page, checkout, tmp_path):
-    """The blocks of a page, one after the other, as one program in a checkout."""
-    program = tmp_path / "program.py"  # a file, since Warp reads the source of kernels
-    program.write_text("\n".join(code for language, code in blocks(page) if language == "python"), encoding="utf-8")
-    runpy.run_path(str(program))
+    runpy.run_path(program_of(page, tmp_path))
+
+
+@pytest.mark.slow
+def test_python_of_the_kernels_runs_without_spadwarp_in_reach(tmp_path):
+    command = [sys.executable, program_of(ROOT / "kernels" / "README.md", tmp_path)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "kernels")}
+    process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert "reach the plate without a collision" in process.stdout, process.stderr
 
 
 @pytest.mark.slow
@@ -129,10 +142,9 @@ def test_commands_in_the_text_run(page, checkout):
     if page.name == "denoising.md":
         Path("out").mkdir()
         np.save("out/depth.npy", np.full((24, 32), 15.0))
-        spadwarp.simulate("plane_5m", photons=100_000).save("out/result.h5")
-    for language, code in blocks(page):
-        for line in lines(code) if language in ("sh", "bash") else ():
-            run_small(line)
+        spadwarp.simulate("plane_5m", photons=20_000).save("out/result.h5")
+    for line in commands(page):
+        run_small(line)
 
 
 @pytest.mark.slow
@@ -150,7 +162,5 @@ def test_tutorial_runs(checkout):
 
 
 def test_everything_that_is_left_out_stands_in_a_page():
-    text = [
-        line for page in PAGES for language, code in blocks(page) if language in ("sh", "bash") for line in lines(code)
-    ]
+    text = [line for page in PAGES for line in commands(page)]
     assert not [pattern for pattern in LEFT_OUT if not any(re.search(pattern, line) for line in text)]

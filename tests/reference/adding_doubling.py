@@ -48,20 +48,8 @@ def slab(
     beam = nodes or _needed_nodes(anisotropy)
     asked = np.maximum(np.atleast_1d(np.asarray(mu, np.float64)), 1e-14)
     cosines, flux = _nodes(beam, asked)
-
-    half_space = optical_depth == math.inf
-    target = 64.0 if half_space else optical_depth
-    depth = target * 2.0**-_START
-    same, opposite = _redistribution(cosines, anisotropy)
-    reflect, transmit = _single_scattering(cosines, same, opposite, albedo, depth)
-    doublings = 0
-    while doublings < _START or (half_space and np.abs(transmit).max() > 1e-14):
-        # not by squaring: forty squarings of 1 - 1e-12 would leave an error of 1e-6 in the energy
-        layer = (reflect, transmit, np.exp(-depth * 2.0**doublings / cosines))
-        reflect, transmit, _ = _add(layer, layer, flux)
-        doublings += 1
-    direct = 0.0 if half_space else np.exp(-optical_depth)
-
+    reflect, transmit, _ = _doubled(cosines, flux, anisotropy, albedo, optical_depth)
+    direct = 0.0 if optical_depth == math.inf else np.exp(-optical_depth)
     return Slab(
         reflected=_real(flux @ reflect[:, beam]),
         transmitted=_real(flux @ transmit[:, beam] + direct),
@@ -82,33 +70,23 @@ def exit_cosine_fractions(
     mu = edges[:-1, None] + width * (x + 1) / 2
     solved = slab(anisotropy=anisotropy, albedo=albedo, optical_depth=optical_depth, mu=mu.ravel())
     weight = 2 * mu * width * gauss / 2
-    return (solved.reflection.reshape(mu.shape) * weight).sum(1), (solved.transmission.reshape(mu.shape) * weight).sum(
-        1
-    )
+    back, forth = ((face.reshape(mu.shape) * weight).sum(1) for face in (solved.reflection, solved.transmission))
+    return back, forth
 
 
 def cumulative_reflectance(
-    path: float,
-    *,
-    anisotropy: float,
-    scattering: float,
-    absorption: float,
-    thickness: float = math.inf,
-    nodes: int | None = None,
+    path: float, *, anisotropy: float, scattering: float, absorption: float, nodes: int | None = None
 ) -> float:
-    """Fraction of a normally incident pulse that has left the lit face after at most `path` [m] in the medium.
+    """Fraction of a pulse on a half-space, at normal incidence, that has left it after at most `path` [m] in it.
 
     The Laplace transform over path is R at the absorption s; inverted for its running integral with the Euler
     summation of Abate and Whitt (1995), and with the absorption's own decay put back by shifting s. Error about 1e-8.
     """
-    terms, euler = 24, 14
-    a = 19.0
+    terms, euler, a = 24, 14, 19.0
 
     def transform(s: complex) -> complex:
-        extinction = scattering + absorption + s
-        depth = math.inf if thickness == math.inf else extinction * thickness
-        solved = slab(anisotropy=anisotropy, albedo=scattering / extinction, optical_depth=depth, nodes=nodes)
-        return solved.reflected / s
+        albedo = scattering / (scattering + absorption + s)
+        return slab(anisotropy=anisotropy, albedo=albedo, optical_depth=math.inf, nodes=nodes).reflected / s
 
     values = [transform(complex(a, 2 * math.pi * k) / (2 * path)).real for k in range(terms + euler + 1)]
     series = values[0] / 2 + np.cumsum([0.0] + [(-1) ** k * values[k] for k in range(1, terms + euler + 1)])
@@ -166,6 +144,20 @@ def _single_scattering(cosines: NDArray, same: NDArray, opposite: NDArray, albed
     return reflect, transmit
 
 
+def _doubled(cosines: NDArray, flux: NDArray, anisotropy: float, albedo: complex, optical_depth: complex):
+    """Reflection, diffuse transmission and direct beam of a uniform layer, from one so thin that it scatters once."""
+    half_space = optical_depth == math.inf
+    depth = (64.0 if half_space else optical_depth) * 2.0**-_START
+    reflect, transmit = _single_scattering(cosines, *_redistribution(cosines, anisotropy), albedo, depth)
+    doublings = 0
+    while doublings < _START or (half_space and np.abs(transmit).max() > 1e-14):
+        # not by squaring: forty squarings of 1 - 1e-12 would leave an error of 1e-6 in the energy
+        layer = (reflect, transmit, np.exp(-depth * 2.0**doublings / cosines))
+        reflect, transmit, _ = _add(layer, layer, flux)
+        doublings += 1
+    return reflect, transmit, np.exp(-depth * 2.0**doublings / cosines)
+
+
 def _add(upper: tuple[NDArray, NDArray, NDArray], lower: tuple[NDArray, NDArray, NDArray], flux: NDArray):
     """Reflection, transmission and direct beam of a uniform layer on top of another or of a stack, lit from above.
 
@@ -188,17 +180,9 @@ def stack(layers: Sequence[tuple[float, float, float]], *, nodes: int | None = N
     incidence."""
     nodes = nodes or max(_needed_nodes(anisotropy) for anisotropy, *_ in layers)
     cosines, flux = _nodes(nodes)
-    solved = []
-    for anisotropy, albedo, optical_depth in layers:
-        depth = optical_depth * 2.0**-_START
-        reflect, transmit = _single_scattering(cosines, *_redistribution(cosines, anisotropy), albedo, depth)
-        for doubling in range(_START):
-            direct = np.exp(-depth * 2.0**doubling / cosines)
-            reflect, transmit, _ = _add((reflect, transmit, direct), (reflect, transmit, direct), flux)
-        solved.append((reflect, transmit, np.exp(-optical_depth / cosines)))
-    whole = solved.pop()
-    while solved:
-        whole = _add(solved.pop(), whole, flux)
+    *others, whole = (_doubled(cosines, flux, *layer) for layer in layers)
+    while others:
+        whole = _add(others.pop(), whole, flux)
     reflect, transmit, direct = whole
     return float(flux @ reflect[:, nodes]), float(flux @ transmit[:, nodes] + direct[nodes])
 

@@ -1,4 +1,7 @@
-"""Published Stokes vectors of Rayleigh-scattering slabs, in the conventions of `vector_slab`.
+"""Published Stokes vectors of what Rayleigh-scattering slabs reflect.
+
+Azimuths φ of the directions of propagation, anticlockwise seen from above; Q = ⟨E_φ² − E_θ²⟩ and U = 2⟨E_θ·E_φ⟩, with
+θ̂ and φ̂ of increasing zenith angle and azimuth, at the zenith those of the meridian φ.
 
 Rows: face, µ, azimuth of propagation from that of the beam [°], I, Q, U for a flux of π; without depolarisation.
 Natraj, Li & Yung (2009, ApJ 691, 1909), which corrects Coulson, Dave & Sekera (1960); Natraj & Hovenier (2012, ApJ 748,
@@ -7,7 +10,7 @@ Natraj, Li & Yung (2009, ApJ 691, 1909), which corrects Coulson, Dave & Sekera (
 
 from dataclasses import dataclass
 
-UPPER, LOWER = "upper", "lower"
+UPPER = "upper"
 Row = tuple[str, float, float, float, float, float]
 
 
@@ -37,10 +40,6 @@ TABLES = (
         (UPPER, 0.40, 60.0, 0.12752450, -0.06066038, 0.05293867),
         (UPPER, 1.00, 0.0, 0.05300496, 0.03755859, 0.0),
         (UPPER, 1.00, 60.0, 0.05300496, -0.01877930, 0.03252669),
-        (LOWER, 0.10, 0.0, 0.13485741, -0.01538451, 0.0),
-        (LOWER, 0.20, 90.0, 0.10033646, -0.07022742, 0.02479837),
-        (LOWER, 0.84, 180.0, 0.05854240, 0.03041692, 0.0),
-        (LOWER, 1.00, 0.0, 0.04682203, 0.03225729, 0.0),
     )),
     Table("Kokhanovsky et al. 2010", 0.3262, 0.5, 0.0, 1e-6, tuple(
         (face, mu, phi, 0.5 * i, 0.5 * q, 0.5 * u) for face, mu, phi, i, q, u in (
@@ -48,8 +47,6 @@ TABLES = (
             (UPPER, 0.7660444431, 0.0, 0.1560517, 0.1140612, 0.0),
             (UPPER, 0.7660444431, 90.0, 0.1746397, -0.08605730, 0.07322031),
             (UPPER, 0.0174524064, 90.0, 0.5458706, -0.2592859, 0.3917105),
-            (LOWER, 0.7660444431, 90.0, 0.1689676, -0.08295291, 0.07055535),
-            (LOWER, 0.7660444431, 180.0, 0.1509949, 0.1096469, 0.0),
         )
     )),
     Table("Natraj et al. 2009", 1.0, 0.6, 0.8, 1e-8, (
@@ -57,9 +54,6 @@ TABLES = (
         (UPPER, 0.52, 0.0, 0.47725195, 0.11269547, 0.0),
         (UPPER, 0.84, 120.0, 0.50469021, -0.06450226, 0.00462844),
         (UPPER, 1.00, 0.0, 0.46917958, 0.06476738, 0.0),
-        (LOWER, 0.20, 120.0, 0.46930289, -0.02910950, 0.09788965),
-        (LOWER, 0.52, 60.0, 0.44678528, -0.06285040, 0.05299454),
-        (LOWER, 0.84, 180.0, 0.31265451, 0.08807208, 0.0),
     )),
     Table("Natraj & Hovenier 2012", 2.0, 0.5, 0.25, 1e-8, _hovenier((
         (UPPER, 0.10, 0.0, 0.52908133, -0.03666586, 0.0),
@@ -67,8 +61,5 @@ TABLES = (
         (UPPER, 0.50, 180.0, 0.49055823, 0.03618719, 0.0),
         (UPPER, 0.90, 90.0, 0.28930984, 0.08588871, -0.04780830),
         (UPPER, 1.00, 0.0, 0.27723461, -0.08017274, 0.0),
-        (LOWER, 0.10, 90.0, 0.13217771, 0.01409473, -0.01902730),
-        (LOWER, 0.50, 0.0, 0.22452437, 0.01119809, 0.0),
-        (LOWER, 0.90, 180.0, 0.17935403, -0.04973153, 0.0),
     ))),
 )  # fmt: skip

@@ -4,29 +4,10 @@ import numpy as np
 import pytest
 
 from reference.polarised_lidar import linear, pencil, stokes_factor
-from reference.rayleigh_tables import TABLES
 from reference.single_scatter import Lidar, single_scatter, single_scatter_total
 from reference.stokes import analysed, block_matrix, rayleigh_density, rayleigh_matrix, reciprocal, scattered
-from reference.vector_slab import radiance
 
 pytestmark = pytest.mark.physics
-
-
-@pytest.mark.parametrize("table", TABLES, ids=lambda t: f"{t.source}, depth {t.optical_depth}")
-def test_slabs_reproduce_published_stokes_vectors(table):
-    mu, phi = (sorted({row[k] for row in table.rows}) for k in (1, 2))
-    solved = radiance(
-        rayleigh_matrix,
-        rayleigh_density,
-        optical_depth=table.optical_depth,
-        mu0=table.mu0,
-        mu=mu,
-        phi=np.radians(phi),
-        ground=table.ground,
-    )
-    for face, one_mu, one_phi, *expected in table.rows:
-        found = getattr(solved, face)[mu.index(one_mu), phi.index(one_phi)]
-        np.testing.assert_allclose(found, [*expected, 0.0], atol=6.0 * table.digits, rtol=0)
 
 
 def test_the_field_of_a_driven_dipole_is_the_rayleigh_matrix():
