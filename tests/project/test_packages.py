@@ -143,10 +143,10 @@ def test_one_line_methods_have_one_line():
 # Lines of `*.py`: what a package is to come to, and what it has. What it has may only fall; a feature that needs more
 # lines deletes as many, or brings its own with a reason.
 LINES = {
-    "spadwarp": (750, 2697),
+    "spadwarp": (750, 1256),
     "analytic": (2000, 2282),
-    "benchmark": (500, 0),
-    "checks": (800, 0),
+    "benchmark": (500, 566),
+    "checks": (800, 875),
     "cli": (2900, 3014),
     "dataset": (2600, 2865),
     "denoise": (6900, 6087),
