@@ -156,6 +156,7 @@ def read_tree(mesh: wp.Mesh, extent: float) -> Tree:
     inner = np.concatenate(levels)
     below = np.full((most, 2), -1)
     below[inner] = children[inner]
+    boxes[np.setdiff1d(np.arange(most), np.append(leaf, inner))] = 0.0  # the tree does not use them: they hold anything
     pad = np.float32(box_padding(extent))
     return Tree(int(root[0]), below, boxes[:, 0] - pad, boxes[:, 1] + pad, start, start + size, faces)
 
@@ -167,9 +168,8 @@ def open_tree(tree: Tree, closed: np.ndarray, width: int) -> tuple[np.ndarray, n
     Returns:
         The tree's node that each stands for; its children among those, [nodes, width], -1 for none; its level.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # places that the tree does not use hold anything
-        size = tree.upper - tree.lower
-        area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
+    size = tree.upper - tree.lower
+    area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
     area = np.append(np.where(closed, -1.0, area), -1.0)  # the last is that of the child -1
     nodes, children, here = [], [], np.array([tree.root])
     while here.size:
