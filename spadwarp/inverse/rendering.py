@@ -231,7 +231,8 @@ class _PlacedReceiver(NamedTuple):
     def slopes(self, slopes: Mapping[str, ExpectedLight], unknowns: Sequence[Unknown]) -> Rows:
         """Derivatives of λ, `[unknown, pixel, bin]`."""
         height, width = self.receiver.image
-        result = np.empty((len(unknowns), height * width, self.receiver.window.recorded), np.float32)
+        bins = self.receiver.window.edges.size - 1
+        result = np.empty((len(unknowns), height * width, bins), np.float32)
         for row, unknown in zip(result, unknowns, strict=True):
             if unknown.name == BACKGROUND:
                 row[:] = self.receiver.noise_slope().numpy()

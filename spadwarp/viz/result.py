@@ -275,10 +275,11 @@ def _water_text(medium: Medium) -> str:
     if medium.layers:
         extinctions = ", ".join(f"{water.extinction:.3g}" for water in medium.waters)
         return f"{len(medium.waters)} layers of water, c = {extinctions} 1/m"
-    values = ", ".join(f"{_SYMBOLS.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items())
-    law = _LAWS.get(medium.phase_function, "") + values
     if medium.phase_function == "tabulated":
         law = f"phase function {Path(str(medium.phase_table)).stem}"
+    else:
+        values = (f"{_SYMBOLS.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items())
+        law = _LAWS.get(medium.phase_function, "") + ", ".join(values)
     albedo = "U(0, 0.97)" if medium.albedo == "lu2024" else f"{medium.albedo:.3g}"
     grid = "" if medium.grid is None else f", with {medium.grid.shape or Path(str(medium.grid.file)).name}"
     return f"water c = {medium.extinction:.3g} 1/m, albedo {albedo}, {law}{grid}"

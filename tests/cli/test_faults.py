@@ -36,7 +36,8 @@ def small_files(size):
 )
 def test_a_full_disk_leaves_the_old_files(words, done, tmp_path, tmp_path_factory):
     if words[0] == "detect":  # its kernels are in the cache then, which has no room for them either
-        run("detect", done, "--pulses", 1000, "--out", tmp_path_factory.mktemp("before"))
+        before = ("detect", str(done), "--pulses", "1000", "--out", str(tmp_path_factory.mktemp("before")))
+        subprocess.run([sys.executable, "-m", "spadwarp", *before], env=ENVIRONMENT, check=True, capture_output=True)
     for name in ("old", "result.npy", "frames.h5"):
         (tmp_path / name).write_text("old")
     words = [word.replace("RUN", str(done)).replace("PLACE", str(tmp_path)) for word in words]
