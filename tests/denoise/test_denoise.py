@@ -21,9 +21,7 @@ from helpers.datasets import recipe
 from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.dataset import Plan
-from spadwarp.denoise import baselines, files, network_files, photon_counts, samples
-from spadwarp.denoise import evaluation as metrics
-from spadwarp.denoise import training as training_steps
+from spadwarp.denoise import baselines, evaluation, files, network_files, photon_counts, samples, training
 from spadwarp.denoise.files import read_scenes
 from spadwarp.denoise.frames import depth_frames, fill_missing
 from spadwarp.denoise.networks import build_network
@@ -80,7 +78,7 @@ def test_scores_are_those_of_their_definitions():
     clean[:, 16:] = 14.5
     estimate = clean.copy()
     estimate[::2] += 0.02
-    found = metrics.score(clean, estimate, gate=GATE)
+    found = evaluation.score(clean, estimate, gate=GATE)
     assert found.rmse_mm == pytest.approx(20.0 / np.sqrt(2), rel=1e-4)
     assert found.within_1cm == 0.5 and found.within_5cm == 1.0
     assert found.edge_mm == pytest.approx(10.0, rel=1e-3)
@@ -98,17 +96,17 @@ def test_scores_are_those_of_their_definitions():
 def test_pixels_without_a_target_do_not_count():
     clean = scene()
     estimate = np.nan_to_num(clean, nan=13.5)
-    found = metrics.score(clean, estimate, gate=GATE)
+    found = evaluation.score(clean, estimate, gate=GATE)
     assert found.rmse_mm == 0.0 and found.psnr == 100.0 and found.ssim == pytest.approx(1.0)
     with pytest.raises(ValueError, match="no pixel sees a target"):
-        metrics.score(np.full((16, 16), np.nan, np.float32), np.ones((16, 16), np.float32), gate=GATE)
+        evaluation.score(np.full((16, 16), np.nan, np.float32), np.ones((16, 16), np.float32), gate=GATE)
 
 
 def test_steps_of_a_staircase():
     clean = scene()
-    assert metrics.staircase_steps(clean, clean) == metrics.Steps(total=3, resolved=3)
+    assert evaluation.staircase_steps(clean, clean) == evaluation.Steps(total=3, resolved=3)
     flat = np.where(clean < 14.99, 14.8, clean).astype(np.float32)  # the steps are gone, the wall is there
-    assert metrics.staircase_steps(clean, flat).resolved < 3
+    assert evaluation.staircase_steps(clean, flat).resolved < 3
 
 
 # Evaluation on a dataset
@@ -210,7 +208,7 @@ def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, m
     assert steps == [4, 8, 12, 16]
 
     streams = [torch.Generator().manual_seed(3 * 1009 + rank) for rank in range(2)]
-    draw, loss = samples.draw_batch, training_steps.loss_of
+    draw, loss = samples.draw_batch, training.loss_of
 
     def both(scenes, noise, *, size, generator, **others):
         halves = [draw(scenes, noise, size=size // 2, generator=one, **others) for one in streams]
@@ -221,7 +219,7 @@ def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, m
         return sum(loss(one, Batch(*parts), kind=kind) for one, *parts in halves) / 2
 
     monkeypatch.setattr(samples, "draw_batch", both)
-    monkeypatch.setattr(training_steps, "loss_of", mean_loss)
+    monkeypatch.setattr(training, "loss_of", mean_loss)
     scenes = [read_scenes(dataset, split) for split in ("train", "validation")]
     fit(load_training_recipe(place), *scenes, tmp_path / "one", device="cpu")
     torch.manual_seed(3)

@@ -15,7 +15,6 @@ from helpers.stepped_frames import noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.dataset import FrameReader
 from spadwarp.denoise import denoise_file, files
-from spadwarp.denoise import files as reading
 from spadwarp.denoise.files import read_depth
 from spadwarp.frames import instrument_response
 from spadwarp.io.arrays import write_exr
@@ -139,8 +138,8 @@ def test_of_histograms_only_the_bins_within_the_gate_count(model, tmp_path, monk
     counts = np.random.default_rng(2).poisson(0.02, (16, 16, 256)).astype(np.uint16)
     counts[..., 59:62] += 5
     counts[..., 149:152] += 2
-    estimated, depth_of = [], reading.depth_of
-    monkeypatch.setattr(reading, "depth_of", lambda held, **rest: estimated.append(held) or depth_of(held, **rest))
+    estimated, depth_of = [], files.depth_of
+    monkeypatch.setattr(files, "depth_of", lambda held, **rest: estimated.append(held) or depth_of(held, **rest))
     path, out = saved(tmp_path, counts)
     options = {"model": model, "device": "cpu", **response(200e-12), **KNOWN}
     gate = (100 * METRES, 220 * METRES)

@@ -11,8 +11,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from spadwarp import ConfigError, FileError
 from spadwarp.denoise import network_files, networks
-from spadwarp.denoise import networks as pyramid
-from spadwarp.denoise import networks as selection
 from spadwarp.denoise.frames import POOLED
 from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.recipe import Noise, TrainingRecipe, load_training_recipe
@@ -58,7 +56,7 @@ def test_order_statistics_are_those_of_a_sort():
     image = torch.rand(2, 1, 11, 9, generator=torch.Generator().manual_seed(1))
     padded = torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate")[:, 0]
     expected = padded.unfold(1, 3, 1).unfold(2, 3, 1).flatten(3).sort(dim=-1).values
-    for rank, values in zip((2, 4, 6), pyramid.ranks(image), strict=True):
+    for rank, values in zip((2, 4, 6), networks.ranks(image), strict=True):
         assert torch.equal(values[:, 0], expected[..., rank])
 
 
@@ -97,18 +95,18 @@ def test_the_selection_of_strips_is_that_of_whole_frames(monkeypatch):
     generator = torch.Generator().manual_seed(7)
     shapes = ((2, 1, 23, 9), (2, 3, 23, 9), (2, FEATURES, 23, 9))
     images = [torch.rand(shape, generator=generator) for shape in shapes]
-    network = selection.Selection()
+    network = networks.Selection()
     torch.nn.init.normal_(network.last.weight)  # all candidates are chosen
     with torch.no_grad():
-        whole = selection.selected(*network(*images))
-        monkeypatch.setattr(selection, "_PIXELS_AT_ONCE", 5 * 9)
-        assert torch.allclose(selection.selected_depth(network, *images), whole, atol=1e-6)
+        whole = networks.selected(*network(*images))
+        monkeypatch.setattr(networks, "_PIXELS_AT_ONCE", 5 * 9)
+        assert torch.allclose(networks.selected_depth(network, *images), whole, atol=1e-6)
 
 
 def test_the_selection_is_never_the_mean_of_two_surfaces():
     candidates = torch.tensor([0.2, 0.2, 0.7, 0.7])[None, :, None, None]
     for scores, expected in (([0.0, 0.0, 0.1, 0.0], 0.7), ([0.1, 0.0, 0.0, 0.0], 0.2)):
-        found = selection.selected(candidates, torch.tensor(scores)[None, :, None, None])
+        found = networks.selected(candidates, torch.tensor(scores)[None, :, None, None])
         assert torch.allclose(found, torch.tensor(expected))
 
 

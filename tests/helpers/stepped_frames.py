@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from spadwarp.denoise import apply
-from spadwarp.denoise import evaluation as metrics
+from spadwarp.denoise import apply, evaluation
 
 GATE = (13.5, 16.0)
 
@@ -34,4 +33,4 @@ def denoised(depth, **options):
 
 def scores(clean, estimate):
     """Scores over `GATE`; a pixel without an estimate counts as one in the middle of the gate."""
-    return metrics.score(clean, np.nan_to_num(estimate, nan=14.75), gate=GATE)
+    return evaluation.score(clean, np.nan_to_num(estimate, nan=14.75), gate=GATE)
