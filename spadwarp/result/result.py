@@ -132,6 +132,7 @@ class ResultHead:
     batch_size: int = 0
     requested: tuple[int, int] = (0, 0)
     focus_distance: float | None = None
+    file_hashes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -153,6 +154,7 @@ class Result(ResultHead, Tallies):
         partial: Whether the run was interrupted; `photons` then counts those that were done.
         photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
         requested: The ids [start, stop) that were asked for; an interrupted run has only a part of them.
+        file_hashes: SHA-256 of each of `scene.files` when the photons were traced.
         batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
     """
 
@@ -483,6 +485,9 @@ def difference(a: ResultHead, b: ResultHead) -> str:
     if one != other:
         sections = [name for name in type(one).model_fields if getattr(one, name) != getattr(other, name)]
         return f"the scene of the results differs in {', '.join(sections)}: only photons and output may differ"
+    for path, mine, its in zip(a.scene.files, a.file_hashes, b.file_hashes, strict=False):
+        if mine != its:
+            return f"{path} is another file than it was: its content has changed between the runs"
     pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit", "batch_size")}
     if isinstance(a, Result) and isinstance(b, Result):
         pairs["list of derivatives"] = tuple(a.derivatives), tuple(b.derivatives)

@@ -36,6 +36,7 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
+from spadwarp.io.paths import sha256
 from spadwarp.io.text import parse_toml, read_columns
 from spadwarp.values import UNITS, ConfigError, FileError, Interval, bounds, parse_number, quantity, shown, suggestion
 
@@ -481,6 +482,10 @@ class Document(Section):
 
         with_paths(type(self), self.to_dict(), noted)
         return [path for path in found if path.suffix]
+
+    def file_hashes(self) -> tuple[str, ...]:
+        """SHA-256 of each of `files` as it is now. Raises `FileError`."""
+        return tuple(map(sha256, self.files))
 
     def to_toml(self, *, folder: FileName | None = None) -> str:
         """The full text that is read back to an equal document.
