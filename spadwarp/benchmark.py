@@ -25,7 +25,7 @@ from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import provenance, simulate, trace, truth_maps
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.values import FileError, check_choice, check_integer, path_from_time, time_from_path
+from spadwarp.values import FileError, check_choice, check_integer, guarded, path_from_time, time_from_path
 
 if TYPE_CHECKING:
     import warp as wp
@@ -564,3 +564,6 @@ def newest_report(directory: str | Path, *, like: Mapping[str, Any], cases: Sequ
             return path
     threads = "" if like["threads"] is None else f" with {like['threads']} threads"
     raise FileError(f"{directory}: no report of {', '.join(cases)} from {like['device_name']}{threads}")
+
+
+guarded(__name__, __all__)

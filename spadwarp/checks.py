@@ -41,6 +41,7 @@ from spadwarp.transport import points_per_flight
 from spadwarp.values import (
     ArgumentError,
     ConfigError,
+    guarded,
     path_from_time,
     quantity,
     range_from_time,
@@ -873,3 +874,6 @@ _CHECKS = (
     *(_check_daylight, _check_medium, _check_phase_table, _check_collisions, _check_grid),
     *(_check_polarisation, _check_statistics),
 )
+
+
+guarded(__name__, __all__)

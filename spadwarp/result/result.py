@@ -485,8 +485,8 @@ def difference(a: ResultHead, b: ResultHead) -> str:
     if one != other:
         sections = [name for name in type(one).model_fields if getattr(one, name) != getattr(other, name)]
         return f"the scene of the results differs in {', '.join(sections)}: only photons and output may differ"
-    for path, mine, its in zip(a.scene.files, a.file_hashes, b.file_hashes, strict=False):
-        if mine != its:
+    for path, now, before in zip(a.scene.files, a.file_hashes, b.file_hashes, strict=False):
+        if now != before:
             return f"{path} is another file than it was: its content has changed between the runs"
     pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit", "batch_size")}
     if isinstance(a, Result) and isinstance(b, Result):

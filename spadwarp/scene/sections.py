@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,7 +155,24 @@ def presets(section: str | None = None) -> dict[str, Preset]:
     return {f"{section}.{name}": preset for section, rows in PRESETS.items() for name, preset in rows.items()}
 
 
-class Section(BaseModel):
+if TYPE_CHECKING:
+    _Model = BaseModel
+else:
+
+    class _Refusing(type(BaseModel)):
+        """Fields given in Python are refused as those of a file are."""
+
+        def __call__(cls, /, *arguments: Any, **fields: Any) -> Any:
+            try:
+                return super().__call__(*arguments, **fields)
+            except ValidationError as error:
+                raise ConfigError(describe(error, cls, {})) from None
+
+    class _Model(BaseModel, metaclass=_Refusing):
+        pass
+
+
+class Section(_Model):
     """One table of a scene: frozen, strict about types, unknown keys refused.
 
     A preset, `preset = "uwoc-harbour"`, lies under the section's own fields; it need not fill its section.
