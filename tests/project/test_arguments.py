@@ -1,4 +1,4 @@
-"""Arguments of public functions that are not of their type end in a sentence that names them, not in a library's error."""
+"""Arguments that are not of their type end in a sentence that names them, not in a library's error."""
 
 import pickle
 
