@@ -107,6 +107,8 @@ def in_words(error: BaseException) -> str | None:
     if short:
         most = "" if limit is None else f" (this process may use {limit / 2**30:.3g} GiB, see ulimit -v)"
         return f"not enough memory{most}" + (f": {text}" if str(error) else "")
+    if isinstance(error, FileNotFoundError) and error.filename is None:
+        return "the working directory is not there any more"
     if isinstance(error, OSError) and error.strerror:
         names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
         return f"{names}: {error.strerror}" if names else error.strerror

@@ -174,7 +174,8 @@ def _verdict(found: Proposal) -> str:
     if found.pulses_for in ("depth error", "false peaks"):
         longest = with_prefix(found.time, "s")
         return f"A depth error of {asked} takes {pulses}, more than {longest}; limit: {found.limit}."
-    return f"A depth error of {asked} is out of reach: {total} with {pulses}; limit: {found.limit}."
+    least = f"{total} with {pulses}" if math.isfinite(found.terms["total"]) else f"no depth with {pulses}"
+    return f"A depth error of {asked} is out of reach: {least}; limit: {found.limit}."
 
 
 def _reception(found: Proposal, name: str) -> str:

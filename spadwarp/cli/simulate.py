@@ -6,7 +6,7 @@ import importlib
 import math
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -232,7 +232,12 @@ def _while_pictures_load(report: Report | None, scene: Scene) -> Iterator[Report
     if not (scene.output.png or scene.output.pdf) or address_space() is not None:
         yield report
         return
-    loading = threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True)
+
+    def load() -> None:
+        with suppress(ImportError):  # raised again where it is needed
+            importlib.import_module("spadwarp.viz")
+
+    loading = threading.Thread(target=load, daemon=True)
     loading.start()
 
     def reported(stage: str, done: int, total: int) -> None:

@@ -49,14 +49,18 @@ def init(
         say(f"written: {path}\nVS Code, once:\n  code --install-extension tamasfe.even-better-toml")
         say(f"first line of a TOML file beside it, for VS Code and taplo:\n  #:schema {place}")
         return
-    name = name or "scene"
-    path = Path(name if name.endswith(".toml") else f"{name}.toml")
+    name = "scene" if name is None else name
+    if not Path(name).name:
+        wrong(f"{name!r} is no name of a file", "NAME")
+    path = Path(name if name.lower().endswith(".toml") else f"{name}.toml")
     check_outputs(files={"NAME": path})
     out = f"{path.with_suffix('')}/"
     if example is None:
         text = spadwarp.scene.template().replace("out/", out).replace(" scene.toml", f" {path}")
     else:
-        text = spadwarp.io.example_or_path(example, "scenes").read_text(encoding="utf-8")
+        copied = spadwarp.io.example_or_path(example, "scenes")
+        spadwarp.load_scene(copied)
+        text = spadwarp.io.read_text(copied)
     spadwarp.io.write_text(text, path)
     say(f"written: {path}\nnext: spadwarp check {path}; spadwarp plan {path}; spadwarp simulate {path} --out {out}")
 

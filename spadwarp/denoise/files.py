@@ -425,7 +425,7 @@ def train(
     if recipe.data is not None:
         training, validation = (read_scenes(recipe.data, split) for split in ("train", "validation"))
     trained = fit(recipe, training, validation, Path(out), device=device, progress=progress, notify=notify)
-    if environment_integer("RANK", 0) == 0:
+    if environment_integer("RANK", 0) == 0 and trained.log.is_file() and trained.log.stat().st_size:
         log = [json.loads(line) for line in trained.log.read_text().splitlines()]
         draw_learning_curves(log, Path(out) / "curves.png", title=f"{recipe.model}, seed {recipe.seed}")
     return trained

@@ -191,6 +191,8 @@ def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:
         raise FileError(f"{path}: holds NaN, as depth does; histograms are finite and not negative")
     if values.dtype.kind in "if" and not (values.min() >= 0 and math.isfinite(values.max())):
         raise FileError(f"{path}: holds {values.min()} … {values.max()}; finite values, not negative, are needed")
+    if values.dtype.kind in "iu" and values.max() >= 2**31:
+        raise FileError(f"{path}: holds counts up to {values.max()}; a bin of a frame is in [0, {2**31 - 1}]")
     return values
 
 

@@ -175,6 +175,16 @@ class PortGeometry:
         away, radius = math.dist(np.ravel(x), self.centre), self.radius
         return "" if away < radius else f"it is {away:.4g} m from the dome's centre, the radius is {radius:g} m"
 
+    def houses(self, x: ArrayLike, tangent: float, aperture_radius: float) -> bool:
+        """Whether a point is in the housing or the window that the camera looks through: of a flat one, as wide as its
+        view with that tangent of its half angle; above a calm surface everywhere."""
+        if self.shape == "dome":
+            return math.dist(np.ravel(x), self.centre) < self.radius + self.thickness
+        x, normal = np.asarray(x, np.float64), np.array(self.normal)
+        ahead = float(x @ normal)
+        wide = tangent * self.nearest + aperture_radius
+        return ahead < self.nearest and (not self.thickness or float(np.linalg.norm(x - ahead * normal)) <= wide)
+
     def enter(self, x: ArrayLike, u: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
         """Rays from x inside along unit vectors u, `[..., 3]`, up to where they enter the water.
 

@@ -243,6 +243,23 @@ def points_inside(triangles: Floats, planes: Floats) -> Floats:
     return np.concatenate(found)
 
 
+def within_port(scene: Scene, triangles: Floats) -> str:
+    """Which part of triangles reaches into the housing or the window of the camera's port; empty where none does."""
+    if (port := camera_port(scene)) is None or not len(triangles):
+        return ""
+    nearest = port.nearest * (1.0 - 1e-6)
+    if port.shape == "flat":
+        planes = np.vstack([view_planes(scene.camera), [*(-np.array(port.normal)), nearest]])
+        inside = points_inside(triangles, planes)
+    else:
+        from trimesh.triangles import closest_point
+
+        found = closest_point(triangles, np.broadcast_to(port.centre, (len(triangles), 3)))
+        outer = (port.radius + port.thickness) * (1.0 - 1e-6)
+        inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
+    return f"a target is at {inside[0].round(6).tolist()} m in the camera's frame" if len(inside) else ""
+
+
 def _spread(triangles: Floats) -> Floats:
     """Points evenly over each triangle; of many triangles the corners alone."""
     steps = 6 if len(triangles) < 2000 else 1

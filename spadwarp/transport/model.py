@@ -22,7 +22,7 @@ from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import camera_port, laser_port
-from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes
+from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_scale
 from spadwarp.values import ConfigError, DeviceError
@@ -67,7 +67,7 @@ def build_model(
         FileError: That table or the beam's profile cannot be read.
         DeviceError: The device has too little memory.
     """
-    _check_domain(scene, camera)
+    check_places(scene, mesh, camera)
     if camera:
         _check_gate(scene)
     if scale is None:
@@ -426,9 +426,11 @@ def _channel_rows(camera: Camera) -> list[list[float]]:
 # What is refused
 
 
-def _check_domain(scene: Scene, camera: bool) -> None:
-    """Refuses a camera or a laser, or the way out of its port, outside the domain; and a lens or a beam that reaches
-    through a face that reflects: beyond it nothing is mirrored."""
+def check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) -> None:
+    """Refuses a target within the camera's port; a camera or a laser, or the way out of its port, outside the domain;
+    and a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
+    if camera and mesh is not None and (found := within_port(scene, mesh.vertices[mesh.faces].astype(np.float64))):
+        raise ConfigError(f"camera.port: {found}, within the housing or the window", source=scene.source)
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
     ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)]

@@ -13,7 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib
+try:
+    import matplotlib
+except ValueError as error:
+    raise ImportError(f"MPLBACKEND = {os.environ.get('MPLBACKEND')}: {error}") from None
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes

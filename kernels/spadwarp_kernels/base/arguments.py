@@ -35,14 +35,15 @@ def _limits(interval: str) -> tuple[float, float, bool, bool]:
 
 
 def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
-    """A finite number within an interval, written as in an error: `"[0, 1)"`."""
+    """A finite number within an interval, written as in an error: `"[0, 1)"`; a closed end is compared as float32."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ArgumentError(f"{name} = {value!r} is not a number") from None
     low, high, low_open, high_open = _limits(interval)
     inside = (low < number if low_open else low <= number) and (number < high if high_open else number <= high)
-    if not (inside and math.isfinite(number)):
+    ends = [end for end, is_open in ((low, low_open), (high, high_open)) if not is_open]
+    if not (math.isfinite(number) and (inside or any(np.float32(end) == np.float32(number) for end in ends))):
         raise ArgumentError(f"{name} = {value} is outside {interval}")
     return number
 
@@ -178,7 +179,8 @@ def check_values(name: str, array: wp.array, interval: str) -> None:
     for the device."""
     low, high, *_ = _limits(interval)
     values = array.numpy().ravel()
-    outside = ~((values >= np.float64(low)) & (values <= np.float64(high)))
+    ends = np.array([low, high], np.float64 if values.dtype.kind == "i" else values.dtype)
+    outside = ~((values >= ends[0]) & (values <= ends[1]))
     if outside.any():
         k = int(outside.argmax())
         raise ArgumentError(f"{name}[{k // (values.size // array.size)}] = {values[k]} is outside {interval}")

@@ -200,7 +200,8 @@ def dark_count_rates(
     `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure. Raises `ArgumentError`.
     """
     pixels, seed = check_integer("pixels", pixels, 0), check_seed(seed)
-    check_range("[0, inf)", median=median, spread=spread, hot_rate=hot_rate, offset=offset)
+    check_range("[0, 1e12]", median=median, hot_rate=hot_rate, offset=offset)
+    check_number("spread", spread, "[0, 10]")
     check_number("hot_fraction", hot_fraction, "[0, 1]")
     rate = wp.empty(pixels, dtype=float, device=check_device("device", device))
     return _by_row(_dark_count_kernel, [seed, median, spread, hot_fraction, hot_rate, offset], rate)

@@ -132,7 +132,7 @@ def make_surfaces(
         device, face_count = mesh.device, mesh.indices.size // 3
 
     def by_face(name: str, value: Any, dtype: type, interval: str = "[0, 1]") -> wp.array:
-        if mesh is None or value is None:
+        if mesh is None or (value is None and name != "reflectance"):
             return wp.zeros(0, dtype=dtype, device=device)
         if not isinstance(value, wp.array) and np.ndim(value) == 0:
             return wp.full(face_count, check_number(name, value, interval), dtype=dtype, device=device)
