@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import spadwarp_kernels as sk
-from helpers.estimators import agreeing_cells, cells
+from helpers.estimators import PHOTONS, agreeing_cells, cells
 from helpers.scenes import ELSEWHERE, LAYERS, PENCIL, PLATE, PLUME, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp import simulate
@@ -21,10 +21,11 @@ TABLE = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis_threshold", [1.0, 0.97])
-def test_estimators_agree_in_every_component(axis_threshold, device):
+@pytest.mark.parametrize(("axis_threshold", "photons"), [(1.0, {"analog": 40_000, "guided": 20_000}), (0.97, PHOTONS)])
+def test_estimators_agree_in_every_component(axis_threshold, photons, device):
     """A raised near-axis threshold shows a wrong reading of the rule as 15 to 60 %; at the default it hides in 1 %."""
-    cells = agreeing_cells(scene(transport={"axis_threshold": axis_threshold}), device)
+    one = scene(transport={"axis_threshold": axis_threshold})
+    cells = agreeing_cells(one, device, photons=photons, clear=photons is PHOTONS)
     assert (cells["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
@@ -33,7 +34,7 @@ def test_estimators_agree_in_every_component(axis_threshold, device):
 def test_estimators_agree_with_a_tabulated_phase_function(medium, axis_threshold, device):
     """Two terms, one of them backward, under a raised near-axis threshold; a peak without a width."""
     one = scene(medium=medium, transport={"axis_threshold": axis_threshold})
-    agreeing_cells(one, device, photons={"analog": 60_000, "guided": 15_000})
+    agreeing_cells(one, device, photons={"analog": 40_000, "guided": 15_000})
 
 
 @pytest.mark.slow
@@ -96,16 +97,6 @@ def test_clear_water_gives_straight_lines_only(estimator, device):
     assert not result.component("forward_scattered").any()
 
 
-def test_reflectance_scales_the_ballistic_return(device):
-    """Half the reflectance, half the light: one surface each, the same photons, so equal to the rounding of the
-    tally."""
-    bright, dark = (
-        simulate(scene(targets=[{**PLATE, "reflectance": rho}]), photons=50_000, seed=2, device=device)
-        for rho in (0.8, 0.4)
-    )
-    assert bright.component("ballistic").sum() == pytest.approx(2 * dark.component("ballistic").sum(), rel=1e-5)
-
-
 def test_a_blocker_casts_a_shadow(device):
     """A black screen between plate and lens removes the plate's light from the pixels that it covers, and only
     there."""
@@ -148,7 +139,7 @@ VESSEL = {"builtin": "box", "size": [3.0, 2.0, 4.0], "translation": [0.0, 0.0, 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("events", [1, 2, 3, 5])
+@pytest.mark.parametrize("events", [1, 2, 5])
 def test_estimators_agree_under_a_cap_on_events(events, device):
     """White vessel, lossless water: no light is lost but by the cap, so that the last allowed event is a fair part.
 

@@ -8,7 +8,7 @@ import pytest
 import spadwarp
 from helpers.estimators import PHOTONS, agreeing_cells
 from helpers.opencv import project_points
-from helpers.scenes import BEYOND, PLATE, scene
+from helpers.scenes import PLATE, scene
 from spadwarp import simulate
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_angles, rotation_matrix
@@ -135,20 +135,19 @@ def test_layers_of_water_stand_in_the_world(device):
     """Camera, laser and layers under one motion: photons end where the motion takes their ends."""
     turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
     layers = [{"start": 0.7, "extinction": 3.0, "albedo": 0.5}, {"start": 1.5, "extinction": 0.2, "albedo": 0.9}]
-    pose, box = rotation_matrix((10.0, 20.0, 30.0)), {"shape": "box", "lower": -60.0, "upper": 60.0}
+    pose, apart = rotation_matrix((10.0, 20.0, 30.0)), {"translation": [0.0, 0.0, -400.0]}
+    around = {"domain": {"shape": "box", "lower": -900.0, "upper": 900.0}, "targets": [PLATE | apart]}
     here = scene(
         medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]},
         camera={"rotation_deg": [10.0, 20.0, 30.0]},
-        domain=box,
-        targets=BEYOND,
+        **around,
     )
     start = float(turn @ [0.6, 0.0, 0.8] @ shift)
     moved = [{**layer, "start": layer["start"] + start} for layer in layers]
     there = scene(
         medium={"layers": moved, "layer_axis": (turn @ [0.6, 0.0, 0.8]).tolist()},
         camera={"position": shift.tolist(), "rotation_deg": rotation_angles(turn @ pose)},
-        domain=box,
-        targets=[{**BEYOND[0], "translation": (turn @ [0.0, 0.0, 40.0] + shift).tolist()}],
+        **around,
     )
     along, same = (one.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0)) for one in (there, here))
     assert along == pytest.approx(same)
