@@ -173,4 +173,6 @@ def test_names_and_what_is_refused(everywhere, tmp_path):
         trace(one, photons=100, device="cpu", derivatives=NAMES[:1])
     large = {"width": 2000, "height": 2000}
     with pytest.raises(spadwarp.ConfigError, match="fewer pixels, bins or blocks"):
-        simulate(scene(medium={"grid": everywhere}, camera=large), derivatives=NAMES, blocks=(8, 6, 10), photons=10)
+        simulate(
+            scene(medium={"grid": everywhere}, camera=large), derivatives=WITH_TARGET, blocks=(8, 6, 10), photons=10
+        )
