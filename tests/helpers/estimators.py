@@ -8,7 +8,7 @@ import spadwarp
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene.pose import rotation_matrix
 
-PHOTONS = {"analog": 60_000, "next_event": 30_000, "guided": 30_000}
+PHOTONS = {"analog": 40_000, "next_event": 20_000, "guided": 20_000}
 
 
 def cells(one, device, photons, seeds=32, pixels=False):

@@ -10,6 +10,10 @@ from spadwarp.scene import Scene
 WATER = {"extinction": 0.5, "albedo": 0.8, "anisotropy": 0.8, "group_index": 1.0}
 PLATE = {"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 
+# A target and a layer of water that no light of the gate meets: they give a scene the kernel of those that need one.
+BEYOND = [{**PLATE, "translation": [0.0, 0.0, 40.0]}]
+ELSEWHERE = [{"start": 50.0, "extinction": 0.5, "albedo": 0.8}]
+
 # Of so many faces that a GPU walks down a tree to them.
 TREE = {"builtin": "staircase", "translation": [0.0, 0.0, 2.2], "reflectance": 0.7}
 
@@ -23,7 +27,7 @@ PLUME |= {"turbulence": 0.5, "seed": 5, "translation": [0.0, 0.0, 1.2]}
 PENCIL = {"profile": "collimated", "position": [0.0, 0.0, 0.0]}
 
 
-def scattered_once(medium, edges, estimator="guided"):
+def scattered_once(medium, edges):
     """Light of a pencil beam at x = -0.1 m that scatters once, by bins of path [m]."""
     gate = {"start_ns": edges[0] / 0.299792458, "bin_width_ps": 1e3 * (edges[1] - edges[0]) / 0.299792458}
     return scene(
@@ -31,17 +35,9 @@ def scattered_once(medium, edges, estimator="guided"):
         laser={**PENCIL, "position": [-0.1, 0.0, 0.0]},
         camera={"aperture_diameter": 0.01},
         gate={**gate, "bins": len(edges) - 1},
-        targets=[],
-        transport={"estimator": estimator, "max_collisions": 1},
+        targets=BEYOND,
+        transport={"max_collisions": 1},
     )
-
-
-def half_spaces(folder, step=1.25):
-    """Two cells, a step from c = 0.3 to 1.2 at z = `step` m: c and b of both, and the grid."""
-    c, b = np.array([0.3, 1.2]), np.array([0.24, 0.6])
-    path = folder / "halves.npz"
-    np.savez(path, extinction=c.reshape(1, 1, 2), scattering=b.reshape(1, 1, 2), size=[80.0, 80.0, 40.0])
-    return c, b, {"file": str(path), "translation": [0.0, 0.0, step]}
 
 
 def scene(**sections):
@@ -74,7 +70,7 @@ def single_scatter_case(field_of_view, half_angle):
         "laser": {"half_angle_deg": half_angle, "position": [-0.1, 0.0, 0.0]},
         "camera": {"width": 4, "height": 4, "horizontal_fov_deg": field_of_view, "aperture_diameter": aperture},
         "gate": {"start_ns": 3.0 / 0.299792458, "bin_width_ps": 1e3 / 0.299792458, "bins": 4},
-        "targets": [],
+        "targets": BEYOND,
         "transport": {"estimator": "guided", "max_collisions": 1, "axis_threshold": 1.0},
     }
     return lidar, sections

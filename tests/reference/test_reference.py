@@ -30,18 +30,16 @@ def within(score, expected, errors=4.0, digits=0.0):
 def test_slabs_reproduce_published_totals(g, albedo, parts, reflected, transmitted):
     """And a stack of equal layers is the slab."""
     solved = slab(anisotropy=g, albedo=albedo, optical_depth=sum(parts))
-    for value, digits in ((solved.reflected, reflected), (solved.transmitted, transmitted)):
+    found = solved.reflected, solved.transmitted
+    for value, digits in zip(found, (reflected, transmitted), strict=True):
         # half a unit of the last digit given
         assert abs(value - float(digits)) <= 0.5000001 * 10.0 ** -len(digits.split(".")[1])
-    assert stack([(g, albedo, part) for part in parts]) == pytest.approx(
-        (solved.reflected, solved.transmitted), abs=1e-9
-    )
+    assert stack([(g, albedo, part) for part in parts]) == pytest.approx(found, abs=1e-9)
 
 
 def test_a_stack_keeps_all_light_and_knows_its_order():
     above, below = (0.8, 0.7, 0.6), (0.3, 1.0, 1.1)
-    black = stack([(0.8, 0.0, 0.6), (0.3, 0.0, 1.1)])
-    assert black == pytest.approx((0.0, math.exp(-1.7)), rel=1e-9)
+    assert stack([(0.8, 0.0, 0.6), (0.3, 0.0, 1.1)]) == pytest.approx((0.0, math.exp(-1.7)), rel=1e-9)
     # Without absorption nothing is lost, whatever the order.
     for layers in ([(0.8, 1.0, 0.6), below], [below, (0.8, 1.0, 0.6)], [(-0.5, 1.0, 3.0)], [(0.924, 1.0, 3.0)]):
         assert sum(stack(layers)) == pytest.approx(1.0, abs=1e-9)
@@ -93,11 +91,8 @@ def test_walk_keeps_its_energy():
 
 def test_lidar_return_is_the_published_one_from_the_laser_s_side_and_from_the_camera_s():
     """Two quadratures over different variables; what keeps them apart is the rim of the cone across the pixels."""
-    published, found = (
-        ["3.4429e-9", "2.0505e-9", "1.0213e-9", "5.0801e-10", "2.6848e-10"],
-        single_scatter_total(Lidar()),
-    )
-    assert [f"{v:.4e}".replace("e-0", "e-") for v in found] == published
+    found = single_scatter_total(Lidar(), order=150)
+    assert found == pytest.approx([3.4429e-9, 2.0505e-9, 1.0213e-9, 5.0801e-10, 2.6848e-10], rel=2e-5)
     np.testing.assert_allclose(single_scatter(Lidar()).sum((0, 1)), found, rtol=1e-4)
     assert henyey_greenstein([-1, 1], 0.924) == pytest.approx([1.633780e-3, 26.50745], rel=5e-7)
 
@@ -112,16 +107,14 @@ def test_lambertian_plane_keeps_radiometry():
 
 
 def test_moments_reproduce_published_values():
+    """And agree with the walk."""
     five, collided = after_path(5, scattering=1, anisotropy=0), after_collisions(5, extinction=1, anisotropy=0.924)
     assert (five.z, five.r2) == pytest.approx((0.993262, 8.013476), abs=5e-7)
     found = (collided.z, collided.r2, collided.cos_theta)
     assert found == pytest.approx((4.295598, 27.128079, 0.673535), abs=5e-7)
-
-
-def test_moments_agree_with_the_walk():
     rng = np.random.default_rng(4)
     for g, limit, expected in (
-        (0.924, {"max_collisions": 5}, after_collisions(5, extinction=1.0, anisotropy=0.924)),
+        (0.924, {"max_collisions": 5}, collided),
         (0.5, {"max_path": 5.0}, after_path(5.0, scattering=1.0, anisotropy=0.5)),
     ):
         ended = walk(Medium(1.0, 1.0, g), pencil(100_000), rng, **limit)
@@ -152,7 +145,7 @@ def test_orders_of_scattering_add_up():
 @pytest.mark.slow
 def test_isotropic_fluence_agrees_with_the_walk_and_its_second_moment():
     rng, edges = np.random.default_rng(6), np.linspace(0, 5, 6)[1:-1]
-    ended = walk(Medium(1.0, 1.0, 0.0), isotropic(200_000, rng), rng, max_path=5.0)
+    ended = walk(Medium(1.0, 1.0, 0.0), isotropic(100_000, rng), rng, max_path=5.0)
     distance = np.linalg.norm(ended.position, axis=1)
     for edge, share in zip(edges, isotropic_radial_cdf(edges, path=5.0, scattering=1.0), strict=True):
         assert within(distance < edge, share)
@@ -162,21 +155,19 @@ def test_isotropic_fluence_agrees_with_the_walk_and_its_second_moment():
     assert second == pytest.approx(after_path(5.0, scattering=1.0, anisotropy=0.0).r2, abs=1e-4)
 
 
-@pytest.mark.parametrize(("extinction", "g"), [(1e-9, 0.0), (2.0, 0.924), (1.0, -0.5)])
+@pytest.mark.parametrize(("extinction", "g"), [(1e-9, 0.0), (2.0, 0.924)])
 def test_mean_path_under_cosine_law_light_depends_on_the_shape_alone(extinction, g):
     size, rng = np.array([1.0, 2.0, 3.0]), np.random.default_rng(7)
     photons = walk(Medium(extinction, 1.0, g), cosine_law_on_box(100_000, rng, size), rng, lower=(0, 0, 0), upper=size)
     assert within(photons.path, mean_path(6.0, 22.0))
 
 
-@pytest.mark.parametrize(("depth", "published"), [(0.0, 0.1769), (29.0, 0.8857)])
-def test_cube60_absorption(depth, published):
-    """MCX's cube60 in millimetres; published to four digits."""
-    rng, start = np.random.default_rng(8), (29.0, 29.0, depth)
-    source = isotropic(8_000, rng, start) if depth else pencil(40_000, start)
-    gate = 5e-9 * 299_792_458e3 / 1.37
+def test_cube60_absorption():
+    """MCX's cube60 in millimetres, an isotropic source in its middle; published to four digits."""
+    rng, gate = np.random.default_rng(8), 5e-9 * 299_792_458e3 / 1.37
+    source = isotropic(6_000, rng, (29.0, 29.0, 29.0))
     photons = walk(Medium(1.005, 1 / 1.005, 0.01), source, rng, lower=(0, 0, 0), upper=(60, 60, 60), max_path=gate)
     # max_path ends with the weight that the photon still has; only what collisions took is absorbed
     score = 1 - photons.weight
     assert photons.absorbed == pytest.approx(score.sum(), rel=1e-9)
-    assert within(score, published, digits=0.00005)
+    assert within(score, 0.8857, digits=0.00005)

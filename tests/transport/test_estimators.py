@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import spadwarp_kernels as sk
-from helpers.estimators import agreeing_cells, cells
-from helpers.scenes import LAYERS, PENCIL, PLATE, PLUME, scene
+from helpers.estimators import PHOTONS, agreeing_cells, cells
+from helpers.scenes import ELSEWHERE, LAYERS, PENCIL, PLATE, PLUME, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp import simulate
 from spadwarp.device import pick_device
@@ -21,25 +21,20 @@ TABLE = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis_threshold", [1.0, 0.97])
-def test_estimators_agree_in_every_component(axis_threshold, device):
+@pytest.mark.parametrize(("axis_threshold", "photons"), [(1.0, {"analog": 40_000, "guided": 20_000}), (0.97, PHOTONS)])
+def test_estimators_agree_in_every_component(axis_threshold, photons, device):
     """A raised near-axis threshold shows a wrong reading of the rule as 15 to 60 %; at the default it hides in 1 %."""
-    cells = agreeing_cells(scene(transport={"axis_threshold": axis_threshold}), device)
+    one = scene(transport={"axis_threshold": axis_threshold})
+    cells = agreeing_cells(one, device, photons=photons, clear=photons is PHOTONS)
     assert (cells["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
 @pytest.mark.slow
-def test_estimators_agree_with_a_tabulated_phase_function(device):
-    """Two terms, one of them backward, under a raised near-axis threshold."""
-    photons = {"analog": 40_000, "next_event": 20_000, "guided": 20_000}
-    agreeing_cells(scene(medium=TABLE, transport={"axis_threshold": 0.97}), device, photons=photons, clear=True)
-
-
-@pytest.mark.slow
-def test_guided_has_the_analog_walks_expectation_with_fournier_forand(device):
-    """The peak without a width gives next_event an infinite variance; guided stands against the photons themselves."""
-    photons = {"analog": 60_000, "guided": 15_000}
-    agreeing_cells(scene(medium={"phase_function": "fournier_forand"}), device, photons=photons)
+@pytest.mark.parametrize(("medium", "axis_threshold"), [(TABLE, 0.97), ({"phase_function": "fournier_forand"}, 1.0)])
+def test_estimators_agree_with_a_tabulated_phase_function(medium, axis_threshold, device):
+    """Two terms, one of them backward, under a raised near-axis threshold; a peak without a width."""
+    one = scene(medium=medium, transport={"axis_threshold": axis_threshold})
+    agreeing_cells(one, device, photons={"analog": 40_000, "guided": 15_000})
 
 
 @pytest.mark.slow
@@ -49,8 +44,7 @@ def test_a_table_of_henyey_greenstein_is_henyey_greenstein(device, tmp_path):
     value = sk.henyey_greenstein_density(2.0 * np.sin(np.radians(angle) / 2) ** 2, 0.8)
     np.savetxt(tmp_path / "hg.csv", np.column_stack([angle, value]), delimiter=",", header="angle_deg,value")
     table = {"phase_function": "tabulated", "phase_table": str(tmp_path / "hg.csv")}
-    guided = {"estimator": "guided"}
-    one, other = (cells(scene(medium=water, transport=guided), device, 20_000) for water in ({}, table))
+    one, other = (cells(scene(medium=water), device, 20_000) for water in ({}, table))
     assert equal_means_p(one, other) > 1e-3
     assert one.sum() == pytest.approx(other.sum(), rel=3e-3)
 
@@ -63,8 +57,17 @@ WATERS = {
 }
 
 
-@pytest.mark.parametrize("water", WATERS)
-@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+@pytest.mark.parametrize(
+    ("water", "estimator"),
+    [
+        ("one", "next_event"),
+        ("one", "guided"),
+        ("layers", "next_event"),
+        ("layers", "guided"),
+        ("cells", "guided"),
+        ("cells by delta tracking", "next_event"),
+    ],
+)
 def test_ballistic_return_of_a_lambertian_plate_meets_the_closed_form(estimator, water, device):
     """Pencil beam onto a plate: R/pi exp(-2 tau) A/d^2 to 1 %, for a lens small against the distance."""
     one = scene(
@@ -92,16 +95,6 @@ def test_clear_water_gives_straight_lines_only(estimator, device):
     assert result.component("ballistic").sum() > 0
     assert not result.component("backscatter").any()
     assert not result.component("forward_scattered").any()
-
-
-def test_reflectance_scales_the_ballistic_return(device):
-    """Half the reflectance, half the light: one surface each, the same photons, so equal to the rounding of the
-    tally."""
-    bright, dark = (
-        simulate(scene(targets=[{**PLATE, "reflectance": rho}]), photons=50_000, seed=2, device=device)
-        for rho in (0.8, 0.4)
-    )
-    assert bright.component("ballistic").sum() == pytest.approx(2 * dark.component("ballistic").sum(), rel=1e-5)
 
 
 def test_a_blocker_casts_a_shadow(device):
@@ -146,7 +139,7 @@ VESSEL = {"builtin": "box", "size": [3.0, 2.0, 4.0], "translation": [0.0, 0.0, 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("events", [1, 2, 3, 5])
+@pytest.mark.parametrize("events", [1, 2, 5])
 def test_estimators_agree_under_a_cap_on_events(events, device):
     """White vessel, lossless water: no light is lost but by the cap, so that the last allowed event is a fair part.
 
@@ -173,10 +166,17 @@ def test_estimators_agree_under_a_cap_on_events(events, device):
 )
 def test_estimators_share_one_ledger(end, device):
     """Without directed directions to the unit, seed by seed; guided in its mean over seeds."""
-    glossy = {"specular": 0.5, "roughness": 0.4, "reflectance": 0.3}
+    box = {"shape": "box", "lower": [-1.3, -0.9, -0.4], "upper": [1.2, 1.1, 3.4]}
+    camera, laser = {"port": {"distance": 0.05}}, {"port": "camera"}
+    if "termination" in end:  # in a tank, as the tests of its walls
+        box["outside_index"] = {"z_high": 1.0}
+        camera["rotation_deg"], laser = [5.0, 0.0, 0.0], {}
     one = scene(
-        domain={"shape": "box", "lower": [-1.3, -0.9, -0.4], "upper": [1.2, 1.1, 3.4]},
-        targets=[{**PLATE, **glossy}, {**VESSEL, "size": [2.0, 4.0, 3.0], **glossy}],
+        medium={"phase_index": 1.34, "layers": ELSEWHERE},
+        domain=box,
+        camera=camera,
+        laser=laser,
+        targets=[{**PLATE, "reflectance": 0.3}, {**VESSEL, "size": [2.0, 4.0, 3.0], "reflectance": 0.3}],
         transport={"max_collisions": 8, "weight_cutoff": 0.2, **end},
     )
 
@@ -187,10 +187,9 @@ def test_estimators_share_one_ledger(end, device):
         counts = {name: result.counters[name] for name in ("water_collisions", "surface_events")}
         return {**result.energy_balance, **counts}
 
-    entry = next(iter(end))
-    analog = ledger("analog")
-    assert analog == ledger("next_event")
-    assert all(analog[name] > 0 for name in (entry, "exit_y_low", "absorbed_surface"))
+    entry, found = next(iter(end)), ledger("next_event")
+    assert "termination" in end or found == ledger("analog")
+    assert all(found[name] > 0 for name in (entry, "exit_y_low", "absorbed_surface"))
     means = [[ledger(name, 4000, seed)[entry] for seed in range(32)] for name in ("next_event", "guided")]
     assert equal_means_p(*(np.array(values, float)[:, None] for values in means)) > 1e-3
 

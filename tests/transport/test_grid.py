@@ -1,6 +1,5 @@
 """Water cell by cell: against one water, layers and quadrature; the estimators against each other."""
 
-import itertools
 import math
 
 import h5py
@@ -10,8 +9,8 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 import spadwarp
-from helpers.estimators import agreeing_cells, cells, means
-from helpers.scenes import LAYERS, PLUME, half_spaces, scattered_once, scene
+from helpers.estimators import cells, means
+from helpers.scenes import LAYERS, PLUME, scattered_once, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene.medium import grid_cells
 
@@ -48,11 +47,9 @@ def layered_cells(tmp_path_factory):
     return {"file": str(path)}
 
 
-@pytest.mark.parametrize("tracking", TRACKING)
-@pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
+@pytest.mark.parametrize(("estimator", "tracking"), [("analog", "regular"), ("next_event", "delta")])
 def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, device):
-    """No tentative collision is rejected: up to rounding, the same histories, but for the points of flights that
-    guided draws from blocks, and for light that comes back, which delta tracking guides more often."""
+    """No tentative collision is rejected: up to rounding, the same histories."""
     plain, cellular = (
         spadwarp.simulate(
             scene(medium=medium, transport={"estimator": estimator}), photons=60_000, seed=3, device=device
@@ -60,10 +57,8 @@ def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, devic
         for medium in ({}, {"grid": {**one_water, "tracking": tracking}})
     )
     assert cellular.tallies.any() and cellular.energy_report()["exact"] and cellular.counters["invalid"] == 0
-    rtol = 0.05 if (estimator, tracking) == ("guided", "delta") else 2e-3 if device == "cpu" else 2e-2
-    np.testing.assert_allclose(
-        cellular.histogram.sum(axis=(0, 1)), plain.histogram.sum(axis=(0, 1)), rtol=rtol, atol=1e-6
-    )
+    light = [result.histogram.sum(axis=(0, 1)) for result in (cellular, plain)]
+    np.testing.assert_allclose(*light, rtol=2e-3 if device == "cpu" else 2e-2, atol=1e-6)
 
 
 @pytest.mark.parametrize("estimator", ["analog", "guided"])
@@ -82,30 +77,21 @@ def test_regular_tracking_of_cells_that_repeat_layers_has_their_histories(estima
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
-def test_cells_that_repeat_layers_have_their_expectation(estimator, layered_cells, device):
-    """By chance of 32 seeds; regular tracking has the histories of the layers, see above."""
-    photons = {"analog": 20_000, "next_event": 10_000, "guided": 8_000}[estimator]
+def test_estimators_and_tracking_agree_through_a_plume(device):
+    """In clear water, so that next_event has a finite variance; guided knows its total to 1 %."""
 
-    def run(medium):
-        # What scatters next to the lens has no finite variance in next_event.
-        near = {"medium": medium, "transport": {"estimator": estimator}, "gate": {"start_ns": 4.0}}
-        return cells(scene(**near), device, photons)
+    def run(estimator, tracking, photons):
+        medium = {"extinction": 1e-3, "grid": {**PLUME, "tracking": tracking}}
+        one = scene(medium=medium, transport={"estimator": estimator})
+        assert 0.3 < one.optical_depth((0.0, 0.0, 0.0), (0.0, 0.1, 2.2)) < 3.0
+        return cells(one, device, photons)
 
-    layered = run({"layers": LAYERS})
-    found = run({"grid": {**layered_cells, "tracking": "delta"}})
-    assert equal_means_p(found, layered, 0.2) > 1e-3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("tracking", TRACKING)
-def test_estimators_agree_through_a_plume(tracking, device):
-    """In clear water, so that next_event has a finite variance."""
-    one = scene(medium={"extinction": 1e-3, "grid": {**PLUME, "tracking": tracking}})
-    assert 0.3 < one.optical_depth((0.0, 0.0, 0.0), (0.0, 0.1, 2.2)) < 3.0
-    few = {"analog": 30_000, "next_event": 12_000, "guided": 12_000}
-    found = agreeing_cells(one, device, photons=few if tracking == "delta" else {"guided": 12_000, "analog": 30_000})
-    assert (found["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
+    guided = run("guided", "delta", 12_000)
+    assert (guided.reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
+    total = guided.sum(axis=1)
+    assert total.std() / total.mean() / math.sqrt(32) < 0.01
+    for other in (("guided", "regular", 12_000), ("next_event", "delta", 12_000), ("analog", "regular", 30_000)):
+        assert equal_means_p(run(*other), guided) > 1e-3, other
 
 
 # Single scatter of a pencil beam at x = -0.1 m, in cells, against the integral along it
@@ -169,25 +155,3 @@ def test_single_scatter_of_a_gaussian_cloud_is_that_of_the_integral(tracking, de
     first, last = ((path**2 - 0.01) / (2.0 * path) for path in edges[[0, -1]])
     total = quad(gaussian, first, last, epsabs=1e-14, limit=200)[0]
     assert mean.sum() == pytest.approx(total, rel=0.003, abs=4.0 * math.sqrt((error**2).sum()))
-
-
-@pytest.mark.parametrize("tracking", TRACKING)
-def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp_path, device):
-    """Two cells, a step from c 0.3 to 1.2 at z = 1.25 m; 0.3 % of each bin, and 4 standard errors."""
-    c, b, grid = half_spaces(tmp_path)
-    edges = np.arange(1.5, 4.01, 0.25)
-    one = scattered_once({"grid": {**grid, "tracking": tracking}}, edges)
-
-    def brought(z):
-        """Both ways cross the step at the same part of their length."""
-        near = min(1.25 / z, 1.0)
-        tau = (c[0] * near + c[1] * (1.0 - near)) * (z + math.hypot(0.1, z))
-        return float(_brought(one, z, b[int(z > 1.25)], tau))
-
-    ends = (edges**2 - 0.01) / (2.0 * edges)
-    expected = np.array(
-        [quad(brought, low, high, points=[1.25], epsabs=1e-15)[0] for low, high in itertools.pairwise(ends)]
-    )
-    mean, error, *_ = means(one, device, 100_000, 8)
-    assert (np.abs(mean - expected) < 4.0 * error + 0.003 * expected).all(), (mean - expected) / error
-    assert (error < 0.01 * expected).all()

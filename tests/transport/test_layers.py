@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import spadwarp
-from helpers.estimators import agreeing_cells
-from helpers.scenes import LAYERS, PENCIL, PLATE, WATER, scene
+from helpers.estimators import agreeing_cells, means
+from helpers.scenes import BEYOND, LAYERS, PENCIL, PLATE, WATER, scene
 from reference.adding_doubling import stack
 from reference.single_scatter import Lidar, single_scatter_total
 from spadwarp import simulate
@@ -28,8 +28,9 @@ DEPTH = 0.5 * 1.2 + 1.5 * 0.5 + 0.2 * 0.5
 @pytest.mark.parametrize("estimator", ["analog", "next_event", "guided"])
 def test_layers_of_one_water_are_that_water(estimator, device):
     """Not a bit differs on the CPU; on CUDA the compiler may round differently."""
+    transport = {"estimator": estimator}
     plain, layered = (
-        simulate(scene(medium=medium, transport={"estimator": estimator}), photons=100_000, seed=3, device=device)
+        simulate(scene(medium=medium, transport=transport), photons=100_000, seed=3, device=device)
         for medium in ({}, SAME)
     )
     assert layered.tallies.any() and layered.energy_report()["exact"]
@@ -50,12 +51,10 @@ def test_estimators_agree_through_layers(device):
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
 def test_single_scattering_is_that_of_the_quadrature(estimator, device):
     """By bins of 25 cm of path, which show each layer; the plate is black and behind the gate."""
-    edges = np.arange(1.5, 4.01, 0.25)
-    gate = {"start_ns": 1.5e9 / SPEED_OF_LIGHT, "bin_width_ps": 0.25e12 / SPEED_OF_LIGHT, "bins": edges.size - 1}
     one = scene(
         medium=LAYERED,
         camera={"aperture_diameter": 0.02},
-        gate=gate,
+        gate={"start_ns": 1.5e9 / SPEED_OF_LIGHT, "bin_width_ps": 0.25e12 / SPEED_OF_LIGHT, "bins": 10},
         targets=[{**PLATE, "reflectance": 0.0}],
         transport={"estimator": estimator, "max_collisions": 1},
     )
@@ -70,11 +69,7 @@ def test_single_scattering_is_that_of_the_quadrature(estimator, device):
         layers=((1.2, 1.5, 0.6, 0.5), (1.7, 0.2, 0.9, 0.8)),
     )
     expected = single_scatter_total(reference, order=60).reshape(-1, 20).sum(axis=1)
-    rows = []
-    for seed in range(16):
-        result = simulate(one, photons=50_000, seed=seed, device=device)
-        rows.append(result.component("backscatter").sum(axis=(0, 1)))
-    mean, error = np.mean(rows, axis=0), np.std(rows, axis=0, ddof=1) / 4.0
+    mean, error, *_ = means(one, device, 50_000, 16)
     # 0.2 %: the quadrature, whose nodes do not know where the layers begin.
     assert (np.abs(mean - expected) < 4.0 * error + 0.002 * expected).all(), (mean - expected) / error
     assert (error < 0.05 * expected).all()
@@ -83,9 +78,10 @@ def test_single_scattering_is_that_of_the_quadrature(estimator, device):
 def test_a_slab_of_three_layers_passes_and_returns_what_adding_says(device):
     one = scene(
         medium=LAYERED,
-        laser=PENCIL,
-        domain={"shape": "slab", "lower": [-math.inf, -math.inf, 0.0], "upper": [math.inf, math.inf, 3.0]},
-        targets=[],
+        laser={**PENCIL, "frame": "world", "direction": [0.0, 0.0, 1.0]},
+        camera={"rotation_deg": [10.0, 20.0, 30.0]},
+        domain={"shape": "slab", "lower": 0.0, "upper": 3.0},
+        targets=BEYOND,
         transport={"max_path": 1000.0, "weight_cutoff": 1e-5, "max_collisions": 1000},
     )
     count = 400_000

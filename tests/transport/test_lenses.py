@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import spadwarp
-from helpers.estimators import agreeing_cells
+from helpers.estimators import PHOTONS, agreeing_cells
 from helpers.opencv import project_points
 from helpers.scenes import PLATE, scene
 from spadwarp import simulate
@@ -18,19 +18,23 @@ pytestmark = pytest.mark.physics
 
 BENT = {"horizontal_fov_deg": None, "fx": 4.3, "fy": 4.6, "cx": 1.2, "cy": 1.9}
 BENT["distortion"] = [-0.15, 0.02, 0.01, -0.02, 0]
+POSE = {"position": [0.4, -0.3, -0.2], "rotation_deg": [6.0, -9.0, 20.0]}
+WORLD = {"position": [0.7, 0.2, -0.1], "direction": [-0.2, -0.1, 1.0], "frame": "world"}
 CAMERAS = {
-    "thin lens": {"camera": {"focus_distance": 1.2}},
-    "calibrated, posed, laser in the world": {
-        "camera": {**BENT, "position": [0.4, -0.3, -0.2], "rotation_deg": [6.0, -9.0, 20.0], "focus_distance": 3.0},
-        "laser": {"position": [0.7, 0.2, -0.1], "direction": [-0.2, -0.1, 1.0], "frame": "world"},
-    },
+    "thin lens": (PHOTONS, {"camera": {"focus_distance": 1.2}}),
+    "calibrated, posed, laser in the world": (
+        {"analog": 60_000, "guided": 30_000},
+        {"camera": {**BENT, **POSE, "focus_distance": 3.0}, "laser": WORLD},
+    ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_estimators_agree_behind_every_lens(camera, device):
-    cells = agreeing_cells(scene(**CAMERAS[camera]), device, pixels=True, converged=0.1, clear=True)
+    photons, sections = CAMERAS[camera]
+    one, clear = scene(**sections), photons is PHOTONS
+    cells = agreeing_cells(one, device, photons=photons, pixels=True, converged=0.1, clear=clear)
     # Every component and pixel is seen.
     pixels = cells["guided"][:, -16:]
     assert (pixels.std(axis=0) / pixels.mean(axis=0) / math.sqrt(32) < 0.1).all()
@@ -41,12 +45,13 @@ def test_estimators_agree_behind_every_lens(camera, device):
 def test_a_thin_lens_stopped_down_is_a_pinhole(estimator, device):
     """The same photons through a hole of 20 µm, focused at 1.2 m, or a point: the same image to what rounding
     moves from a pixel to its neighbour."""
-    sections = {"transport": {"estimator": estimator}, "camera": {"width": 16, "height": 16, "aperture_diameter": 2e-5}}
-    camera = sections["camera"]
-    sections["camera"] = {**camera, "pinhole": True}
-    pinhole = simulate(scene(**sections), photons=100_000, seed=1, device=device)
-    sections["camera"] = {**camera, "focus_distance": 1.2}
-    thin = simulate(scene(**sections), photons=100_000, seed=1, device=device)
+    camera = {"width": 16, "height": 16, "aperture_diameter": 2e-5}
+    thin, pinhole = (
+        simulate(
+            scene(transport={"estimator": estimator}, camera={**camera, **lens}), photons=100_000, seed=1, device=device
+        )
+        for lens in ({"focus_distance": 1.2}, {"pinhole": True})
+    )
     wrong = np.abs(thin.intensity - pinhole.intensity).sum() / pinhole.intensity.sum()
     assert wrong < 0.01
     np.testing.assert_allclose(thin.histogram.sum(axis=(0, 1)), pinhole.histogram.sum(axis=(0, 1)), rtol=0.01)
@@ -116,45 +121,34 @@ def test_moving_everything_together_changes_nothing(device):
         np.testing.assert_allclose(there.depth(), here.depth(), rtol=0.01)
 
 
-def test_the_domain_stands_in_the_world(device):
-    """A camera that is turned against a box of water: photons end on the faces that the ledger names."""
-    box = {"shape": "box", "lower": [-0.5, -0.8, -0.4], "upper": [0.6, 0.9, 1.0]}
-    one = scene(
-        medium={"albedo": 1.0, "extinction": 2.0},
-        camera={"position": [0.1, 0.2, 0.1], "rotation_deg": [20.0, 130.0, -50.0]},
-        domain=box,
-        targets=[],
-        transport={"weight_cutoff": 0.0, "max_collisions": 1000},
-    )
-    records = spadwarp.transport.trace(one, photons=20_000, seed=1, device=device)
-    for index, axis in enumerate("xyz"):
-        for side, corner in (("low", box["lower"]), ("high", box["upper"])):
-            ended = records.ended(f"exit_{axis}_{side}")
-            assert ended.sum() > 100
-            np.testing.assert_allclose(records.position[ended, index], corner[index], atol=1e-5)
-    inside = (records.position > np.array(box["lower"]) - 1e-5) & (records.position < np.array(box["upper"]) + 1e-5)
-    assert inside.all()
-
-
 def test_a_camera_outside_the_water_is_refused():
-    outside = scene(domain={"shape": "slab", "lower": 0.5, "upper": 9.0}, laser={"position": [0, 0, 1.0]})
-    with pytest.raises(ConfigError, match=r"camera\.position: z = 0\.0 is outside \[0\.5, 9\.0\], the domain"):
-        simulate(outside, photons=10, device="cpu")
-    with pytest.raises(ConfigError, match=r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\], the domain"):
-        simulate(scene(domain={"shape": "box", "lower": 1.0, "upper": 9.0}), photons=10, device="cpu")
+    camera = {"domain": {"shape": "slab", "lower": 0.5, "upper": 9.0}, "laser": {"position": [0, 0, 1.0]}}
+    laser = {"domain": {"shape": "box", "lower": 1.0, "upper": 9.0}}
+    for sections, text in (
+        (camera, r"camera\.position: z = 0\.0 is outside \[0\.5, 9\.0\], the domain"),
+        (laser, r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\], the domain"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            simulate(scene(**sections, transport={"termination": "roulette"}), photons=10, device="cpu")
 
 
 def test_layers_of_water_stand_in_the_world(device):
     """Camera, laser and layers under one motion: photons end where the motion takes their ends."""
     turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])
     layers = [{"start": 0.7, "extinction": 3.0, "albedo": 0.5}, {"start": 1.5, "extinction": 0.2, "albedo": 0.9}]
-    here = scene(medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]}, targets=[])
+    pose, apart = rotation_matrix((10.0, 20.0, 30.0)), {"translation": [0.0, 0.0, -400.0]}
+    around = {"domain": {"shape": "box", "lower": -900.0, "upper": 900.0}, "targets": [PLATE | apart]}
+    here = scene(
+        medium={"layers": layers, "layer_axis": [0.6, 0.0, 0.8]},
+        camera={"rotation_deg": [10.0, 20.0, 30.0]},
+        **around,
+    )
     start = float(turn @ [0.6, 0.0, 0.8] @ shift)
     moved = [{**layer, "start": layer["start"] + start} for layer in layers]
     there = scene(
         medium={"layers": moved, "layer_axis": (turn @ [0.6, 0.0, 0.8]).tolist()},
-        camera={"position": shift.tolist(), "rotation_deg": rotation_angles(turn)},
-        targets=[],
+        camera={"position": shift.tolist(), "rotation_deg": rotation_angles(turn @ pose)},
+        **around,
     )
     along, same = (one.optical_depth((0.1, 0, 0), (0.3, 0.2, 4.0)) for one in (there, here))
     assert along == pytest.approx(same)

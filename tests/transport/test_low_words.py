@@ -1,6 +1,7 @@
 """Low words of a large tally: who keeps them apart, and that the sums are those of additions of 64 bits."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ import warp as wp
 
 import spadwarp
 import spadwarp_kernels as sk
-from helpers.scenes import TREE, scene
+from helpers.scenes import ELSEWHERE, TREE, scene
 from helpers.statistics_of_samples import DEVICES
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
@@ -28,7 +29,7 @@ CASES = {
     "analog": {"transport": {"estimator": "analog"}},
     "tree": {"targets": [TREE], "transport": {"estimator": "next_event"}},
     "guided tree": {"targets": [TREE], "transport": {"estimator": "guided"}},
-    "points": {"targets": [TREE], "transport": {"estimator": "guided", "points_per_flight": 3}},
+    "points": {"targets": [TREE], "medium": {"layers": ELSEWHERE}, "transport": {"points_per_flight": 3}},
     "pencil": PENCIL,
 }
 
@@ -56,7 +57,7 @@ def tally_of(spec, model, launches=2, photons=100_000):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("device", "case"), [("cpu", "water"), *itertools.product(DEVICES[1:], CASES)])
 def test_the_tally_has_the_same_bits_after_every_launch(always, device, case):
     spec, model = built(CASES[case], device)
     assert model.split_accumulators

@@ -6,7 +6,7 @@ import pytest
 import spadwarp
 import spadwarp_kernels as sk
 from helpers.estimators import cells
-from helpers.scenes import scene
+from helpers.scenes import BEYOND, ELSEWHERE, PLATE, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp import simulate
 from spadwarp.transport import trace
@@ -19,6 +19,9 @@ BARS = [
     {"builtin": "box", "size": [0.3, 2.0, 0.4], "translation": [0.4, 0.0, 1.5], "reflectance": 0.5},
 ]
 LAYERS = {"layers": [{"start": 0.8, "extinction": 1.0, "albedo": 0.6}]}
+ONE_WATER = {"layers": ELSEWHERE}
+
+POLARISED = {"medium": {"scattering_matrix": "scaled_rayleigh"}, "camera": {"polarisation": "stokes"}}
 
 
 def with_points(one, points):
@@ -27,10 +30,12 @@ def with_points(one, points):
 
 @pytest.mark.physics
 @pytest.mark.slow
-@pytest.mark.parametrize("sections, points", [({}, 2), ({"targets": BARS}, 3), ({"medium": LAYERS}, 3)])
-def test_more_points_have_the_expectation_of_one(sections, points, device):
-    """A plate; boxes that hide water from the lens, so that later points trace shadow rays of their own; layers."""
-    one, more = (cells(with_points(scene(**sections), n), device, 15_000, pixels=True) for n in (1, points))
+@pytest.mark.parametrize(("medium", "targets", "points"), [({}, [PLATE], 2), (LAYERS, BARS, 3)])
+def test_more_points_have_the_expectation_of_one(medium, targets, points, device):
+    """A plate; in layers boxes that hide water from the lens, so that later points trace shadow rays of their own."""
+    one, more = (
+        cells(with_points(scene(medium=medium, targets=targets), n), device, 15_000, pixels=True) for n in (1, points)
+    )
     assert equal_means_p(one, more) > 1e-3
     for found in (one, more):
         assert found.sum(axis=1).std() / found.sum(axis=1).mean() / np.sqrt(len(found)) < 0.015
@@ -43,11 +48,11 @@ def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
     sections = {
         "camera": {"width": 32, "height": 32, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
         "gate": {"bins": 16, "bin_width_ps": 1000.0},
-        "targets": [],
+        "targets": BEYOND,
     }
 
     def variance(points):
-        one = with_points(scene(**sections), points)
+        one = with_points(scene(**sections, medium=ONE_WATER if points == 3 else {}), points)
         light = [simulate(one, photons=20_000, seed=seed, device=device).histogram for seed in range(24)]
         return np.var(light, axis=0).sum(axis=(0, 1))[2:8]
 
@@ -56,27 +61,25 @@ def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
     assert 0.25 < np.median(triple / single) < 0.55
 
 
-@pytest.mark.parametrize("kind", ["derivative", "polarised", "grid"])
+@pytest.mark.parametrize("kind", ["derivatives", "polarised in cells"])
 def test_three_points_where_a_warp_has_a_short_queue(kind, device, tmp_path):
     """Light, or its derivative, that a flight and the surface at its end bring: sums over all bins agree within errors.
 
     Here a round of flights adds three times as many requests as a warp of a GPU scores at a time.
     """
-    sections, names = {}, ["medium.scattering"] if kind == "derivative" else []
-    if kind == "polarised":
-        sections = {"medium": {"scattering_matrix": "scaled_rayleigh"}, "camera": {"polarisation": "stokes"}}
-    if kind == "grid":
-        path, cells = tmp_path / "cells.npz", np.full((2, 2, 2), 0.5)
-        np.savez(path, extinction=cells, albedo=cells, size=[9.0] * 3)
-        sections = {"medium": {"grid": {"file": str(path), "tracking": "regular"}}}
+    names = ["medium.absorption", "medium.scattering", "medium.anisotropy", "reflectance"]
+    sections, names = ({}, names) if kind == "derivatives" else (POLARISED, [])
+    np.savez(tmp_path / "cells.npz", extinction=np.full((2, 2, 2), 0.5), albedo=np.full((2, 2, 2), 0.8), size=[9.0] * 3)
+    cells = {"grid": {"file": str(tmp_path / "cells.npz"), "tracking": "regular"}}
 
     def totals(points):
-        one = with_points(scene(**sections), points)
+        medium = cells if points == 3 and not names else ONE_WATER
+        one = with_points(scene(**sections | {"medium": sections.get("medium", {}) | medium}), points)
         rows = []
         for seed in range(12):
             result = simulate(one, photons=20_000, seed=seed, device=device, derivatives=names)
             assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
-            rows.append(result.derivatives[names[0]].sum() if names else result.histogram.sum())
+            rows.append(result.derivatives["medium.scattering"].sum() if names else result.histogram.sum())
         return np.array(rows)
 
     one, three = totals(1), totals(3)
@@ -88,25 +91,21 @@ def test_records_of_photons_have_no_points(device):
     assert np.array_equal(one.position, more.position) and np.array_equal(one.weight, more.weight)
 
 
+FACES = {"shape": "box", "lower": -2.0, "upper": 4.0, "outside_index": {"y_low": 1.0}}
+
+
 @pytest.mark.parametrize(
-    "changes, named",
+    ("changes", "named"),
     [
         ({"transport.estimator": "next_event"}, 'estimator = "next_event"'),
-        (
-            {
-                "transport.estimator": "guided",
-                "domain": {"shape": "box", "lower": -2.0, "upper": 4.0, "outside_index": {"y_low": 1.0}},
-            },
-            "faces of the domain that reflect",
-        ),
+        ({"domain": FACES}, "faces of the domain that reflect"),
     ],
 )
 def test_what_goes_with_one_point_alone_is_refused(changes, named, device):
     one = scene().with_overrides({"transport.points_per_flight": 2, **changes})
+    text = f"transport.points_per_flight = 2 cannot be combined with {named}; take 1"
     for refuse in (lambda: simulate(one, photons=100, device=device), lambda: spadwarp.check(one)):
-        with pytest.raises(
-            ConfigError, match=f"transport.points_per_flight = 2 cannot be combined with {named}; take 1"
-        ):
+        with pytest.raises(ConfigError, match=text):
             refuse()
     with pytest.raises(ConfigError, match="points_per_flight"):
         scene(transport={"points_per_flight": 4})

@@ -1,8 +1,8 @@
 """Runs cut into launches, batches, devices and shards, in spite of failures: all end with the bits of one run."""
 
 import dataclasses
+import itertools
 import signal
-import threading
 import warnings
 
 import numpy as np
@@ -15,7 +15,7 @@ import spadwarp_kernels as sk
 from helpers.cli import run
 from helpers.inverse import plate
 from helpers.runs import PHOTONS, RUN, same
-from helpers.scenes import PLATE, TREE, scene
+from helpers.scenes import ELSEWHERE, PLATE, TREE, scene
 from helpers.statistics_of_samples import DEVICES
 from spadwarp import ConfigError, DeviceError, RunOptions, merge, simulate
 from spadwarp.result import component_errors
@@ -37,9 +37,8 @@ def test_one_seed_gives_the_same_bits_however_the_run_is_cut_up(estimator, targe
     one = scene(transport={"estimator": estimator}, targets=targets)
 
     def cut(threads, launch_size, seed=2**63 + 5):
-        return simulate(
-            one, photons=20_000, seed=seed, device=device, run=RunOptions(threads=threads, launch_size=launch_size)
-        )
+        options = RunOptions(threads=threads, launch_size=launch_size)
+        return simulate(one, photons=20_000, seed=seed, device=device, run=options)
 
     whole = cut(1, 20_000)
     assert whole.tallies.any()
@@ -81,12 +80,10 @@ SEVERAL = ["cpu", "cpu,cpu", "cpu,cpu,cpu", *(["cuda:0,cuda:0", "cuda:all"] if "
 @pytest.mark.parametrize("uncertainty", [False, True])
 @pytest.mark.parametrize("device", SEVERAL)
 def test_devices_with_tallies_of_their_own_add_up_to_one(device, uncertainty, whole):
-    one = whole[uncertainty]
-    if device.startswith("cuda"):
-        one = simulate(scene(), **RUN, device="cuda:0", uncertainty=uncertainty)
-    seen = []
-    options = {**RUN, "device": device, "uncertainty": uncertainty, "progress": lambda *report: seen.append(report)}
-    cut = simulate(scene(), **options, run=RunOptions(threads=4, launch_size=3000))
+    options, seen = {**RUN, "uncertainty": uncertainty}, []
+    one = simulate(scene(), **options, device="cuda:0") if device.startswith("cuda") else whole[uncertainty]
+    run = {"device": device, "run": RunOptions(threads=4, launch_size=3000)}
+    cut = simulate(scene(), **options, **run, progress=lambda *report: seen.append(report))
     same(cut, one)
     assert cut.provenance["device"] == device or device == "cuda:all"
     traced = [done for stage, done, _ in seen if stage == "trace"]
@@ -144,23 +141,16 @@ def test_an_interrupted_shard_knows_where_it_ends(uncertainty, whole, tmp_path):
     same(merge([rest, here(**half, run=RunOptions(shard=(1, 2)))]), whole[uncertainty])
 
 
-CELLS = {
-    "shape": "plume",
-    "size": 1.2,
-    "cells": 10,
-    "extinction": 2.0,
-    "translation": [0.0, 0.0, 1.1],
-    "tracking": "delta",
-}
+CELLS = {"shape": "plume", "size": 1.2, "cells": 10, "extinction": 2.0, "translation": [0.0, 0.0, 1.1]}
 BLOCKS = tuple(f"medium.grid.{kind}" for kind in ("absorption", "scattering", "extinction"))
 SIGNED = {
     "derivatives": (
-        {"transport": {"estimator": "guided"}},
-        {"derivatives": ("absorption", "scattering", "anisotropy", "reflectance")},
+        {"medium": {"layers": ELSEWHERE}},
+        {"derivatives": ("medium.absorption", "medium.scattering", "medium.anisotropy", "reflectance")},
         "medium.absorption, medium.scattering",
     ),
     "blocks": (
-        {"medium": {"grid": CELLS}, "transport": {"estimator": "next_event"}},
+        {"medium": {"grid": {**CELLS, "tracking": "delta"}}},
         {"derivatives": (*BLOCKS, "reflectance"), "blocks": (2, 1, 5)},
         "medium.grid.scattering of 2 x 1 x 5 blocks",
     ),
@@ -205,26 +195,22 @@ def test_derivatives_and_channels_survive_files_merging_and_resuming(kind, tmp_p
 
 
 def test_what_cannot_be_merged_is_refused():
-    one, options = scene(), {"photons": 1000, "device": "cpu"}
-    a = simulate(one, **options, seed=5)
-    later = {**options, "run": RunOptions(first_photon=1000)}
+    def part(first=1000, photons=1000, seed=5, **changes):
+        one = scene().with_overrides(changes)
+        return simulate(one, photons=photons, seed=seed, device="cpu", run=RunOptions(first_photon=first))
+
+    a = part(0)
     for other, text in (
         (a, "ids 0 to 999 are in more than one"),
-        (simulate(one, **later, seed=6), "seed of the results differs"),
-        (
-            simulate(one.with_overrides({"medium.extinction": 0.6}), **later, seed=5),
-            "scene of the results differs in medium: only photons",
-        ),
-        (
-            simulate(one.with_overrides({"transport.termination": "roulette"}), **later, seed=5),
-            "scene of the results differs in transport: only photons",
-        ),
+        (part(seed=6), "seed of the results differs"),
+        (part(medium={"extinction": 0.6}), "scene of the results differs in medium: only photons"),
+        (part(transport={"max_collisions": 3}), "scene of the results differs in transport: only photons"),
     ):
         with pytest.raises(ConfigError, match=text):
             merge([a, other])
-    same(merge([simulate(one, **later, seed=5), a]), simulate(one, **{**options, "photons": 2000}, seed=5))
+    same(merge([part(), a]), part(0, 2000))
     with pytest.raises(ConfigError, match="photons = 1000 is outside"):
-        simulate(one, **options, run=RunOptions(resume=a))
+        here(photons=1000, run=RunOptions(resume=a))
     with pytest.raises(ConfigError, match="no batches"):
         _ = a.standard_error
 
@@ -260,26 +246,18 @@ def test_wrong_use_is_named(arguments, text, whole):
 # Checkpoints and failures
 
 
-def failing_after(calls, monkeypatch, error):
-    """Lets the launches after so many fail as a device does."""
-    launch, left = sk.launch_transport, [calls]
-    lock = threading.Lock()
-
-    def fail(*arguments, **options):
-        with lock:
-            left[0] -= 1
-        if left[0] < 0:
-            raise RuntimeError(error)
-        launch(*arguments, **options)
-
-    monkeypatch.setattr(sk, "launch_transport", fail)
-
-
 @pytest.mark.parametrize("device", ["cpu", "cpu,cpu"])
 @pytest.mark.parametrize("uncertainty", [False, True])
 def test_a_device_that_disappears_costs_what_was_not_in_a_checkpoint(device, uncertainty, whole, tmp_path, monkeypatch):
-    place = tmp_path / "checkpoint.h5"
-    failing_after(120, monkeypatch, "CUDA error 719: unspecified launch failure")
+    """After 120 launches."""
+    place, launch, calls = tmp_path / "checkpoint.h5", sk.launch_transport, itertools.count()
+
+    def fail(*arguments, **options):
+        if next(calls) >= 120:
+            raise RuntimeError("CUDA error 719: unspecified launch failure")
+        launch(*arguments, **options)
+
+    monkeypatch.setattr(sk, "launch_transport", fail)
     often = RunOptions(**SMALL_LAUNCHES, checkpoint=place, checkpoint_every=0.0)
     with pytest.raises(DeviceError) as caught:
         simulate(scene(), **RUN, device=device, uncertainty=uncertainty, run=often)
@@ -417,9 +395,8 @@ def test_moments_of_the_components_are_those_of_the_batches(device):
         assert error == pytest.approx(np.std(total, ddof=1) / np.mean(total) / np.sqrt(32))
         squares = (np.array(total, float) - np.mean(total)) ** 2
         assert share == pytest.approx(32 / 31 * squares.max() / squares.sum())
-    parts = [
-        simulate(scene(), photons=32 * size, **options, uncertainty=True, run=RunOptions(shard=(k, 2))) for k in (1, 2)
-    ]
+    options |= {"photons": 32 * size, "uncertainty": True}
+    parts = [simulate(scene(), **options, run=RunOptions(shard=(k, 2))) for k in (1, 2)]
     assert merge(parts).batch_moments == whole.batch_moments
 
 
@@ -484,13 +461,8 @@ def test_the_stopping_rule_does_not_see_how_many_devices_there_are():
 
 def test_a_resumed_run_counts_all_batches_for_its_stopping_rule(whole):
     photons, seen = 64 * whole[True].batch_size, []
-    resumed = here(
-        photons=photons,
-        relative_error=1e-6,
-        progress=lambda *report: seen.append(report[0]),
-        run=RunOptions(resume=whole[True]),
-    )
-    assert resumed.photons == photons
+    options = {"photons": photons, "relative_error": 1e-6, "run": RunOptions(resume=whole[True])}
+    assert here(**options, progress=lambda *report: seen.append(report[0])).photons == photons
     assert [remark for remark in seen if remark.startswith("error")][-1].split(" after ")[1].startswith("64 batches; ")
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import spadwarp
 import spadwarp_kernels as sk
 from helpers.launch import Floats, launched
-from helpers.scenes import scene
+from helpers.scenes import BEYOND, PENCIL, PLATE, scene
 from spadwarp import RunOptions, simulate
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
@@ -22,24 +22,16 @@ from spadwarp.values import ConfigError, SpadwarpError, path_from_time
 from spadwarp_kernels.photon.state import to_fixed_point
 
 
-def plate_at(distance, extinction, *, reflectance=0.5, estimator="next_event", **sections):
+def plate_at(distance, extinction, *, reflectance=0.5, estimator="next_event"):
     """A pencil beam onto a plate across the axis; a history ends at its first event, which is all of the ballistic
     return."""
-    tables = {
-        "medium": {"extinction": extinction, "albedo": 0.8, "anisotropy": 0.924},
-        "laser": {"profile": "collimated", "position": [0.0, 0.0, 0.0]},
-        "camera": {"width": 1, "height": 1, "horizontal_fov_deg": 2.0, "aperture_diameter": 0.05},
-        "gate": {"start_ns": 0.0, "bin_width_ps": 1000.0, "bins": 100},
-        "targets": [
-            {"builtin": "plane", "size": [4.0, 4.0], "translation": [0, 0, distance], "reflectance": reflectance}
-        ],
-        "transport": {"estimator": estimator, "max_collisions": 1},
-    }
     return scene(
-        **{
-            name: {**fields, **sections.get(name, {})} if name != "targets" else fields
-            for name, fields in tables.items()
-        }
+        medium={"extinction": extinction, "anisotropy": 0.924},
+        laser=PENCIL,
+        camera={"width": 1, "height": 1, "horizontal_fov_deg": 2.0, "aperture_diameter": 0.05},
+        gate={"bin_width_ps": 1000.0, "bins": 100},
+        targets=[{**PLATE, "size": [4.0, 4.0], "translation": [0, 0, distance], "reflectance": reflectance}],
+        transport={"estimator": estimator, "max_collisions": 1},
     )
 
 
@@ -56,7 +48,7 @@ def test_a_far_target_is_seen_behind_a_bright_bin_at_the_lens(estimator, device)
     """One pixel, wide bins, a gate from 0: 19 attenuation lengths, within 3 standard errors of the lidar equation, and
     within the rounding of the photons that have reached the plate."""
     one = plate_at(8.0, 1.2, estimator=estimator)
-    photons = 8_000_000
+    photons = 4_000_000
     result = simulate(one, photons=photons, seed=1, device=device)
     reached = result.counters["surface_events"]
     value = result.component("ballistic").sum() * photons
@@ -85,15 +77,9 @@ def test_the_ballistic_return_meets_the_closed_form_in_any_scene(distance, depth
     speed = path_from_time(1e-9, one.medium.group_index)  # per ns
     start = drawn["start"] * 2 * distance / speed
     bins = math.ceil((2.2 * distance / speed - start) * 1000.0 / drawn["bin_width"])
-    one = one.with_overrides(
-        camera={
-            "width": drawn["pixels"],
-            "height": 1,
-            "horizontal_fov_deg": drawn["view"],
-            "aperture_diameter": drawn["aperture"],
-        },
-        gate={"start_ns": start, "bin_width_ps": drawn["bin_width"], "bins": bins},
-    )
+    camera = {"width": drawn["pixels"], "horizontal_fov_deg": drawn["view"], "aperture_diameter": drawn["aperture"]}
+    gate = {"start_ns": start, "bin_width_ps": drawn["bin_width"], "bins": bins}
+    one = one.with_overrides(camera=camera, gate=gate)
     result = simulate(one, photons=100_000, seed=seed, device="cpu")
     reached, value = result.counters["surface_events"], one_return(one, distance) / result.unit
     assert reached > 100
@@ -130,11 +116,10 @@ def test_the_brightest_bin_follows_the_phase_function(water, device):
         medium={"extinction": 1.0, "albedo": 0.9, **water},
         laser={"position": [0.0, 0.0, 0.0], "half_angle_deg": 5.0},
         camera={"width": 1, "height": 1, "aperture_diameter": 0.05},
-        targets=[],
-        transport={"estimator": "guided"},
+        targets=BEYOND,
     )
     result = simulate(one, photons=100_000, seed=2, device=device)
-    fill = result.tallies.sum(axis=0).max() / result.photons * photon_capacity(one, None) / 2.0**62
+    fill = result.tallies.sum(axis=0).max() / result.photons * photon_capacity(one, build_mesh(one)) / 2.0**62
     assert 1e-5 < fill < 0.5
 
 
@@ -206,7 +191,7 @@ def test_rounding_that_decides_the_error_is_a_warning():
     """30 attenuation lengths of water behind a gate from 0."""
     one = scene(
         medium={"extinction": 8.0, "albedo": 0.5},
-        targets=[{"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.0]}],
+        targets=[{**PLATE, "translation": [0.0, 0.0, 2.0], "reflectance": 0.5}],
         gate={"bins": 4, "bin_width_ps": 3e4},
         transport={"estimator": "next_event", "max_collisions": 60, "weight_cutoff": 0.0},
     )
