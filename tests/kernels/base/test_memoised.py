@@ -3,22 +3,12 @@
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-import pytest
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 
 
-@pytest.fixture
-def hasty():
-    """Threads that take turns all the time."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    yield
-    sys.setswitchinterval(before)
-
-
-def test_each_thread_gets_its_own_function(hasty):
+def test_each_thread_gets_its_own_function():
     @memoised
     def make(number):
         @wp.func
@@ -27,7 +17,12 @@ def test_each_thread_gets_its_own_function(hasty):
 
         return one
 
-    with ThreadPoolExecutor(8) as pool:
-        made = list(pool.map(make, range(100)))
+    before = sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(1e-6)  # threads take turns all the time
+        with ThreadPoolExecutor(8) as pool:
+            made = list(pool.map(make, range(100)))
+    finally:
+        sys.setswitchinterval(before)
     assert [function.func.__closure__[0].cell_contents for function in made] == list(range(100))
     assert [make(number) for number in range(100)] == made
