@@ -48,9 +48,10 @@ def kernel_of(function, arrays, out):
 
 
 def each(function, inputs, out=(float,), device="cpu"):
-    """What a Warp function returns for each entry of the arrays among its inputs: as `launched`, one array by itself."""
-    named = zip(function.input_types, inputs, strict=True)
-    arrays = {name: value for name, value in named if isinstance(value, np.ndarray | wp.array)}
+    """What a Warp function returns for each entry of the arrays among its arguments: NumPy arrays, one by itself."""
+    given = [(*item, value) for item, value in zip(function.input_types.items(), inputs, strict=True)]
+    whole = {name for name, kind, _ in given if hasattr(kind, "dtype")}
+    arrays = {name: value for name, _, value in given if isinstance(value, np.ndarray | wp.array) and name not in whole}
     count = min(map(len, arrays.values()))
     found = launched(kernel_of(function, frozenset(arrays), tuple(out)), inputs, out, device, count)
     return found if len(found) > 1 else found[0]
