@@ -1,7 +1,6 @@
 """Flights through layers against sums in float64, and against the homogeneous functions bit for bit."""
 
 import numpy as np
-import pytest
 
 import spadwarp_kernels as sk
 from helpers.launch import each
@@ -61,8 +60,3 @@ def test_layers_of_one_extinction_are_no_layers(device):
     distance, mean, _ = flown(device, [0.7] * 5)
     np.testing.assert_array_equal(distance, each(sk.free_path, [rays()[2], 0.7], device=device))
     np.testing.assert_array_equal(mean, np.float32(0.7))
-
-
-def test_lists_of_different_lengths_are_refused():
-    with pytest.raises(ValueError, match="start 2, extinction 1, albedo 2, anisotropy 2"):
-        sk.make_layers([0.0, 1.0], [0.3], [0.5, 0.5], [0.9, 0.9], device="cpu")

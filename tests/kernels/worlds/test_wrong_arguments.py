@@ -8,7 +8,8 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.worlds import STILL, garden, transforms
+from helpers.launch import on_device
+from helpers.worlds import STILL, transforms
 from spadwarp_kernels.worlds.shapes import move_shapes
 
 SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
@@ -19,18 +20,13 @@ def poses(*rows):
 
 
 def triangle(last=2):
-    points = wp.array(np.array([(0, 0, 3), (1, 0, 3), (0, 1, 3)], np.float32), dtype=wp.vec3, device="cpu")
-    return wp.Mesh(points, wp.array([0, 1, last], dtype=int, device="cpu"))
+    return wp.Mesh(on_device([(0, 0, 3.0), (1, 0, 3), (0, 1, 3)]), on_device([0, 1, last]))
 
 
 def boxes(**arguments):
     given = {"kind": ["plane", "box"], "size": [(0, 0, 0), (0.3, 0.2, 0.2)], "body": [-1, 0], "device": "cpu"}
     given |= {"local": [(0, 0, 4, 0, 0, 0, 1), STILL]} | arguments
     return sk.make_shapes(given.pop("kind"), given.pop("size"), **given)
-
-
-def meshed(mesh, **arguments):
-    return sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh], device="cpu", **arguments)
 
 
 def one_step(kind, shapes, camera_q, body_q):
@@ -44,20 +40,16 @@ def one_step(kind, shapes, camera_q, body_q):
 
 
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
-@pytest.mark.parametrize(
-    ("row", "text"),
-    [
+def test_poses_of_a_first_step(kind):
+    for row, text in (
         ((np.nan,) * 7, r"\[nan, .*\] is not finite"),
         ((np.inf, 0, 0, 0, 0, 0, 1), r"\[inf, .*\] is not finite"),
         ((0,) * 7, "has the quaternion .* of length 0; one of length 1 is needed"),
         ((0, 0, 0, 0, 0, 0, 2), "has the quaternion .* of length 2; one of length 1 is needed"),
-    ],
-)
-def test_poses_of_a_first_step(kind, row, text):
-    with pytest.raises(sk.ArgumentError, match=r"camera_q\[0\].* " + text):
-        one_step(kind, boxes(), poses(row), poses(STILL))
-    with pytest.raises(sk.ArgumentError, match=r"body_q\[0\].* " + text):
-        one_step(kind, boxes(), poses(STILL), poses(row))
+    ):
+        for name, pair in (("camera_q", (row, STILL)), ("body_q", (STILL, row))):
+            with pytest.raises(sk.ArgumentError, match=rf"{name}\[0\].* {text}"):
+                one_step(kind, boxes(), *map(poses, pair))
 
 
 @pytest.mark.parametrize(
@@ -107,9 +99,12 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
         (lambda: sk.SpadCamera(world=3, device="cpu"), "world is int; a list is needed"),
         (lambda: move_shapes(3, None), "shapes is int; a Shapes is needed"),
         (lambda: sk.SpadTracer(BOX_ON_BODY_2, world=["a"], device="cpu"), "world = 'a' is not an integer"),
-        (lambda: sk.SpadTracer(garden("cpu")[0], cameras=3), "world = 2 is none of the 2 worlds"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, photons=0), r"photons = 0 is outside \[1, 67108864\]"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, estimator="analog"), "estimator = 'analog' is not one of 'guided'"),
+        (lambda: sk.SpadTracer(boxes(worlds=2), SMALL, 3), "world = 2 is none of the 2 worlds"),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, photons=0), r"photons = 0 is outside \[1, 67108864\]"),
+        (
+            lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, estimator="analog"),
+            "estimator = 'analog' is not one of 'guided'",
+        ),
         (lambda: sk.write_poses(None, poses(STILL), poses(STILL)), "position is None"),
     ],
 )
@@ -137,8 +132,8 @@ def test_arrays_that_no_device_holds():
         sk.SpadCamera(SMALL, 10**9, device="cpu")
     with pytest.raises(sk.ArgumentError, match=r"= 40000000 x 6 x 8 x 8192: .* need 1.26e\+05 GB, and cpu has"):
         sk.SpadCamera(dataclasses.replace(SMALL, bins=8192), 4 * 10**7, device="cpu")
-    with pytest.raises(sk.ArgumentError, match="oversampling = 17179869184 is outside"):
-        sk.SpadTracer(boxes(), sk.SpadConfig(width=512, height=512, bins=64), oversampling=1024)
+    with pytest.raises(sk.ArgumentError, match="oversampling = 2415919104 is outside"):
+        sk.SpadTracer(boxes(), dataclasses.replace(SMALL, width=192, height=192, bins=64), oversampling=1024)
     with pytest.raises(sk.ArgumentError, match="world 0 of camera 0 has no shapes"):
         sk.SpadTracer(boxes(visible=False), SMALL)
 
@@ -146,7 +141,7 @@ def test_arrays_that_no_device_holds():
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
 def test_a_mesh_lives_as_long_as_its_shapes(kind):
     mesh = triangle()
-    shapes = meshed(mesh.id)
+    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], device="cpu")
     del mesh
     gc.collect()
     assert np.nanmin(one_step(kind, shapes, poses(STILL), None).true_depth.numpy()) == pytest.approx(3.0)
