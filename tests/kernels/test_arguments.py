@@ -140,7 +140,13 @@ def test_meshes_and_rasters_of_another_model(box):
 
 PORT = {"index": (1.0, 1.5, 1.34), "group_index": (1.0, 1.5, 1.36)}
 NONE = {"kinds": (), "value": (), "scale": (1.0,), "channels": 1, "device": "cpu"}
-CORNERS = np.zeros((1, 3, 2))
+TILT = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+CORNERS, ONES = np.zeros((1, 3, 2)), np.ones((2, 2, 2))
+GRID = {"extinction": ONES, "albedo": ONES, "size": (1.0, 1.0, 1.0), "device": "cpu"}
+
+
+def polarised(**arguments):
+    sk.make_polarisation(**arguments, device="cpu")
 
 
 @pytest.mark.parametrize(
@@ -148,22 +154,57 @@ CORNERS = np.zeros((1, 3, 2))
     [
         (lambda: sk.make_boundary([1, 0, 0], [0, 0]), r"high = \[0, 0\] is not three numbers"),
         (lambda: sk.make_boundary(None, [0, 0, 0]), "low is .* a list is needed"),
-        (lambda: sk.sphere_integral(3.0), "function = 3.0 is not a function"),
-        (lambda: sk.sphere_integral(lambda t: None), "what function returns has shape"),
-        (lambda: sk.surface_choices(None), "surfaces is .* a Surfaces is needed"),
-        (lambda: sk.surface_choices(sk.Surfaces()), "surfaces.corner_reflectance is missing"),
-        (lambda: analytic.make_optics([]), r"port = \[\] is not a PortKind"),
-        (lambda: sk.make_derivatives(**NONE | {"kinds": None}), "kinds is .* a list is needed"),
-        (lambda: sk.make_derivatives(**NONE, waters=[0.5]), "waters holds numbers that are not whole"),
-        (lambda: sk.make_derivatives(**NONE, faces="x"), "faces is .* not an array of numbers"),
-        (lambda: sk.make_derivatives(**NONE, blocks=3), "blocks is .* a Blocks is needed"),
-        (lambda: sk.make_dome_port(radius=1e300, thickness=0.01, **PORT), r"radius = 1e\+300 is outside \(0, 1e9\]"),
-        (lambda: sk.make_textures(np.array([3]), CORNERS, [CORNERS[0]]), r"face holds 3 to 3, outside \[-1, 0\]"),
-        (lambda: sk.make_textures(np.array([0]), CORNERS, [[[0.5, 2.0]]]), r"images\[0\] holds 0.5 to 2.0, outside \["),
+        (lambda: sk.make_boundary([0, 0, 0], [0, 0, 0]), "all faces let all light out"),
+        (lambda: sk.make_boundary([0, -1, 0], [0, 0, 0]), "low, y, = -1 is outside"),
+        (lambda: sk.make_boundary([0, 1, 0], [0, 0, 0], max_reflections=9), "max_reflections = 9 is outside"),
+        (
+            lambda: sk.make_grid(**GRID | {"extinction": np.ones((2, 2))}),
+            r"extinction has shape \(2, 2\); 3 dimensions",
+        ),
+        (lambda: sk.make_grid(**GRID | {"extinction": -ONES}), r"extinction = -1.0 is outside \[0, inf\)"),
+        (lambda: sk.make_grid(**GRID | {"albedo": np.nan * ONES}), r"albedo = nan is outside \[0, 1\]"),
+        (
+            lambda: sk.make_grid(**GRID | {"albedo": np.ones((2, 2, 3))}),
+            r"albedo has cells \(2, 2, 3\), extinction \(2,",
+        ),
+        (lambda: sk.make_grid(**GRID, anisotropy=ONES), r"anisotropy = 1.0 is outside \(-1, 1\)"),
+        (lambda: sk.make_grid(**GRID, rotation=np.ones((3, 3))), "rotation = "),
+        (lambda: sk.make_grid(**GRID | {"size": (1.0, 0.0, 1.0)}), r"size = 0.0 is outside \(0, inf\)"),
         (lambda: sk.make_layers([0, 1], [1, -1], [0, 0], [0, 0]), r"extinction\[1\] = -1 is outside \(0, inf\)"),
         (lambda: sk.make_layers([0, 5, 1], [1] * 3, [0] * 3, [0] * 3), r"start\[2\] = 1 is outside \[5.0, inf\)"),
         (lambda: sk.make_layers([0, 1], [0.3], [0, 0], [0, 0]), "start 2, extinction 1, albedo 2, anisotropy 2"),
         (lambda: sk.henyey_greenstein_density(0.5, 1), r"g = 1 is outside \(-1, 1\)"),
+        (lambda: sk.interpolated_density([0.1], [1.0]), "two or more"),
+        (lambda: sk.interpolated_density([0.1, 0.1], [1.0, 1.0]), "ascending"),
+        (lambda: sk.interpolated_density([0.1, 4.0], [1.0, 1.0]), "outside"),
+        (lambda: sk.interpolated_density([-0.1, 1.0], [1.0, 1.0]), "outside"),
+        (lambda: sk.interpolated_density([0.1, 1.0], [1.0, -1.0]), "not negative"),
+        (lambda: sk.interpolated_density([0.1, 1.0], [0.0, 0.0]), "not all 0"),
+        (lambda: sk.interpolated_density([0.1, 1.0], [1.0, math.nan]), "finite"),
+        (lambda: sk.sphere_integral(3.0), "function = 3.0 is not a function"),
+        (lambda: sk.sphere_integral(lambda t: None), "what function returns has shape"),
+        (lambda: sk.surface_choices(None), "surfaces is .* a Surfaces is needed"),
+        (lambda: sk.surface_choices(sk.Surfaces()), "surfaces.corner_reflectance is missing"),
+        (lambda: sk.make_textures(np.array([3]), CORNERS, [CORNERS[0]]), r"face holds 3 to 3, outside \[-1, 0\]"),
+        (lambda: sk.make_textures(np.array([0]), CORNERS, [[[0.5, 2.0]]]), r"images\[0\] holds 0.5 to 2.0, outside \["),
+        (lambda: sk.make_derivatives(**NONE | {"kinds": None}), "kinds is .* a list is needed"),
+        (lambda: sk.make_derivatives(**NONE, waters=[0.5]), "waters holds numbers that are not whole"),
+        (lambda: sk.make_derivatives(**NONE, faces="x"), "faces is .* not an array of numbers"),
+        (lambda: sk.make_derivatives(**NONE, blocks=3), "blocks is .* a Blocks is needed"),
+        (lambda: sk.make_flat_port(**PORT, distance=0.0), "reaches through the port"),
+        (lambda: sk.make_flat_port(**PORT, distance=0.05, thickness=-1.0), "thickness = -1.0 is outside"),
+        (lambda: sk.make_flat_port(**PORT, distance=0.001, normal=TILT, aperture_radius=0.02), "through the port"),
+        (lambda: sk.make_flat_port(**PORT | {"index": (0.5, 1.5, 1.3)}, distance=0.05), r"index\[0\] = 0.5 is outside"),
+        (lambda: sk.make_dome_port(**PORT, radius=0.05, thickness=0.0, centre=(0.0, 0.0, 0.06)), "too far"),
+        (lambda: sk.make_dome_port(**PORT, radius=1e300, thickness=0.01), r"radius = 1e\+300 is outside \(0, 1e9\]"),
+        (lambda: analytic.make_optics([]), r"port = \[\] is not a PortKind"),
+        (lambda: polarised(laser=(1.0, 0.9, 0.9, 0.0)), "polarised by more than 1"),
+        (lambda: polarised(laser=1.0), "laser = 1.0 is not a Stokes vector"),
+        (lambda: polarised(matrix=lambda c: np.full((len(c), 5), 1.5)), "beyond m11"),
+        (lambda: polarised(matrix=lambda c: np.zeros((3, 5))), "cosines"),
+        (lambda: polarised(matrix=1.0), "matrix = 1.0 is not a function"),
+        (lambda: polarised(channels=[[1.0, 0.0]]), "rows of 4"),
+        (lambda: polarised(channels=[1.0]), r"channels\[0\] is .* a list is needed"),
     ],
 )
 def test_parts_of_a_model(call, text):

@@ -6,7 +6,6 @@ import warp as wp
 
 from helpers.launch import each, on_device
 from reference import refraction
-from spadwarp_kernels import ArgumentError
 from spadwarp_kernels.optics import DOME_PORT, FLAT_PORT, make_dome_port, make_flat_port
 from spadwarp_kernels.optics.port import Connection, PortRay
 
@@ -134,18 +133,3 @@ def test_what_lies_behind_the_port_has_no_way(device):
     # Beyond the critical angle water lets no light out.
     u = np.array([[0.8, 0.0, -0.6]], np.float32)
     assert each(FLAT_PORT.leave, [case("surface")[1], u * -9, u], [PortRay], device)["transmission"][0] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("make", "changes", "text"),
-    [
-        (make_flat_port, dict(distance=0.0), "reaches through the port"),
-        (make_flat_port, dict(distance=0.05, thickness=-1.0), "thickness = -1.0 is outside"),
-        (make_flat_port, dict(distance=0.001, normal=TILT, aperture_radius=0.02), "reaches through the port"),
-        (make_flat_port, dict(distance=0.05, index=(0.5, 1.5, 1.3)), r"index\[0\] = 0.5 is outside"),
-        (make_dome_port, dict(radius=0.05, thickness=0.0, centre=(0.0, 0.0, 0.06)), "too far"),
-    ],
-)
-def test_impossible_ports_are_named(make, changes, text):
-    with pytest.raises(ArgumentError, match=text):
-        make(**{"index": (1.0, 1.5, 1.34), "group_index": (1.0, 1.5, 1.36)} | changes)

@@ -150,20 +150,3 @@ def test_a_window_has_the_transmissions_of_both_polarisations(device):
         p = p * 4.0 * one * two / (one + two) ** 2
     np.testing.assert_allclose(out["m12"], (p - s) / (p + s), atol=1e-5)
     np.testing.assert_allclose(out["m33"], 2.0 * np.sqrt(p * s) / (p + s), atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ({"laser": (1.0, 0.9, 0.9, 0.0)}, "polarised by more than 1"),
-        ({"laser": 1.0}, "laser = 1.0 is not a Stokes vector"),
-        ({"matrix": lambda c: np.full((len(c), 5), 1.5)}, "beyond m11"),
-        ({"matrix": lambda c: np.zeros((3, 5))}, "cosines"),
-        ({"matrix": 1.0}, "matrix = 1.0 is not a function"),
-        ({"channels": [[1.0, 0.0]]}, "rows of 4"),
-        ({"channels": [1.0]}, r"channels\[0\] is .* a list is needed"),
-    ],
-)
-def test_what_no_light_and_no_matrix_can_be_is_refused(arguments, text):
-    with pytest.raises(sk.ArgumentError, match=text):
-        sk.make_polarisation(**arguments, device="cpu")

@@ -121,17 +121,3 @@ def test_images_are_what_reflections_one_by_one_lead_to(device):
         assert passes[k] == pytest.approx(expected, rel=2e-3, abs=1e-6)
         axis, side = met[0]
         assert first[k] == 1 + 2 * axis + side
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "reflections", "message"),
-    [
-        ([0, 0], [1, 1, 1], 2, "low = "),
-        ([0, 0, 0], [0, 0, 0], 2, "all faces let all light out"),
-        ([0, -1, 0], [0, 0, 0], 2, "low, y, = -1 is outside"),
-        ([0, 1, 0], [0, 0, 0], 9, "max_reflections = 9 is outside"),
-    ],
-)
-def test_boundaries_that_are_none_are_refused(low, high, reflections, message):
-    with pytest.raises(sk.ArgumentError, match=message):
-        sk.make_boundary(low, high, max_reflections=reflections, device="cpu")

@@ -138,25 +138,6 @@ def test_flights_in_vacuum_and_beside_the_box_know_no_end(tracking, device):
     assert (each(tracking.free_path, [medium, layers, x, u, np.float32([0.5, 1e-12]), 7], device=device) >= 1e30).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"extinction": np.ones((2, 2))}, "extinction has shape (2, 2); 3 dimensions"),
-        ({"extinction": np.full((2, 2, 2), -1.0)}, "extinction = -1.0 is outside [0, inf)"),
-        ({"albedo": np.full((2, 2, 2), np.nan)}, "albedo = nan is outside [0, 1]"),
-        ({"albedo": np.ones((2, 2, 3))}, "albedo has cells (2, 2, 3), extinction (2, 2, 2)"),
-        ({"anisotropy": np.ones((2, 2, 2))}, "anisotropy = 1.0 is outside (-1, 1)"),
-        ({"rotation": np.ones((3, 3))}, "rotation = "),
-        ({"size": (1.0, 0.0, 1.0)}, "size = 0.0 is outside (0, inf)"),
-    ],
-)
-def test_grids_that_cannot_be_are_refused(change, text):
-    ones = np.ones((2, 2, 2))
-    with pytest.raises(sk.ArgumentError) as caught:
-        sk.make_grid(**{"extinction": ones, "albedo": ones, "size": (1.0, 1.0, 1.0), **change}, device="cpu")
-    assert str(caught.value).startswith(text)
-
-
 def test_blocks_divide_the_cells():
     """Place of a block: that of its cells."""
     turn = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
