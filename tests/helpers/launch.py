@@ -6,7 +6,11 @@ import linecache
 import numpy as np
 import warp as wp
 
-Vectors, Floats, Integers = (wp.array(dtype=kind) for kind in (wp.vec3, float, int))  # of a kernel's arguments
+Floats = wp.array(dtype=float)  # of a kernel's arguments
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def on_device(values, device="cpu", dtype=None):

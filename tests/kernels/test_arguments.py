@@ -12,6 +12,7 @@ import spadwarp_kernels as sk
 from helpers.launch import on_device
 from helpers.lidar import lidar
 from helpers.lit_box import lit_box
+from helpers.meshes import mesh_of
 from spadwarp_kernels import analytic, detection
 
 NEXT_EVENT = sk.TransportSpec("next_event")
@@ -21,7 +22,7 @@ NEXT_EVENT = sk.TransportSpec("next_event")
 def box():
     shape = trimesh.creation.box((1.0, 1.0, 1.0))
     shape.apply_translation((0.0, 0.0, 5.0))
-    return wp.Mesh(on_device(shape.vertices), on_device(shape.faces.ravel()))
+    return mesh_of(shape.vertices, shape.faces)
 
 
 def model_of(mesh, *, keep=True, use_warp_bvh=False, device="cpu", scale=2.0**50, **changes):

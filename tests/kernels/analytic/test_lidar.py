@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import on_device
+from helpers.launch import on_device, unit
 from helpers.lidar import AXIS, C0, lidar
 from reference import crlb
 from reference.single_scatter import Lidar as ReferenceLidar
@@ -142,8 +142,7 @@ def test_backscatter_of_a_laser_beside_the_lens_agrees_with_quadrature(device):
     water = {"extinction": reference.extinction, "scattering": reference.extinction * reference.albedo}
     beam = {"half_angle": reference.half_angle, "laser": reference.laser_position}
     one = lidar(**water, **beam, pixel_tangent=2 * tangent / 24, start=2.0 / C0, stop=7.0 / C0, nearest=0.01)
-    view = grid((np.arange(24) - 11.5) / 12 * tangent)
-    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    view = unit(grid((np.arange(24) - 11.5) / 12 * tangent))
     total = scatter_table(one, view, np.zeros(576), reference.anisotropy, device)[2].reshape(24, 24)
     expected = single_scatter(reference)[:, :, 0]
     assert total.sum() == pytest.approx(expected.sum(), rel=0.02)

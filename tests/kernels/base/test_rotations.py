@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from helpers.launch import each
+from helpers.launch import each, unit
 from helpers.statistics_of_samples import chi2_p
 from spadwarp_kernels import one_minus_cosine, random_block, rotate_direction, u01
 from spadwarp_kernels.base.rotations import OFF_AXIS, cos_sin_turn, orthonormal_basis, snap_from
@@ -12,13 +12,13 @@ from spadwarp_kernels.base.rotations import OFF_AXIS, cos_sin_turn, orthonormal_
 def unit_vectors(count, seed=0):
     v = np.random.default_rng(seed).normal(size=(count, 3))
     v[:6] = np.concatenate([np.eye(3), -np.eye(3)])
-    return (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32)
+    return unit(v).astype(np.float32)
 
 
 def test_bases_are_orthonormal_everywhere(device):
     n = unit_vectors(100_000)
     n[6:12] = [[1e-4, 0, -1], [0, 1e-7, -1], [1e-20, 0, -1], [1e-4, 0, 1], [3e-8, 0, 1], [-1e-4, 1e-4, -1]]
-    n[6:12] /= np.linalg.norm(n[6:12], axis=1, keepdims=True)
+    n = unit(n)
     frames = np.stack([*each(orthonormal_basis, [n], (wp.vec3, wp.vec3), device), n.astype(np.float64)], axis=1)
     np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frames.shape), atol=2e-6)
     np.testing.assert_allclose(np.linalg.det(frames), 1.0, atol=3e-6)
@@ -64,8 +64,7 @@ def test_near_axis_rule_snaps_the_direction_unless_it_is_off():
 
 def test_one_minus_cosine_keeps_small_angles():
     angle = np.geomspace(1e-5, 3.1, 2000)
-    u = np.tile([0.6, 0.0, 0.8], (angle.size, 1)).astype(np.float32).astype(np.float64)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u = unit(np.tile(np.float32([0.6, 0.0, 0.8]), (angle.size, 1)).astype(np.float64))
     t = each(one_minus_cosine, [u, np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * [0.0, 1.0, 0.0]])
     # Rounding the vectors themselves moves the angle by 6e-8: 1e-4 of 1e-3 rad.
     assert np.abs(t / (2 * np.sin(angle / 2) ** 2) - 1)[angle > 1e-3].max() < 5e-4

@@ -159,14 +159,11 @@ def test_dead_time_gives_the_closed_form_rate(rate, dead_time):
 
 
 def test_dead_time_casts_its_shadow():
-    # A strong return early in the period blinds the detector behind it and no further.
+    """A strong return early in the period blinds the detector behind it and no further."""
     hazard = np.full(BINS, 1e-3)
     hazard[4] = 3.0
-    width = PERIOD / BINS
-    counts, _ = events(hazard, pulses=100_000, dead_time=6 * width)
-    rate = counts[0] / 100_000
-    fired = rate[4]
-    assert abs(fired - (1 - np.exp(-3)) * (1 - 5e-3)) < 0.01
+    rate = events(hazard, pulses=100_000, dead_time=6 * PERIOD / BINS)[0][0] / 100_000
+    assert abs(rate[4] - (1 - np.exp(-3)) * (1 - 5e-3)) < 0.01
     assert (rate[6:10] < 0.2e-3).all()  # only the 5 % of pulses that did not fire
     np.testing.assert_allclose(rate[12:], 1e-3, rtol=4 / np.sqrt(100))
 
@@ -253,9 +250,7 @@ def test_response_matrix_is_applied_and_noise_added():
 
 
 def test_crosstalk_goes_to_the_four_neighbours():
-    light = np.zeros((4, 5, 3), np.float32)
-    light[1, 2] = [1.0, 2.0, 0.0]
-    light[3, 0] = [0.0, 0.0, 4.0]  # a corner has two
+    light = np.random.default_rng(1).random((4, 5, 3), np.float32)
     hazard = array(light.reshape(20, 3))
     add_crosstalk(hazard, array(light.reshape(20, 3)), image_width=5, probability=0.1)
     padded = np.pad(light, ((1, 1), (1, 1), (0, 0)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import each, on_device
+from helpers.launch import each, on_device, unit
 from helpers.statistics_of_samples import chi2_p, sample_count
 from spadwarp_kernels import Camera, Gate
 from spadwarp_kernels.optics.camera import clip_to_gate, clip_to_view, in_view, lens_point, project, ready_camera
@@ -44,8 +44,7 @@ def test_the_clip_is_what_camera_and_gate_see(inverse_focus, device):
     gate.start, gate.stop = 4.0, 11.0
     rng = np.random.default_rng(5)
     x = rng.uniform([-3, -3, -1], [3, 3, 6], size=(2000, 3)).astype(np.float32)
-    u = rng.normal(size=x.shape)
-    u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
+    u = unit(rng.normal(size=x.shape)).astype(np.float32)
     view = each(clip_to_view, [camera, camera.view, x, u, o, 9.0], [wp.vec2], device)
     s0, s1 = each(clip_to_gate, [gate, x, u, 1.5, o, on_device(view, device, wp.vec2)], [wp.vec2], device).T
     s = np.linspace(0.0, 9.0, 901)

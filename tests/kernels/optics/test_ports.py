@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import each, on_device
+from helpers.launch import each, on_device, unit
 from reference import refraction
 from spadwarp_kernels.optics import DOME_PORT, FLAT_PORT, make_dome_port, make_flat_port
 from spadwarp_kernels.optics.port import Connection, PortRay
@@ -104,7 +104,7 @@ def test_rays_through_a_port_and_back(name, device):
     kind, port, faces, n, group = case(name)
     (x, _), shape = points(name), SHAPES[name]
     aim = np.random.default_rng(3).uniform(-0.25, 0.25, x.shape) * shape.get("radius", shape.get("distance"))
-    u = ((aim - x) / np.linalg.norm(aim - x, axis=1, keepdims=True)).astype(np.float32)
+    u = unit(aim - x).astype(np.float32)
     found = each(kind.leave, [port, x, u], [PortRay], device)
     back = each(kind.enter, [port, found["x"], -found["u"]], [PortRay], device)
     passed = np.flatnonzero(found["transmission"] > 0.0)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import each, on_device
+from helpers.launch import each, on_device, unit
 from reference.stokes import MIRROR, block_matrix, scattered
 from spadwarp_kernels.base.rotations import orthonormal_basis
 from spadwarp_kernels.riders.polarisation import (
@@ -23,8 +23,7 @@ pytestmark = pytest.mark.physics
 
 
 def directions(count, rng):
-    u = rng.normal(size=(count, 3))
-    return (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
+    return unit(rng.normal(size=(count, 3))).astype(np.float32)
 
 
 def matrix(cosine):
@@ -54,7 +53,7 @@ def turned(u, v, stokes, device, elements=matrix):
 
 
 def reference(u, v, stokes, before, after):
-    u, v = (one / np.linalg.norm(one, axis=-1, keepdims=True) for one in (np.float64(u), np.float64(v)))
+    u, v = (unit(np.float64(one)) for one in (u, v))
     matrices = lambda c: block_matrix(*np.moveaxis(matrix(c), -1, 0))  # noqa: E731
     return scattered(stokes, before, u, v, after, matrices)
 
@@ -72,8 +71,7 @@ def test_light_that_hardly_turns_keeps_its_plane(sign, angle, device):
     both rotations have the same error."""
     rng = np.random.default_rng(2)
     u, aside = directions(5000, rng), directions(5000, rng)
-    v = sign * u + angle * aside
-    v = (v / np.linalg.norm(v, axis=1, keepdims=True)).astype(np.float32)
+    v = unit(sign * u + angle * aside).astype(np.float32)
     stokes = rng.normal(size=(5000, 4)).astype(np.float32)
     # As molecules forward and spheres backward: m33 = m22 and m33 = -m22 there.
     same = lambda c: np.tile([0.0, 1.0, sign, 0.0, sign], (len(c), 1))  # noqa: E731
@@ -105,8 +103,8 @@ def test_the_way_back_is_p_m_transposed_p(device):
 
     def chain(path):
         columns = []
-        for unit in np.eye(4, dtype=np.float32):
-            stokes = np.tile(unit, (2000, 1))
+        for one in np.eye(4, dtype=np.float32):
+            stokes = np.tile(one, (2000, 1))
             for u, v in itertools.pairwise(path):
                 stokes = turned(u, v, stokes, device)[0]
             columns.append(stokes)

@@ -7,8 +7,8 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from helpers.brute_force import check_hits
-from helpers.launch import each, on_device
-from helpers.meshes import mesh_and_surfaces
+from helpers.launch import each, on_device, unit
+from helpers.meshes import mesh_and_surfaces, mesh_of, soup
 from spadwarp_kernels import intersect_mesh, intersect_surfaces
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.surface.bvh import LARGEST_LEAF, pack_bvh
@@ -37,8 +37,7 @@ def walked(surfaces, x, u, device):
 
 def packed(shape, leaf_size, device="cpu"):
     """Mesh, nodes, faces as CUDA takes them, and the face in each slot, or its complement."""
-    arrays = on_device(shape.vertices, device), on_device(np.ravel(shape.faces), device, int)
-    mesh = wp.Mesh(*arrays, bvh_constructor="cubql", bvh_leaf_size=leaf_size)
+    mesh = mesh_of(shape.vertices, shape.faces, device, "cubql", leaf_size)
     nodes, rows, order, _ = pack_bvh(mesh, float(np.abs(shape.vertices).max()))
     return mesh, nodes.numpy(), rows, order.numpy()
 
@@ -76,8 +75,7 @@ def scenes():
     turned = [box.copy() for box in boxes]
     for box in turned:
         box.apply_transform(trimesh.transformations.random_rotation_matrix(rng.uniform(size=3)))
-    soup = rng.normal(size=(60, 1, 3)) + 0.6 * rng.normal(size=(60, 3, 3))
-    triangles = trimesh.Trimesh(soup.reshape(-1, 3), np.arange(180).reshape(-1, 3), process=False)
+    triangles = soup(rng.normal(size=(60, 1, 3)) + 0.6 * rng.normal(size=(60, 3, 3)))
     shapes = {"boxes": boxes, "turned": turned, "triangles": [triangles], "both": [*boxes[:3], triangles, *turned[3:]]}
     shapes["dense"] = [box.subdivide() for box in boxes[:2]]
     return {name: trimesh.util.concatenate(parts) for name, parts in shapes.items()}
@@ -123,8 +121,7 @@ def test_rays_hit_what_a_search_in_float64_hits(name, leaf_size, device):
     aim, other = corners[ends, rng.integers(3, size=len(x))], corners[ends, rng.integers(3, size=len(x))]
     aim += rng.uniform(size=(len(x), 1)) * (other - aim) + 1e-3 * rng.normal(size=x.shape)
     aim[::2] = rng.normal(size=aim[::2].shape)
-    u = aim - x
-    u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
+    u = unit(aim - x).astype(np.float32)
     _kept, nodes, rows, order = packed(shape, leaf_size, device)
     joined = np.signbit(rows.numpy()[2::3, 3])
     slots = np.concatenate([tried(leaf, joined, order) for leaf, _, _ in leaves(nodes)])
@@ -147,7 +144,7 @@ def test_a_moving_mesh_has_leaves_of_triangles(leaf_size, device):
     sk.update_surfaces(surfaces, mesh)
     mesh.refit()
     x, u = rng.normal(size=(2, 20_000, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u = unit(u)
     mine, hers = walked(surfaces, x, u, device), each(intersect_mesh, [mesh.id, x, u, 4.0], [SurfaceHit], device)
     assert (mine["face"] >= 0).mean() > 0.2
     assert (mine["face"] == hers["face"]).mean() > 0.999

@@ -6,7 +6,8 @@ import trimesh
 import warp as wp
 
 from helpers.brute_force import check_hits
-from helpers.launch import each, on_device
+from helpers.launch import each, on_device, unit
+from helpers.meshes import mesh_of, soup
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.patches import load_row, nearest_patch, pack_patches, set_patches
@@ -34,13 +35,9 @@ def cast(patches, normals, x, u, device="cpu", reach=4.0):
     return each(hit_patch, [patches, normals, x, u, reach], (float, wp.vec3, wp.vec3i), device)
 
 
-def mesh_of(points, faces, device="cpu"):
-    return wp.Mesh(on_device(np.asarray(points), device), on_device(np.ravel(faces), device, int))
-
-
 def pairs_of(points, faces):
     """(face, second face, corner) of the patches; a triangle is its own second face."""
-    patches, _ = pack_patches(mesh_of(np.asarray(points, float), faces), np.arange(len(faces)))
+    patches, _ = pack_patches(mesh_of(points, faces), np.arange(len(faces)))
     rows = patches.numpy().reshape(-1, 5, 4).view(np.int32)
     return [(int(row[4, 1]), int(row[4, 3]), int(row[3, 3])) for row in rows]
 
@@ -49,11 +46,6 @@ def packed(shape, pairs=True, device="cpu"):
     """The mesh, its patches, and the normals of its faces, which stand in slots in the opposite order."""
     mesh = mesh_of(shape.vertices, shape.faces, device)
     return mesh, *pack_patches(mesh, np.arange(len(shape.faces))[::-1], pairs)
-
-
-def soup(corners):
-    """Faces that share no vertices."""
-    return trimesh.Trimesh(np.reshape(corners, (-1, 3)), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
 
 
 def turned_box(extents, angles):
@@ -87,15 +79,13 @@ def test_rays_hit_what_a_search_in_float64_hits(name, pairs, device):
     share = rng.uniform(size=(len(x), 1))
     ends = rng.integers(len(corners), size=20_000)
     aim[:20_000], other[:20_000] = corners[ends, 0], corners[ends, 2 - (np.arange(20_000) % 2)]
-    u = aim + share * (other - aim) + 1e-3 * rng.normal(size=x.shape) * rng.integers(2, size=(len(x), 1)) - x
-    u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
-
+    to = aim + share * (other - aim) + 1e-3 * rng.normal(size=x.shape) * rng.integers(2, size=(len(x), 1))
+    u = unit(to - x).astype(np.float32)
     distance, normal, faces = cast(patches, normals, x, u, device)
     check_hits(corners, x, u, 4.0, (faces[:, 1], distance))
     hit = faces[:, 1] >= 0
     named = faces[hit, 1]
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[named]
-    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    n = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[named]
     y = x + distance[:, None] * u
     assert np.abs(((y[hit] - corners[named, 0]) * n).sum(axis=1)).max() < 1e-5
     np.testing.assert_array_equal(faces[hit, 0], len(shape.faces) - 1 - named)
@@ -113,10 +103,9 @@ def test_no_ray_slips_through_a_diagonal_or_an_edge(device):
     share = rng.uniform(size=(len(chosen), 1))
     to = edges[chosen, 0] + share * (edges[chosen, 1] - edges[chosen, 0])
     x = 0.9 * box.vertices[rng.integers(8, size=len(to))] * rng.uniform(size=(len(to), 1))
-    u = (to - x) / np.linalg.norm(to - x, axis=1, keepdims=True)
     for pairs in (True, False):
         _kept, patches, normals = packed(box, pairs, device)
-        faces = cast(patches, normals, x, u, device, reach=9.0)[2]
+        faces = cast(patches, normals, x, unit(to - x), device, reach=9.0)[2]
         assert (faces[:, 1] < 0).sum() <= 2
 
 

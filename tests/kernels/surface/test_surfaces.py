@@ -9,9 +9,9 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import each, on_device
+from helpers.launch import each, on_device, unit
 from helpers.lit_box import lit_box
-from helpers.meshes import mesh_and_surfaces
+from helpers.meshes import mesh_and_surfaces, mesh_of
 from spadwarp_kernels.optics.visibility import near_depth_map
 from spadwarp_kernels.surface.bvh import read_tree
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
@@ -31,15 +31,13 @@ def ball(device, count=24):
     first = (np.arange(2 * count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     faces = np.stack([first, first + count, first + 1, first + 1, first + count, first + count + 1], axis=1)
     points = points.reshape(-1, 3).astype(np.float32)
-    mesh = wp.Mesh(on_device(points, device), on_device(faces.ravel(), device, int))
-    return mesh, points
+    return mesh_of(points, faces, device), points
 
 
 def distances(surfaces, mesh, device, count=20_000):
     """By our walk and by Warp's."""
     rng = np.random.default_rng(2)
-    u = rng.normal(size=(count, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u = unit(rng.normal(size=(count, 3)))
     x = rng.uniform(-2, 2, (count, 3)) - 5.0 * u
     mine = each(sk.intersect_surfaces, [surfaces, x, u, 100.0, False], [SurfaceHit], device)
     return mine["distance"], each(sk.intersect_mesh, [mesh.id, x, u, 100.0], [SurfaceHit], device)["distance"]
@@ -131,7 +129,7 @@ def test_nothing_hides_what_lies_before_the_map(device):
     behind, wall = 0.1 * square - (0, 0, 2.5), square[:, [1, 0, 2]] @ turn - (3.0, 0, 0)
     corners = np.concatenate([square - (0, -0.5, 0), wall, behind, small]).astype(np.float32)
     faces = (np.array([0, 1, 2, 0, 2, 3]) + 4 * np.arange(4)[:, None]).ravel()
-    mesh = wp.Mesh(on_device(corners, device), on_device(faces, device, int))
+    mesh = mesh_of(corners, faces, device)
     camera = wide_camera()
     near = near_depth_map(mesh, camera).numpy().astype(float)
     assert near[100, 64] == pytest.approx(0.4 / (0.8 * 73.0 / 128), rel=0.05)  # of the floor, less the lens's radius

@@ -6,8 +6,8 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import each
-from helpers.meshes import mesh_and_surfaces
+from helpers.launch import each, unit
+from helpers.meshes import mesh_and_surfaces, soup
 from spadwarp_kernels import intersect_mesh, intersect_surfaces, offset_from_surface
 from spadwarp_kernels.surface.bvh import segment_meets_box
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
@@ -16,10 +16,6 @@ from spadwarp_kernels.surface.ray_cast import SurfaceHit
 def cast(surfaces, x, u, device="cpu", reach=4.0, any_hit=False):
     """Hits by our walk."""
     return each(intersect_surfaces, [surfaces, x, u, reach, any_hit], [SurfaceHit], device)
-
-
-def unit(u):
-    return u / np.linalg.norm(u, axis=1, keepdims=True)
 
 
 SHAPES = {
@@ -50,13 +46,12 @@ def test_our_walk_hits_what_warp_hits(builder, leaf_size, device):
     """In a soup of triangles of all sizes, from outside and inside, along the axes too; and in the shapes above."""
     rng = np.random.default_rng(5)
     corners = rng.normal(size=(3000, 1, 3)) + rng.lognormal(-2.0, 1.0, (3000, 1, 1)) * rng.normal(size=(3000, 3, 3))
-    soup = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(9000).reshape(-1, 3), process=False)
     x = rng.uniform(-3, 3, size=(50_000, 3))
     u = rng.normal(size=x.shape)
     u[:5000, 0] = 0.0
     u[2500:7500, 1] = 0.0
     u = unit(u)
-    for shape in (soup, *(shape for shape, _ in SHAPES.values())):
+    for shape in (soup(corners), *(shape for shape, _ in SHAPES.values())):
         mesh, surfaces = mesh_and_surfaces(shape, device, builder=builder, leaf_size=leaf_size)
         hers = each(intersect_mesh, [mesh.id, x, u, 4.0], [SurfaceHit], device)
         nearest, some = (cast(surfaces, x, u, device, any_hit=any_hit) for any_hit in (False, True))

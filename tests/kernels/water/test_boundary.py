@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import each
+from helpers.launch import each, unit
 from spadwarp_kernels.water.limits import (
     Exit,
     Limits,
@@ -107,7 +107,7 @@ def test_images_are_what_reflections_one_by_one_lead_to(device):
     limits.boundary = sk.make_boundary(*indices, max_reflections=4, device=device)
     images = limits.boundary.images
     seen = each(image_point, [limits.lower, limits.upper, images, x], [wp.vec3], device)
-    along = (o - seen) / np.linalg.norm(o - seen, axis=1, keepdims=True)
+    along = unit(o - seen)
     heading = each(image_direction, [images, along], [wp.vec3], device)
     passes = each(image_reflectance, [limits.boundary, images, along], device=device)
     first = each(next_face, [limits, 1e30, x, heading], [Exit], device)["face"]

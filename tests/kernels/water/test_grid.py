@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import each, on_device
+from helpers.launch import each, on_device, unit
 from spadwarp_kernels.water.grid import grid_cell
 from spadwarp_kernels.water.medium import ProfileSample
 
@@ -33,9 +33,8 @@ def rays(count=4_000):
     u = rng.normal(size=(count, 3))
     u[:100] = AXES[:, 0]  # along the cells
     u[100:200] = -AXES[:, 2]
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
     length = rng.uniform(0.0, 5.0, count).astype(np.float32)
-    return x, u.astype(np.float32), 1 - rng.random(count, dtype=np.float32), length
+    return x, unit(u).astype(np.float32), 1 - rng.random(count, dtype=np.float32), length
 
 
 def optical_depth(extinction, x, u, length):
@@ -56,7 +55,7 @@ def optical_depth(extinction, x, u, length):
 
 def one_line(count):
     """Many times the same flight of 3 m."""
-    u = np.float32([0.2, -0.1, 1.0] / np.linalg.norm([0.2, -0.1, 1.0]))
+    u = np.float32(unit([0.2, -0.1, 1.0]))
     return np.tile(np.float32(CENTRE + np.array([-0.2, 0.4, -1.9])), (count, 1)), np.tile(u, (count, 1))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 import spadwarp_kernels as sk
-from helpers.launch import each
+from helpers.launch import each, unit
 from spadwarp_kernels.water.medium import layer_index, layered_extinction, layered_free_path
 
 AXIS = np.array([0.36, -0.48, 0.8])
@@ -17,8 +17,7 @@ def rays():
     x = rng.uniform(-4.0, 4.0, (COUNT, 3)).astype(np.float32)
     u = rng.normal(size=(COUNT, 3))
     u[:200] = np.cross(u[:200], AXIS)  # along the layers
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return x, u.astype(np.float32), 1 - rng.random(COUNT, dtype=np.float32)
+    return x, unit(u).astype(np.float32), 1 - rng.random(COUNT, dtype=np.float32)
 
 
 def flown(device, extinction):

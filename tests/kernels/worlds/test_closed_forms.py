@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import each
+from helpers.launch import each, unit
 from spadwarp_kernels.worlds import SHAPE_KINDS
 from spadwarp_kernels.worlds.shapes import ShapeHit, intersect_shape
 
@@ -41,8 +41,7 @@ def inside(kind, p):
 def test_nearest_point_is_on_the_surface(kind, start, device):
     rng = np.random.default_rng(5)
     count = 2000
-    u = rng.normal(size=(count, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u = unit(rng.normal(size=(count, 3)))
     if start == "outside":
         x = rng.uniform(-0.6, 0.6, (count, 3)) - 3.0 * u
     else:
@@ -60,8 +59,7 @@ def test_nearest_point_is_on_the_surface(kind, start, device):
     assert ((depth < 2e-4) if start == "outside" else (depth > -2e-4)).all()
     # The normal is the direction in which the depth changes most.
     p, h = (x + s[:, None] * u)[hit].astype(np.float64), 1e-6
-    slope = np.stack([inside(kind, p + h * e) - inside(kind, p - h * e) for e in np.eye(3)], axis=-1)
-    slope /= np.linalg.norm(slope, axis=-1, keepdims=True)
+    slope = unit(np.stack([inside(kind, p + h * e) - inside(kind, p - h * e) for e in np.eye(3)], axis=-1))
     assert np.quantile(1.0 - np.abs(np.sum(slope * n[hit], axis=-1)), 0.98) < 1e-3  # edges aside
 
 

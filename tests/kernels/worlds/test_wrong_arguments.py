@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import on_device
+from helpers.meshes import mesh_of
 from helpers.worlds import STILL, transforms
 from spadwarp_kernels.worlds.shapes import move_shapes
 
@@ -23,7 +23,7 @@ def poses(*rows):
 
 
 def triangle(last=2):
-    return wp.Mesh(on_device([(0, 0, 3.0), (1, 0, 3), (0, 1, 3)]), on_device([0, 1, last]))
+    return mesh_of([(0, 0, 3), (1, 0, 3), (0, 1, 3)], [0, 1, last])
 
 
 def camera(cameras=1, **arguments):
