@@ -14,6 +14,7 @@ from helpers.lidar import lidar
 from helpers.lit_box import lit_box
 from helpers.meshes import mesh_of
 from spadwarp_kernels import analytic, detection
+from spadwarp_kernels.optics import DOME_PORT
 
 NEXT_EVENT = sk.TransportSpec("next_event")
 
@@ -144,6 +145,11 @@ NONE = {"kinds": (), "value": (), "scale": (1.0,), "channels": 1, "device": "cpu
 TILT = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 CORNERS, ONES = np.zeros((1, 3, 2)), np.ones((2, 2, 2))
 GRID = {"extinction": ONES, "albedo": ONES, "size": (1.0, 1.0, 1.0), "device": "cpu"}
+CELLS = sk.make_grid(np.ones((4, 2, 2)), np.ones((4, 2, 2)), size=(1.0, 1.0, 1.0), device="cpu")
+
+
+def in_cells(**choices):
+    sk.make_transport_kernel(sk.TransportSpec(grid=sk.REGULAR_TRACKING, **choices))
 
 
 def polarised(**arguments):
@@ -171,6 +177,15 @@ def polarised(**arguments):
         (lambda: sk.make_grid(**GRID, anisotropy=ONES), r"anisotropy = 1.0 is outside \(-1, 1\)"),
         (lambda: sk.make_grid(**GRID, rotation=np.ones((3, 3))), "rotation = "),
         (lambda: sk.make_grid(**GRID | {"size": (1.0, 0.0, 1.0)}), r"size = 0.0 is outside \(0, inf\)"),
+        (lambda: sk.make_blocks(CELLS, (3, 2, 1), [1.0]), "does not divide 4"),
+        (lambda: sk.make_blocks(CELLS, (2, 2), [1.0]), "3 are needed"),
+        (lambda: sk.make_blocks(CELLS, (2, 2, 0), [1.0]), r"blocks\[2\] = 0"),
+        (lambda: sk.make_blocks(CELLS, (2, 2, 1), []), "kinds of derivatives by block"),
+        (lambda: sk.make_blocks(CELLS, (2, 2, 1), [0.0]), r"scale\[0\]"),
+        (lambda: sk.make_transport_kernel(sk.TransportSpec(blocks=("absorption",))), r"spec\.blocks"),
+        (lambda: in_cells(blocks=("anisotropy",)), r"spec\.blocks"),
+        (lambda: in_cells(blocks=("absorption", "absorption")), r"spec\.blocks"),
+        (lambda: in_cells(blocks=("absorption",), bounded=True, reflecting=True), r"spec\.blocks"),
         (lambda: sk.make_layers([0, 1], [1, -1], [0, 0], [0, 0]), r"extinction\[1\] = -1 is outside \(0, inf\)"),
         (lambda: sk.make_layers([0, 5, 1], [1] * 3, [0] * 3, [0] * 3), r"start\[2\] = 1 is outside \[5.0, inf\)"),
         (lambda: sk.make_layers([0, 1], [0.3], [0, 0], [0, 0]), "start 2, extinction 1, albedo 2, anisotropy 2"),
@@ -198,7 +213,7 @@ def polarised(**arguments):
         (lambda: sk.make_flat_port(**PORT | {"index": (0.5, 1.5, 1.3)}, distance=0.05), r"index\[0\] = 0.5 is outside"),
         (lambda: sk.make_dome_port(**PORT, radius=0.05, thickness=0.0, centre=(0.0, 0.0, 0.06)), "too far"),
         (lambda: sk.make_dome_port(**PORT, radius=1e300, thickness=0.01), r"radius = 1e\+300 is outside \(0, 1e9\]"),
-        (lambda: analytic.make_optics([]), r"port = \[\] is not a PortKind"),
+        (lambda: analytic.make_optics([]), r"port = \[\] is not a PortKind or None"),
         (lambda: polarised(laser=(1.0, 0.9, 0.9, 0.0)), "polarised by more than 1"),
         (lambda: polarised(laser=1.0), "laser = 1.0 is not a Stokes vector"),
         (lambda: polarised(matrix=lambda c: np.full((len(c), 5), 1.5)), "beyond m11"),
@@ -278,6 +293,9 @@ def test_detection(call, text):
         call(arrays((6, 8))[0])
 
 
+DOME, PORTS = analytic.make_optics(DOME_PORT, DOME_PORT), sk.make_dome_port(**PORT, radius=0.08, thickness=0.006)
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
@@ -287,12 +305,20 @@ def test_detection(call, text):
         ({"stop": 0.0}, r"lidar.stop = 0.0 is outside \(0.0, inf\)"),
         ({"axis": (0.0, 0.0, 0.0)}, "lidar.axis .* a unit vector is needed"),
         ({"source": 9}, r"lidar.source = 9 is outside \[0, 2\]"),
+        ({"optics": DOME}, r"lidar\.ports\.camera\.index\[0\] = 0.0 is outside \[1, inf\)"),
+        ({"optics": DOME, "port": PORTS, "profile": 2, "radius": 0.1}, "a collimated beam does not stay one behind a"),
+        ({"optics": DOME, "port": PORTS, "lu2024": 1}, "lidar.lu2024 = 1 is for a camera and a laser in the water"),
+        ({"optics": "flat"}, "is not of make_optics"),
     ],
 )
-def test_a_lidar_out_of_range(changes, text):
+def test_lidars_and_their_optics(changes, text):
     view, numbers = wp.zeros(4, dtype=wp.vec3d, device="cpu"), arrays(4, dtype=wp.float64)[0]
+    given = {name: value for name, value in changes.items() if name == "optics"}
+    one = lidar(**{name: value for name, value in changes.items() if name not in ("optics", "port")})
+    if "port" in changes:
+        one.ports.camera = one.ports.laser = changes["port"]
     with pytest.raises(sk.ArgumentError, match=text):
-        sk.signal_map(lidar(**changes), view, numbers, view, numbers)
+        sk.signal_map(one, view, numbers, view, numbers, **given)
 
 
 def test_maps_of_another_size():

@@ -9,7 +9,7 @@ import warp as wp
 from helpers.launch import on_device
 from helpers.lidar import C0, lidar
 from reference import refraction
-from spadwarp_kernels import ArgumentError, analytic
+from spadwarp_kernels import analytic
 from spadwarp_kernels.optics import DOME_PORT, FLAT_PORT, make_dome_port, make_flat_port
 
 pytestmark = pytest.mark.physics
@@ -66,23 +66,3 @@ def test_signal_of_a_pixel_is_that_of_its_rays(name, device):
     signal, _ = signal_map(name, 1e-4, 0.02, aim, device)
     collected = 0.6 / math.pi * (to_lens @ NORMAL) * through * density * area * -seen[2]
     assert signal == pytest.approx(laser_through * collected * passed, rel=1e-3)
-
-
-def test_what_optics_cannot_have_is_refused_by_name():
-    kind, port, _ = PORTS["dome"]
-    view, number = wp.zeros(1, dtype=wp.vec3d, device="cpu"), wp.ones(1, dtype=wp.float64, device="cpu")
-    optics = analytic.make_optics(kind, kind)
-    for changes, text in (
-        ({"profile": 2, "radius": 0.1}, "a collimated beam does not stay one behind a dome"),
-        ({"lu2024": 1}, "lidar.lu2024 = 1 is for a camera and a laser in the water"),
-    ):
-        one = lidar(**changes)
-        one.ports.camera = one.ports.laser = port
-        with pytest.raises(ArgumentError, match=text):
-            analytic.signal_map(one, view, number, view, number, optics=optics)
-    with pytest.raises(ArgumentError, match=r"lidar\.ports\.camera\.index\[0\] = 0.0 is outside \[1, inf\)"):
-        analytic.signal_map(lidar(), view, number, view, number, optics=optics)
-    with pytest.raises(ArgumentError, match="is not a PortKind or None"):
-        analytic.make_optics("flat")
-    with pytest.raises(ArgumentError, match="is not of make_optics"):
-        analytic.signal_map(lidar(), view, number, view, number, optics="flat")

@@ -92,11 +92,13 @@ def test_first_photon_counts_covary_as_a_multinomial(alpha):
     assert abs(correlation - exact) < 4 / np.sqrt(frames)
 
 
-def test_tiny_hazards_count_as_often_as_they_should():
-    hazard = np.full((200, 1000), 3e-9)
-    counts = first_photon(hazard, pulses=1_000_000, seed=5)
+def test_tiny_hazards_count_as_often_as_they_should_and_counters_stop_at_their_depth():
+    counts = first_photon(np.full((200, 1000), 3e-9), pulses=1_000_000, seed=5)
     assert abs(counts.sum() - 600) < 4 * np.sqrt(600)
     assert (counts > 1).sum() <= 6  # 0.9 expected
+    counts, shallow = (first_photon(shape(1.0), pulses=10_000, seed=4, **one) for one in ({}, {"counter_depth": 255}))
+    assert counts.max() > 255
+    np.testing.assert_array_equal(shallow, np.minimum(counts, 255))
 
 
 def test_counts_and_events_do_not_depend_on_the_cut():
@@ -109,12 +111,6 @@ def test_counts_and_events_do_not_depend_on_the_cut():
     options = {"pulses": 300, "dead_time": 20e-9, "afterpulsing_probability": 0.1, "afterpulsing_time_constant": 1e-8}
     parts = [events(hazard, frames=frames, first_frame=first, **options)[0] for first, frames in ((0, 5), (2, 2))]
     np.testing.assert_array_equal(parts[1], parts[0][8:16])
-
-
-def test_counters_stop_at_their_depth():
-    counts, shallow = (first_photon(shape(1.0), pulses=10_000, seed=4, **one) for one in ({}, {"counter_depth": 255}))
-    assert counts.max() > 255
-    np.testing.assert_array_equal(shallow, np.minimum(counts, 255))
 
 
 @pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
@@ -158,7 +154,7 @@ def test_dead_time_gives_the_closed_form_rate(rate, dead_time):
     assert chi_square(counts.sum(0), np.full(BINS, 1 / BINS) * counts.sum() / 1e9, 10**9) > 1e-4
 
 
-def test_dead_time_casts_its_shadow():
+def test_dead_time_casts_its_shadow_also_from_unrecorded_bins():
     """A strong return early in the period blinds the detector behind it and no further."""
     hazard = np.full(BINS, 1e-3)
     hazard[4] = 3.0
@@ -166,15 +162,11 @@ def test_dead_time_casts_its_shadow():
     assert abs(rate[4] - (1 - np.exp(-3)) * (1 - 5e-3)) < 0.01
     assert (rate[6:10] < 0.2e-3).all()  # only the 5 % of pulses that did not fire
     np.testing.assert_allclose(rate[12:], 1e-3, rtol=4 / np.sqrt(100))
-
-
-def test_unrecorded_bins_fire_unseen():
-    hazard = np.full(BINS, 0.05)
-    counts, _ = events(hazard, pulses=20_000, recorded=10, dead_time=40e-9)
+    # Bins that are not recorded fire unseen.
+    counts, _ = events(np.full(BINS, 0.05), pulses=20_000, recorded=10, dead_time=40e-9)
     rate = BINS * 0.05 / PERIOD
     expected = rate / (1 + rate * 40e-9) * PERIOD * 20_000 * 10 / BINS
-    assert counts.shape == (1, 10)
-    assert abs(counts.sum() - expected) < 4 * np.sqrt(expected)
+    assert counts.shape == (1, 10) and abs(counts.sum() - expected) < 4 * np.sqrt(expected)
 
 
 @pytest.mark.parametrize("dead_time", [0.0, 60e-9])

@@ -147,20 +147,3 @@ def test_blocks_divide_the_cells():
     cells, found = (np.array(g.turn).reshape(3, 3) @ x + np.array(g.shift) for g in (grid, blocks.grid))
     np.testing.assert_allclose(found, cells / [2.0, 2.0, 2.0], rtol=1e-5)
     assert (blocks.count, tuple(blocks.grid.size)) == (6, (2, 3, 1))
-    for shape, scale, words in (
-        ((3, 3, 1), [1.0], "does not divide 4"),
-        ((2, 3), [1.0], "3 are needed"),
-        ((2, 3, 0), [1.0], r"blocks\[2\] = 0"),
-        ((2, 3, 1), [], "kinds of derivatives by block"),
-        ((2, 3, 1), [0.0], r"scale\[0\]"),
-    ):
-        with pytest.raises(sk.ArgumentError, match=words):
-            sk.make_blocks(grid, shape, scale)
-    for changes in (
-        {"grid": None},
-        {"blocks": ("anisotropy",)},
-        {"blocks": ("absorption", "absorption")},
-        {"bounded": True, "reflecting": True},
-    ):
-        with pytest.raises(sk.ArgumentError, match=r"spec\.blocks"):
-            sk.make_transport_kernel(sk.TransportSpec(**{"grid": REGULAR, "blocks": ("absorption",), **changes}))

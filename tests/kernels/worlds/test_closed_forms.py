@@ -42,9 +42,8 @@ def test_nearest_point_is_on_the_surface(kind, start, device):
     rng = np.random.default_rng(5)
     count = 2000
     u = unit(rng.normal(size=(count, 3)))
-    if start == "outside":
-        x = rng.uniform(-0.6, 0.6, (count, 3)) - 3.0 * u
-    else:
+    x = rng.uniform(-0.6, 0.6, (count, 3)) - 3.0 * u
+    if start == "inside":
         x = rng.uniform(-1, 1, (8 * count, 3)) * SIZE
         x = x[inside(kind, x) > 1e-3][:count]
     x, u = x.astype(np.float32), u[: len(x)].astype(np.float32)
