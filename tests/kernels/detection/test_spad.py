@@ -203,6 +203,16 @@ def test_afterpulses_come_with_their_time_constant():
     assert abs(late.mean() / expected - 1) < 0.06
 
 
+def test_afterpulses_of_a_gated_detector_wait_for_its_windows():
+    """Traps empty from the end of the dead time on: exp(−t/τ) of them reach the next window."""
+    tau, probability, dead_time, width = 20e-9, 0.1, 30e-9, PERIOD / BINS
+    options = {"afterpulsing_probability": probability, "afterpulsing_time_constant": tau, "dead_time": dead_time}
+    counts, _ = events(1e-3 * (np.arange(BINS) == 0), pulses=40_000_000, gated=True, **options)
+    left = probability * np.exp(-(PERIOD - width / 2 - dead_time) / tau)
+    expected = counts[0, 0] * left * (1 - np.expm1(-width / tau) / np.expm1(-PERIOD / tau))  # beyond the first bin
+    assert abs(counts[0, 1:].sum() - expected) < 4 * np.sqrt(expected) + 2 * probability * expected
+
+
 @pytest.mark.parametrize("gated", [True, False])
 def test_the_time_tags_are_the_counts(gated):
     hazard = np.stack([shape(0.2), shape(1.0), np.zeros(BINS)])

@@ -9,15 +9,14 @@ from spadwarp_kernels.water.medium import layer_index, layered_extinction, layer
 AXIS = np.array([0.36, -0.48, 0.8])
 START = [-9.0, -1.0, 0.5, 0.6, 3.0]  # the first is not read
 EXTINCTION = [0.2, 1.5, 0.05, 4.0, 0.7]
-COUNT = 20_000
 
 
-def rays():
+def rays(count=20_000):
     rng = np.random.default_rng(4)
-    x = rng.uniform(-4.0, 4.0, (COUNT, 3)).astype(np.float32)
-    u = rng.normal(size=(COUNT, 3))
+    x = rng.uniform(-4.0, 4.0, (count, 3)).astype(np.float32)
+    u = rng.normal(size=(count, 3))
     u[:200] = np.cross(u[:200], AXIS)  # along the layers
-    return x, unit(u).astype(np.float32), 1 - rng.random(COUNT, dtype=np.float32)
+    return x, unit(u).astype(np.float32), 1 - rng.random(count, dtype=np.float32)
 
 
 def flown(device, extinction):

@@ -133,10 +133,8 @@ def test_henyey_greenstein_has_its_law_and_mean_cosine(g, device):
 
 def distribution(density):
     """Distribution function of t from its own quadrature of the density, constant up to FLAT as the tables are."""
-    edges = np.concatenate(
-        [[0.0], FLAT * np.geomspace(1e-300 / FLAT, 1.0, 4001)[1:], np.geomspace(FLAT, 1.0, 8001)[1:]]
-    )
-    edges = np.concatenate([edges, 2.0 - np.geomspace(1e-9, 1.0, 8001)[-2::-1], [2.0]])
+    near, far = FLAT * np.geomspace(1e-300 / FLAT, 1.0, 4001)[1:], np.geomspace(FLAT, 1.0, 8001)[1:]
+    edges = np.concatenate([[0.0], near, far, 2.0 - np.geomspace(1e-9, 1.0, 8001)[-2::-1], [2.0]])
     node, weight = leggauss(4)
     t = 0.5 * (edges[1:] + edges[:-1])[:, None] + 0.5 * np.diff(edges)[:, None] * node
     mass = np.pi * np.diff(edges) * (density(np.maximum(t, 1e-300)) @ weight)
