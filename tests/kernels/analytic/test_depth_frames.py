@@ -15,7 +15,7 @@ pytestmark = pytest.mark.physics
 WIDTH, HEIGHT = 52, 40  # rows that do not end at a byte
 OFFSET, STEP = 9.0, 1e-3
 LASER = np.array([0.3, 0.0, 0.0])
-VIEW = unit(np.stack([np.linspace(-0.3, 0.3, 50), np.zeros(50), np.ones(50)], axis=1))
+VIEW = unit(np.stack([np.linspace(0.0, 0.6, 50), np.zeros(50), np.ones(50)], axis=1))
 SIGMA = np.linspace(0.01, 0.2, 50)
 SIGMA[0] = np.nan
 TIMES = np.linspace(4.0, 20.0, 9)[None], np.array([[0, 0.5, 0.7, 0.8, 0.86, 0.9, 0.94, 0.97, 1.0]])  # of backscatter

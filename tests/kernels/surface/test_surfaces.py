@@ -147,10 +147,12 @@ def test_nothing_hides_what_lies_before_the_map(device):
     assert (each(sk.intersect_surfaces, inputs, [SurfaceHit], device)["face"] < 0).all()
 
 
-def tally(model, spec, first_id=0, offset=0, count=20_000):
-    data = sk.make_data(model)
+def tally(model, spec, first_id=0, offset=0):
+    data = sk.make_data(model, histogram=not spec.merged)
+    if spec.merged:
+        data = dataclasses.replace(data, tally=wp.zeros(model.tally_size // 3, dtype=wp.int64, device=model.device))
     data.offset.fill_(offset)
-    sk.launch_transport(spec, model, data, seed=3, first_id=first_id, photon_count=count)
+    sk.launch_transport(spec, model, data, seed=3, first_id=first_id, photon_count=20_000)
     return data.tally.numpy()
 
 
@@ -170,14 +172,11 @@ def test_transport_by_public_queries_and_by_steps(device):
     other = tally(public, spec._replace(use_warp_bvh=True))
     # A ray on an edge may fall on either side of it: the same photons otherwise.
     assert light.sum() > 0 and np.abs(light - other).sum() < 1e-3 * light.sum()
-    stepped = spec._replace(stepped=True)
-    assert np.array_equal(tally(model, stepped), light)
-    assert np.array_equal(tally(model, stepped, first_id=4, offset=2**40), tally(model, spec, first_id=2**40 + 4))
-    # One tally for all components.
-    small = wp.zeros(light.size // 3, dtype=wp.int64, device=device)
-    data = dataclasses.replace(sk.make_data(model, histogram=False), tally=small)
-    sk.launch_transport(spec._replace(merged=True), model, data, seed=3, first_id=0, photon_count=20_000)
-    assert np.array_equal(small.numpy(), light.reshape(3, -1).sum(axis=0))
+    # A step has one tally for all components.
+    step = spec._replace(stepped=True, merged=True)
+    assert np.array_equal(tally(model, step), light.reshape(3, -1).sum(axis=0))
+    later = tally(model, spec, first_id=2**40 + 4).reshape(3, -1).sum(axis=0)
+    assert np.array_equal(tally(model, step, first_id=4, offset=2**40), later)
     with pytest.raises(sk.ArgumentError, match="merged needs guided or next_event"):
         tally(model, sk.TransportSpec("analog", merged=True))
 
