@@ -6,7 +6,7 @@ import warp as wp
 from scipy import stats
 
 from helpers.launch import each, on_device
-from spadwarp_kernels.base import binomial
+from spadwarp_kernels.base.binomial import binomial
 from spadwarp_kernels.base.native import expm1, log1p
 
 pytestmark = pytest.mark.physics
