@@ -1,13 +1,18 @@
-"""Compiled kernels of the package: put where Warp looks for them, and only where they can be used."""
+"""Compiled kernels, put where Warp looks for them and only where they can be used; what is made once."""
 
 import json
+import sys
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import warp as wp
 
+import spadwarp_kernels as sk
+from helpers.lit_box import lit_box
 from spadwarp_kernels import unpack_kernels
 from spadwarp_kernels.base import kernels as compiled
+from spadwarp_kernels.transport import launch
 
 
 @pytest.fixture
@@ -65,3 +70,33 @@ def test_none_and_a_damaged_archive_are_no_failure(archive):
             for name, text in manifest.items():
                 file.writestr(name, text)
         assert unpack_kernels() == 0
+
+
+def test_each_thread_gets_its_own_function():
+    @compiled.memoised
+    def make(number):
+        @wp.func
+        def one() -> int:
+            return wp.static(number)
+
+        return one
+
+    before = sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(1e-6)  # threads take turns all the time
+        with ThreadPoolExecutor(8) as pool:
+            made = list(pool.map(make, range(100)))
+    finally:
+        sys.setswitchinterval(before)
+    assert [function.func.__closure__[0].cell_contents for function in made] == list(range(100))
+    assert [make(number) for number in range(100)] == made
+
+
+def test_the_kernel_that_is_loaded_is_launched(device, monkeypatch):
+    made, make = [], launch.make_transport_kernel
+    monkeypatch.setattr(launch, "make_transport_kernel", lambda *choices: made.append(make(*choices)) or made[-1])
+    model = sk.Model(device, mesh=None, surfaces=sk.make_surfaces(None, device=device), scale=2.0**50, **lit_box())
+    spec = sk.TransportSpec("next_event", mesh=False)
+    sk.load_transport_kernel(spec, device, model=model, photon_count=20)
+    sk.launch_transport(spec, model, sk.make_data(model), seed=1, first_id=0, photon_count=20)
+    assert len(made) == 2 and made[0] is made[1]

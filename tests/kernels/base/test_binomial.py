@@ -5,29 +5,21 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.launch import Integers, launched, on_device
-from spadwarp_kernels.base import binomial
+from helpers.launch import each, on_device
+from spadwarp_kernels.base.binomial import binomial
 from spadwarp_kernels.base.native import expm1, log1p
 
 pytestmark = pytest.mark.physics
 
 
-@wp.kernel(enable_backward=False)
-def _draw(n: int, hazard: wp.float64, seed: wp.uint64, base: wp.uint64, counts: Integers):
-    i = wp.tid()
-    count, _block = binomial(n, hazard, seed, base + wp.uint64(i), wp.uint32(0), wp.uint32(0))
-    counts[i] = count
+@wp.func
+def draw(n: int, hazard: wp.float64, seed: wp.uint64, id: int):
+    count, _block = binomial(n, hazard, seed, wp.uint64(id), wp.uint32(0), wp.uint32(0))
+    return count
 
 
-@wp.kernel(enable_backward=False)
-def _functions(x: wp.array(dtype=wp.float64), grown: wp.array(dtype=wp.float64), logged: wp.array(dtype=wp.float64)):
-    i = wp.tid()
-    grown[i] = expm1(x[i])
-    logged[i] = log1p(x[i])
-
-
-def _sample(n, hazard, *, seed=3, base=0, size=400_000):
-    return launched(_draw, [n, hazard, seed, base], [int], count=size)[0]
+def sample(n, hazard, *, seed=3, base=0, size=400_000):
+    return each(draw, [n, hazard, seed, base + np.arange(size)], [int])
 
 
 @pytest.mark.parametrize(
@@ -40,7 +32,7 @@ def _sample(n, hazard, *, seed=3, base=0, size=400_000):
     ],
 )
 def test_frequencies_follow_the_law(n, p):
-    counts = _sample(n, -np.log1p(-p))
+    counts = sample(n, -np.log1p(-p))
     law = stats.binom(n, p)
     low, high = int(law.ppf(1e-4)), int(law.ppf(1 - 1e-4))
     edges = np.arange(low, high + 1)
@@ -61,7 +53,7 @@ def test_frequencies_follow_the_law(n, p):
 @pytest.mark.parametrize("p", [1e-6, 0.25, 0.5, 0.75, 1 - 1e-6])
 def test_large_counts_have_the_right_moments(p):
     n = 2**31 - 1
-    counts = _sample(n, -np.log1p(-p), size=200_000).astype(np.float64)
+    counts = sample(n, -np.log1p(-p), size=200_000).astype(np.float64)
     z = (counts - n * p) / np.sqrt(n * p * (1 - p))
     assert abs(z.mean()) < 4 / np.sqrt(z.size)
     assert abs(z.var() - 1) < 4 * np.sqrt(2 / z.size)
@@ -70,21 +62,18 @@ def test_large_counts_have_the_right_moments(p):
 
 
 def test_limits():
-    assert (_sample(100, 0.0, size=100) == 0).all()
-    assert (_sample(0, 1.0, size=100) == 0).all()
-    assert (_sample(100, np.inf, size=100) == 100).all()
-    assert (_sample(100, 800.0, size=100) == 100).all()
+    for n, hazard, count in ((100, 0.0, 0), (0, 1.0, 0), (100, np.inf, 100), (100, 800.0, 100)):
+        assert (sample(n, hazard, size=100) == count).all()
 
 
 def test_draws_depend_on_seed_and_id_alone():
-    whole = _sample(1000, 0.2, size=200)
-    np.testing.assert_array_equal(_sample(1000, 0.2, base=50, size=100), whole[50:150])
-    assert (_sample(1000, 0.2, seed=4, size=200) != whole).any()
+    whole = sample(1000, 0.2, size=200)
+    np.testing.assert_array_equal(sample(1000, 0.2, base=50, size=100), whole[50:150])
+    assert (sample(1000, 0.2, seed=4, size=200) != whole).any()
 
 
 def test_small_arguments_keep_their_digits():
     x = np.concatenate([-np.geomspace(1e-18, 0.9, 200), np.geomspace(1e-18, 30.0, 200)])
-    inputs = [on_device(x, dtype=wp.float64)]
-    grown, logged = launched(_functions, inputs, (wp.float64, wp.float64), count=x.size)
+    grown, logged = (each(function, [on_device(x, dtype=wp.float64)], [wp.float64]) for function in (expm1, log1p))
     np.testing.assert_allclose(grown, np.expm1(x), rtol=1e-12)
     np.testing.assert_allclose(logged, np.log1p(x), rtol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import Floats, Integers, launched, on_device
+from helpers.launch import each, on_device
 from spadwarp_kernels.base import random_block, u01
 from spadwarp_kernels.base.philox import (
     PREFETCHED_WORDS,
@@ -21,71 +21,45 @@ from spadwarp_kernels.base.philox import (
 )
 
 
-@wp.kernel(enable_backward=False)
-def _philox(words: wp.array(dtype=wp.uint32), out: wp.array(dtype=wp.vec4ui)):
-    """The words of a counter, id, event and stream, and of a key, the seed."""
-    out[0] = random_block(join_words(words[5], words[4]), join_words(words[1], words[0]), words[2], words[3])
-
-
-@wp.kernel(enable_backward=False)
-def _uniforms(words: wp.array(dtype=wp.uint32), coarse: Floats, fine: Floats):
-    i = wp.tid()
-    coarse[i] = u01(words[i])
-    fine[i] = u01_fine(words[i])
-
-
-@wp.kernel(enable_backward=False)
-def _blocks(seed: wp.uint64, base: wp.uint64, out: wp.array(dtype=wp.vec4ui)):
-    i = wp.tid()
-    out[i] = random_block(seed, base + wp.uint64(i), wp.uint32(3), wp.uint32(1))
-
-
-@wp.kernel(enable_backward=False)
-def _keyed_blocks(keys: RoundKeys, base: wp.uint64, out: wp.array(dtype=wp.vec4ui)):
-    i = wp.tid()
-    out[i] = random_block_keyed(keys, base + wp.uint64(i), wp.uint32(3), wp.uint32(1))
+def blocks(function, seed, first_id, device="cpu", *, count=1000, event=3, stream=1):
+    ids = on_device(np.arange(count, dtype=np.uint64) + np.uint64(first_id), device, wp.uint64)
+    return each(function, [seed, ids, event, stream], [wp.vec4ui], device)
 
 
 @pytest.mark.parametrize(
     ("counter_key", "expected"),
     [
-        ([0] * 6, [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]),
-        ([0xFFFFFFFF] * 6, [0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD]),
-        (
-            [0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344, 0xA4093822, 0x299F31D0],
-            [0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1],
-        ),
+        ("0 " * 6, "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
+        ("ffffffff " * 6, "408f276d 41c83b0e a20bc7c6 6d5451fd"),
+        ("243f6a88 85a308d3 13198a2e 03707344 a4093822 299f31d0", "d16cfe09 94fdcceb 5001e420 24126ea1"),
     ],
 )
 def test_known_answers(counter_key, expected):
-    words = on_device(np.array(counter_key, np.uint32), dtype=wp.uint32)
-    assert launched(_philox, [words], [wp.vec4ui], count=1)[0][0].tolist() == expected
+    """The words of a counter, id, event and stream, and of a key, the seed."""
+    low, high, event, stream, *key = (int(word, 16) for word in counter_key.split())
+    found = blocks(random_block, key[1] << 32 | key[0], high << 32 | low, count=1, event=event, stream=stream)
+    assert found[0].tolist() == [int(word, 16) for word in expected.split()]
 
 
 def test_uniforms_stay_below_one_and_reach_their_grid():
     words = np.array([0, 1, 255, 256, 0x7FFFFFFF, 0xFFFFFF00, 0xFFFFFFFF], np.uint32)
-    inputs = [on_device(words, dtype=wp.uint32)]
-    coarse, fine = launched(_uniforms, inputs, (float, float), count=words.size)
-    assert coarse.max() < 1.0 and fine.max() < 1.0
+    coarse, fine = (each(function, [on_device(words, dtype=wp.uint32)]) for function in (u01, u01_fine))
+    assert coarse.max() < 1.0 and fine.max() < 1.0 and fine[1] == 2.0**-32
     np.testing.assert_array_equal(coarse, (words >> 8) / 2.0**24)
-    assert fine[1] == 2.0**-32
 
 
 def test_ids_beyond_32_bits_have_streams_of_their_own():
-    blocks = [launched(_blocks, [7, base], [wp.vec4ui], count=1000)[0] for base in (0, 1 << 32)]
-    assert len(np.unique(np.concatenate(blocks), axis=0)) == 2000
+    found = [blocks(random_block, 7, first) for first in (0, 1 << 32)]
+    assert len(np.unique(np.concatenate(found), axis=0)) == 2000
 
 
 @pytest.mark.parametrize("seed", [0, 1, 0x123456789ABCDEF0, 2**64 - 1])
 def test_round_keys_give_the_blocks_of_their_seed(seed, device):
-    plain, keyed = (
-        launched(kernel, [start, 1 << 33], [wp.vec4ui], device, 1000)[0]
-        for kernel, start in ((_blocks, seed), (_keyed_blocks, round_keys(seed)))
-    )
-    np.testing.assert_array_equal(plain, keyed)
+    keyed = blocks(random_block_keyed, round_keys(seed), 1 << 33, device)
+    np.testing.assert_array_equal(keyed, blocks(random_block, seed, 1 << 33, device))
 
 
-def _ahead(*streams):
+def ahead_kernel(*streams):
     events, prefetch = make_prefetch(*streams)
 
     @wp.kernel(enable_backward=False)
@@ -104,28 +78,25 @@ def _ahead(*streams):
 
 @pytest.mark.parametrize("streams", [(1,), (1, 2)])
 def test_words_of_events_ahead_are_those_of_each_event(streams):
-    keys = round_keys(0x9E3779B97F4A7C15)
+    kernel, keys = ahead_kernel(*streams), round_keys(0x9E3779B97F4A7C15)
     for id, event in ((7, 1), (2**64 - 2, 2**32 - 3)):
         out = wp.zeros(16, dtype=wp.vec4ui, device="cpu")
-        wp.launch(_ahead(*streams), dim=1, inputs=[keys, id, event], outputs=[out], device="cpu")
+        wp.launch(kernel, dim=1, inputs=[keys, id, event], outputs=[out], device="cpu")
         together, alone = out.numpy().reshape(2, 8, 4)
         np.testing.assert_array_equal(together, alone)
 
 
-@wp.kernel(enable_backward=False)
-def _sequences(seeds: Integers, first: Floats, second: Floats, third: Floats):
-    i = wp.tid()
-    state = step_sequence(begin_sequence(join_words(wp.uint32(7), wp.uint32(seeds[i]))))
-    first[i] = u01(sequence_word(state))
-    state = step_sequence(state)
-    second[i] = u01(sequence_word(state))
-    third[i] = u01(sequence_word(step_sequence(state)))
+@wp.func
+def sequence(seed: int):
+    state = step_sequence(begin_sequence(join_words(wp.uint32(7), wp.uint32(seed))))
+    second = step_sequence(state)
+    return u01(sequence_word(state)), u01(sequence_word(second)), u01(sequence_word(step_sequence(second)))
 
 
 def test_sequences_of_seeds_that_follow_each_other_are_even_and_independent(device):
     """Chi square of triples in 8 x 8 x 8 boxes, and correlations of neighbours; 4 standard deviations."""
     count = 100_000
-    columns = np.array(launched(_sequences, [np.arange(count)], (float,) * 3, device))
+    columns = np.array(each(sequence, [np.arange(count)], (float,) * 3, device))
     boxes = np.histogramdd(columns.T, bins=8, range=[(0.0, 1.0)] * 3)[0]
     chi2 = ((boxes - count / 512) ** 2).sum() / (count / 512)
     assert abs(chi2 - 511) < 4.0 * (2 * 511) ** 0.5

@@ -7,29 +7,17 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.launch import Floats, Vectors, launched
-from spadwarp_kernels import (
-    TABULATED,
-    Camera,
-    Layers,
-    Medium,
-    fournier_forand_density,
-    make_phase_tables,
-    random_block,
-    u01,
-)
-from spadwarp_kernels.base.philox import u01_fine
-from spadwarp_kernels.estimators.contribution import make_sample_flight
-from spadwarp_kernels.optics.visibility import make_sample_lens
+from helpers.launch import each
+from spadwarp_kernels import TABULATED, Camera, Layers, Medium, fournier_forand_density, make_phase_tables
+from spadwarp_kernels.estimators.contribution import FlightSample, make_sample_flight
+from spadwarp_kernels.optics.visibility import LensSample, make_sample_lens
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE
-
-sample_lens = make_sample_lens(None)
 
 G = 0.924
 A2 = (1 - G) ** 2 / G
 
 
-def _hg_angle(theta):
+def hg_angle(theta):
     """Over the angle, what is (a^2 + c^2)^(-3/2) over the chord c = 2 sin(theta/2), and its integral from theta on."""
     c = 2 * np.sin(0.5 * theta)
     return (A2 + c**2) ** -1.5 * np.cos(0.5 * theta), (1 - c / np.sqrt(A2 + c**2)) / A2
@@ -40,15 +28,15 @@ _Q = fournier_forand_density(2 * np.sin(_THETA / 2) ** 2, 1.10, 3.5835)
 _REST = np.append(np.cumsum((0.5 * (_Q[1:] + _Q[:-1]) * np.diff(_THETA))[::-1])[::-1], 0.0)
 
 
-def _table_angle(theta):
+def table_angle(theta):
     """Fournier-Forand over the angle itself, and its integral from theta on."""
     return np.interp(theta, _THETA, _Q), np.interp(theta, _THETA, _REST)
 
 
-# What the angle follows: the guide, its law, how closely a density in a cell of the table keeps to it, million draws.
+# How a flight is sampled, what its angle follows, and how closely a density in a cell of the table keeps to it.
 LAWS = {
-    "henyey_greenstein": (HENYEY_GREENSTEIN_GUIDE, _hg_angle, 1e-4, 10),
-    "tabulated": (TABULATED.guide, _table_angle, 1e-3, 1),
+    "henyey_greenstein": (make_sample_flight(HENYEY_GREENSTEIN_GUIDE), hg_angle, 1e-4),
+    "tabulated": (make_sample_flight(TABULATED.guide), table_angle, 1e-3),
 }
 
 # Flights x + s u, s in [0, length], as the lens at the origin sees them: towards it, away from it, past it.
@@ -62,25 +50,7 @@ FLIGHTS = {
 }
 
 
-def _flights(guide):
-    sample_flight = make_sample_flight(guide)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def flights(x: wp.vec3, u: wp.vec3, interval: wp.vec2, c: float, medium: Medium, s: Floats, p: Floats):
-        i = wp.tid()
-        block = random_block(wp.uint64(2), wp.uint64(i), wp.uint32(0), wp.uint32(2))
-        xi_choice, xi = u01(block[0]), u01_fine(block[1])
-        sample = sample_flight(x, u, interval, c, medium, xi_choice, xi, Layers(), wp.vec3())
-        s[i] = sample.s
-        p[i] = sample.density
-
-    return flights
-
-
-FLIGHT_KERNELS = {name: _flights(guide) for name, (guide, *_) in LAWS.items()}
-
-
-def _mixture(law, s, x, u, s0, s1, c):
+def mixture(law, s, x, u, s0, s1, c):
     """The density in float64, from its definition: half exp(-c s), half in the angle."""
     x, u = np.asarray(x), np.asarray(u) / np.linalg.norm(u)
     t_c, d = -x @ u, np.linalg.norm(np.cross(x, u))
@@ -96,49 +66,44 @@ def _mixture(law, s, x, u, s0, s1, c):
     return 0.5 * linear + 0.5 * angular
 
 
-def sampled(name, extinction, flight, device, count):
-    """Places along the flight, and their densities."""
-    medium = Medium()
-    medium.anisotropy = G
-    medium.phase = make_phase_tables(lambda t: fournier_forand_density(t, 1.10, 3.5835), device=device)
-    x, u, interval = flight
-    inputs = [wp.vec3(*x), wp.vec3(*u / np.linalg.norm(u)), wp.vec2(*interval), extinction, medium]
-    return launched(FLIGHT_KERNELS[name], inputs, (float, float), device, count)
-
-
 @pytest.mark.physics
 @pytest.mark.parametrize("flight", FLIGHTS)
 @pytest.mark.parametrize(
     ("law", "extinction"), [("henyey_greenstein", 0.3), ("henyey_greenstein", 2.5), ("tabulated", 0.3)]
 )
 def test_flight_samples_follow_their_density(law, extinction, flight, device):
-    _, angle, closeness, millions = LAWS[law]
+    sample_flight, angle, closeness = LAWS[law]
     x, u, (s0, s1) = FLIGHTS[flight]
-    s, p = sampled(law, extinction, FLIGHTS[flight], device, (millions if device != "cpu" else 1) * 1_000_000)
+    medium, rng = Medium(), np.random.default_rng(2)
+    medium.anisotropy = G
+    medium.phase = make_phase_tables(lambda t: fournier_forand_density(t, 1.10, 3.5835), device=device)
+    xi = np.minimum(rng.random((2, 500_000 if device == "cpu" else 10_000_000)), 1 - 2.0**-24).astype(np.float32)
+    inputs = [
+        wp.vec3(*x),
+        wp.vec3(*u / np.linalg.norm(u)),
+        wp.vec2(s0, s1),
+        extinction,
+        medium,
+        *xi,
+        Layers(),
+        wp.vec3(),
+    ]
+    sample = each(sample_flight, inputs, [FlightSample], device)
+    s, p = sample["s"].astype(float), sample["density"]
     assert s.min() >= np.float32(s0) and s.max() <= np.float32(s1)
     assert np.isfinite(p).all() and (p > 0).all()
     # What is claimed is what the definition says, to float32's resolution of the position.
-    claimed = p[:2000] / _mixture(angle, s[:2000], x, u, s0, s1, extinction) - 1
+    claimed = p[:2000] / mixture(angle, s[:2000], x, u, s0, s1, extinction) - 1
     assert np.abs(np.median(claimed)) < closeness and np.quantile(np.abs(claimed), 0.9) < 5e-3
     # And what is drawn: equal parts by the integral of the density, with nodes where the density is.
     grid = np.unique(np.concatenate([np.linspace(s0, s1, 100_001), np.quantile(s, np.linspace(0, 1, 100_001))]))
-    mass = np.concatenate(
-        [[0], np.cumsum(np.diff(grid) * _mixture(angle, 0.5 * (grid[1:] + grid[:-1]), x, u, s0, s1, extinction))]
-    )
+    parts = np.diff(grid) * mixture(angle, 0.5 * (grid[1:] + grid[:-1]), x, u, s0, s1, extinction)
+    mass = np.concatenate([[0], np.cumsum(parts)])
     assert mass[-1] == pytest.approx(1.0, abs=1e-3)
     edges = np.interp(np.linspace(0, 1, 41), mass / mass[-1], grid)
     wide = np.diff(edges) > 64 * np.spacing(np.float32(max(s1, 5.0)))  # narrower parts are a few grid points wide
     counts = np.histogram(s, bins=edges)[0][wide]
     assert stats.chisquare(counts, np.full(counts.size, counts.sum() / counts.size)).pvalue > 1e-5
-
-
-@wp.kernel(enable_backward=False)
-def _lens_points(camera: Camera, x: wp.vec3, u: wp.vec3, point: Vectors, weight: Floats):
-    i = wp.tid()
-    block = random_block(wp.uint64(3), wp.uint64(i), wp.uint32(0), wp.uint32(4))
-    sample = sample_lens(camera, x, u, u01(block[0]), u01(block[1]))
-    point[i] = sample.point
-    weight[i] = sample.weight
 
 
 @pytest.mark.parametrize("passes", [(0.0, 0.0), (0.15, 0.05), (0.0, -0.199), (0.3, 0.0)])
@@ -149,8 +114,9 @@ def test_lens_points_are_even_but_for_their_weight(passes, device):
     u = np.array([0.3, -0.2, -0.9])
     u /= np.linalg.norm(u)
     place = np.array([*passes, 0.0])
-    x = place - 2.0 * u
-    point, weight = launched(_lens_points, [camera, wp.vec3(*x), wp.vec3(*u)], [wp.vec3, float], device, 400_000)
+    x, xi = place - 2.0 * u, np.random.default_rng(3).random((2, 400_000), np.float32)
+    sample = each(make_sample_lens(None), [camera, wp.vec3(*x), wp.vec3(*u), *xi], [LensSample], device)
+    point, weight = sample["point"].astype(float), sample["weight"].astype(float)
     a, b = point[:, 0] / radius, point[:, 1] / radius
     assert (a**2 + b**2 < 1 + 1e-4).all() and not point[:, 2].any()
     expected = {"1": 1.0, "a": 0.0, "b": 0.0, "a*a": 0.25, "b*b": 0.25, "a*b": 0.0, "(a*a + b*b)**2": 1 / 3}

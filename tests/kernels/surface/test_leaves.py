@@ -7,53 +7,37 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from helpers.brute_force import check_hits
-from helpers.launch import Vectors, launched, on_device
-from helpers.meshes import mesh_and_surfaces
+from helpers.launch import each, on_device, unit
+from helpers.meshes import mesh_and_surfaces, mesh_of, soup
 from spadwarp_kernels import intersect_mesh, intersect_surfaces
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.surface.bvh import LARGEST_LEAF, pack_bvh
+from spadwarp_kernels.surface.ray_cast import SurfaceHit
 from spadwarp_kernels.surface.triangle import meet_planes
 
-Rows = wp.array(dtype=wp.vec4)
+Rows, Slots = wp.array(dtype=wp.vec4), wp.array(dtype=int)
 
 
-@wp.kernel(enable_backward=False)
-def _cast(rows: Rows, slots: wp.array(dtype=int), x: Vectors, u: Vectors, reach: float, met: wp.array(dtype=wp.vec2)):
+@wp.func
+def nearest_of(rows: Rows, slots: Slots, x: wp.vec3, u: wp.vec3, reach: float):
     """Distance and slot of the nearest of what is kept in the slots."""
-    i = wp.tid()
-    nearest = float(reach)
-    found = int(-1)
+    nearest, found = float(reach), int(-1)
     for k in range(slots.shape[0]):
         row = 3 * slots[k]
-        hit = meet_planes(rows[row], rows[row + 1], rows[row + 2], x[i], u[i])
+        hit = meet_planes(rows[row], rows[row + 1], rows[row + 2], x, u)
         if hit[0] >= 0.0 and hit[0] < nearest:
             nearest = hit[0]
             found = slots[k] + wp.where(hit[1] > 0.0 and bits_of(rows[row + 2][3]) < 0, 1, 0)
-    met[i] = wp.vec2(nearest, float(found))
+    return nearest, found
 
 
-@wp.kernel(enable_backward=False)
-def _walk(surfaces: sk.Surfaces, x: Vectors, u: Vectors, reach: float, met: wp.array(dtype=wp.vec2)):
-    i = wp.tid()
-    hit = intersect_surfaces(surfaces, x[i], u[i], reach, False)
-    met[i] = wp.vec2(hit.distance, float(hit.face))
-
-
-@wp.kernel(enable_backward=False)
-def _warps_walk(mesh: wp.uint64, x: Vectors, u: Vectors, reach: float, met: wp.array(dtype=wp.vec2)):
-    i = wp.tid()
-    hit = intersect_mesh(mesh, x[i], u[i], reach)
-    met[i] = wp.vec2(hit.distance, float(hit.face))
+def walked(surfaces, x, u, device):
+    return each(intersect_surfaces, [surfaces, x, u, 4.0, False], [SurfaceHit], device)
 
 
 def packed(shape, leaf_size, device="cpu"):
     """Mesh, nodes, faces as CUDA takes them, and the face in each slot, or its complement."""
-    mesh = wp.Mesh(
-        on_device(shape.vertices, device),
-        on_device(np.ravel(shape.faces), device, int),
-        bvh_constructor="cubql",
-        bvh_leaf_size=leaf_size,
-    )
+    mesh = mesh_of(shape.vertices, shape.faces, device, "cubql", leaf_size)
     nodes, rows, order, _ = pack_bvh(mesh, float(np.abs(shape.vertices).max()))
     return mesh, nodes.numpy(), rows, order.numpy()
 
@@ -91,8 +75,7 @@ def scenes():
     turned = [box.copy() for box in boxes]
     for box in turned:
         box.apply_transform(trimesh.transformations.random_rotation_matrix(rng.uniform(size=3)))
-    soup = rng.normal(size=(60, 1, 3)) + 0.6 * rng.normal(size=(60, 3, 3))
-    triangles = trimesh.Trimesh(soup.reshape(-1, 3), np.arange(180).reshape(-1, 3), process=False)
+    triangles = soup(rng.normal(size=(60, 1, 3)) + 0.6 * rng.normal(size=(60, 3, 3)))
     shapes = {"boxes": boxes, "turned": turned, "triangles": [triangles], "both": [*boxes[:3], triangles, *turned[3:]]}
     shapes["dense"] = [box.subdivide() for box in boxes[:2]]
     return {name: trimesh.util.concatenate(parts) for name, parts in shapes.items()}
@@ -133,24 +116,21 @@ def test_rays_hit_what_a_search_in_float64_hits(name, leaf_size, device):
     shape = SCENES[name]
     rng = np.random.default_rng(2)
     corners = np.asarray(shape.vertices, np.float32).astype(float)[shape.faces]
-    x = 2.0 * rng.normal(size=(20_000, 3)).astype(np.float32)
+    x = 2.0 * rng.normal(size=(10_000, 3)).astype(np.float32)
     ends = rng.integers(len(corners), size=len(x))
     aim, other = corners[ends, rng.integers(3, size=len(x))], corners[ends, rng.integers(3, size=len(x))]
     aim += rng.uniform(size=(len(x), 1)) * (other - aim) + 1e-3 * rng.normal(size=x.shape)
     aim[::2] = rng.normal(size=aim[::2].shape)
-    u = aim - x
-    u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
+    u = unit(aim - x).astype(np.float32)
     _kept, nodes, rows, order = packed(shape, leaf_size, device)
     joined = np.signbit(rows.numpy()[2::3, 3])
     slots = np.concatenate([tried(leaf, joined, order) for leaf, _, _ in leaves(nodes)])
-    slots = on_device(slots, device, int)
-    (met,) = launched(_cast, [rows, slots, x, u, 4.0], [wp.vec2], device, len(x))
-    slot = met[:, 1].astype(int)
+    distance, slot = each(nearest_of, [rows, on_device(slots, device, int), x, u, 4.0], (float, int), device)
     found = np.where(slot >= 0, np.where(order[slot] < 0, ~order[slot], order[slot]), -1)
     kept, surfaces = mesh_and_surfaces(shape, device, builder="cubql", leaf_size=leaf_size)
-    (walked,) = launched(_walk, [surfaces, x, u, 4.0], [wp.vec2], device, len(x))
+    hit = walked(surfaces, x, u, device)
     assert kept.id
-    check_hits(corners, x, u, 4.0, (found, met[:, 0]), (walked[:, 1].astype(int), walked[:, 0]))
+    check_hits(corners, x, u, 4.0, (found, distance), (hit["face"], hit["distance"]))
 
 
 @SIZES
@@ -164,9 +144,8 @@ def test_a_moving_mesh_has_leaves_of_triangles(leaf_size, device):
     sk.update_surfaces(surfaces, mesh)
     mesh.refit()
     x, u = rng.normal(size=(2, 20_000, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    (mine,) = launched(_walk, [surfaces, x, u, 4.0], [wp.vec2], device, len(x))
-    (hers,) = launched(_warps_walk, [mesh.id, x, u, 4.0], [wp.vec2], device, len(x))
-    assert (mine[:, 1] >= 0).mean() > 0.2
-    assert (mine[:, 1] == hers[:, 1]).mean() > 0.999
-    assert (np.abs(mine[:, 0] - hers[:, 0]) < 1e-4).mean() > 0.999
+    u = unit(u)
+    mine, hers = walked(surfaces, x, u, device), each(intersect_mesh, [mesh.id, x, u, 4.0], [SurfaceHit], device)
+    assert (mine["face"] >= 0).mean() > 0.2
+    assert (mine["face"] == hers["face"]).mean() > 0.999
+    assert (np.abs(mine["distance"] - hers["distance"]) < 1e-4).mean() > 0.999

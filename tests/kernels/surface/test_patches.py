@@ -6,47 +6,38 @@ import trimesh
 import warp as wp
 
 from helpers.brute_force import check_hits
-from helpers.launch import Vectors, launched, on_device
+from helpers.launch import each, on_device, unit
+from helpers.meshes import mesh_of, soup
 from spadwarp_kernels.base.native import bits_of
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.patches import load_row, nearest_patch, pack_patches, set_patches
 from spadwarp_kernels.surface.ray_cast import patch_hit
 
-OUT = (float, wp.vec3, wp.vec3i)
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+Rows = wp.array(dtype=wp.vec4)
 
 
-@wp.kernel(enable_backward=False)
-def _cast(
-    patches: wp.array(dtype=wp.vec4),
-    normals: wp.array(dtype=wp.vec4),
-    x: Vectors,
-    u: Vectors,
-    reach: float,
-    distance: wp.array(dtype=float),
-    normal: Vectors,
-    faces: wp.array(dtype=wp.vec3i),
-):
+@wp.func
+def hit_patch(patches: Rows, normals: Rows, x: wp.vec3, u: wp.vec3, reach: float):
     """Distance, normal against the ray, and (slot, face, face in that slot)."""
-    i = wp.tid()
-    met = nearest_patch(patches, x[i], u[i], reach)
-    distance[i] = met[0]
-    faces[i] = wp.vec3i(-1)
+    met = nearest_patch(patches, x, u, reach)
+    normal, faces = wp.vec3(), wp.vec3i(-1)
     if bits_of(met[3]) >= 0:
         surfaces = Surfaces()
         surfaces.patches = patches
         hit = patch_hit(surfaces, met)
-        normal[i] = hit.normal
-        faces[i] = wp.vec3i(hit.slot, hit.face, bits_of(load_row(normals, hit.slot)[3]))
+        normal = hit.normal
+        faces = wp.vec3i(hit.slot, hit.face, bits_of(load_row(normals, hit.slot)[3]))
+    return met[0], normal, faces
 
 
-def mesh_of(points, faces, device="cpu"):
-    return wp.Mesh(on_device(np.asarray(points), device), on_device(np.ravel(faces), device, int))
+def cast(patches, normals, x, u, device="cpu", reach=4.0):
+    return each(hit_patch, [patches, normals, x, u, reach], (float, wp.vec3, wp.vec3i), device)
 
 
 def pairs_of(points, faces):
     """(face, second face, corner) of the patches; a triangle is its own second face."""
-    patches, _ = pack_patches(mesh_of(np.asarray(points, float), faces), np.arange(len(faces)))
+    patches, _ = pack_patches(mesh_of(points, faces), np.arange(len(faces)))
     rows = patches.numpy().reshape(-1, 5, 4).view(np.int32)
     return [(int(row[4, 1]), int(row[4, 3]), int(row[3, 3])) for row in rows]
 
@@ -57,22 +48,18 @@ def packed(shape, pairs=True, device="cpu"):
     return mesh, *pack_patches(mesh, np.arange(len(shape.faces))[::-1], pairs)
 
 
+def turned_box(extents, angles):
+    turn = trimesh.transformations.random_rotation_matrix(np.array(angles))
+    return trimesh.creation.box(extents=extents, transform=turn)
+
+
 def scenes():
     rng = np.random.default_rng(11)
-    quads, triangles = [], []
-    for _ in range(3):
-        o, a, b = rng.normal(size=(3, 3))
-        quads += [[o, o + a, o + a + b], [o, o + a + b, o + b]]
-    for _ in range(4):
-        triangles.append(rng.normal(size=(3, 3)))
+    quads = [[o, o + a, o + a + b, o, o + a + b, o + b] for o, a, b in rng.normal(size=(3, 3, 3))]
+    quads, triangles = list(np.reshape(quads, (6, 3, 3))), list(rng.normal(size=(4, 3, 3)))
     shapes = {"parallelograms": quads, "triangles": triangles, "both": [*quads[:3], *triangles, *quads[3:]]}
-    soups = {
-        name: trimesh.Trimesh(np.reshape(corners, (-1, 3)), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
-        for name, corners in shapes.items()
-    }
-    box = trimesh.creation.box(extents=(1.0, 2.0, 0.5))
-    box.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.3, 0.6, 0.9])))
-    return soups | {"box": box}
+    shapes = {name: soup(corners) for name, corners in shapes.items()}
+    return shapes | {"box": turned_box((1.0, 2.0, 0.5), (0.3, 0.6, 0.9))}
 
 
 SCENES = scenes()
@@ -92,15 +79,13 @@ def test_rays_hit_what_a_search_in_float64_hits(name, pairs, device):
     share = rng.uniform(size=(len(x), 1))
     ends = rng.integers(len(corners), size=20_000)
     aim[:20_000], other[:20_000] = corners[ends, 0], corners[ends, 2 - (np.arange(20_000) % 2)]
-    u = aim + share * (other - aim) + 1e-3 * rng.normal(size=x.shape) * rng.integers(2, size=(len(x), 1)) - x
-    u = (u / np.linalg.norm(u, axis=1, keepdims=True)).astype(np.float32)
-
-    distance, normal, faces = launched(_cast, [patches, normals, x, u, 4.0], OUT, device, len(x))
+    to = aim + share * (other - aim) + 1e-3 * rng.normal(size=x.shape) * rng.integers(2, size=(len(x), 1))
+    u = unit(to - x).astype(np.float32)
+    distance, normal, faces = cast(patches, normals, x, u, device)
     check_hits(corners, x, u, 4.0, (faces[:, 1], distance))
     hit = faces[:, 1] >= 0
     named = faces[hit, 1]
-    n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[named]
-    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    n = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[named]
     y = x + distance[:, None] * u
     assert np.abs(((y[hit] - corners[named, 0]) * n).sum(axis=1)).max() < 1e-5
     np.testing.assert_array_equal(faces[hit, 0], len(shape.faces) - 1 - named)
@@ -112,18 +97,15 @@ def test_rays_hit_what_a_search_in_float64_hits(name, pairs, device):
 
 def test_no_ray_slips_through_a_diagonal_or_an_edge(device):
     """From inside a closed box, at the edges and diagonals of all faces."""
-    box = trimesh.creation.box(extents=(1.0, 2.0, 3.0))
-    box.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.7])))
-    rng = np.random.default_rng(3)
+    rng, box = np.random.default_rng(3), turned_box((1.0, 2.0, 3.0), (0.1, 0.5, 0.7))
     edges = box.vertices[box.edges_unique]
     chosen = rng.integers(len(edges), size=200_000)
     share = rng.uniform(size=(len(chosen), 1))
     to = edges[chosen, 0] + share * (edges[chosen, 1] - edges[chosen, 0])
     x = 0.9 * box.vertices[rng.integers(8, size=len(to))] * rng.uniform(size=(len(to), 1))
-    u = (to - x) / np.linalg.norm(to - x, axis=1, keepdims=True)
     for pairs in (True, False):
         _kept, patches, normals = packed(box, pairs, device)
-        _, _, faces = launched(_cast, [patches, normals, x, u, 9.0], OUT, device, len(x))
+        faces = cast(patches, normals, x, unit(to - x), device, reach=9.0)[2]
         assert (faces[:, 1] < 0).sum() <= 2
 
 
@@ -136,62 +118,53 @@ def test_a_box_has_six_patches_and_a_plane_one(scale):
         box = trimesh.creation.box(extents=scale * rng.uniform(0.3, 3, size=3), transform=pose)
         faces = box.faces
         if turn % 2:  # faces that share no vertices, each beginning at any corner
-            box = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+            box = soup(box.triangles)
             faces = np.array([np.roll(face, rng.integers(3)) for face in box.faces])
         patches = pairs_of(box.vertices, faces)
         assert len(patches) == 6
         assert sorted(face for first, second, _ in patches for face in (first, second)) == list(range(12))
         for first, second, _ in patches:
             assert box.face_normals[first] @ box.face_normals[second] > 0.999
-    assert pairs_of(scale * SQUARE, [[0, 1, 2], [0, 2, 3]]) == [(0, 1, 1)]
+    assert pairs_of(scale * SQUARE, TWO) == [(0, 1, 1)]
     slanted = scale * np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [2, -1, 0]])
     assert pairs_of(slanted, [[0, 1, 2], [0, 3, 1]]) == [(0, 1, 2)]
 
 
+TWO = [[0, 1, 2], [0, 2, 3]]
+
+
 @pytest.mark.parametrize(
-    ("points", "faces"),
+    ("points", "faces", "pairs"),
     [
-        (
-            np.add(SQUARE, [[0, 0, 0], [0, 0, 0], [0.01, 0, 0], [0, 0, 0]]),
-            [[0, 1, 2], [0, 2, 3]],
-        ),  # not a parallelogram
-        (np.add(SQUARE, [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1e-4]]), [[0, 1, 2], [0, 2, 3]]),  # not flat
-        (SQUARE, [[0, 1, 2], [0, 3, 2]]),  # turned the other way
-        (SQUARE, [[0, 1, 2], [0, 1, 2]]),  # twice the same
-        (SQUARE, [[0, 1, 2], [0, 1, 3]]),  # overlapping
-        (SQUARE, [[0, 2, 2], [0, 2, 2]]),  # without area
-        (SQUARE * [1, 1e-6, 1], [[0, 1, 2], [0, 2, 3]]),  # less high than what counts as one point
+        (SQUARE + np.outer([0, 0, 1, 0], [0.01, 0, 0]), TWO, [(0, 0, 0), (1, 1, 0)]),  # not a parallelogram
+        (SQUARE + np.outer([0, 0, 0, 1], [0, 0, 1e-4]), TWO, [(0, 0, 0), (1, 1, 0)]),  # not flat
+        (SQUARE, [[0, 1, 2], [0, 3, 2]], [(0, 0, 0), (1, 1, 0)]),  # turned the other way
+        (SQUARE, [[0, 1, 2], [0, 1, 2]], [(0, 0, 0), (1, 1, 0)]),  # twice the same
+        (SQUARE, [[0, 1, 2], [0, 1, 3]], [(0, 0, 0), (1, 1, 0)]),  # overlapping
+        (SQUARE, [[0, 2, 2], [0, 2, 2]], [(0, 0, 0), (1, 1, 0)]),  # without area
+        (SQUARE * [1, 1e-6, 1], TWO, [(0, 0, 0), (1, 1, 0)]),  # less high than what counts as one point
+        # Each face is of one parallelogram: three that fit together pairwise, and a square that is there twice.
+        ([*SQUARE, [-1, 1, 0]], [[0, 1, 3], [1, 2, 3], [0, 3, 4]], [(0, 1, 0), (2, 2, 0)]),
+        (SQUARE, [[0, 1, 3], [1, 2, 3]] * 2, [(0, 1, 0), (2, 3, 0)]),
     ],
 )
-def test_other_faces_stay_by_themselves(points, faces):
-    assert pairs_of(points, faces) == [(0, 0, 0), (1, 1, 0)]
-
-
-def test_each_face_is_of_one_parallelogram():
-    """Of three triangles that fit together pairwise, and of a square that is there twice."""
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [-1, 1, 0]], float)
-    assert pairs_of(points, [[0, 1, 2], [1, 3, 2], [0, 2, 4]]) == [(0, 1, 0), (2, 2, 0)]
-    square = [[0, 1, 3], [1, 2, 3]]
-    assert pairs_of(SQUARE, square + square) == [(0, 1, 0), (2, 3, 0)]
+def test_only_two_faces_that_fit_make_a_parallelogram(points, faces, pairs):
+    assert pairs_of(points, faces) == pairs
 
 
 def test_patches_without_area_are_never_hit():
     shape = trimesh.Trimesh(np.array([[0, 0, 1], [1, 0, 1], [2, 0, 1]], float), [[0, 1, 2], [1, 1, 1]], process=False)
     _kept, patches, normals = packed(shape)
-    x = np.zeros((3, 3))
-    u = np.array([[0, 0, 1], [0.6, 0, 0.8], [1, 0, 0]])
-    distance, _, faces = launched(_cast, [patches, normals, x, u, 5.0], OUT, count=3)
-    assert (faces == -1).all()
-    np.testing.assert_array_equal(distance, 5.0)
+    distance, _, faces = cast(patches, normals, np.zeros((3, 3)), np.array([[0, 0, 1], [0.6, 0, 0.8], [1, 0, 0]]))
+    assert (faces == -1).all() and (distance == 4.0).all()
 
 
 def test_patches_of_single_faces_follow_points_that_move():
-    shape = trimesh.Trimesh(np.add(SQUARE, [0, 0, 1]), [[0, 1, 2], [0, 2, 3]], process=False)
+    shape = trimesh.Trimesh(np.add(SQUARE, [0, 0, 1]), TWO, process=False)
     mesh, patches, normals = packed(shape, pairs=False)
-    moved = np.add(shape.vertices, [[0, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, 3]])
-    mesh.points.assign(on_device(moved))
+    mesh.points.assign(on_device(shape.vertices + np.outer([0, 0, 1, 3], [0, 0, 1])))
     set_patches(mesh, patches, normals)
     rays = np.array([[0.7, 0.2, 0.0], [0.2, 0.7, 0.0]]), np.array([[0.0, 0.0, 1.0]] * 2)
-    distance, _, faces = launched(_cast, [patches, normals, *rays, 9.0], OUT, count=2)
+    distance, _, faces = cast(patches, normals, *rays, reach=9.0)
     np.testing.assert_array_equal(faces[:, 1], [0, 1])
     np.testing.assert_allclose(distance, [1.2, 1.0 + 0.7 * 3 - 0.2 * 2], atol=1e-6)

@@ -5,9 +5,8 @@ import pytest
 import warp as wp
 from scipy import stats
 
-from helpers.launch import Floats, Vectors, launched
+from helpers.launch import each, unit
 from helpers.statistics_of_samples import chi2_p, sample_count
-from spadwarp_kernels import random_block, u01
 from spadwarp_kernels.surface.reflectance import ggx_brdf, ggx_normals, ggx_pdf, sample_ggx, sample_lambert, unshadowed
 
 pytestmark = pytest.mark.physics
@@ -17,30 +16,20 @@ ACROSS = np.array([0.8, 0.6, 0.0])
 ASIDE = np.cross(NORMAL, ACROSS)
 
 
-@wp.kernel(enable_backward=False)
-def _draw(u: wp.vec3, n: wp.vec3, alpha: float, v: Vectors, leaving: Floats):
-    i = wp.tid()
-    block = random_block(wp.uint64(11), wp.uint64(i), wp.uint32(1), wp.uint32(1))
-    v[i] = sample_ggx(u, n, alpha, float(block[0] >> wp.uint32(8)) / 16777216.0, float(block[1]) / 4294967296.0)
-    leaving[i] = unshadowed(u, v[i], n, alpha, 1.0)
-
-
-@wp.kernel(enable_backward=False)
-def _evaluate(u: Vectors, v: Vectors, n: wp.vec3, alpha: float, brdf: Floats, pdf: Floats, facets: Floats):
-    i = wp.tid()
-    brdf[i] = ggx_brdf(u[i], v[i], n, alpha)
-    pdf[i] = ggx_pdf(u[i], v[i], n, alpha)
-    facets[i] = ggx_normals(v[i], n, alpha)
+def uniform(count):
+    return np.random.default_rng(11).random((2, count), np.float32)
 
 
 def draw(angle, alpha, count, device):
-    inputs = [wp.vec3(*incoming(angle)), wp.vec3(*NORMAL), alpha]
-    return launched(_draw, inputs, (wp.vec3, float), device, count)
+    """Directions of the lobe, and the part of their light that leaves the surface."""
+    u, n = wp.vec3(*incoming(angle)), wp.vec3(*NORMAL)
+    v = each(sample_ggx, [u, n, alpha, *uniform(count)], [wp.vec3], device)
+    return v, each(unshadowed, [u, v, n, alpha, 1.0], device=device)
 
 
-def evaluate(u, v, alpha, device="cpu"):
+def evaluate(function, u, v, alpha):
     u, v = np.broadcast_arrays(u, v)
-    return launched(_evaluate, [u, v, wp.vec3(*NORMAL), alpha], [float] * 3, device)
+    return each(function, [u, v, wp.vec3(*NORMAL), alpha])
 
 
 def incoming(angle_deg):
@@ -102,10 +91,7 @@ def test_sampled_facets_follow_the_visible_normals(angle, alpha, device):
     assert expected.sum() == pytest.approx(1.0, abs=1e-3)
     expected *= count / expected.sum()
     rare = expected < 10
-    observed, expected = (
-        np.append(observed[~rare], observed[rare].sum()),
-        np.append(expected[~rare], expected[rare].sum()),
-    )
+    observed, expected = (np.append(cells[~rare], cells[rare].sum()) for cells in (observed, expected))
     if expected[-1] < 10:
         observed, expected = observed[:-1], expected[:-1]
         expected *= observed.sum() / expected.sum()
@@ -122,8 +108,7 @@ def test_density_and_facets_are_normalised(angle, alpha):
     u = incoming(angle)
     along = -(h @ u)
     v = u + 2 * along[:, None] * h
-    _, pdf, _ = evaluate(u, v, alpha)
-    _, _, facets = evaluate(u, h, alpha)
+    pdf, facets = evaluate(ggx_pdf, u, v, alpha), each(ggx_normals, [h, wp.vec3(*NORMAL), alpha])
     density = 1 / (np.pi * alpha**2 * cosine**4 * (1 + (tangent / alpha) ** 2) ** 2)  # Walter eq 33
     np.testing.assert_allclose(facets, density, rtol=2e-3 if alpha < 0.1 else 1e-4)
     seen = along > 1e-3
@@ -134,11 +119,9 @@ def test_density_and_facets_are_normalised(angle, alpha):
 @pytest.mark.parametrize("alpha", [0.05, 0.3, 1.0])
 def test_light_and_eye_may_change_places(alpha):
     rng = np.random.default_rng(4)
-    w, v = rng.normal(size=(2, 5000, 3))
-    w, v = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in (w, v))
+    w, v = unit(rng.normal(size=(2, 5000, 3)))
     w, v = (a - 2 * np.minimum(a @ NORMAL, 0)[:, None] * NORMAL for a in (w, v))
-    there, *_ = evaluate(-w, v, alpha)
-    back, *_ = evaluate(-v, w, alpha)
+    there, back = evaluate(ggx_brdf, -w, v, alpha), evaluate(ggx_brdf, -v, w, alpha)
     assert (there > 0).all()
     np.testing.assert_allclose(there, back, rtol=1e-4)
 
@@ -154,22 +137,12 @@ def test_lobe_reflects_its_albedo_and_no_more(angle, alpha, device):
 
 
 def test_nothing_is_reflected_through_the_surface():
-    below = incoming(40.0)
-    brdf, pdf, _ = evaluate(incoming(20.0), np.array([below, -NORMAL]), 0.5)
-    assert (brdf == 0).all() and np.isfinite(pdf).all()
-
-
-@wp.kernel(enable_backward=False)
-def _lambert(normal: wp.vec3, v: Vectors):
-    i = wp.tid()
-    block = random_block(wp.uint64(9), wp.uint64(i), wp.uint32(0), wp.uint32(1))
-    v[i] = sample_lambert(normal, u01(block[0]), u01(block[1]))
+    below = incoming(20.0), np.array([incoming(40.0), -NORMAL]), 0.5
+    assert (evaluate(ggx_brdf, *below) == 0).all() and np.isfinite(evaluate(ggx_pdf, *below)).all()
 
 
 def test_lambert_follows_the_cosine_law(device):
-    normal = np.array([0.48, -0.6, 0.64])
-    (v,) = launched(_lambert, [wp.vec3(*normal)], [wp.vec3], device, sample_count(device))
-    cosine = v @ normal
+    """cos^2 is uniform under the cosine law."""
+    cosine = each(sample_lambert, [wp.vec3(*NORMAL), *uniform(sample_count(device))], [wp.vec3], device) @ NORMAL
     assert cosine.min() > -1e-6
-    # cos^2 is uniform under the cosine law.
     assert chi2_p(cosine, lambda c: np.clip(c, 0, 1) ** 2) > 1e-4

@@ -9,16 +9,17 @@ import trimesh
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.launch import Floats, Integers, Vectors, launched, on_device
-from helpers.meshes import mesh_and_surfaces
+from helpers.launch import each, on_device, unit
+from helpers.lit_box import lit_box
+from helpers.meshes import mesh_and_surfaces, mesh_of
 from spadwarp_kernels.optics.visibility import near_depth_map
 from spadwarp_kernels.surface.bvh import read_tree
+from spadwarp_kernels.surface.ray_cast import SurfaceHit
 
 PRIVATE_LAYOUT = (
-    f"Warp {wp.__version__} keeps its BVH in another layout than kernels/spadwarp_kernels/surface/bvh.py reads "
-    "(members of wp::Mesh::bvh: node_lowers, node_uppers, root, primitive_indices, num_nodes, max_nodes). Mend "
-    "`_read_node` there; until then make_surfaces(..., use_warp_bvh=True) "
-    "takes wp.mesh_query_ray."
+    f"Warp {wp.__version__} keeps its BVH in another layout than surface/bvh.py reads (members of wp::Mesh::bvh: "
+    "node_lowers, node_uppers, root, primitive_indices, num_nodes, max_nodes). Mend `_read_node` there; until then "
+    "make_surfaces(..., use_warp_bvh=True) takes wp.mesh_query_ray."
 )
 
 
@@ -30,30 +31,16 @@ def ball(device, count=24):
     first = (np.arange(2 * count - 1)[:, None] * count + np.arange(count - 1)).ravel()
     faces = np.stack([first, first + count, first + 1, first + 1, first + count, first + count + 1], axis=1)
     points = points.reshape(-1, 3).astype(np.float32)
-    mesh = wp.Mesh(on_device(points, device), on_device(faces.ravel(), device, int))
-    return mesh, points
+    return mesh_of(points, faces, device), points
 
 
-@wp.kernel(enable_backward=False)
-def cast(surfaces: sk.Surfaces, x: Vectors, u: Vectors, mine: Floats, hers: Floats):
-    i = wp.tid()
-    mine[i] = sk.intersect_surfaces(surfaces, x[i], u[i], 100.0, False).distance
-    hers[i] = sk.intersect_mesh(surfaces.mesh, x[i], u[i], 100.0).distance
-
-
-@wp.kernel(enable_backward=False)
-def meets(surfaces: sk.Surfaces, x: Vectors, way: Vectors, met: Integers):
-    i = wp.tid()
-    hit = sk.intersect_surfaces(surfaces, x[i], wp.normalize(way[i]), wp.length(way[i]), True)
-    met[i] = wp.where(hit.slot >= 0, 1, 0)
-
-
-def distances(surfaces, device, count=20_000):
+def distances(surfaces, mesh, device, count=20_000):
+    """By our walk and by Warp's."""
     rng = np.random.default_rng(2)
-    u = rng.normal(size=(count, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u = unit(rng.normal(size=(count, 3)))
     x = rng.uniform(-2, 2, (count, 3)) - 5.0 * u
-    return launched(cast, [surfaces, x, u], (float, float), device, count)
+    mine = each(sk.intersect_surfaces, [surfaces, x, u, 100.0, False], [SurfaceHit], device)
+    return mine["distance"], each(sk.intersect_mesh, [mesh.id, x, u, 100.0], [SurfaceHit], device)["distance"]
 
 
 def test_the_tree_is_read_as_warp_writes_it(device):
@@ -63,54 +50,44 @@ def test_the_tree_is_read_as_warp_writes_it(device):
         mesh = wp.Mesh(mesh.points, mesh.indices, bvh_constructor=constructor, bvh_leaf_size=1)
         try:
             tree = read_tree(mesh, 1.2)
+            assert sorted(tree.faces) == list(range(len(tree.faces))), "faces are missing"
+            corners, stack, seen = points[mesh.indices.numpy().reshape(-1, 3)[tree.faces]], [tree.root], 0
+            while stack:
+                node = stack.pop()
+                held = corners[tree.start[node] : tree.stop[node]]
+                inside = (held >= tree.lower[node]).all() and (held <= tree.upper[node]).all()
+                assert inside, "a face leaves a box"
+                if tree.children[node, 0] >= 0:
+                    stack += tree.children[node].tolist()
+                else:
+                    seen += len(held)
+            assert seen == len(tree.faces), "faces are in no leaf"
         except Exception as error:
-            pytest.fail(f"{PRIVATE_LAYOUT} ({error})")
-        assert sorted(tree.faces) == list(range(len(tree.faces))), (
-            f"{PRIVATE_LAYOUT} (faces are missing, {constructor})"
-        )
-        corners, stack, seen = points[mesh.indices.numpy().reshape(-1, 3)[tree.faces]], [tree.root], 0
-        while stack:
-            node = stack.pop()
-            held = corners[tree.start[node] : tree.stop[node]]
-            inside = (held >= tree.lower[node]).all() and (held <= tree.upper[node]).all()
-            assert inside, f"{PRIVATE_LAYOUT} (a face leaves a box, {constructor})"
-            if tree.children[node, 0] >= 0:
-                stack += tree.children[node].tolist()
-            else:
-                seen += len(held)
-        assert seen == len(tree.faces), f"{PRIVATE_LAYOUT} (faces are in no leaf, {constructor})"
+            pytest.fail(f"{PRIVATE_LAYOUT} ({error}, {constructor})")
 
 
 @pytest.mark.parametrize("use_warp_bvh", [False, True])
 def test_surfaces_follow_moving_points(use_warp_bvh, device):
+    """Updated in place; and made of the mesh that has been refitted, whatever its builder."""
     mesh, points = ball(device)
+    moved = (points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)).astype(np.float32)
+    new = wp.Mesh(on_device(moved, device), mesh.indices)
     surfaces = sk.make_surfaces(mesh, extent=5.0, use_warp_bvh=use_warp_bvh)
     assert sk.surface_choices(surfaces)["use_warp_bvh"] == use_warp_bvh
-    before = distances(surfaces, device)[0]
-    moved = points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)
-    mesh.points.assign(moved.astype(np.float32))
+    before, fresh = distances(surfaces, mesh, device)[0], distances(sk.make_surfaces(new), new, device)[0]
+    mesh.points.assign(moved)
     sk.update_surfaces(surfaces, mesh)
+    pairs = [(surfaces, mesh)]
+    for constructor in ("sah", "cubql"):
+        refitted = wp.Mesh(on_device(points, device), mesh.indices, bvh_constructor=constructor, bvh_leaf_size=1)
+        refitted.points.assign(moved)
+        refitted.refit()
+        pairs.append((sk.make_surfaces(refitted, use_warp_bvh=use_warp_bvh), refitted))
     mesh.refit()
-    mine, hers = distances(surfaces, device)
-    new = wp.Mesh(on_device(moved.astype(np.float32), device), mesh.indices)
-    fresh = distances(sk.make_surfaces(new), device)[0]
-    assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
-    assert (np.abs(mine - before) > 1e-3).mean() > 0.1
-
-
-@pytest.mark.parametrize("constructor", ["sah", "cubql"])
-def test_surfaces_of_a_refitted_mesh(constructor, device):
-    """`simulate(kept=...)` makes surfaces of the mesh that it has kept, refitted."""
-    kept, points = ball(device)
-    mesh = wp.Mesh(wp.clone(kept.points), kept.indices, bvh_constructor=constructor, bvh_leaf_size=1)
-    moved = (points * (1.0, 1.5, 0.7) + (0.5, -0.3, 1.0)).astype(np.float32)
-    for one in (mesh, kept):
-        one.points.assign(moved)
-    mesh.refit()
-    new = wp.Mesh(kept.points, kept.indices)
-    mine, hers = distances(sk.make_surfaces(mesh), device)
-    fresh = distances(sk.make_surfaces(new), device)[0]
-    assert mine == pytest.approx(hers, abs=2e-5) and np.abs(mine - fresh).max() < 2e-5
+    for one, its_mesh in pairs:
+        mine, hers = distances(one, its_mesh, device)
+        assert np.abs(mine - hers).max() < 2e-5 and np.abs(mine - fresh).max() < 2e-5
+        assert (np.abs(mine - before) > 1e-3).mean() > 0.1
 
 
 def wide_camera():
@@ -132,15 +109,15 @@ def test_the_map_of_a_camera_follows(device):
         found = surfaces.near_depth.numpy()
         assert np.array_equal(found, near_depth_map(mesh, camera).numpy())
         assert found[64, 64] == pytest.approx(shift - 1.0, abs=0.25) and found[64, 0] > 1e29
-    with pytest.raises(sk.ArgumentError, match="made with a camera; update_surfaces needs the same"):
-        sk.update_surfaces(surfaces, mesh)
-    with pytest.raises(sk.ArgumentError, match="made without a camera"):
-        sk.update_surfaces(sk.make_surfaces(mesh, extent=9.0), mesh, camera)
-    with pytest.raises(sk.ArgumentError, match="make_surfaces needs an extent"):
-        sk.update_surfaces(sk.make_surfaces(mesh), mesh)
-    other, _ = ball(device)
-    with pytest.raises(sk.ArgumentError, match="not those of mesh"):
-        sk.update_surfaces(sk.make_surfaces(mesh), other)
+    bare = sk.make_surfaces(mesh)
+    for args, text in (
+        ((surfaces, mesh), "made with a camera; update_surfaces needs the same"),
+        ((sk.make_surfaces(mesh, extent=9.0), mesh, camera), "made without a camera"),
+        ((bare, mesh), "make_surfaces needs an extent"),
+        ((bare, ball(device)[0]), "not those of mesh"),
+    ):
+        with pytest.raises(sk.ArgumentError, match=text):
+            sk.update_surfaces(*args)
 
 
 def test_nothing_hides_what_lies_before_the_map(device):
@@ -149,15 +126,10 @@ def test_nothing_hides_what_lies_before_the_map(device):
     turn = np.array([[0.8, 0.1, 0.59], [0.0, 0.98, -0.17], [-0.6, 0.14, 0.79]])
     square = np.array([(-20.0, 0, -20), (20, 0, -20), (20, 0, 20), (-20, 0, 20)])
     small = np.array([(-0.3, -0.8, 2.0), (0.2, -0.7, 2.2), (0.0, -0.4, 1.9), (0.1, -0.9, 2.1)])
-    parts = [
-        np.array((0, 0.5, 0)) + square,
-        square[:, [1, 0, 2]] @ turn - (3.0, 0, 0),
-        0.1 * square - (0, 0, 2.5),
-        small,
-    ]
-    corners = np.concatenate(parts).astype(np.float32)
+    behind, wall = 0.1 * square - (0, 0, 2.5), square[:, [1, 0, 2]] @ turn - (3.0, 0, 0)
+    corners = np.concatenate([square - (0, -0.5, 0), wall, behind, small]).astype(np.float32)
     faces = (np.array([0, 1, 2, 0, 2, 3]) + 4 * np.arange(4)[:, None]).ravel()
-    mesh = wp.Mesh(on_device(corners, device), on_device(faces, device, int))
+    mesh = mesh_of(corners, faces, device)
     camera = wide_camera()
     near = near_depth_map(mesh, camera).numpy().astype(float)
     assert near[100, 64] == pytest.approx(0.4 / (0.8 * 73.0 / 128), rel=0.05)  # of the floor, less the lens's radius
@@ -170,25 +142,17 @@ def test_nothing_hides_what_lies_before_the_map(device):
     start = np.concatenate([tangent, np.ones((count, 1))], axis=1) * depth[:, None]
     turn = rng.uniform(0, 2 * np.pi, count)
     lens = camera.aperture_radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
-    (met,) = launched(meets, [sk.make_surfaces(mesh), start, lens - start], [int], device, count)
-    assert not met.any()
+    way = np.linalg.norm(lens - start, axis=1, keepdims=True)
+    inputs = [sk.make_surfaces(mesh), start, (lens - start) / way, way[:, 0].astype(np.float32), True]
+    assert (each(sk.intersect_surfaces, inputs, [SurfaceHit], device)["face"] < 0).all()
 
 
-def small_model(mesh, surfaces):
-    medium, laser, limits, camera, gate = sk.Medium(), sk.Laser(), sk.Limits(), sk.Camera(), sk.Gate()
-    medium.extinction, medium.albedo, medium.anisotropy, medium.axis_threshold = 0.2, 0.7, 0.9, 1.0
-    laser.position, laser.axis, laser.spread = wp.vec3(0.05, 0.0, 0.0), wp.vec3(0.0, 0.0, 1.0), 0.02
-    camera.width, camera.height, camera.pixel_tangent = 8, 8, 0.04
-    camera.aperture_radius, camera.aperture_area = 0.01, math.pi * 1e-4
-    gate.start, gate.stop, gate.bins, gate.bins_per_metre = 2.0, 10.0, 16, 2.0
-    limits.max_path, limits.max_collisions, limits.weight_cutoff = 10.0, 32, 1e-3
-    return sk.Model(mesh.device, medium, laser, camera, gate, limits, sk.Guiding(), mesh, surfaces, 2.0**50)
-
-
-def tally(model, spec, first_id=0, offset=0, count=20_000):
-    data = sk.make_data(model)
+def tally(model, spec, first_id=0, offset=0):
+    data = sk.make_data(model, histogram=not spec.merged)
+    if spec.merged:
+        data = dataclasses.replace(data, tally=wp.zeros(model.tally_size // 3, dtype=wp.int64, device=model.device))
     data.offset.fill_(offset)
-    sk.launch_transport(spec, model, data, seed=3, first_id=first_id, photon_count=count)
+    sk.launch_transport(spec, model, data, seed=3, first_id=first_id, photon_count=20_000)
     return data.tally.numpy()
 
 
@@ -197,7 +161,9 @@ def test_transport_by_public_queries_and_by_steps(device):
     mesh, points = ball(device)
     mesh.points.assign(points + np.array([0.0, 0.0, 3.0], np.float32))
     mesh.refit()
-    model = small_model(mesh, sk.make_surfaces(mesh, 0.5))
+    structs = lit_box()
+    structs["gate"].start, structs["gate"].stop, structs["gate"].bins_per_metre = 2.0, 10.0, 1.0
+    model = sk.Model(mesh.device, mesh=mesh, surfaces=sk.make_surfaces(mesh, 0.5), scale=2.0**50, **structs)
     spec = sk.TransportSpec("next_event")
     light = tally(model, spec)
     public = dataclasses.replace(model, surfaces=sk.make_surfaces(mesh, 0.5, use_warp_bvh=True))
@@ -206,22 +172,17 @@ def test_transport_by_public_queries_and_by_steps(device):
     other = tally(public, spec._replace(use_warp_bvh=True))
     # A ray on an edge may fall on either side of it: the same photons otherwise.
     assert light.sum() > 0 and np.abs(light - other).sum() < 1e-3 * light.sum()
-    stepped = spec._replace(stepped=True)
-    assert np.array_equal(tally(model, stepped), light)
-    assert np.array_equal(tally(model, stepped, first_id=4, offset=2**40), tally(model, spec, first_id=2**40 + 4))
-    # One tally for all components.
-    small = wp.zeros(light.size // 3, dtype=wp.int64, device=device)
-    data = dataclasses.replace(sk.make_data(model, histogram=False), tally=small)
-    sk.launch_transport(spec._replace(merged=True), model, data, seed=3, first_id=0, photon_count=20_000)
-    assert np.array_equal(small.numpy(), light.reshape(3, -1).sum(axis=0))
+    # A step has one tally for all components.
+    step = spec._replace(stepped=True, merged=True)
+    assert np.array_equal(tally(model, step), light.reshape(3, -1).sum(axis=0))
+    later = tally(model, spec, first_id=2**40 + 4).reshape(3, -1).sum(axis=0)
+    assert np.array_equal(tally(model, step, first_id=4, offset=2**40), later)
     with pytest.raises(sk.ArgumentError, match="merged needs guided or next_event"):
         tally(model, sk.TransportSpec("analog", merged=True))
 
 
 def test_surfaces_check_their_arrays_and_the_spec_that_goes_with_them():
     mesh, _ = mesh_and_surfaces(trimesh.creation.box(), "cpu")
-    with pytest.raises(ValueError, match="specular has 5 entries; the mesh has 12 faces"):
-        sk.make_surfaces(mesh, 0.5, specular=wp.zeros(5, dtype=float, device="cpu"))
     image = np.linspace(0, 1, 6).reshape(2, 3)
     textures = sk.make_textures(np.full(12, -1), np.zeros((12, 3, 2)), [image], device="cpu")
     surfaces = sk.make_surfaces(mesh, 0.25, specular=0.5, roughness=0.1, textures=textures)
@@ -230,10 +191,6 @@ def test_surfaces_check_their_arrays_and_the_spec_that_goes_with_them():
     np.testing.assert_allclose(surfaces.roughness.numpy(), 0.1)
     plain = sk.make_surfaces(mesh, 0.25)
     assert sk.surface_choices(plain) == {"pattern": False, "specular": False, "use_warp_bvh": False}
-    limits = sk.Limits()
-    model = sk.Model(
-        mesh.device, sk.Medium(), sk.Laser(), sk.Camera(), sk.Gate(), limits, sk.Guiding(), mesh, surfaces, 1.0
-    )
-    data = sk.make_data(model, histogram=False)
-    with pytest.raises(ValueError, match=r"spec.pattern = False does not go with the model's surfaces"):
-        sk.launch_transport(sk.TransportSpec("none"), model, data, seed=1, first_id=0, photon_count=1)
+    model = sk.Model("cpu", mesh=mesh, surfaces=surfaces, scale=1.0, **lit_box())
+    with pytest.raises(sk.ArgumentError, match=r"spec.pattern = False does not go with the model's surfaces"):
+        tally(model, sk.TransportSpec("next_event"))

@@ -4,18 +4,15 @@ import math
 
 import numpy as np
 import pytest
-import warp as wp
 from numpy.polynomial.legendre import leggauss
 from scipy import stats
 
 import spadwarp_kernels as sk
-from helpers.launch import launched
+from helpers.launch import each
 from helpers.statistics_of_samples import chi2_p, sample_count
 from reference import fournier_forand
 from reference.single_scatter import henyey_greenstein
 from spadwarp_kernels import HENYEY_GREENSTEIN, TABULATED
-from spadwarp_kernels.base.philox import u01_fine
-from spadwarp_kernels.water.phase_functions import PHASE_FUNCTIONS
 
 COUNT = 1_000_000
 FLAT = 2.0**-32  # the tables are constant up to here
@@ -68,14 +65,15 @@ def test_fournier_forand_is_the_derivative_of_its_integral():
     assert np.abs(np.diff(np.log(sk.fournier_forand_density(seam, 1.10, 3.5835)), 2)).max() < 1e-9
 
 
-def test_henyey_greenstein_understates_what_comes_straight_back():
-    """p(180°) of Fournier-Forand is 0.00286 per steradian, 1.75 times that of Henyey-Greenstein of g = 0.924."""
+def test_values_of_the_reference():
+    """Henyey-Greenstein understates what comes straight back: p(180°) of Fournier-Forand is 1.75 times that of
+    g = 0.924. Two terms are a mixture."""
     back = float(sk.fournier_forand_density(2.0, 1.10, 3.5835))
     assert back == pytest.approx(0.00286, abs=5e-6)
     assert back / henyey_greenstein(-1, 0.924) == pytest.approx(1.749, abs=5e-4)
-
-
-def test_two_terms_are_a_mixture():
+    # p(0) amplifies the rounding of g in float32.
+    p = each(HENYEY_GREENSTEIN.pdf, [np.float32([2.0, 0.0]), medium_of("cpu", g=0.924)])
+    np.testing.assert_allclose(p, [1.633780e-3, 26.50745], rtol=2e-6)
     t = np.linspace(0, 2, 9)
     expected = 0.7 * henyey_greenstein(1 - t, 0.9) + 0.3 * henyey_greenstein(1 - t, -0.2)
     np.testing.assert_allclose(sk.two_term_henyey_greenstein_density(t, 0.9, -0.2, 0.7), expected, rtol=1e-12)
@@ -92,43 +90,7 @@ def test_measured_points_are_joined_by_power_laws():
     np.testing.assert_allclose(np.array(at) / at[3], [0.5, 0.0, 0.5, 1.0], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("angles", "values", "text"),
-    [
-        ([0.1], [1.0], "two or more"),
-        ([0.1, 0.1], [1.0, 1.0], "ascending"),
-        ([0.1, 4.0], [1.0, 1.0], "outside"),
-        ([-0.1, 1.0], [1.0, 1.0], "outside"),
-        ([0.1, 1.0], [1.0, -1.0], "not negative"),
-        ([0.1, 1.0], [0.0, 0.0], "not all 0"),
-        ([0.1, 1.0], [1.0, math.nan], "finite"),
-    ],
-)
-def test_what_is_no_phase_function_is_refused(angles, values, text):
-    with pytest.raises(ValueError, match=text):
-        sk.interpolated_density(angles, values)
-
-
 # ---- Samples and densities of the kernels.
-
-
-def _kernels(phase):
-    sample, pdf = phase.sample, phase.pdf
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def draw(medium: sk.Medium, t: wp.array(dtype=float)):
-        i = wp.tid()
-        t[i] = sample(u01_fine(sk.random_block(wp.uint64(11), wp.uint64(i), wp.uint32(0), wp.uint32(1))[1]), medium)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def evaluate(medium: sk.Medium, t: wp.array(dtype=float), p: wp.array(dtype=float)):
-        i = wp.tid()
-        p[i] = pdf(t[i], medium)
-
-    return draw, evaluate
-
-
-KERNELS = {name: _kernels(phase) for name, phase in PHASE_FUNCTIONS.items()}
 
 
 def medium_of(device, density="two_term", g=0.85):
@@ -138,27 +100,8 @@ def medium_of(device, density="two_term", g=0.85):
 
 
 def sampled(phase, medium, device, count=COUNT):
-    return launched(KERNELS[phase.name][0], [medium], device=device, count=count)[0]
-
-
-def mass_by_angle(phase, medium, device="cpu"):
-    """Probability between edges in t = 1 - cos(theta), and their middles."""
-    fine = np.concatenate([[0.0], np.geomspace(1e-9, 1.0, 20_001)])
-    edges = np.concatenate([fine, 2.0 - fine[-2::-1]])
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    density = launched(KERNELS[phase.name][1], [medium, middle.astype(np.float32)], device=device)[0]
-    return edges, middle, 2.0 * np.pi * density * np.diff(edges)
-
-
-@pytest.mark.physics
-@pytest.mark.parametrize("name", PHASE_FUNCTIONS)
-def test_samples_of_every_phase_function_follow_its_density(name, device):
-    phase, medium = PHASE_FUNCTIONS[name], medium_of(device)
-    edges, _, mass = mass_by_angle(phase, medium, device)
-    total = np.concatenate([[0.0], np.cumsum(mass)])
-    assert phase.name == name and total[-1] == pytest.approx(1.0, abs=1e-4)
-    samples = sampled(phase, medium, device, sample_count(device))
-    assert chi2_p(samples, lambda t: np.interp(t, edges, total / total[-1])) > 1e-4
+    xi = np.minimum(np.random.default_rng(11).random(count), 1 - 2.0**-24).astype(np.float32)
+    return each(phase.sample, [xi, medium], device=device)
 
 
 @pytest.mark.physics
@@ -172,35 +115,26 @@ def test_henyey_greenstein_has_its_law_and_mean_cosine(g, device):
     values = sampled(HENYEY_GREENSTEIN, medium_of(device, g=g), device, sample_count(device))
     assert values.min() >= 0.0 and values.max() <= 2.0
     assert chi2_p(values, law) > 1e-4
+    # Of 0.99 a third of all angles lie below 3e-3 rad, where 1 - cos in float32 would be a few grid steps.
+    assert g < 0.99 or len(np.unique(values[values < 5e-6])) > 20_000
     # The standard error of a mean of 2e6 numbers in [-1, 1] is below 7.1e-4.
     assert abs(1 - values.mean() - g) < 5 * values.std() / np.sqrt(values.size)
-    _, middle, mass = mass_by_angle(HENYEY_GREENSTEIN, medium_of(device, g=g), device)
+    fine = np.concatenate([[0.0], np.geomspace(1e-9, 1.0, 20_001)])
+    edges = np.concatenate([fine, 2.0 - fine[-2::-1]])
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    density = each(HENYEY_GREENSTEIN.pdf, [middle.astype(np.float32), medium_of(device, g=g)], device=device)
+    mass = 2.0 * np.pi * density * np.diff(edges)
     assert mass.sum() == pytest.approx(1.0, abs=2e-5)
     assert (mass * (1 - middle)).sum() == pytest.approx(g, abs=2e-5)
-
-
-@pytest.mark.physics
-def test_small_angles_of_henyey_greenstein_are_resolved():
-    """At g = 0.99 a third of all angles lie below 3e-3 rad, where 1 - cos in float32 would be a few grid steps."""
-    t = sampled(HENYEY_GREENSTEIN, medium_of("cpu", g=0.99), "cpu")
-    assert len(np.unique(t[t < 5e-6])) > 10_000
-
-
-def test_values_of_the_reference():
-    """g = 0.924: p(pi) = 1.633780e-3 and p(0) = 26.50745 per steradian; p(0) amplifies the rounding of g in float32."""
-    (p,) = launched(KERNELS["henyey_greenstein"][1], [medium_of("cpu", g=0.924), np.float32([2.0, 0.0])])
-    np.testing.assert_allclose(p, [1.633780e-3, 26.50745], rtol=2e-6)
 
 
 # ---- Tables.
 
 
-def _cdf(density):
+def distribution(density):
     """Distribution function of t from its own quadrature of the density, constant up to FLAT as the tables are."""
-    edges = np.concatenate(
-        [[0.0], FLAT * np.geomspace(1e-300 / FLAT, 1.0, 4001)[1:], np.geomspace(FLAT, 1.0, 8001)[1:]]
-    )
-    edges = np.concatenate([edges, 2.0 - np.geomspace(1e-9, 1.0, 8001)[-2::-1], [2.0]])
+    near, far = FLAT * np.geomspace(1e-300 / FLAT, 1.0, 4001)[1:], np.geomspace(FLAT, 1.0, 8001)[1:]
+    edges = np.concatenate([[0.0], near, far, 2.0 - np.geomspace(1e-9, 1.0, 8001)[-2::-1], [2.0]])
     node, weight = leggauss(4)
     t = 0.5 * (edges[1:] + edges[:-1])[:, None] + 0.5 * np.diff(edges)[:, None] * node
     mass = np.pi * np.diff(edges) * (density(np.maximum(t, 1e-300)) @ weight)
@@ -209,51 +143,25 @@ def _cdf(density):
     return lambda x: np.interp(x, np.concatenate([[0.0], edges]), np.concatenate([[0.0], total]))
 
 
-@wp.kernel(enable_backward=False)
-def _evaluate_guide(
-    medium: sk.Medium,
-    t: wp.array(dtype=float),
-    theta: wp.array(dtype=float),
-    p: wp.array(dtype=float),
-    lobe: wp.array(dtype=float),
-    complement: wp.array(dtype=float),
-    q: wp.array(dtype=float),
-    back: wp.array(dtype=float),
-):
-    i = wp.tid()
-    p[i] = wp.static(TABULATED.pdf)(t[i], medium)
-    lobe[i] = wp.static(TABULATED.guide.lobe_pdf)(t[i], medium, sk.Guiding())
-    complement[i] = wp.static(TABULATED.guide.complement)(theta[i], medium)
-    q[i] = wp.static(TABULATED.guide.density)(theta[i], medium)
-    back[i] = wp.static(TABULATED.guide.angle)(complement[i], medium)
-
-
-def _evaluated(name, t, theta, device="cpu"):
-    """pdf(t), lobe(t), complement(theta), q(theta), angle(complement(theta)) in float64."""
-    return launched(_evaluate_guide, [medium_of(device, name), t, theta], [float] * 5, device)
-
-
 @pytest.mark.physics
 @pytest.mark.parametrize("name", DENSITIES)
-def test_samples_follow_what_was_tabulated(name, device):
-    values = sampled(TABULATED, medium_of(device, name), device)
+def test_samples_follow_what_was_tabulated_and_densities_integrate_to_one(name, device):
+    medium = medium_of(device, name)
+    values = sampled(TABULATED, medium, device)
     assert values.min() >= 0.0 and values.max() <= 2.0
-    assert chi2_p(values, _cdf(DENSITIES[name]), bins=100) > 1e-5
+    assert chi2_p(values, distribution(DENSITIES[name]), bins=100) > 1e-5
     mean = sk.sphere_integral(lambda t: t * DENSITIES[name](t)) / sk.sphere_integral(DENSITIES[name])
     assert abs(values.mean() - mean) < 5 * values.std() / math.sqrt(COUNT)
-
-
-@pytest.mark.physics
-@pytest.mark.parametrize("name", DENSITIES)
-def test_densities_of_tables_integrate_to_one(name, device):
     forward = np.concatenate([[0.0], np.geomspace(1e-12, 1.0, 40_001)])
     edges = np.concatenate([forward, 2.0 - forward[-2::-1]])
-    theta = np.linspace(1e-5, math.pi, len(edges) - 1)
-    p, lobe, complement, _, back = _evaluated(name, 0.5 * (edges[1:] + edges[:-1]), theta, device)
-    solid_angle = 2 * np.pi * np.diff(edges)
-    assert (p * solid_angle).sum() == pytest.approx(1.0, abs=1e-4)
-    assert (lobe * solid_angle).sum() == pytest.approx(1.0, abs=1e-4)
+    solid_angle, t = 2 * np.pi * np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
+    lobe = each(TABULATED.guide.lobe_pdf, [t, medium, sk.Guiding()], device=device)
+    for density in (each(TABULATED.pdf, [t, medium], device=device), lobe):
+        assert (density * solid_angle).sum() == pytest.approx(1.0, abs=1e-4)
     # The angle at which a flight turns: complement falls from 1 to 0, and `angle` undoes it.
+    theta = np.linspace(1e-5, math.pi, len(t))
+    complement = each(TABULATED.guide.complement, [theta, medium], device=device)
+    back = each(TABULATED.guide.angle, [complement, medium], device=device)
     assert (np.diff(complement) <= 0).all() and complement[-1] < 1e-6 < complement[0]
     inside = (complement[1:-1] > 1e-6) & (np.abs(np.diff(complement)[1:]) > 1e-5 * complement[1:-1])
     np.testing.assert_allclose(back[1:-1][inside], theta[1:-1][inside], rtol=1e-3)
@@ -263,10 +171,11 @@ def test_densities_of_tables_integrate_to_one(name, device):
 @pytest.mark.parametrize("name", ["henyey_greenstein 0.924", "henyey_greenstein -0.9", "fournier_forand", "steep"])
 def test_tables_are_true_to_the_function(name):
     """To a few thousandths at any angle; the angle at which a flight turns is drawn from the same function."""
+    medium = medium_of("cpu", name)
     t = np.concatenate([np.geomspace(1e-9, 1.0, 20_000), 2.0 - np.geomspace(1e-5, 1.0, 20_000)]).astype(np.float32)
+    np.testing.assert_allclose(each(TABULATED.pdf, [t, medium]), DENSITIES[name](t.astype(np.float64)), rtol=2e-3)
     theta = np.concatenate([np.geomspace(1e-4, 1.0, 20_000), np.linspace(1.0, 3.14, 20_000)]).astype(np.float32)
-    p, _, complement, q, _ = _evaluated(name, t, theta)
-    np.testing.assert_allclose(p, DENSITIES[name](t.astype(np.float64)), rtol=2e-3)
+    q, complement = (each(f, [theta, medium]) for f in (TABULATED.guide.density, TABULATED.guide.complement))
     turned = DENSITIES[name](2.0 * np.sin(0.5 * theta.astype(np.float64)) ** 2)
     np.testing.assert_allclose(q / turned, np.median(q / turned), rtol=5e-3)
     # The complement is the integral of q from the angle on.

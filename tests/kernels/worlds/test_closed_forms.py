@@ -4,19 +4,16 @@ import numpy as np
 import pytest
 import warp as wp
 
-from helpers.launch import Floats, Vectors, launched
+from helpers.launch import each, unit
 from spadwarp_kernels.worlds import SHAPE_KINDS
-from spadwarp_kernels.worlds.shapes import intersect_shape
+from spadwarp_kernels.worlds.shapes import ShapeHit, intersect_shape
 
 SIZE = (0.4, 0.7, 0.3)
 
 
-@wp.kernel(enable_backward=False)
-def trace(kind: int, size: wp.vec3, x: Vectors, u: Vectors, distance: Floats, normal: Vectors):
-    i = wp.tid()
-    hit = intersect_shape(kind, size, wp.uint64(0), x[i], u[i], 1.0e10)
-    distance[i] = hit.distance
-    normal[i] = hit.normal
+def trace(kind, size, x, u, device):
+    hit = each(intersect_shape, [SHAPE_KINDS.index(kind), wp.vec3(*size), 0, x, u, 1e10], [ShapeHit], device)
+    return hit["distance"].astype(float), hit["normal"]
 
 
 def inside(kind, p):
@@ -43,16 +40,14 @@ def inside(kind, p):
 @pytest.mark.parametrize("start", ["outside", "inside"])
 def test_nearest_point_is_on_the_surface(kind, start, device):
     rng = np.random.default_rng(5)
-    count = 4000
-    u = rng.normal(size=(count, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    if start == "outside":
-        x = rng.uniform(-0.6, 0.6, (count, 3)) - 3.0 * u
-    else:
+    count = 2000
+    u = unit(rng.normal(size=(count, 3)))
+    x = rng.uniform(-0.6, 0.6, (count, 3)) - 3.0 * u
+    if start == "inside":
         x = rng.uniform(-1, 1, (8 * count, 3)) * SIZE
         x = x[inside(kind, x) > 1e-3][:count]
     x, u = x.astype(np.float32), u[: len(x)].astype(np.float32)
-    s, n = launched(trace, [SHAPE_KINDS.index(kind), wp.vec3(*SIZE), x, u], (float, wp.vec3), device, len(x))
+    s, n = trace(kind, SIZE, x, u, device)
     hit = s > 0.0
     assert hit.mean() > 0.2 if start == "outside" else hit.all()
     assert np.abs(inside(kind, x[hit] + s[hit, None] * u[hit])).max() < 2e-5
@@ -63,8 +58,7 @@ def test_nearest_point_is_on_the_surface(kind, start, device):
     assert ((depth < 2e-4) if start == "outside" else (depth > -2e-4)).all()
     # The normal is the direction in which the depth changes most.
     p, h = (x + s[:, None] * u)[hit].astype(np.float64), 1e-6
-    slope = np.stack([inside(kind, p + h * e) - inside(kind, p - h * e) for e in np.eye(3)], axis=-1)
-    slope /= np.linalg.norm(slope, axis=-1, keepdims=True)
+    slope = unit(np.stack([inside(kind, p + h * e) - inside(kind, p - h * e) for e in np.eye(3)], axis=-1))
     assert np.quantile(1.0 - np.abs(np.sum(slope * n[hit], axis=-1)), 0.98) < 1e-3  # edges aside
 
 
@@ -72,5 +66,4 @@ def test_plane_ends_at_its_width(device):
     x = np.array([(0.19, 0.34, 1.0), (0.21, 0.0, 1.0), (0.0, 0.36, 1.0), (0.0, 0.0, -1.0)])
     u = np.array([(0.0, 0.0, -1.0)] * 4)
     for size, expected in ((SIZE, [1.0, -1.0, -1.0, -1.0]), ((0.0, 0.0, 0.0), [1.0, 1.0, 1.0, -1.0])):
-        distance, _ = launched(trace, [0, wp.vec3(*size), x, u], (float, wp.vec3), device, 4)
-        assert distance.tolist() == expected
+        assert trace("plane", size, x, u, device)[0].tolist() == expected

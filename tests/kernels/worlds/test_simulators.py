@@ -1,5 +1,7 @@
 """Shapes and poses of Newton and MuJoCo, against the simulators' own rays."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
@@ -7,9 +9,7 @@ import warp as wp
 import spadwarp_kernels as sk
 
 CONFIG = sk.SpadConfig(width=80, height=60, absorption=0.0, scattering=0.0)
-MEASURED = sk.SpadConfig(
-    width=80, height=60, absorption=0.0, scattering=0.0, dark_rate=0.0, pulse_energy=2e-11, pulses=200_000
-)
+MEASURED = dataclasses.replace(CONFIG, dark_rate=0.0, pulse_energy=2e-11, pulses=200_000)
 
 
 def looking(position, forward):

@@ -5,39 +5,52 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.worlds import transforms
+from helpers.launch import on_device
+from helpers.worlds import STILL, square, transforms
 
 CLEAR = {"absorption": 0.0, "scattering": 0.0}
 SMALL = {"width": 24, "height": 18}
 
 
-def room(device, worlds=2):
-    """A wall at z = 4 in all worlds, a ball on body w in world w, a textured square in the last."""
-    square = np.array([(-0.5, -0.5, 0), (0.5, -0.5, 0), (0.5, 0.5, 0), (-0.5, 0.5, 0)], np.float32)
-    faces = wp.array([0, 1, 2, 0, 2, 3], dtype=int, device=device)
-    mesh = wp.Mesh(wp.array(square, dtype=wp.vec3, device=device), faces)
-    uv = (square[:, :2] + 0.5)[[[0, 1, 2], [0, 2, 3]]]
-    textures = sk.make_textures(np.zeros(2, int), uv, [np.array([[0.25, 1.0]])], device=device)
+BODIES = [(-0.8, 0, 2, 0, 0, 0, 1), (0, 0.3, 2.5, 0, 0, 0, 1)]
+
+
+def room(device):
+    """A wall at z = 4 in both worlds, a ball on body w in world w, a square with an image in the second."""
+    mesh, uv = square(device)
     return sk.make_shapes(
-        ["plane", *["sphere"] * worlds, "mesh"],
-        [(0, 0, 0), *[(0.4, 0, 0)] * worlds, (1, 1, 1)],
-        body=[-1, *range(worlds), -1],
-        local=[(0, 0, 4, 0, 0, 0, 1), *[(0, 0, 0, 0, 0, 0, 1)] * worlds, (1, 0, 3, 0, 0, 0, 1)],
-        mesh=[None, *[None] * worlds, mesh],
-        reflectance=[0.5, *[0.3] * worlds, 0.8],
-        world=[-1, *range(worlds), worlds - 1],
-        worlds=worlds,
-        first_face=[-1, *[-1] * worlds, 0],
-        textures=textures,
+        ["plane", "sphere", "sphere", "mesh"],
+        [(0, 0, 0), (0.4, 0, 0), (0.4, 0, 0), (1, 1, 1)],
+        body=[-1, 0, 1, -1],
+        local=[(0, 0, 4, 0, 0, 0, 1), STILL, STILL, (1, 0, 3, 0, 0, 0, 1)],
+        mesh=[None, None, None, mesh],
+        reflectance=[0.5, 0.3, 0.3, 0.8],
+        world=[-1, 0, 1, 1],
+        worlds=2,
+        first_face=[-1, -1, -1, 0],
+        textures=sk.make_textures(np.zeros(2, int), uv, [np.array([[0.25, 1.0]])], device=device),
         device=device,
     )
 
 
+def seen(device, config):
+    """A camera in each world, which has looked at the room."""
+    camera = sk.SpadCamera(config, 2, device=device)
+    camera.update(room(device), transforms([STILL] * 2, device), transforms(BODIES, device))
+    return camera
+
+
+def facing(device, z, **options):
+    """A camera that was given images of depths z of faces towards it."""
+    camera = sk.SpadCamera(sk.SpadConfig(**SMALL, **options), device=device)
+    normal = np.tile(np.float32([0, 0, -1]), (1, 18, 24, 1))
+    camera.update_from_images(on_device(z, device), on_device(normal, device, wp.vec3), 0.4)
+    return camera
+
+
 def test_worlds_bodies_and_reflectance(device):
     """Each camera sees its world and what stands in all; bodies move; images multiply the reflectance."""
-    camera = sk.SpadCamera(sk.SpadConfig(width=120, height=90, **CLEAR), 2, device=device)
-    poses = transforms([(0, 0, 0, 0, 0, 0, 1)] * 2, device)
-    camera.update(room(device), poses, transforms([(-0.8, 0, 2, 0, 0, 0, 1), (0, 0.3, 2.5, 0, 0, 0, 1)], device))
+    camera = seen(device, sk.SpadConfig(width=120, height=90, **CLEAR))
     depth, reflectance = camera.true_depth.numpy(), camera.reflectance.numpy()
     assert depth[:, 0, 0] == pytest.approx(4.0, rel=1e-6)
     tangent = camera.config.pixel_tangent
@@ -92,16 +105,13 @@ def test_frames_name_one_pose(device):
 def test_images_of_the_simulator(device):
     """Depth, normals and reflectance from elsewhere give the rates of the camera's own rays."""
     config = sk.SpadConfig(**SMALL)
-    camera = sk.SpadCamera(config, 2, device=device)
-    poses = transforms([(0, 0, 0, 0, 0, 0, 1)] * 2, device)
-    camera.update(room(device), poses, transforms([(-0.8, 0, 2, 0, 0, 0, 1), (0, 0.3, 2.5, 0, 0, 0, 1)], device))
+    camera = seen(device, config)
     depth, normal, reflectance = (wp.clone(one) for one in (camera.true_depth, camera.normal, camera.reflectance))
     rates = camera.rates.numpy()
     camera.update_from_images(depth, normal, reflectance)
     assert camera.rates.numpy() == pytest.approx(rates, rel=1e-5, abs=1e-12)  # normals are normalised anew
     view = config.lines_of_sight()[:, 2].reshape(18, 24)
-    along = wp.array((depth.numpy() / view).astype(np.float32), device=device)
-    back = wp.array(-normal.numpy(), dtype=wp.vec3, device=device)  # either side
+    along, back = on_device(depth.numpy() / view, device), on_device(-normal.numpy(), device, wp.vec3)  # either side
     camera.update_from_images(along, back, reflectance, along_ray=True)
     assert camera.rates.numpy() == pytest.approx(rates, rel=1e-4, abs=1e-9)
     camera.update_from_images(depth, None, reflectance)
@@ -109,38 +119,30 @@ def test_images_of_the_simulator(device):
     assert np.median(slopes) > 0.9999 and (slopes > 0).all()
     # Normals in the world's frame: a camera turned by half a circle about its axis.
     turned = sk.SpadCamera(config, 2, device=device)
-    world = wp.array(normal.numpy() * (-1, -1, 1), dtype=wp.vec3, device=device)
+    world = on_device(normal.numpy() * (-1, -1, 1), device, wp.vec3)
     turned.update_from_images(depth, world, reflectance, camera_q=transforms([(0, 0, 0, 0, 0, 1, 0)] * 2, device))
     assert turned.normal.numpy() == pytest.approx(normal.numpy(), abs=1e-6)
 
 
 def test_rates_are_those_of_the_analytic_model(device):
     """Over the bins: the signal of `signal_map`, the backscatter of `single_scatter_table`, the dark counts."""
-    config = sk.SpadConfig(**SMALL, gate=(0.5, 8.0), dark_rate=5e4, bins=200)
-    camera = sk.SpadCamera(config, device=device)
     z = np.linspace(2.0, 5.0, 18 * 24, dtype=np.float32).reshape(1, 18, 24)
-    normal = np.zeros((1, 18, 24, 3), np.float32)
-    normal[..., 2] = -1.0
-    arrays = wp.array(z, device=device), wp.array(normal, dtype=wp.vec3, device=device)
-    camera.update_from_images(*arrays, 0.4)
-    rates = camera.rates.numpy().reshape(-1, 200).astype(float)
+    gate = {"gate": (0.5, 8.0), "bins": 200}
+    camera = facing(device, z, **gate, dark_rate=5e4)
+    config, rates = camera.config, camera.rates.numpy().reshape(-1, 200).astype(float)
     view = config.lines_of_sight()
-    distance = z.ravel() / view[:, 2]
-    view_d = wp.array(view, dtype=wp.vec3d, device=device)
-    distance_d = wp.array(distance, dtype=wp.float64, device=device)
-    normal_d = wp.array(normal.reshape(-1, 3).astype(float), dtype=wp.vec3d, device=device)
+    distance = on_device(z.ravel() / view[:, 2], device, wp.float64)
+    view, normal = on_device(view, device, wp.vec3d), on_device(np.tile([0, 0, -1.0], (len(view), 1)), device, wp.vec3d)
     reflectance = wp.full(distance.size, 0.4, dtype=wp.float64, device=device)
-    signal, arrival = (one.numpy() for one in sk.signal_map(config.lidar(), view_d, distance_d, normal_d, reflectance))
-    phase = wp.array(config.phase_table(), dtype=wp.float64, device=device)
-    back = sk.single_scatter_table(config.lidar(), phase, view_d, distance_d)[2].numpy()
+    signal, arrival = (one.numpy() for one in sk.signal_map(config.lidar(), view, distance, normal, reflectance))
+    phase = on_device(config.phase_table(), device, wp.float64)
+    back = sk.single_scatter_table(config.lidar(), phase, view, distance)[2].numpy()
     dark = config.dark_rate * 2 * 7.5 / config.speed
     # The response carries what arrives at the gate's start over it, in both directions.
     assert rates.sum(axis=1) == pytest.approx(signal + back + dark, rel=0.03)
     assert rates.sum(axis=1).sum() == pytest.approx((signal + back + dark).sum(), rel=5e-3)
     # Without water: the mean and spread of the histogram are the arrival time and the response.
-    camera = sk.SpadCamera(sk.SpadConfig(**SMALL, gate=(0.5, 8.0), bins=200, dark_rate=0.0, **CLEAR), device=device)
-    camera.update_from_images(*arrays, 0.4)
-    rates = camera.rates.numpy().reshape(-1, 200).astype(float)
+    rates = facing(device, z, **gate, dark_rate=0.0, **CLEAR).rates.numpy().reshape(-1, 200).astype(float)
     path = 1.0 + (np.arange(200) + 0.5) * config.bin_path
     mean = rates @ path / rates.sum(axis=1)
     assert mean == pytest.approx(arrival * config.speed, abs=2e-4)
@@ -168,14 +170,9 @@ def test_counts_follow_the_law_of_the_first_photon(device):
 
 @pytest.mark.parametrize("method", ["centroid", "matched", "likelihood"])
 def test_depth_in_clear_water_has_no_offset(method, device):
-    config = sk.SpadConfig(**SMALL, method=method, pulses=100_000, pulse_energy=2e-12, absorption=0.02, scattering=0.0)
-    camera = sk.SpadCamera(config, device=device)
     z = np.random.default_rng(3).uniform(1.0, 3.0, (1, 18, 24)).astype(np.float32)
-    normal = wp.array(
-        np.broadcast_to([0.0, 0.0, -1.0], (1, 18, 24, 3)).astype(np.float32), dtype=wp.vec3, device=device
-    )
-    camera.update_from_images(wp.array(z, device=device), normal, 0.5)
-    error = camera.depth.numpy() - z
+    options = {"pulses": 100_000, "pulse_energy": 2e-12, "absorption": 0.02, "scattering": 0.0}
+    error = facing(device, z, method=method, **options).depth.numpy() - z
     assert np.isfinite(error).all()
     assert abs(np.median(error)) < 1e-3 and np.median(abs(error)) < 5e-3
 

@@ -14,8 +14,7 @@ pytestmark = pytest.mark.parametrize("kind", ["camera", "tracer"])
 
 def small_step(kind, device):
     """A camera, the bodies that it sees, and its step."""
-    shapes, bodies = garden(device)
-    poses, config = transforms([STILL] * 2, device), sk.SpadConfig(**SMALL)
+    (shapes, bodies), poses, config = garden(device), transforms([STILL] * 2, device), sk.SpadConfig(**SMALL)
     if kind == "tracer":
         camera = sk.SpadTracer(shapes, config, 2, photons=20_000)
         return camera, bodies, lambda: camera.update(poses, bodies)

@@ -8,10 +8,14 @@ import pytest
 import warp as wp
 
 import spadwarp_kernels as sk
-from helpers.worlds import STILL, garden, transforms
+from helpers.meshes import mesh_of
+from helpers.worlds import STILL, transforms
 from spadwarp_kernels.worlds.shapes import move_shapes
 
 SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
+
+
+LARGE = dataclasses.replace(SMALL, width=192, height=192, bins=64)
 
 
 def poses(*rows):
@@ -19,8 +23,15 @@ def poses(*rows):
 
 
 def triangle(last=2):
-    points = wp.array(np.array([(0, 0, 3), (1, 0, 3), (0, 1, 3)], np.float32), dtype=wp.vec3, device="cpu")
-    return wp.Mesh(points, wp.array([0, 1, last], dtype=int, device="cpu"))
+    return mesh_of([(0, 0, 3), (1, 0, 3), (0, 1, 3)], [0, 1, last])
+
+
+def camera(cameras=1, **arguments):
+    return sk.SpadCamera(SMALL, cameras, **arguments, device="cpu")
+
+
+def depths(cameras):
+    return wp.zeros((cameras, 6, 8), dtype=float, device="cpu")
 
 
 def boxes(**arguments):
@@ -29,35 +40,23 @@ def boxes(**arguments):
     return sk.make_shapes(given.pop("kind"), given.pop("size"), **given)
 
 
-def meshed(mesh, **arguments):
-    return sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh], device="cpu", **arguments)
-
-
 def one_step(kind, shapes, camera_q, body_q):
-    if kind == "camera":
-        camera = sk.SpadCamera(SMALL, device="cpu")
-        camera.update(shapes, camera_q, body_q)
-    else:
-        camera = sk.SpadTracer(shapes, SMALL, photons=500)
-        camera.update(camera_q, body_q)
-    return camera
+    one = camera() if kind == "camera" else sk.SpadTracer(shapes, SMALL, photons=500)
+    one.update(*([shapes] if kind == "camera" else []), camera_q, body_q)
+    return one
 
 
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
-@pytest.mark.parametrize(
-    ("row", "text"),
-    [
+def test_poses_of_a_first_step(kind):
+    for row, text in (
         ((np.nan,) * 7, r"\[nan, .*\] is not finite"),
         ((np.inf, 0, 0, 0, 0, 0, 1), r"\[inf, .*\] is not finite"),
         ((0,) * 7, "has the quaternion .* of length 0; one of length 1 is needed"),
         ((0, 0, 0, 0, 0, 0, 2), "has the quaternion .* of length 2; one of length 1 is needed"),
-    ],
-)
-def test_poses_of_a_first_step(kind, row, text):
-    with pytest.raises(sk.ArgumentError, match=r"camera_q\[0\].* " + text):
-        one_step(kind, boxes(), poses(row), poses(STILL))
-    with pytest.raises(sk.ArgumentError, match=r"body_q\[0\].* " + text):
-        one_step(kind, boxes(), poses(STILL), poses(row))
+    ):
+        for name, pair in (("camera_q", (row, STILL)), ("body_q", (STILL, row))):
+            with pytest.raises(sk.ArgumentError, match=rf"{name}\[0\].* {text}"):
+                one_step(kind, boxes(), *map(poses, pair))
 
 
 @pytest.mark.parametrize(
@@ -107,10 +106,24 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
         (lambda: sk.SpadCamera(world=3, device="cpu"), "world is int; a list is needed"),
         (lambda: move_shapes(3, None), "shapes is int; a Shapes is needed"),
         (lambda: sk.SpadTracer(BOX_ON_BODY_2, world=["a"], device="cpu"), "world = 'a' is not an integer"),
-        (lambda: sk.SpadTracer(garden("cpu")[0], cameras=3), "world = 2 is none of the 2 worlds"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, photons=0), r"photons = 0 is outside \[1, 67108864\]"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, estimator="analog"), "estimator = 'analog' is not one of 'guided'"),
+        (lambda: sk.SpadTracer(boxes(worlds=2), SMALL, 3), "world = 2 is none of the 2 worlds"),
+        (lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, photons=0), r"photons = 0 is outside \[1, 67108864\]"),
+        (
+            lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, estimator="analog"),
+            "estimator = 'analog' is not one of 'guided'",
+        ),
         (lambda: sk.write_poses(None, poses(STILL), poses(STILL)), "position is None"),
+        # Kernels would read beyond the arrays.
+        (lambda: camera().update(BOX_ON_BODY_2, poses(STILL), None), "body_q has 0 poses; the shapes are on 3 bodies"),
+        (lambda: camera().update(BOX_ON_BODY_2, poses(STILL), poses(STILL, STILL)), "body_q has 2 poses; the shapes"),
+        (lambda: camera(world=[1]).update(boxes(), *[poses(STILL)] * 2), "world = 1 is none of the 1 worlds"),
+        (lambda: camera().update_from_images(depths(1), reflectance="dark"), "reflectance = 'dark' is not a number"),
+        (lambda: camera().update_from_images(depths(2)), r"depth is a wp.array of float32, shape \(2, 6, 8\)"),
+        # Arrays that no device holds.
+        (lambda: camera(cameras=10**9), r"cameras x config.height x config.width = 48000000000 is outside"),
+        (lambda: sk.SpadCamera(dataclasses.replace(SMALL, bins=8192), 4 * 10**7, device="cpu"), "need 1.26e.05 GB"),
+        (lambda: sk.SpadTracer(boxes(), LARGE, oversampling=1024), "oversampling = 2415919104 is outside"),
+        (lambda: sk.SpadTracer(boxes(visible=False), SMALL), "world 0 of camera 0 has no shapes"),
     ],
 )
 def test_errors_name_the_argument(call, text):
@@ -118,35 +131,10 @@ def test_errors_name_the_argument(call, text):
         call()
 
 
-def test_poses_worlds_and_images_that_there_are_not_are_refused():
-    """Kernels would read beyond the arrays."""
-    for body_q in (None, poses(STILL, STILL)):
-        with pytest.raises(sk.ArgumentError, match=r"body_q has [02] poses; the shapes are on 3 bodies"):
-            sk.SpadCamera(SMALL, device="cpu").update(BOX_ON_BODY_2, poses(STILL), body_q)
-    camera = sk.SpadCamera(SMALL, world=[1], device="cpu")
-    with pytest.raises(sk.ArgumentError, match="world = 1 is none of the 1 worlds"):
-        camera.update(BOX_ON_BODY_2, poses(STILL), poses(STILL, STILL, STILL))
-    with pytest.raises(sk.ArgumentError, match=r"reflectance = 'dark' is not a number"):
-        camera.update_from_images(camera.true_depth, reflectance="dark")
-    with pytest.raises(sk.ArgumentError, match=r"depth is a wp.array of float32, shape \(2, 6, 8\)"):
-        camera.update_from_images(wp.zeros((2, 6, 8), dtype=float, device="cpu"))
-
-
-def test_arrays_that_no_device_holds():
-    with pytest.raises(sk.ArgumentError, match=r"cameras x config.height x config.width = 48000000000 is outside"):
-        sk.SpadCamera(SMALL, 10**9, device="cpu")
-    with pytest.raises(sk.ArgumentError, match=r"= 40000000 x 6 x 8 x 8192: .* need 1.26e\+05 GB, and cpu has"):
-        sk.SpadCamera(dataclasses.replace(SMALL, bins=8192), 4 * 10**7, device="cpu")
-    with pytest.raises(sk.ArgumentError, match="oversampling = 17179869184 is outside"):
-        sk.SpadTracer(boxes(), sk.SpadConfig(width=512, height=512, bins=64), oversampling=1024)
-    with pytest.raises(sk.ArgumentError, match="world 0 of camera 0 has no shapes"):
-        sk.SpadTracer(boxes(visible=False), SMALL)
-
-
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
 def test_a_mesh_lives_as_long_as_its_shapes(kind):
     mesh = triangle()
-    shapes = meshed(mesh.id)
+    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], device="cpu")
     del mesh
     gc.collect()
     assert np.nanmin(one_step(kind, shapes, poses(STILL), None).true_depth.numpy()) == pytest.approx(3.0)
@@ -156,13 +144,13 @@ def test_what_changes_in_place_to_something_that_there_is_not(device):
     """Worlds of cameras and kinds of shapes: nothing is seen there."""
     world = wp.zeros(1, dtype=int, device=device)
     shapes = sk.make_shapes(["plane"], [(0, 0, 0)], local=[(0, 0, 4, 0, 0, 0, 1)], device=device)
-    camera = sk.SpadCamera(SMALL, world=world, device=device)
+    one = sk.SpadCamera(SMALL, world=world, device=device)
     pose = wp.array([STILL], dtype=wp.transform, device=device)
     for there in (0, 7, -3):
         world.fill_(there)
-        camera.update(shapes, pose)
-        assert np.isfinite(camera.true_depth.numpy()).all() == (there == 0)
+        one.update(shapes, pose)
+        assert np.isfinite(one.true_depth.numpy()).all() == (there == 0)
     world.zero_()
     shapes.table.kind.fill_(99)
-    camera.update(shapes, pose)
-    assert np.isnan(camera.true_depth.numpy()).all()
+    one.update(shapes, pose)
+    assert np.isnan(one.true_depth.numpy()).all()
