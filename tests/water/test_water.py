@@ -150,21 +150,6 @@ def test_chlorophyll_and_coefficients_displace_each_other():
     assert (given.chlorophyll, given.extinction) == (None, pytest.approx(0.3))
 
 
-@pytest.mark.parametrize(
-    ("medium", "wavelength", "text"),
-    [
-        ({"chlorophyll": 0.5, "preset": "uwoc-clear"}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with pres"),
-        ({"chlorophyll": 0.5, "absorption": 0.1}, 532.0, "medium.chlorophyll = 0.5 cannot be combined with abs"),
-        ({"chlorophyll": 31.0}, 532.0, "medium.chlorophyll = 31.0 is outside [0, 30]"),
-        ({"chlorophyll": 0.5}, 850.0, "laser.wavelength_nm = 850.0 is outside [400, 700]"),
-    ],
-)
-def test_what_cannot_be_is_said(medium, wavelength, text):
-    with pytest.raises(spadwarp.ConfigError) as caught:
-        scene(medium, wavelength)
-    assert str(caught.value).startswith(text)
-
-
 def findings(one, field):
     return {message.level: message for message in spadwarp.check(one) if message.field == field}
 
