@@ -60,7 +60,7 @@ def test_no_two_targets_look_alike():
             assert (one & other).sum() < 0.9 * (one | other).sum()
 
 
-@pytest.mark.parametrize("name", ["pipe_valve", "starfish", "submarine", "television"])
+@pytest.mark.parametrize("name", ["pipe_valve", "television"])
 def test_same_bits_in_every_call_and_copies(name):
     first, second = (so.to_trimesh(SHAPES[name]()) for _ in range(2))
     assert first.vertices.tobytes() == second.vertices.tobytes() and first.faces.tobytes() == second.faces.tobytes()

@@ -80,21 +80,7 @@ def test_depth_frame_finds_the_target_within_a_bin(laser):
     np.testing.assert_allclose(distance * pixel_directions(result.scene.camera)[..., 2], depth)
 
 
-def test_nothing_returned_is_nan_not_zero():
-    assert np.isnan(make_result(make_scene(), empty=True).depth()).all()
-
-
-def test_pixel_directions_pass_through_pixel_centres():
-    camera = make_scene(width=16, height=12).camera
-    rays = pixel_directions(camera)
-    assert rays.shape == (12, 16, 3)
-    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1.0)
-    tangent = np.tan(np.radians(10.0)) / 8  # half the field over half the pixels
-    first = rays[0, 0] / rays[0, 0, 2]
-    np.testing.assert_allclose(first, [-7.5 * tangent, -5.5 * tangent, 1.0])  # up and left: −x, −y
-
-
-def test_range_is_nan_for_paths_shorter_than_the_baseline_and_for_nan():
+def test_range_is_nan_for_paths_shorter_than_the_baseline():
     assert np.isnan(range_from_path([0.5, 1.0, -3.0, np.nan], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])).all()
 
 
@@ -105,11 +91,9 @@ def test_range_is_nan_for_paths_shorter_than_the_baseline_and_for_nan():
 )
 def test_range_from_path_undoes_the_path(laser, direction, distance):
     u = np.array(direction) / np.linalg.norm(direction)
-    detour = np.linalg.norm(distance * u - laser) + distance - np.linalg.norm(laser)
-    path = detour + np.linalg.norm(laser)
-    if detour < 1e-6:  # the target lies between lens and laser: any point there has this path
-        return
-    np.testing.assert_allclose(range_from_path(path, u, laser), distance, rtol=1e-6)
+    path = np.linalg.norm(distance * u - laser) + distance
+    if path - np.linalg.norm(laser) > 1e-6:  # else the target lies between lens and laser: any point has this path
+        np.testing.assert_allclose(range_from_path(path, u, laser), distance, rtol=1e-6)
 
 
 # Accounts
@@ -131,4 +115,5 @@ def test_summary_is_plain_numbers(result):
     np.testing.assert_allclose(sum(summary["collected_fraction"].values()), result.histogram.sum(), rtol=1e-12)
     np.testing.assert_allclose(summary["detections_per_pulse"], result.detections.sum(), rtol=1e-12)
     assert summary["truth"]["depth_m"] == pytest.approx([14.29, 14.79], abs=1e-5)
-    assert make_result(make_scene(), empty=True).summary()["pixels_with_return"] == 0
+    nothing = make_result(make_scene(), empty=True)
+    assert nothing.summary()["pixels_with_return"] == 0 and np.isnan(nothing.depth()).all()
