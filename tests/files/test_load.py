@@ -8,7 +8,6 @@ import pytest
 
 import spadwarp
 from helpers.cli import DEVICE, run, tables
-from helpers.coarse_pictures import coarse_pictures
 from helpers.datasets import make, recipe
 from helpers.scenes import scene as make_scene
 from spadwarp.analytic import AnalyticFile
@@ -22,11 +21,6 @@ SCENE = make_scene(
     gate={"start_ns": 5.0, "bin_width_ps": 200.0, "bins": 150},
     laser={"pulse_energy": 1e-12, "repetition_rate": 1e6},
 )
-
-
-@pytest.fixture(autouse=True)
-def plain_pictures(monkeypatch):
-    coarse_pictures(monkeypatch.setattr)
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +37,9 @@ def files(tmp_path_factory):
     save_records(trace(SCENE, photons=100, device="cpu"), folder / "records.h5")
     make(recipe(), folder / "dataset")
     shard = next((folder / "dataset").glob("frames-*.h5")).name
-    inside = {"result": "run/result.h5", "run": "run", "checkpoint": "unfinished/checkpoint.h5"}
-    inside |= {"unfinished": "unfinished", "frames": "counts", "analytic": "model", "dataset": "dataset"}
-    inside |= {
-        "records": "records.h5",
-        "shard": f"dataset/{shard}",
-        "shard's scenes": f"dataset/scenes/{shard.replace('frames', 'scenes')}",
-    }
+    inside = {name: name for name in ("run", "unfinished", "dataset")} | {"frames": "counts", "analytic": "model"}
+    inside |= {"result": "run/result.h5", "checkpoint": "unfinished/checkpoint.h5", "records": "records.h5"}
+    inside |= {"shard": f"dataset/{shard}", "shard's scenes": f"dataset/scenes/{shard.replace('frames', 'scenes')}"}
     return {name: folder / place for name, place in inside.items()}
 
 
@@ -127,7 +117,7 @@ def test_the_loader_says_what_it_cannot_take(files, tmp_path):
         file.attrs["format"] = "someone else's"
     for name, words in (
         ("nothing.h5", "no such file"),
-        ("frames-00000.h5", "frames-00000"),  # without its dataset
+        ("frames-00000.h5", "no dataset there"),  # without its dataset
         ("other.h5", 'none of ours: its format is "someone else\'s"'),
     ):
         with pytest.raises(spadwarp.FileError, match=words):
