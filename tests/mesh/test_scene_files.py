@@ -69,8 +69,7 @@ def test_units_transforms_and_polygons_of_usd(stage):
     from pxr import UsdGeom
 
     outer = UsdGeom.Xform.Define(stage, "/outer")
-    outer.AddTranslateOp().Set((100, 0, 0))
-    outer.AddRotateZOp().Set(90)
+    outer.AddTranslateOp().Set((100, 0, 0)), outer.AddRotateZOp().Set(90)
     inner = polygon_box(stage, "/outer/box")
     inner.AddScaleOp().Set((30, 10, 5))
     mesh = loaded(saved(stage))
@@ -111,9 +110,7 @@ def test_simple_shapes_of_usd(stage):
 
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     cylinder = UsdGeom.Cylinder.Define(stage, "/cylinder")
-    cylinder.CreateAxisAttr("Y")
-    cylinder.CreateHeightAttr(4.0)
-    cylinder.CreateRadiusAttr(0.5)
+    cylinder.CreateAxisAttr("Y"), cylinder.CreateHeightAttr(4.0), cylinder.CreateRadiusAttr(0.5)
     UsdGeom.Sphere.Define(stage, "/guide").CreatePurposeAttr("guide")
     mesh = loaded(saved(stage))
     np.testing.assert_allclose(np.ptp(mesh.bounds, axis=0), [1.0, 4.0, 1.0], atol=1e-3)
