@@ -105,13 +105,9 @@ def test_a_comparison_is_welchs_test(staircase, seconds, verdict):
 
 def test_the_newest_report_of_such_a_device_is_taken(staircase, tmp_path):
     made = report([staircase])
-    for name, date, changed in (
-        ("a", "2026-01-01", {}),
-        ("b", "2026-02-01", {}),
-        ("c", "2026-03-01", {"device_name": "another"}),
-        ("d", "2026-04-01", {"threads": 999}),
-    ):
-        stored = {**made, "provenance": {**made["provenance"], "date": date, **changed}}
+    changes = {"a": {}, "b": {}, "c": {"device_name": "another"}, "d": {"threads": 999}}
+    for month, (name, changed) in enumerate(changes.items(), start=1):
+        stored = {**made, "provenance": {**made["provenance"], "date": f"2026-0{month}-01", **changed}}
         (tmp_path / f"{name}.json").write_text(json.dumps(stored))
     assert [path.stem for path, _ in history(tmp_path)] == ["a", "b", "c", "d"]
     like = made["provenance"]
@@ -192,8 +188,7 @@ def test_scaling_says_how_cost_grows(monkeypatch, staircase):
     ("arguments", "words"),
     [
         ({"cases": ["staircase"]}, r"'staircase' is not one of 'water', .*did you mean 'staircase_5m'"),
-        ({"cases": ["water"], "photons": 0}, r"photons = 0 is outside \[1, "),
-        ({"cases": ["water"], "repeats": 0}, r"repeats = 0 is outside \[1, "),
+        *(({"cases": ["water"], name: 0}, rf"{name} = 0 is outside \[1, ") for name in ("photons", "repeats")),
     ],
 )
 def test_errors_name_the_argument(arguments, words):

@@ -1,5 +1,5 @@
 """Files of every kind that somebody has changed, or that were cut: an error that names file and dataset, nothing read
-from elsewhere, no array made that the scene does not have."""
+from elsewhere, no array made that the scene does not have. Random damage: `tests/fuzz`."""
 
 import shutil
 
@@ -147,20 +147,9 @@ def test_an_attribute_that_is_not_as_it_should_be_is_refused(name, valid, copy):
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_file_that_was_cut_or_has_wrong_bytes_is_an_error_or_read(name, valid, copy):
+def test_a_file_that_was_cut_is_refused(name, valid, copy):
     path, content = copy / name, (valid / name).read_bytes()
-    generator = np.random.default_rng(5)
     for length in np.linspace(0, len(content) - 1, 12).astype(int):
         path.write_bytes(content[:length])
         with pytest.raises(FileError, match=path.name):
             READERS[name](path)
-    for _ in range(15):
-        changed = bytearray(content)
-        for place in generator.integers(len(content), size=3):
-            changed[place] = generator.integers(256)
-        path.unlink()
-        path.write_bytes(changed)
-        try:
-            READERS[name](path)
-        except FileError as error:
-            assert path.name in str(error)

@@ -130,19 +130,13 @@ distortion_coefficients: !!opencv-matrix
    dt: d
    data: [ -2.8e-01, 0.07, 0., 0., -0.01 ]
 """
-_ROS_YAML = f"""{_SIZE}camera_matrix:
-  rows: 3
-  cols: 3
-  data: [61.0, 0, 29.2, 0, 63.5, 25.1, 0, 0, 1]
-distortion_model: plumb_bob
-distortion_coefficients:
-  rows: 1
-  cols: 5
-  data: [-0.28, 0.07, 0, 0, -0.01]
-"""
-_OPENCV_JSON = """{"image_width": 64, "image_height": 48,
- "camera_matrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d",
-                   "data": [61.0, 0.0, 29.2, 0.0, 63.5, 25.1, 0.0, 0.0, 1.0]},
+_MATRICES = {"camera_matrix": "3 3 [61.0, 0, 29.2, 0, 63.5, 25.1, 0, 0, 1]"}
+_MATRICES["distortion_coefficients"] = "1 5 [-0.28, 0.07, 0, 0, -0.01]"
+_ROS_YAML = f"{_SIZE}distortion_model: plumb_bob\n" + "".join(
+    "{}:\n  rows: {}\n  cols: {}\n  data: {}\n".format(name, *text.split(" ", 2)) for name, text in _MATRICES.items()
+)
+_OPENCV_JSON = """{"image_width": 64, "image_height": 48, "camera_matrix": {"type_id": "opencv-matrix",
+  "rows": 3, "cols": 3, "dt": "d", "data": [61.0, 0.0, 29.2, 0.0, 63.5, 25.1, 0.0, 0.0, 1.0]},
  "distortion_coefficients": {"type_id": "opencv-matrix", "rows": 5, "cols": 1, "dt": "d",
                              "data": [-0.28, 0.07, 0.0, 0.0, -0.01]}}"""
 _PLAIN_JSON = '{"K": [[61.0, 0, 29.2], [0, 63.5, 25.1], [0, 0, 1]], "dist": [[-0.28, 0.07, 0, 0, -0.01, 0, 0, 0]]}'
