@@ -8,6 +8,7 @@ from scipy import io, sparse
 
 import spadwarp
 from helpers.cli import run
+from helpers.datasets import make, recipe
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.frames import record_frames
 from spadwarp.frames.measured import read_histograms
@@ -257,24 +258,18 @@ def test_command(frames, tmp_path):
     assert not (tmp_path / "e").exists()  # the array neither, nor an empty folder
 
 
-RECIPE = {
-    **{"name": "both kinds", "seed": 3, "scenes_per_target": 2, "scenes_per_shard": 2},
-    **{"pose": {"distance": 5.0}, "exposure": {"pulses_per_depth_frame": 3000}, "frames": {"per_scene": 2}},
-    "targets": {"builtin": ["staircase", "sphere"], "test": ["sphere"]},
-    "gate": {"before": 1.5, "behind": 1.0, "bins": 40},
-    "monte_carlo": {"share": 1.0, "photons": 20_000},
-    "scene": {
-        "medium": {"extinction": 0.3, "albedo": 0.8},
-        "laser": {"half_angle_deg": 12.0, "position": [-0.05, 0.0, 0.0], "repetition_rate": 5e6},
-        "camera": {"width": 7, "height": 4, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
-    },
+CHANGES = {
+    **{"targets.builtin": ["staircase", "car"], "targets.validation": [], "targets.test": ["car"]},
+    **{"scene.camera.width": 7, "scene.camera.height": 4, "gate.bins": 40, "frames.per_scene": 2},
+    **{"monte_carlo.share": 1.0, "monte_carlo.photons": 20_000, "scenes_per_shard": 2},
+    **{"exposure.signal_photons": None, "exposure.pulses_per_depth_frame": 3000},
 }
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     place = tmp_path_factory.mktemp("dataset") / "traced"
-    spadwarp.dataset.make_dataset(spadwarp.dataset.Recipe.from_dict(RECIPE), place, device="cpu")
+    make(recipe(**CHANGES), place)
     return place
 
 
