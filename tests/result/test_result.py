@@ -20,29 +20,19 @@ def result():
     return make_result(make_scene())
 
 
-def test_components_sum_to_the_histogram_and_carry_its_unit(result):
-    total = sum(result.component(name) for name in COMPONENTS)
-    np.testing.assert_allclose(result.histogram, total, rtol=1e-12)
+def test_histograms_and_their_axis(result):
+    """Components sum to the histogram and carry its unit; bins are half open from the gate's start, paths geometric."""
+    np.testing.assert_allclose(result.histogram, sum(result.component(name) for name in COMPONENTS), rtol=1e-12)
     assert result.histogram[3, 4, 40] == result.tallies[:, 3, 4, 40].sum() * UNIT / result.photons
     np.testing.assert_allclose(result.intensity, result.histogram.sum(-1), rtol=1e-12)
-
-
-def test_detections_are_fractions_times_photons_per_pulse_times_pde(result):
     # 37.5 nJ at 532 nm: E0·λ/(hc); PDE = 0.247 · 0.2
     photons = 37.5e-9 * 532e-9 / (6.62607015e-34 * 299_792_458.0)
     np.testing.assert_allclose(result.detections, result.histogram * photons * 0.247 * 0.2, rtol=1e-12)
-
-
-def test_bins_are_half_open_from_the_gates_start_and_paths_are_geometric(result):
-    gate = result.scene.gate
-    assert result.bin_edges.shape == (gate.bins + 1,)
-    assert result.bin_edges[0] == gate.start
-    np.testing.assert_allclose(np.diff(result.bin_edges), gate.bin_width, rtol=1e-9)
-    np.testing.assert_allclose(result.bin_centres, (result.bin_edges[1:] + result.bin_edges[:-1]) / 2)
-    np.testing.assert_allclose(result.path_edges, result.bin_edges * SPEED)
-
-
-def test_unknown_names_are_refused(result):
+    gate, edges = result.scene.gate, result.bin_edges
+    assert edges.shape == (gate.bins + 1,) and edges[0] == gate.start
+    np.testing.assert_allclose(np.diff(edges), gate.bin_width, rtol=1e-9)
+    np.testing.assert_allclose(result.bin_centres, (edges[1:] + edges[:-1]) / 2)
+    np.testing.assert_allclose(result.path_edges, edges * SPEED)
     with pytest.raises(ValueError, match="'ballistic', 'forward_scattered', 'backscatter'"):
         result.component("fluorescent")
     with pytest.raises(ValueError, match="quantity = 'height'"):
@@ -101,8 +91,7 @@ def test_range_from_path_undoes_the_path(laser, direction, distance):
 
 def test_the_energy_balance_is_exact_and_names_what_is_missing(result):
     report = result.energy_report()
-    assert report["exact"]
-    assert report["difference"] == 0
+    assert report["exact"] and report["difference"] == 0
     assert report["fractions"] == {"absorbed_water": 0.75, "weight_cutoff": 0.5, "roulette": -0.25}
     less = {**result.energy_balance, "absorbed_water": result.energy_balance["absorbed_water"] - 1}
     leaky = dataclasses.replace(result, energy_balance=less).energy_report()

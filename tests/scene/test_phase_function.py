@@ -51,26 +51,29 @@ def test_petzolds_average_particle_has_its_published_moments():
     assert math.log10(ratio) == pytest.approx(1.346, abs=0.01)
 
 
+def about(one, field):
+    return [message for message in spadwarp.check(one) if message.field == field]
+
+
 def test_a_check_reads_the_table_and_says_what_it_leaves_out(tmp_path):
     path = tmp_path / "vsf.csv"
     one = scene(medium={"phase_function": "tabulated", "phase_table": str(path)})
     with pytest.raises(FileError):
         spadwarp.check(one)
     path.write_text("5,4.3\n10,1.15\n90,0.0043\n180,0.0031\n")
-    (note,) = [message for message in spadwarp.check(one) if message.field == "medium.phase_table"]
+    (note,) = about(one, "medium.phase_table")
     assert note.text.startswith("begins at 5°: ") and note.values["continued"] > 0.5
     petzold = one.with_overrides(medium={"phase_table": "petzold-average-particle"})
-    assert not [message for message in spadwarp.check(petzold) if message.field == "medium.phase_table"]
+    assert not about(petzold, "medium.phase_table")
 
 
 def test_a_check_warns_of_a_peak_narrower_than_the_near_axis_rule():
     one = scene(medium={"phase_function": "fournier_forand"}, transport={"axis_threshold": 0.9998})
-    warnings = [message for message in spadwarp.check(one) if message.field == "transport.axis_threshold"]
     within = float(fournier_forand.cumulative(1 - 0.9998, 1.10, 3.5835))
-    assert [message.values["within"] for message in warnings if "within" in message.values] == pytest.approx([within])
-    exact = one.with_overrides(transport={"axis_threshold": 1.0})
+    found = [message.values for message in about(one, "transport.axis_threshold") if "within" in message.values]
+    assert [values["within"] for values in found] == pytest.approx([within])
     broad = {"phase_function": "two_term_henyey_greenstein", "g1": 0.8, "g2": 0.0, "alpha": 0.9}
-    for other in (exact, one.with_overrides(medium=broad)):
+    for other in (one.with_overrides(transport={"axis_threshold": 1.0}), one.with_overrides(medium=broad)):
         assert not [message for message in spadwarp.check(other) if "within" in message.values]
 
 

@@ -11,31 +11,23 @@ from spadwarp.scene import Camera, Gate, Laser, Medium, Scene
 from spadwarp.scene.sections import field_unit, models_of
 from spadwarp.values import percent, quantity, with_prefix
 
+QUANTITIES = {
+    "J": {"150 nJ": 150e-9, "37.5nJ": 37.5e-9},
+    "ps": {"50 ps": 50.0, "0.085 ns": 85.0},
+    "µm": {"1e-3 m": 1000.0, "5 um": 5.0, "5 µm": 5.0, "5 μm": 5.0},  # the micro sign, and the Greek letter
+    "Hz": {"20 MHz": 20e6},
+    "1/s": {"2 kcps": 2000.0},
+    "°": {"180 deg": 180.0, f"{math.pi} rad": 180.0},
+    "1/m": {".3 /m": 0.3, "0.003 1/cm": 0.3},
+    "1": {"20 %": 0.2},
+    "m": {"-5 cm": -0.05},
+    "s": {"2 min": 120.0},
+}
 
-@pytest.mark.parametrize(
-    ("text", "unit", "value"),
-    [
-        ("150 nJ", "J", 150e-9),
-        ("37.5nJ", "J", 37.5e-9),
-        ("50 ps", "ps", 50.0),
-        ("0.085 ns", "ps", 85.0),
-        ("1e-3 m", "µm", 1000.0),
-        ("5 um", "µm", 5.0),
-        ("5 µm", "µm", 5.0),  # the micro sign; the next is the Greek letter
-        ("5 μm", "µm", 5.0),
-        ("20 MHz", "Hz", 20e6),
-        ("2 kcps", "1/s", 2000.0),
-        ("180 deg", "°", 180.0),
-        (f"{math.pi} rad", "°", 180.0),
-        (".3 /m", "1/m", 0.3),
-        ("0.003 1/cm", "1/m", 0.3),
-        ("20 %", "1", 0.2),
-        ("-5 cm", "m", -0.05),
-        ("2 min", "s", 120.0),
-    ],
-)
-def test_texts_become_numbers_correctly_rounded(text, unit, value):
-    assert quantity(text, unit) == value
+
+@pytest.mark.parametrize("unit", QUANTITIES)
+def test_texts_become_numbers_correctly_rounded(unit):
+    assert {text: quantity(text, unit) for text in QUANTITIES[unit]} == QUANTITIES[unit]
 
 
 @pytest.mark.parametrize(
