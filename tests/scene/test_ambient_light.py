@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import spadwarp
+from reference.single_scatter import henyey_greenstein
+from reference.walk import scatter
 from spadwarp.scene import daylight_radiance, daylight_rate, downwelling_irradiance, noise_rate, phase_function
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError
 
@@ -49,22 +51,11 @@ def walk(albedo, g, cosine, depth, photons=60_000):
         inside = (place > 0.0) & (place < 15.0)
         place, directions, weight = place[inside], directions[inside], weight[inside] * albedo
         near = np.abs(place - depth) < 0.5 * thickness
-        cosines = directions[near] @ level.T
-        density = (1.0 - g * g) / (4.0 * math.pi * (1.0 + g * g - 2.0 * g * cosines) ** 1.5)
-        total += (weight[near, None] * density).sum(axis=0) / thickness
+        total += weight[near] @ henyey_greenstein(directions[near] @ level.T, g) / thickness
         faint = weight < 0.02
-        gone = faint & (random.random(weight.size) > 0.1)
-        weight = np.where(faint, 10.0 * weight, weight)[~gone]
-        place, directions = place[~gone], directions[~gone]
-        draw = random.random(place.size)
-        cosine_theta = (1.0 + g * g - ((1.0 - g * g) / (1.0 - g + 2.0 * g * draw)) ** 2) / (2.0 * g)
-        sine, phi = np.sqrt(np.maximum(1.0 - cosine_theta**2, 0.0)), 2.0 * math.pi * random.random(place.size)
-        pole = np.where(np.abs(directions[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-        first = np.cross(directions, pole)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        second = np.cross(directions, first)
-        around = np.cos(phi)[:, None] * first + np.sin(phi)[:, None] * second
-        directions = cosine_theta[:, None] * directions + sine[:, None] * around
+        stays = ~faint | (random.random(weight.size) <= 0.1)
+        weight, place = np.where(faint, 10.0 * weight, weight)[stays], place[stays]
+        directions = scatter(directions[stays], g, random)
     return total / photons
 
 

@@ -72,7 +72,8 @@ def test_backscatter_of_a_power_law(index):
 
 
 def test_kopelevich():
-    """b at 550 nm of 1 ppm; the published parts scattered backward are 0.039 and 0.00064 (Haltrin 1999)."""
+    """b at 550 nm of 1 ppm; the published parts scattered backward are 0.039 and 0.00064 (Haltrin 1999). The volume
+    scattering functions integrate to 1.34 and 0.312 1/m, by a rule of their own."""
     small, large = kopelevich_particles(550.0, small=1.0, large=0.0), kopelevich_particles(550.0, small=0.0, large=1.0)
     assert (small.scattering, large.scattering) == (1.34, 0.312)
     assert small.backscatter_fraction == pytest.approx(0.039, rel=0.05)
@@ -80,13 +81,9 @@ def test_kopelevich():
     blue = kopelevich_particles(450.0, small=0.1, large=0.2)
     expected = 0.134 * (550.0 / 450.0) ** 1.7 + 0.0624 * (550.0 / 450.0) ** 0.3
     assert blue.scattering == pytest.approx(expected)
-
-
-def test_kopelevich_table_holds_its_own_coefficient():
-    """The volume scattering functions integrate to 1.34 and 0.312 1/m, by a rule of their own."""
-    angles, small, large = spadwarp.water.seawater.table_columns("kopelevich_particles")
+    angles, *columns = spadwarp.water.seawater.table_columns("kopelevich_particles")
     theta = np.radians(np.linspace(0.0, 180.0, 100_001))
-    for values, expected in ((small, 1.34), (large, 0.312)):
+    for values, expected in zip(columns, (1.34, 0.312), strict=True):
         curve = np.exp(np.interp(np.degrees(theta), angles, np.log(values)))
         assert 2.0 * math.pi * np.trapezoid(curve * np.sin(theta), theta) == pytest.approx(expected, rel=0.05)
 
