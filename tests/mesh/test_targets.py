@@ -92,25 +92,21 @@ def test_plane_is_a_rectangle_at_zero_that_faces_the_camera_and_box_has_its_side
     assert mesh.is_watertight and mesh.volume == pytest.approx(6.0)
 
 
-def test_sphere_has_its_diameter_and_gets_rounder_with_every_subdivision():
-    missing = []
-    for subdivisions in range(3):
-        mesh = load_target(Target(builtin="sphere", size=(2.0,), subdivisions=subdivisions))
+@pytest.mark.parametrize("name", BUILTINS)
+def test_subdivision_makes_four_faces_of_one_and_a_sphere_rounder(name):
+    size = {"size": (2.0,)} if name == "sphere" else {}
+    meshes = [load_target(Target(builtin=name, **size, subdivisions=n)) for n in range(3)]
+    assert len(meshes[2].faces) == 16 * len(meshes[0].faces)
+    np.testing.assert_allclose(meshes[2].bounds, meshes[0].bounds, atol=1e-6)
+    if name != "sphere":
+        assert meshes[2].area == pytest.approx(meshes[0].area)
+        return
+    for mesh in meshes:
         assert mesh.is_watertight
         np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1.0, rtol=1e-6)
-        missing.append(4 / 3 * np.pi - mesh.volume)
     # Second order: half the edge, a quarter of the error.
-    np.testing.assert_allclose(np.array(missing[:-1]) / missing[1:], 4.0, rtol=0.02)
-
-
-@pytest.mark.parametrize("name", BUILTINS)
-def test_subdivision_makes_four_faces_of_one(name):
-    plain = load_target(Target(builtin=name))
-    fine = load_target(Target(builtin=name, subdivisions=2))
-    assert len(fine.faces) == 16 * len(plain.faces)
-    np.testing.assert_allclose(fine.bounds, plain.bounds, atol=1e-6)
-    if name != "sphere":
-        assert fine.area == pytest.approx(plain.area)
+    missing = np.array([4 / 3 * np.pi - mesh.volume for mesh in meshes])
+    np.testing.assert_allclose(missing[:-1] / missing[1:], 4.0, rtol=0.02)
 
 
 # Placement
