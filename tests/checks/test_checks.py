@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from spadwarp.checks import CheckMessage, check, summary
 from spadwarp.mesh import TriangleMesh
@@ -38,13 +39,18 @@ def find(messages: list[CheckMessage], field: str, level: str = "warning") -> Ch
     return message
 
 
+def checked(mesh=None, **overrides):
+    """Messages about the scene with other values, dots of whose names are written "__"."""
+    one = BASE.with_overrides({name.replace("__", "."): value for name, value in overrides.items()})
+    return check(one, plate(5.0) if mesh is None else mesh)
+
+
 def warnings(messages: list[CheckMessage]) -> list[str]:
     return [str(one) for one in messages if one.level == "warning"]
 
 
-FINE = [{"builtin": "plane", "size": [30, 30], "subdivisions": 7, "translation": [0, 0, 5]}]
-PENCIL = {"laser.profile": "collimated", "laser.beam_radius": 0.0}
-NARROW = {"laser.half_angle_deg": 2.0}
+PENCIL = {"laser__profile": "collimated", "laser__beam_radius": 0.0}
+NARROW = {"laser__half_angle_deg": 2.0}
 
 
 @pytest.mark.parametrize(
@@ -52,14 +58,14 @@ NARROW = {"laser.half_angle_deg": 2.0}
     [
         ({}, plate(5.0)),
         ({}, plate(5.0, side=100.0, x=10.0, y=-20.0)),  # without a corner in the view
-        ({"laser.half_angle_deg": 180.0, "transport.photons": 1e8}, plate(5.0)),
+        ({"laser__half_angle_deg": 180.0, "transport__photons": 1e8}, plate(5.0)),
         (NARROW, plate(5.0, side=1.4)),  # that the beam misses most of is a note
         (PENCIL, plate(5.0)),
-        (PENCIL | {"laser.direction": [0.7, 0, 5.0]}, plate(5.0, side=0.2, x=0.7)),
+        (PENCIL | {"laser__direction": [0.7, 0, 5.0]}, plate(5.0, side=0.2, x=0.7)),
     ],
 )
 def test_a_target_in_view_beam_and_gate_is_no_matter_for_warnings(overrides, mesh):
-    assert warnings(check(BASE.with_overrides(overrides), mesh)) == []
+    assert warnings(checked(mesh, **overrides)) == []
 
 
 @pytest.mark.parametrize("z", [5.0, 4.9])
@@ -95,41 +101,37 @@ def test_a_target_that_the_camera_does_not_see(mesh, words, values):
 
 @pytest.mark.parametrize("profile", ["uniform_cone", "gaussian"])
 def test_a_target_that_the_beam_misses(profile):
-    narrow = BASE.with_overrides({**NARROW, "laser.profile": profile})
-    message = find(check(narrow, plate(5.0, side=0.2, x=0.7)), "targets[0]")
+    message = find(checked(plate(5.0, side=0.2, x=0.7), **NARROW, laser__profile=profile), "targets[0]")
     # The nearest point that is seen lies 0.6 m off the axis.
     assert message.values["nearest_angle_deg"] == pytest.approx(math.degrees(math.atan(0.6 / 5)), abs=1e-3)
     assert "half angle is 2°" in message.text
-    mostly = find(check(narrow, plate(5.0, side=1.4)), "laser.half_angle_deg", "note")
+    mostly = find(checked(plate(5.0, 1.4), **NARROW, laser__profile=profile), "laser.half_angle_deg", "note")
     assert "misses most" in mostly.text and mostly.values["widest_angle_deg"] == pytest.approx(11.2, abs=0.5)
 
 
 def test_a_pencil_beam_hits_what_lies_on_its_line_only():
-    pencil = BASE.with_overrides(PENCIL)
-    assert summary(pencil, plate(5.0))["target_range"] == pytest.approx((5.0, 5.0))
-    assert "the beam misses" in find(check(pencil, plate(5.0, side=0.2, x=0.7)), "targets[0]").text
+    pencil = {name.replace("__", "."): value for name, value in PENCIL.items()}
+    assert summary(BASE.with_overrides(pencil), plate(5.0))["target_range"] == pytest.approx((5.0, 5.0))
+    assert "the beam misses" in find(checked(plate(5.0, side=0.2, x=0.7), **PENCIL), "targets[0]").text
 
 
 def test_a_target_outside_the_gate():
-    message = find(check(BASE, plate(2.0)), "targets[0]")
+    message = find(checked(plate(2.0)), "targets[0]")
     assert message.text.startswith("outside the gate")
     assert message.values["first_ns"] == pytest.approx(4.0 * 1.3638 / SPEED_OF_LIGHT * 1e9, rel=1e-4)
     assert (message.values["start_ns"], message.values["stop_ns"]) == pytest.approx((40.0, 50.0))
-    part = find(check(BASE.with_overrides({"gate.start_ns": 45.6}), plate(5.0)), "targets[0]")
-    assert part.text.startswith("partly outside the gate")
+    assert find(checked(gate__start_ns=45.6), "targets[0]").text.startswith("partly outside the gate")
     start, bins = re.search(r"start_ns = (\d+) and bins = (\d+) hold it", message.text).groups()
-    assert (
-        warnings(check(BASE.with_overrides({"gate.start_ns": float(start), "gate.bins": int(bins)}), plate(2.0))) == []
-    )
+    assert warnings(checked(plate(2.0), gate__start_ns=float(start), gate__bins=int(bins))) == []
 
 
 def test_beyond_the_unambiguous_range():
-    fast = BASE.with_overrides({"laser.repetition_rate": 40e6})
-    message = find(check(fast, plate(5.0)), "laser.repetition_rate")
+    fast = {"laser__repetition_rate": 40e6}
+    message = find(checked(**fast), "laser.repetition_rate")
     assert message.values["unambiguous_range"] == pytest.approx(SPEED_OF_LIGHT / (2 * 1.3638 * 40e6))
-    assert summary(fast, plate(5.0))["unambiguous_range"] == message.values["unambiguous_range"]
-    unfolded = check(fast.with_overrides({"detector.wrap": False}), plate(5.0))
-    assert "ignored" in find(unfolded, "laser.repetition_rate", "note").text
+    numbers = summary(BASE.with_overrides({"laser.repetition_rate": 40e6}), plate(5.0))
+    assert numbers["unambiguous_range"] == message.values["unambiguous_range"]
+    assert "ignored" in find(checked(**fast, detector__wrap=False), "laser.repetition_rate", "note").text
 
 
 COARSE = {"gate.bin_width_ps": 300.0, "laser.pulse_fwhm_ps": 30.0, "detector.jitter_fwhm_ps": 40.0}
@@ -159,44 +161,36 @@ def test_findings_have_their_numbers(field):
 
 
 def test_what_is_not_there_is_noted():
-    assert (
-        "not given"
-        in find(check(BASE.with_overrides({"medium.group_index": None}), plate(5.0)), "medium.group_index", "note").text
-    )
+    assert "not given" in find(checked(medium__group_index=None), "medium.group_index", "note").text
     empty = BASE.with_overrides({"targets": []})
     assert find(check(empty), "targets", "note") and summary(empty)["optical_depth"] is None
 
 
 def test_what_ends_a_history_first():
     # 0.8^n < 2e-4 at n = 39.
-    murky = BASE.with_overrides({"medium.extinction": 5.0})
-    message = find(check(murky, plate(5.0)), "transport.weight_cutoff", "note")
-    assert message.values["cutoff_collisions"] == 39
-    assert 0.8**39 < 2e-4 < 0.8**38
+    murky = {"medium__extinction": 5.0}
+    message = find(checked(**murky), "transport.weight_cutoff", "note")
+    assert message.values["cutoff_collisions"] == 39 and 0.8**39 < 2e-4 < 0.8**38
     assert message.values["path_collisions"] == pytest.approx(5.0 * 50e-9 * SPEED_OF_LIGHT / 1.3638)
-    few = murky.with_overrides({"transport.max_collisions": 20})
-    assert "max_collisions = 20" in find(check(few, plate(5.0)), "transport.max_collisions").text
+    few = find(checked(**murky, transport__max_collisions=20), "transport.max_collisions")
+    assert "max_collisions = 20" in few.text
     for free in ({"termination": "roulette"}, {"weight_cutoff": 0.0}):
-        capped = check(murky.with_overrides(transport={**free, "max_collisions": 1000}), plate(5.0))
-        assert not [
-            one for one in capped if one.field.startswith("transport.w") or one.field == "transport.max_collisions"
-        ]
+        fields = {one.field for one in checked(**murky, transport={**free, "max_collisions": 1000})}
+        assert not fields & {"transport.weight_cutoff", "transport.max_collisions"}
 
 
 def test_a_camera_and_a_laser_outside_the_water_are_both_named():
-    dry = BASE.with_overrides(domain={"shape": "slab", "lower": 1, "upper": 9})
-    assert len([one for one in check(dry, plate(5.0)) if one.field == "domain" and one.level == "warning"]) == 2
+    dry = checked(domain={"shape": "slab", "lower": 1, "upper": 9})
+    assert len([one for one in dry if one.field == "domain" and one.level == "warning"]) == 2
 
 
 def test_expected_signal_of_a_plate_that_fills_a_pixel():
-    # Lidar equation: E0 λ/(hc) PDE · pixel solid angle / cone solid angle · exp(−2cR) · Γ A / (π R²).
+    """Lidar equation: E0 λ/(hc) PDE · pixel solid angle / cone solid angle · exp(−2cR) · Γ A / (π R²)."""
     numbers = summary(BASE, plate(5.0))
     pixel = (2 * math.tan(math.radians(10)) / 32) ** 2
     cone = 2 * math.pi * (1 - math.cos(math.radians(15)))
-    fraction = pixel / cone * math.exp(-3.0) * 0.4 * math.pi * 0.01**2 / (math.pi * 25.0)
-    assert numbers["signal_per_pulse"] == pytest.approx(
-        fraction * numbers["photons_per_pulse"] * numbers["pde"], rel=1e-3
-    )
+    signal = pixel / cone * math.exp(-3.0) * 0.4 * 0.01**2 / 25.0 * numbers["photons_per_pulse"] * numbers["pde"]
+    assert numbers["signal_per_pulse"] == pytest.approx(signal, rel=1e-3)
     assert numbers["samples_per_pixel"] == pytest.approx(1e6 * pixel / cone * math.exp(-1.5), rel=1e-3)
     assert numbers["average_power"] == 0.75
     assert numbers["irradiance"] == pytest.approx(0.75 / (cone * 5.0**2) * math.exp(-1.5), rel=1e-3)
@@ -204,13 +198,13 @@ def test_expected_signal_of_a_plate_that_fills_a_pixel():
 
 
 def test_warnings_come_first():
-    levels = [one.level for one in check(BASE.with_overrides({"gate.start_ns": 90.0}), plate(5.0))]
+    levels = [one.level for one in checked(gate__start_ns=90.0)]
     assert levels == sorted(levels, reverse=True)
 
 
 def test_many_small_faces_agree_with_two_large_ones():
-    fine = BASE.with_overrides(targets=FINE)
-    coarse = fine.with_overrides({"targets[0].subdivisions": 0})
+    plane = {"builtin": "plane", "size": [30, 30], "translation": [0, 0, 5]}
+    fine, coarse = (BASE.with_overrides(targets=[{**plane, "subdivisions": n}]) for n in (7, 0))
     assert summary(fine)["target_range"] == pytest.approx(summary(coarse)["target_range"], rel=1e-3)
 
 
@@ -239,19 +233,18 @@ def test_every_shipped_scene_is_free_of_warnings(path):
     ],
 )
 def test_a_value_in_the_wrong_unit_is_told_with_the_likely_one(field, value, words):
-    base = BASE
-    if "port" in field:
-        base = BASE.with_overrides({"camera.port": {"distance": 0.05, "thickness": 0.01, "material": "BK7"}})
-    message = find(check(base.with_overrides({field: value}), plate(5.0)), field)
+    port = {"camera__port": {"distance": 0.05, "thickness": 0.01, "material": "BK7"}} if "port" in field else {}
+
+    def about(value):
+        return [one for one in checked(**port, **{field.replace(".", "__"): value}) if one.field == field]
+
+    message = find(about(value), field)
     assert words in message.text and message.values["value"] == value
-    right = words.split('"')[1]  # what it suggests is plausible
-    found = check(base.with_overrides({field: right}), plate(5.0))
-    assert not any("plausible" in one.text for one in found if one.field == field)
+    # What it suggests is plausible.
+    assert not any("plausible" in one.text for one in about(words.split('"')[1]))
 
 
 def test_a_mesh_in_millimetres_is_told_with_its_scale(tmp_path):
-    import trimesh
-
     trimesh.creation.box((400, 300, 2000)).export(tmp_path / "box.stl")
     scene = BASE.with_overrides(targets=[{"mesh": str(tmp_path / "box.stl"), "translation": [0, 0, 5000.0]}])
     text = find(check(scene), "targets[0].scale").text
@@ -259,14 +252,12 @@ def test_a_mesh_in_millimetres_is_told_with_its_scale(tmp_path):
 
 
 def test_polarised_light_that_is_not_recorded_and_fields_that_are_not_used_are_noted(tmp_path: Path) -> None:
-    polarised = {"medium.scattering_matrix": "voss_fry", "transport.axis_threshold": 1.0}
-    one = BASE.with_overrides({**polarised, "laser.polarisation": "right_circular", "laser.polarisation_angle_deg": 30})
-    messages = check(one, plate(5.0))
+    light = {"laser__polarisation": "right_circular", "laser__polarisation_angle_deg": 30}
+    light["transport__axis_threshold"] = 1.0
+    messages = checked(**light, medium__scattering_matrix="voss_fry")
     assert "no channels" in find(messages, "camera.polarisation", "note").text
     assert "'linear'" in find(messages, "laser.polarisation_angle_deg", "note").text
-
     table = tmp_path / "matrix.csv"
     table.write_text("angle_deg,m12,m22,m33,m34,m44\n0,0,1,1,0,1\n170,0,1,-1,0,-1\n")
-    changed = {"medium.scattering_matrix": "tabulated", "medium.matrix_table": str(table)}
     with pytest.raises(ConfigError, match=r"matrix\.csv: angle_deg goes from 0 to 170"):
-        check(one.with_overrides(changed), plate(5.0))
+        checked(**light, medium__scattering_matrix="tabulated", medium__matrix_table=str(table))

@@ -1,5 +1,5 @@
 """Files of every kind that somebody has changed, or that were cut: an error that names file and dataset, nothing read
-from elsewhere, no array made that the scene does not have."""
+from elsewhere, no array made that the scene does not have. Random damage: `tests/fuzz`."""
 
 import shutil
 
@@ -18,29 +18,16 @@ from spadwarp.transport import load_records, save_records, trace
 from spadwarp.values import FileError
 
 SMALL = {
-    "targets.builtin": ["staircase"],
-    "targets.validation": [],
-    "frames.per_scene": 2,
-    "scenes_per_target": 1,
-    "gate.bins": 32,
-    "scene.camera.width": 12,
-    "scene.camera.height": 8,
-    "scene.camera.polarisation": "analyser",
-    "scene.laser.polarisation": "linear",
-    "scene.transport.axis_threshold": 1.0,
-    "scene.medium.scattering_matrix": "scaled_rayleigh",
-    "monte_carlo.share": 1.0,
-    "monte_carlo.photons": 10_000,
+    **{"targets.builtin": ["staircase"], "targets.validation": [], "frames.per_scene": 2, "scenes_per_target": 1},
+    **{"gate.bins": 32, "scene.camera.width": 12, "scene.camera.height": 8, "scene.camera.polarisation": "analyser"},
+    **{"scene.laser.polarisation": "linear", "scene.transport.axis_threshold": 1.0},
+    **{"scene.medium.scattering_matrix": "scaled_rayleigh", "monte_carlo.share": 1.0, "monte_carlo.photons": 10_000},
 }
 
 
 def read_frames(path):
     file = FramesFile.load(path)
     file.counts(), file.intensity(), [file.depth(method) for method in file.methods]
-
-
-def read_analytic(path):
-    open_source(path).frame(0)
 
 
 def read_dataset(path):
@@ -52,7 +39,7 @@ def read_dataset(path):
 READERS = {
     "result.h5": spadwarp.load_result,
     "frames.h5": read_frames,
-    "analytic.h5": read_analytic,
+    "analytic.h5": lambda path: open_source(path).frame(0),
     "records.h5": load_records,
     "data/frames-00000.h5": read_dataset,
     "data/histograms-00000.h5": read_dataset,
@@ -135,43 +122,34 @@ def test_a_dataset_that_is_not_as_it_should_be_is_refused_by_name(name, way, val
         assert str(path) in str(caught.value) and dataset.split("/")[-1] in str(caught.value), (dataset, caught.value)
 
 
+ODD = (np.nan, "text", np.zeros(3), np.zeros((0,)), h5py.Empty("f"), -(2**62))
+WRONG = (("format", 3), ("format_version", "new"), ("format_version", 1e300))
+
+
 @pytest.mark.parametrize("name", READERS)
 def test_an_attribute_that_is_not_as_it_should_be_is_refused(name, valid, copy):
+    """Every odd value for each of a result's; for another file's the values in turn."""
     path = copy / name
     with h5py.File(path) as file:
         attributes = list(file.attrs)
-    for attribute in attributes:
-        for value in (np.nan, "text", np.zeros(3), np.zeros((0,)), h5py.Empty("f"), -(2**62)):
-            renew(valid / name, path)
-            with h5py.File(path, "r+") as file:
-                file.attrs[attribute] = value
-            try:
-                READERS[name](path)
-            except FileError as error:
-                assert str(path) in str(error)
-    for attribute, value in (("format", 3), ("format_version", "new"), ("format_version", 1e300)):
+    changes = [(attribute, value) for attribute in attributes for value in ODD]
+    changes = changes if name == "result.h5" else changes[::5]  # all of them in turn
+    for number, (attribute, value) in enumerate([*changes, *WRONG]):
+        refused = number >= len(changes)
         renew(valid / name, path)
         with h5py.File(path, "r+") as file:
             file.attrs[attribute] = value
-        with pytest.raises(FileError, match=attribute):
+        try:
             READERS[name](path)
+            assert not refused
+        except FileError as error:
+            assert str(path) in str(error) and (attribute in str(error) or not refused)
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_file_that_was_cut_or_has_wrong_bytes_is_an_error_or_read(name, valid, copy):
+def test_a_file_that_was_cut_is_refused(name, valid, copy):
     path, content = copy / name, (valid / name).read_bytes()
-    generator = np.random.default_rng(5)
     for length in np.linspace(0, len(content) - 1, 12).astype(int):
         path.write_bytes(content[:length])
         with pytest.raises(FileError, match=path.name):
             READERS[name](path)
-    for _ in range(30):
-        changed = bytearray(content)
-        for place in generator.integers(len(content), size=3):
-            changed[place] = generator.integers(256)
-        path.unlink()
-        path.write_bytes(changed)
-        try:
-            READERS[name](path)
-        except FileError as error:
-            assert path.name in str(error)

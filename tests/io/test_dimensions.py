@@ -73,17 +73,14 @@ def test_frames(result, opened, measured, tmp_path):
         assert tree["tags"].sizes["detection"] == tree.counts.sum() > 0
 
 
-def test_analytic_files(opened, tmp_path):
+def test_analytic_files_and_records(opened, tmp_path):
     scene = make_scene(width=WIDTH, height=HEIGHT, bins=BINS)
     analytic = spadwarp.simulate_analytic(scene, frames=2, seed=5, device="cpu")
     tree = opened(analytic.save(tmp_path / "analytic.h5"))
     assert tree["depth"].dims == ("frame", "y", "x") and tree["maps"].sigma_time.attrs["units"] == "s"
     np.testing.assert_array_equal(tree["depth"], analytic.depth)
     np.testing.assert_array_equal(tree.labels, analytic.labels)
-
-
-def test_records(opened, tmp_path):
-    records = trace(make_scene(width=WIDTH, height=HEIGHT, bins=BINS), photons=200, seed=1, device="cpu")
+    records = trace(scene, photons=200, seed=1, device="cpu")
     tree = opened(save_records(records, tmp_path / "records.h5"))
     assert tree.position.dims == ("photon", "axis")
     np.testing.assert_array_equal(tree.position.sel(axis="z"), records.position[:, 2])

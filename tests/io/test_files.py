@@ -3,11 +3,10 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -35,12 +34,22 @@ def test_hdf5_does_not_wait_in_memory(tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["large.h5"]
 
 
-def test_folders_that_cannot_be_made_are_named(tmp_path):
+def test_folders_and_names_that_cannot_be_made_are_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(FileError, match="cannot be written"):
         write_exr(tmp_path / "file" / "image.exr", {"Z": np.ones((2, 2))})
-    with pytest.raises(FileError, match="cannot be written"), write_hdf5(tmp_path / "file" / "result.h5"):
-        pass
+    for make, name, words in (
+        (write_hdf5, tmp_path / "file" / "result.h5", "cannot be written"),
+        (lock, tmp_path / "file" / "lock", "cannot be written"),
+        (atomic_path, tmp_path / ("a" * 300), "cannot be written"),
+        (atomic_path, "", "no name"),
+    ):
+        with pytest.raises(FileError, match=words), make(name):
+            pass
+    path = tmp_path / ("é" * 127)  # 254 bytes, as long as a file system allows
+    with atomic_path(path) as temporary:
+        temporary.write_text("whole")
+    assert path.read_text() == "whole"
 
 
 def test_two_writers_of_one_file_do_not_share_a_temporary_one(tmp_path, monkeypatch):
@@ -52,17 +61,6 @@ def test_two_writers_of_one_file_do_not_share_a_temporary_one(tmp_path, monkeypa
         one.write_text("one")
         two.write_text("two")
     assert path.read_text() == "one" and list(tmp_path.iterdir()) == [path]
-
-
-def test_names_as_long_as_a_file_system_allows(tmp_path):
-    path = tmp_path / ("é" * 127)  # 254 bytes
-    with atomic_path(path) as temporary:
-        temporary.write_text("whole")
-    assert path.read_text() == "whole"
-    with pytest.raises(FileError, match="cannot be written"), atomic_path(tmp_path / ("a" * 300)):
-        pass
-    with pytest.raises(FileError, match="no name"), atomic_path(""):
-        pass
 
 
 def test_permissions_are_those_of_any_new_file(tmp_path):
@@ -102,18 +100,9 @@ def test_a_lock_has_one_holder_and_leaves_no_file(tmp_path):
     with lock(path) as again:
         assert again
     assert not list(tmp_path.iterdir())
-    (tmp_path / "file").touch()
-    with pytest.raises(FileError, match="cannot be written"), lock(tmp_path / "file" / "lock"):
-        pass
 
 
-HOLD = """
-import sys
-from spadwarp.io.paths import lock
-with lock(sys.argv[1]):
-    print(flush=True)
-    sys.stdin.read()
-"""
+HOLD = "import sys; from spadwarp.io.paths import lock\nwith lock(sys.argv[1]): print(flush=True); sys.stdin.read()"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="has no such locks")
@@ -133,11 +122,11 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path):
 # EXR
 
 
-@given(
-    pixels=arrays.arrays(
-        dtype=st.sampled_from([np.float16, np.float32, np.uint32]), shape=arrays.array_shapes(min_dims=2, max_dims=2)
-    )
-)
+SHAPES = arrays.array_shapes(min_dims=2, max_dims=2)
+
+
+@settings(max_examples=30)
+@given(arrays.arrays(dtype=st.sampled_from([np.float16, np.float32, np.uint32]), shape=SHAPES))
 def test_exr_gives_back_what_it_was_given(tmp_path_factory, pixels):
     path = tmp_path_factory.mktemp("exr") / "image.exr"
     write_exr(path, {"Z": pixels, "N.X": pixels[::-1, ::-1]})
@@ -148,16 +137,10 @@ def test_exr_gives_back_what_it_was_given(tmp_path_factory, pixels):
 
 
 def test_exr_stores_arrays_that_are_not_contiguous(tmp_path):
-    # Views of one array with every kind of stride: transposed, strided, reversed, one channel of an image, broadcast.
     cube = np.random.default_rng(1).normal(size=(8, 10, 3)).astype(np.float32)
-    views = {
-        "transposed": cube[:, :8, 0].T,
-        "strided": np.repeat(cube[:, :8, 0], 2, axis=1)[:, ::2],
-        "reversed": cube[::-1, 7::-1, 1],
-        "channel": cube[:, 1:9, 2],
-        "fortran": np.asfortranarray(cube[:, :8, 1]),
-        "broadcast": np.broadcast_to(cube[0, :8, 0], (8, 8)),
-    }
+    views = {"transposed": cube[:, :8, 0].T, "strided": np.repeat(cube[:, :8, 0], 2, axis=1)[:, ::2]}
+    views |= {"channel": cube[:, 1:9, 2], "fortran": np.asfortranarray(cube[:, :8, 1])}
+    views |= {"reversed": cube[::-1, 7::-1, 1], "broadcast": np.broadcast_to(cube[0, :8, 0], (8, 8))}
     write_exr(tmp_path / "views.exr", views)
     channels, _ = read_exr(tmp_path / "views.exr")
     for name, view in views.items():
@@ -196,20 +179,6 @@ def test_exr_files_that_are_not_whole_are_refused(tmp_path):
         path.write_bytes(content[:length])
         with pytest.raises(FileError, match=r"image\.exr: not an EXR image, or damaged"):
             read_exr(path)
-    with pytest.raises(FileError, match="no such file"):
-        read_exr(tmp_path / "none.exr")
-    with pytest.raises(FileError, match="is not a file"):
-        read_exr(tmp_path)
-
-
-@pytest.mark.skipif("SPADWARP_EXTRA_DATA" not in os.environ, reason="SPADWARP_EXTRA_DATA names no folder with ue_exr")
-@pytest.mark.parametrize("name", ["babiao", "cat"])
-def test_a_game_engines_exports_are_read(name):
-    folder = Path(os.environ["SPADWARP_EXTRA_DATA"]) / "ue_exr"
-    for kind in ("RGBD", "Base_Col", "Surf_Norm"):
-        channels, _ = read_exr(folder / f"{name}_{kind}.EXR")
-        assert set(channels) == {"R", "G", "B", "A"}
-        assert all(pixels.shape == (192, 256) and pixels.dtype == np.float16 for pixels in channels.values())
-    depth = read_exr(folder / f"{name}_RGBD.EXR")[0]["A"].astype(float)  # centimetres
-    if name == "babiao":  # the staircase: plate at 14.89 m, bars 0.1 to 0.6 m proud
-        assert {1429.0, 1439.0, 1449.0, 1459.0, 1469.0, 1479.0, 1489.0} <= set(np.unique(depth))
+    for other, words in ((tmp_path / "none.exr", "no such file"), (tmp_path, "is not a file")):
+        with pytest.raises(FileError, match=words):
+            read_exr(other)

@@ -28,26 +28,24 @@ def collections(content):
         place = content.find(b"GCOL", place + 1)
 
 
-@pytest.mark.parametrize("size", [2**64 - 16, 2**64 - 1, 2**63, 1 << 20, 4096])
-def test_texts_whose_sizes_do_not_fit_are_refused(path, size):
-    """HDF5 follows such sizes for ever."""
+@pytest.mark.parametrize(
+    ("form", "offset", "values"),
+    [
+        *(("<Q", 24, (size,)) for size in (2**64 - 16, 2**64 - 1, 2**63, 1 << 20, 4096)),  # of the first object
+        ("<HxxxxxxQ", 16, (0, 0)),  # free space of no size
+        ("<Q", 8, (2**40,)),
+    ],
+)
+def test_texts_whose_sizes_do_not_fit_are_refused(path, form, offset, values):
+    """HDF5 follows such sizes for ever. A file that has been read is looked at again."""
     assert hdf5_format(path) == "a format"
     content = path.read_bytes()
     for place in collections(content):
         changed = bytearray(content)
-        struct.pack_into("<Q", changed, place + 24, size)  # of the first object
-        path.write_bytes(changed)
+        struct.pack_into(form, changed, place + offset, *values)
+        path.write_bytes(changed + b"\0")
         with pytest.raises(FileError, match=r"file\.h5: damaged: the file has damaged text"):
             hdf5_format(path)
-
-
-def test_free_space_of_no_size_is_refused(path):
-    content = bytearray(path.read_bytes())
-    place = next(collections(content))
-    struct.pack_into("<HxxxxxxQ", content, place + 16, 0, 0)
-    path.write_bytes(content)
-    with pytest.raises(FileError, match="damaged text"):
-        hdf5_format(path)
 
 
 def test_letters_that_only_look_like_a_text_do_no_harm(tmp_path):
@@ -73,15 +71,6 @@ def test_attributes_are_text_or_numbers(path):
         for name in ("list", "place", "pair"):
             with pytest.raises(FileError, match=f"{name} is neither text nor numbers"):
                 file.attribute(name)
-
-
-def test_a_file_that_grows_is_looked_at_again(path):
-    assert hdf5_format(path) == "a format"
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<Q", content, next(collections(content)) + 8, 2**40)
-    path.write_bytes(content + b"\0")
-    with pytest.raises(FileError, match="damaged text"):
-        hdf5_format(path)
 
 
 RNG = np.random.default_rng(3)

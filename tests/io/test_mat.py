@@ -39,12 +39,8 @@ def test_sparse_matrices_and_cells_are_those_that_scipy_writes(tmp_path, packed)
     cells = np.empty((2, 3), object)
     for index in range(6):
         cells.flat[index] = np.arange(float(index))
-    variables = {
-        "matrix": matrix,
-        "cells": cells,
-        "empty": sparse.csc_array((4, 5)),
-        "mixed": np.array([1, "x"], object),
-    }
+    variables = {"matrix": matrix, "cells": cells, "empty": sparse.csc_array((4, 5))}
+    variables["mixed"] = np.array([1, "x"], object)
     savemat(tmp_path / "file.mat", variables, do_compression=packed)
     for name in ("matrix", "empty"):
         found = read(tmp_path / "file.mat", name)
@@ -69,16 +65,26 @@ def test_files_of_version_7_3_hold_nothing_of_other_files(tmp_path):
             read(tmp_path / "file.mat", name)
 
 
-def test_a_type_that_does_not_exist_is_refused(tmp_path):
-    """SciPy looks it up beyond the end of a table, and the process ends."""
+KIND = (12).to_bytes(4, "little"), (480).to_bytes(4, "little")  # the tag of 60 int64
+SHAPE = np.array([3, 4, 5], "<i4").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        # SciPy looks it up beyond the end of a table, and the process ends.
+        *((b"".join(KIND), kind.to_bytes(4, "little"), "damaged or not read") for kind in (0, 8, 14, 255, 65535)),
+        (SHAPE, np.array([2**30] * 3, "<i4").tobytes(), "is not in"),
+    ],
+)
+def test_types_that_do_not_exist_and_bombs_are_refused(tmp_path, old, new, words):
     savemat(tmp_path / "file.mat", {"a": np.arange(60).reshape(3, 4, 5)})
     content = bytearray((tmp_path / "file.mat").read_bytes())
-    place = content.index((12).to_bytes(4, "little") + (480).to_bytes(4, "little"))  # the tag of 60 int64
-    for kind in (0, 8, 14, 255, 65535):
-        content[place : place + 4] = kind.to_bytes(4, "little")
-        (tmp_path / "file.mat").write_bytes(content)
-        with pytest.raises(FileError, match=r"file\.mat: damaged or not readable"):
-            read(tmp_path / "file.mat", "a")
+    place = content.index(old)
+    content[place : place + len(new)] = new
+    (tmp_path / "file.mat").write_bytes(content)
+    with pytest.raises(FileError, match=rf"file\.mat: .*{words}"):
+        read(tmp_path / "file.mat", "a")
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -88,11 +94,11 @@ def test_damaged_files_are_read_or_refused(tmp_path, packed):
     variables |= {"s": sparse.eye_array(9, format="csc"), "c": np.array([np.arange(3), np.arange(2)], object)}
     savemat(path, variables, do_compression=packed)
     content = path.read_bytes()
-    for length in range(0, len(content), 37):
+    for length in range(0, len(content), 101):
         path.write_bytes(content[:length])
         with pytest.raises(FileError):
             read(path, list(variables)[-1])
-    for _ in range(500):
+    for _ in range(150):
         changed = bytearray(content)
         for place in generator.integers(len(content), size=generator.integers(1, 4)):
             changed[place] = generator.choice([0, 255, generator.integers(256)])
@@ -104,13 +110,3 @@ def test_damaged_files_are_read_or_refused(tmp_path, packed):
                     assert np.size(getattr(value, "value", value)) <= 1 << 16
         except FileError as error:
             assert "file.mat" in str(error)
-
-
-def test_a_bomb_is_refused(tmp_path):
-    savemat(tmp_path / "file.mat", {"a": np.zeros((3, 4, 5))})
-    content = bytearray((tmp_path / "file.mat").read_bytes())
-    place = content.index(np.array([3, 4, 5], "<i4").tobytes())
-    content[place : place + 12] = np.array([2**30, 2**30, 2**30], "<i4").tobytes()
-    (tmp_path / "file.mat").write_bytes(content)
-    with pytest.raises(FileError, match="is not in"):
-        read(tmp_path / "file.mat", "a")

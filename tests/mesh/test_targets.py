@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from helpers.synthetic_result import cast_truth, make_scene
 from spadwarp.mesh import BUILTINS, build_mesh, builtin_names, describe_mesh, load_target
@@ -91,57 +92,39 @@ def test_plane_is_a_rectangle_at_zero_that_faces_the_camera_and_box_has_its_side
     assert mesh.is_watertight and mesh.volume == pytest.approx(6.0)
 
 
-def test_sphere_has_its_diameter_and_gets_rounder_with_every_subdivision():
-    missing = []
-    for subdivisions in range(3):
-        mesh = load_target(Target(builtin="sphere", size=(2.0,), subdivisions=subdivisions))
+@pytest.mark.parametrize("name", BUILTINS)
+def test_subdivision_makes_four_faces_of_one_and_a_sphere_rounder(name):
+    size = {"size": (2.0,)} if name == "sphere" else {}
+    meshes = [load_target(Target(builtin=name, **size, subdivisions=n)) for n in range(3)]
+    assert len(meshes[2].faces) == 16 * len(meshes[0].faces)
+    np.testing.assert_allclose(meshes[2].bounds, meshes[0].bounds, atol=1e-6)
+    if name != "sphere":
+        assert meshes[2].area == pytest.approx(meshes[0].area)
+        return
+    for mesh in meshes:
         assert mesh.is_watertight
         np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1.0, rtol=1e-6)
-        missing.append(4 / 3 * np.pi - mesh.volume)
     # Second order: half the edge, a quarter of the error.
-    np.testing.assert_allclose(np.array(missing[:-1]) / missing[1:], 4.0, rtol=0.02)
-
-
-@pytest.mark.parametrize("name", BUILTINS)
-def test_subdivision_makes_four_faces_of_one(name):
-    plain = load_target(Target(builtin=name))
-    fine = load_target(Target(builtin=name, subdivisions=2))
-    assert len(fine.faces) == 16 * len(plain.faces)
-    np.testing.assert_allclose(fine.bounds, plain.bounds, atol=1e-6)
-    if name != "sphere":
-        assert fine.area == pytest.approx(plain.area)
+    missing = np.array([4 / 3 * np.pi - mesh.volume for mesh in meshes])
+    np.testing.assert_allclose(missing[:-1] / missing[1:], 4.0, rtol=0.02)
 
 
 # Placement
 
 
-def turn(points, axis, angle):
-    """Rodrigues' rotation."""
-    cross = np.cross(axis, points)
-    return points * np.cos(angle) + cross * np.sin(angle) + np.outer(points @ axis, axis) * (1 - np.cos(angle))
-
-
-def test_rotation_is_about_the_targets_own_axes_x_then_y_then_z():
+def test_rotation_is_about_the_targets_own_axes_x_then_y_then_z(staircase):
     """After the scale; a positive angle about z turns right to down."""
-    corners = 2.0 * load_target(Target(builtin="box", size=(1.0, 2.0, 3.0))).vertices
-    x, y, z = np.radians([20.0, 30.0, 40.0])
-    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
-    turned_y = about_x @ [0.0, 1.0, 0.0]
-    turned_z = about_x @ [np.sin(y), 0.0, np.cos(y)]
-    expected = np.array([1.0, 2.0, 3.0]) + turn(turn(corners @ about_x.T, turned_y, y), turned_z, z)
+    size = {"builtin": "box", "size": (1.0, 2.0, 3.0)}
+    turn = Rotation.from_euler("XYZ", [20.0, 30.0, 40.0], degrees=True)
+    expected = np.add(turn.apply(2.0 * load_target(Target(**size)).vertices), (1.0, 2.0, 3.0))
     place = {"rotation_deg": (20.0, 30.0, 40.0), "translation": (1.0, 2.0, 3.0), "scale": (2.0, 2.0, 2.0)}
-    placed = load_target(Target(builtin="box", size=(1.0, 2.0, 3.0), **place))
-    np.testing.assert_allclose(placed.vertices, expected, atol=1e-12)
+    np.testing.assert_allclose(load_target(Target(**size, **place)).vertices, expected, atol=1e-12)
     place = {"translation": (0.0, 0.0, 5.0), "rotation_deg": (0.0, 0.0, 90.0)}
     mesh = load_target(Target(builtin="plane", size=(4.0, 1.0), **place))
     np.testing.assert_allclose(mesh.bounds, [[-0.5, -2.0, 5.0], [0.5, 2.0, 5.0]], atol=1e-12)
-    own, placed = (load_target(Target(builtin="anchor", **options)) for options in ({}, place))
-    assert placed.is_watertight and placed.volume == pytest.approx(own.volume)
-
-
-def test_mirrored_targets_keep_their_normals_outwards(staircase):
+    # Mirrored targets keep their normals outwards.
     mesh = load_target(Target(builtin="staircase", scale=(-1.0, 1.0, 1.0)))
-    assert mesh.volume == pytest.approx(staircase.volume)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(staircase.volume)
     assert first_depth(mesh, 1.9, 0.0) == pytest.approx(-0.6)
 
 
@@ -153,10 +136,9 @@ def test_scene_mesh_joins_targets_in_the_camera_frame():
     plane = {"builtin": "plane", "size": [6.0, 4.0], "translation": [0, 0, 9.0], "reflectance": 0.25}
     box = {"builtin": "box", "scale": 0.5, "translation": [0.5, 0, 5.0], "reflectance": 0.75}
     mesh = build_mesh(scene_of(plane, box))
-    assert mesh.face_count == 14
-    dtypes = (mesh.vertices.dtype, mesh.faces.dtype, mesh.reflectance.dtype, mesh.target.dtype)
-    assert dtypes == (np.float32, np.int32, np.float32, np.int32)
-    assert mesh.target.tolist() == [0] * 2 + [1] * 12
+    arrays = (mesh.vertices, mesh.faces, mesh.reflectance, mesh.target)
+    assert [array.dtype for array in arrays] == [np.float32, np.int32, np.float32, np.int32]
+    assert mesh.target.tolist() == [0] * 2 + [1] * 12 and mesh.face_count == 14
     assert mesh.reflectance.tolist() == [0.25] * 2 + [0.75] * 12
     np.testing.assert_allclose(mesh.bounds, [[-3.0, -2.0, 4.75], [3.0, 2.0, 9.0]])
     own = mesh.vertices[mesh.faces[mesh.target == 1].ravel()]
@@ -164,11 +146,10 @@ def test_scene_mesh_joins_targets_in_the_camera_frame():
 
 
 def test_staircase_fills_the_papers_view_from_top_to_bottom():
-    # 20° over 256 pixels are 3.94 m over 192 rows at 14.89 m: less than the 4 m plate; sideways more.
+    """20° over 256 pixels are 3.94 m over 192 rows at 14.89 m: less than the 4 m plate; sideways more."""
     scene = make_scene(width=64, height=48)
     depth = cast_truth(scene, build_mesh(scene)).depth
-    assert np.isfinite(depth[:, 10:54]).all()
-    assert np.isnan(depth[:, [0, -1]]).all()
+    assert np.isfinite(depth[:, 10:54]).all() and np.isnan(depth[:, [0, -1]]).all()
     assert depth[24, 10] == pytest.approx(14.29)  # the left bar is the nearest
     assert depth[2, 50] < depth[13, 50] < depth[22, 50]  # upper right: the top bar is the nearest
 
@@ -195,15 +176,6 @@ def error_of(target):
     return str(caught.value)
 
 
-def test_missing_file_and_folder_and_the_scene_file_are_named(tmp_path):
-    missing = str(tmp_path / "bust.stl")
-    assert error_of({"mesh": missing}) == f"targets[1].mesh = {missing!r}: no such file"
-    assert "is not a file" in error_of({"mesh": str(tmp_path)})
-    scene = Scene.from_dict(scene_of({"mesh": "bust.stl"}).to_dict(), source=tmp_path / "scene.toml")
-    with pytest.raises(MeshError, match=r"scene\.toml: targets\[0\]\.mesh = .*bust\.stl': no such file"):
-        build_mesh(scene)
-
-
 SQUARE_WITH = "OFF\n4 2 0\n0 0 0\n1 0 0\n0 1 0\n1 {} 0\n3 0 1 2\n3 1 3 2\n"
 NOT_FINITE = "1 of 2 faces have coordinates that are not finite"
 
@@ -211,6 +183,8 @@ NOT_FINITE = "1 of 2 faces have coordinates that are not finite"
 @pytest.mark.parametrize(
     ("name", "content", "problem"),
     [
+        ("bust.stl", None, "no such file"),
+        ("", None, "is not a file"),
         *((f"empty.{ending}", "", "") for ending in ("stl", "obj", "ply", "off", "glb")),
         ("noise.stl", "solid nothing of the kind\n", ""),
         ("noise.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", ""),
@@ -226,12 +200,19 @@ NOT_FINITE = "1 of 2 faces have coordinates that are not finite"
 )
 def test_files_without_a_mesh_are_refused_by_name(tmp_path, name, content, problem):
     path = tmp_path / name
-    path.write_bytes(content.encode("latin-1"))
+    if content is not None:
+        path.write_bytes(content.encode("latin-1"))
     text = error_of({"mesh": str(path)})
     assert text.startswith(f"targets[1].mesh = {str(path)!r}: ") and problem in text
-    if problem == "the mesh has no faces":
-        with pytest.raises(MeshError, match="no faces"):
+    if problem in ("the mesh has no faces", "no such file"):
+        with pytest.raises(MeshError, match=problem.removeprefix("the mesh has ")):
             describe_mesh(path)
+
+
+def test_the_scene_file_is_named(tmp_path):
+    scene = Scene.from_dict(scene_of({"mesh": "bust.stl"}).to_dict(), source=tmp_path / "scene.toml")
+    with pytest.raises(MeshError, match=r"scene\.toml: targets\[0\]\.mesh = .*bust\.stl': no such file"):
+        build_mesh(scene)
 
 
 def test_faces_without_area_are_dropped_and_counted(tmp_path):
@@ -246,10 +227,11 @@ def test_built_ins_that_cannot_be_are_refused():
     text = error_of({"builtin": "stairs"})
     assert text.startswith("targets[1].builtin = 'stairs' is not one of 'staircase', 'plane', 'box', 'sphere', ")
     assert text.endswith("'bust'; did you mean 'staircase'?") and all(repr(name) in text for name in builtin_names())
-    problem = "targets[1].size = [2.0, 2.0] cannot be combined with builtin = 'staircase'"
-    assert problem in error_of({"builtin": "staircase", "size": [2.0, 2.0]})
-    problem = "targets[1].subdivisions = 12 makes 2684354560 faces of 160"  # before they are made
-    assert problem in error_of({"builtin": "staircase", "subdivisions": 12})
+    for field, value, problem in (
+        ("size", [2.0, 2.0], "= [2.0, 2.0] cannot be combined with builtin = 'staircase'"),
+        ("subdivisions", 12, "= 12 makes 2684354560 faces of 160"),  # before they are made
+    ):
+        assert f"targets[1].{field} {problem}" in error_of({"builtin": "staircase", field: value})
 
 
 # Mesh files before they stand in a scene
@@ -270,14 +252,9 @@ def test_a_mesh_file_is_described_with_its_likely_unit(tmp_path, metres, unit):
 
 
 def test_an_open_mesh_and_one_of_no_likely_unit_are_told(tmp_path):
-    sphere = trimesh.creation.icosphere()
+    sphere = trimesh.creation.icosphere(radius=1e-3)
     sphere.update_faces(np.arange(len(sphere.faces)) > 20)
     sphere.export(tmp_path / "open.ply")
     found = describe_mesh(tmp_path / "open.ply")
     assert not found.is_watertight and any("not closed" in hint for hint in found.hints)
-    tiny = trimesh.creation.icosphere(radius=1e-3)
-    tiny.export(tmp_path / "tiny.ply")
-    found = describe_mesh(tmp_path / "tiny.ply")
     assert found.unit is None and found.scale == 1.0 and any("neither" in hint for hint in found.hints)
-    with pytest.raises(MeshError, match="no such file"):
-        describe_mesh(tmp_path / "nothing.stl")

@@ -1,6 +1,7 @@
 """torch: the same numbers, in shared memory, wherever they lie."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -36,15 +37,12 @@ def test_tallies_of_the_caller(scene, result, kind, options):
     """They are overwritten, and hold the bits of any run of the seed."""
     if kind == "torch":
         mine = torch.full(SHAPE, 5, dtype=torch.int64)
-        seen = mine.numpy()
     else:
         mine = wp.full(int(np.prod(SHAPE)), 5, dtype=wp.int64, device="cpu")
-        seen = mine.numpy().reshape(SHAPE)
+    seen = mine.numpy().reshape(SHAPE)
     filled = spadwarp.simulate(scene, device="cpu", tallies=mine, **options)
-    assert np.array_equal(filled.tallies, seen)
-    assert np.shares_memory(filled.tallies, seen)
-    if not options:
-        assert np.array_equal(seen, result.tallies)
+    assert np.array_equal(filled.tallies, seen) and np.shares_memory(filled.tallies, seen)
+    assert options or np.array_equal(seen, result.tallies)
 
 
 def test_results_stay_on_the_device(scene, device):
@@ -64,10 +62,10 @@ def test_results_stay_on_the_device(scene, device):
         assert np.array_equal(tensor.cpu().numpy(), numbers, equal_nan=numbers.dtype.kind == "f")
 
 
-def test_results_share_their_memory(result):
+def test_results_and_frames_share_their_memory(result):
     view = spadwarp.result.to_torch(result)
-    assert view.tallies.data_ptr() == result.tallies.ctypes.data
-    assert view.truth.depth.data_ptr() == result.truth.depth.ctypes.data
+    for one, other in ((view.tallies, result.tallies), (view.truth.depth, result.truth.depth)):
+        assert np.shares_memory(one.numpy(), other)
     assert np.array_equal(view.histogram.numpy(), result.histogram)
     assert np.array_equal(view.component("backscatter").numpy(), result.component("backscatter"))
     assert np.allclose(view.detections.numpy(), result.detections, rtol=1e-15)
@@ -80,23 +78,21 @@ def test_results_share_their_memory(result):
     with pytest.raises(ValueError, match=r"torch\.int32 \(384,\); torch\.int64 \(3, 4, 4, 8\) is needed"):
         spadwarp.result.to_torch(result, tallies=flat.int())
 
-
-MODES = {
-    "first photon": {},
-    "summed": {"summed": True},
-    "free running": {"mode": "free_running", "dead_time_ns": 20.0},
-    "free running, summed": {"mode": "free_running", "dead_time_ns": 20.0, "summed": True},
-}
+    frames = spadwarp.detect(result, seed=5, device="cpu")
+    view = spadwarp.result.to_torch(frames)
+    for name in ("counts", "expected", "background"):
+        assert np.shares_memory(getattr(view, name).numpy(), getattr(frames, name))
+    assert dataclasses.replace(view, counts=frames.counts).seed == frames.seed
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_frames_are_the_same_in_torch(result, mode):
-    options = {"frames": 3, "seed": 5, "device": "cpu", "summed": False} | MODES[mode]
-    summed = options.pop("summed")
-    fields = {name: options.pop(name) for name in ("mode", "dead_time_ns") if name in options}
-    detector = result.scene.with_overrides(detector=fields).detector
-    expected = spadwarp.detect(result, detector=detector, summed=summed, **options)
-    frames = spadwarp.detect(spadwarp.result.to_torch(result), detector=detector, summed=summed, **options)
+@pytest.mark.parametrize("summed", [False, True], ids=["frames", "summed"])
+@pytest.mark.parametrize("mode", ["first_photon", "free_running", "daylight"])
+def test_frames_are_the_same_in_torch(result, mode, summed):
+    sections = {"detector.mode": "free_running", "detector.dead_time_ns": 20.0} if mode == "free_running" else {}
+    sections |= {"daylight": {"sun_elevation_deg": 30.0, "depth": 20.0}} if mode == "daylight" else {}
+    result = dataclasses.replace(result, scene=result.scene.with_overrides(sections))
+    options = {"frames": 3, "seed": 5, "device": "cpu", "summed": summed}
+    expected, frames = (spadwarp.detect(one, **options) for one in (result, spadwarp.result.to_torch(result)))
     for name in ("counts", "expected", "background", "intensity"):
         one, other = getattr(frames, name), getattr(expected, name)
         assert isinstance(one, torch.Tensor) and one.numpy().dtype == other.dtype, name
@@ -105,42 +101,23 @@ def test_frames_are_the_same_in_torch(result, mode):
         times = frames.arrival_time(method, device="cpu")
         assert isinstance(times, torch.Tensor) and times.dtype == torch.float64
         assert np.array_equal(times.numpy(), expected.arrival_time(method, device="cpu"), equal_nan=True)
-    if mode == "first photon":
+    if mode == "first_photon" and not summed:
         undone = frames.arrival_time(undo_pile_up=True)
         again = expected.arrival_time(undo_pile_up=True, device="cpu")
         assert np.array_equal(undone.numpy(), again, equal_nan=True)
 
     mine = torch.full(expected.counts.shape, -1, dtype=torch.int32)
-    filled = spadwarp.detect(result, detector=detector, summed=summed, out=mine, **options)
-    assert filled.counts.data_ptr() == mine.data_ptr()
-    assert np.array_equal(mine.numpy(), expected.counts)
-
-
-def test_daylight_is_the_same_in_torch(result):
-    scene = result.scene.with_overrides(daylight={"sun_elevation_deg": 30.0, "depth": 20.0})
-    lit = dataclasses.replace(result, scene=scene)
-    expected, dark = (spadwarp.detect(one, seed=5, device="cpu").expected for one in (lit, result))
-    frames = spadwarp.detect(spadwarp.result.to_torch(lit), seed=5, device="cpu")
-    assert np.array_equal(frames.expected.numpy(), expected) and (expected > dark).all()
-
-
-def test_frames_share_their_memory(result):
-    frames = spadwarp.detect(result, seed=5, device="cpu")
-    view = spadwarp.result.to_torch(frames)
-    for name in ("counts", "expected", "background"):
-        assert np.shares_memory(getattr(view, name).numpy(), getattr(frames, name))
-    assert dataclasses.replace(view, counts=frames.counts).seed == frames.seed
+    filled = spadwarp.detect(result, out=mine, **options)
+    assert filled.counts.data_ptr() == mine.data_ptr() and np.array_equal(mine.numpy(), expected.counts)
 
 
 def test_laws_are_the_same_in_torch():
-    hazard = np.random.default_rng(2).uniform(0.0, 0.2, (2, 3, 8))
-    law = first_photon_probabilities(torch.from_numpy(hazard))
-    assert isinstance(law, torch.Tensor)
-    assert np.array_equal(law.numpy(), first_photon_probabilities(hazard, device="cpu"))
-    counts = np.random.default_rng(2).poisson(3.0, (2, 3, 8))
-    corrected = spadwarp.frames.coates(torch.from_numpy(counts), pulses=1000)
-    assert isinstance(corrected, torch.Tensor)
-    assert np.array_equal(corrected.numpy(), spadwarp.frames.coates(counts, pulses=1000, device="cpu"))
+    random = np.random.default_rng(2)
+    hazard, counts = random.uniform(0.0, 0.2, (2, 3, 8)), random.poisson(3.0, (2, 3, 8))
+    coates = functools.partial(spadwarp.frames.coates, pulses=1000)
+    for law, values in ((first_photon_probabilities, hazard), (coates, counts)):
+        found = law(torch.from_numpy(values))
+        assert isinstance(found, torch.Tensor) and np.array_equal(found.numpy(), law(values, device="cpu"))
 
 
 @pytest.mark.parametrize(
@@ -157,9 +134,13 @@ def test_tallies_that_do_not_fit_are_refused(scene, tallies, words):
         spadwarp.simulate(scene, photons=10, device="cpu", tallies=tallies)
 
 
-def test_counts_that_do_not_fit_are_refused(result):
-    options = {"seed": 5, "device": "cpu"}
-    with pytest.raises(ValueError, match=r"out is torch\.int64 \(1, 4, 4, 8\) on cpu; contiguous torch\.int32"):
-        spadwarp.detect(result, out=torch.zeros((1, 4, 4, 8), dtype=torch.int64), **options)
-    with pytest.raises(ValueError, match="out is a ndarray; a torch tensor is needed"):
-        spadwarp.detect(result, out=np.zeros((1, 4, 4, 8), np.int32), **options)
+@pytest.mark.parametrize(
+    ("out", "words"),
+    [
+        (torch.zeros((1, 4, 4, 8), dtype=torch.int64), r"torch\.int64 \(1, 4, 4, 8\) on cpu; contiguous torch\.int32"),
+        (np.zeros((1, 4, 4, 8), np.int32), "out is a ndarray; a torch tensor is needed"),
+    ],
+)
+def test_counts_that_do_not_fit_are_refused(result, out, words):
+    with pytest.raises(ValueError, match=words):
+        spadwarp.detect(result, out=out, seed=5, device="cpu")

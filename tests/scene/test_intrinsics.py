@@ -19,50 +19,50 @@ LENSES = {
     "pincushion": (0.12, -0.02, 0.0, 0.0, 0.0),
     "decentred": (-0.1, 0.01, 0.004, -0.006, 0.002),
 }
-INTRINSICS = {"width": 64, "height": 48, "fx": 61.0, "fy": 63.5, "cx": 29.2, "cy": 25.1, "aperture_diameter": 0.01}
+MATRIX = (61.0, 63.5, 29.2, 25.1)
+INTRINSICS = dict(zip(("fx", "fy", "cx", "cy"), MATRIX, strict=True))
+INTRINSICS |= {"width": 64, "height": 48, "aperture_diameter": 0.01}
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.fixture(params=LENSES)
+def lens(request):
+    return LENSES[request.param]
+
+
 @pytest.mark.parametrize("rvec", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.9), (-2.0, 0.4, 1.1)])
 def test_points_of_the_world_fall_where_opencv_puts_them(lens, rvec):
     tvec = (0.2, -0.4, 3.0)
-    camera = Camera(**INTRINSICS, distortion=LENSES[lens], **opencv_pose(rvec, tvec))
-    rng = np.random.default_rng(1)
-    seen = rng.uniform([-0.35, -0.3, 1.0], [0.35, 0.3, 5.0], size=(40, 3))
+    camera = Camera(**INTRINSICS, distortion=lens, **opencv_pose(rvec, tvec))
+    seen = np.random.default_rng(1).uniform([-0.35, -0.3, 1.0], [0.35, 0.3, 5.0], size=(40, 3))
     seen[:, :2] *= seen[:, 2:]
     world = to_world(camera, seen)
     np.testing.assert_allclose(to_camera(camera, world), seen, atol=1e-12)
-    expected = project_points(world, rvec, tvec, 61.0, 63.5, 29.2, 25.1, LENSES[lens])
-    points = to_camera(camera, world)
-    ours = image_points(camera, points[:, :2] / points[:, 2:])
-    np.testing.assert_allclose(ours - 0.5, expected, atol=1e-9)
+    ours = image_points(camera, seen[:, :2] / seen[:, 2:])
+    np.testing.assert_allclose(ours - 0.5, project_points(world, rvec, tvec, *MATRIX, lens), atol=1e-9)
 
 
-@pytest.mark.parametrize("lens", LENSES)
 def test_pixel_directions_are_imaged_in_the_middle_of_their_pixels(lens):
-    camera = Camera(**INTRINSICS, distortion=LENSES[lens])
-    view = pixel_directions(camera)
-    expected = project_points(view.reshape(-1, 3), (0, 0, 0), (0, 0, 0), 61.0, 63.5, 29.2, 25.1, LENSES[lens])
+    view = pixel_directions(Camera(**INTRINSICS, distortion=lens))
+    expected = project_points(view.reshape(-1, 3), (0, 0, 0), (0, 0, 0), *MATRIX, lens)
     row, column = np.mgrid[:48, :64]
     np.testing.assert_allclose(expected.reshape(48, 64, 2), np.stack([column, row], axis=-1), atol=1e-8)
     np.testing.assert_allclose(np.linalg.norm(view, axis=-1), 1.0)
 
 
-@pytest.mark.parametrize("lens", LENSES)
 def test_the_view_holds_every_pixel_and_little_more(lens):
-    camera = Camera(**INTRINSICS, distortion=LENSES[lens])
+    camera = Camera(**INTRINSICS, distortion=lens)
     left, top, right, bottom = view_box(camera)
-    inner = image_tangents(camera, np.random.default_rng(2).uniform((0, 0), (64, 48), size=(4000, 2)))
+    random = np.random.default_rng(2)
+    inner = image_tangents(camera, random.uniform((0, 0), (64, 48), size=(4000, 2)))
     assert (inner > (left, top)).all() and (inner < (right, bottom)).all()
     # Each side is touched by the image's border.
-    border = np.array([(c, r) for c in np.linspace(0, 64, 200) for r in (0, 48)])
-    border = image_tangents(
-        camera, np.concatenate([border, [(c, r) for r in np.linspace(0, 48, 200) for c in (0, 64)]])
-    )
+    sides = [(c, r) for c in np.linspace(0, 64, 200) for r in (0, 48)]
+    sides += [(c, r) for r in np.linspace(0, 48, 200) for c in (0, 64)]
+    border = image_tangents(camera, np.array(sides))
     np.testing.assert_allclose((*border.min(axis=0), *border.max(axis=0)), (left, top, right, bottom), atol=0.001)
     views = pixel_views(camera)
-    row, column = np.random.default_rng(3).integers((0, 0), (48, 64), size=(500, 2)).T
-    inside = image_tangents(camera, np.stack([column, row], -1) + np.random.default_rng(4).uniform(size=(500, 2)))
+    row, column = random.integers((0, 0), (48, 64), size=(500, 2)).T
+    inside = image_tangents(camera, np.stack([column, row], -1) + random.uniform(size=(500, 2)))
     assert (inside > views[row, column, :2]).all() and (inside < views[row, column, 2:]).all()
 
 
@@ -76,14 +76,6 @@ def test_without_intrinsics_the_axis_is_in_the_middle():
     shifted = Camera(width=40, height=30, fx=100.0, cx=0.0, cy=0.0, aperture_diameter=0.01)
     np.testing.assert_array_equal(pixel_directions(shifted)[0, 0], [0.0, 0.0, 1.0])
     assert shifted.horizontal_fov == pytest.approx(math.atan(0.395) + math.atan(0.005))
-
-
-def test_focusing_nearer_moves_the_image_plane_away_and_narrows_the_view():
-    """1/f = 1/image + 1/object: 20 mm focused at 0.1 m has its image at 25 mm."""
-    camera = Camera(width=10, height=10, focal_length=0.02, pixel_pitch_um=250.0, f_number=2.0, focus_distance=0.1)
-    assert camera.pixel_tangent == pytest.approx(250e-6 / 0.025)
-    far = Camera(width=10, height=10, focal_length=0.02, pixel_pitch_um=250.0, f_number=2.0, focus_distance=math.inf)
-    assert far.pixel_tangent == pytest.approx(250e-6 / 0.02)
 
 
 # Poses
@@ -108,28 +100,25 @@ def test_look_at_puts_the_point_on_the_axis_and_keeps_the_horizon():
     right, down = rotation_matrix(camera.rotation_deg).T[:2]
     assert right[1] == pytest.approx(0.0, abs=1e-12) and down[1] > 0
     assert look_at((0, 0, 0), (0, 0, 1)) == {"position": (0.0, 0.0, 0.0), "rotation_deg": pytest.approx((0, 0, 0))}
+
+
+def test_opencv_poses_take_a_vector_or_a_matrix():
+    assert opencv_pose((0, 0, 0), (1, 2, 3))["position"] == (-1.0, -2.0, -3.0)
+    for rotation, angle in (((0, 0, math.pi / 2), -90), (rotation_matrix((0, 0, 90)), -90)):
+        np.testing.assert_allclose(opencv_pose(rotation, (0, 0, 0))["rotation_deg"], (0, 0, angle), atol=1e-9)
+    for wrong, problem in (((0, 0), "3 numbers"), (np.diag([1, 1, -1]), "not a rotation matrix")):
+        with pytest.raises(ValueError, match=problem):
+            opencv_pose(wrong, (0, 0, 0))
     with pytest.raises(ValueError, match="no horizon"):
         look_at((0, 0, 0), (0, 3, 0))
 
 
-def test_opencv_poses_are_checked():
-    assert opencv_pose((0, 0, 0), (1, 2, 3))["position"] == (-1.0, -2.0, -3.0)
-    turned = opencv_pose((0, 0, math.pi / 2), (0, 0, 0))
-    np.testing.assert_allclose(turned["rotation_deg"], (0, 0, -90), atol=1e-9)
-    np.testing.assert_allclose(opencv_pose(rotation_matrix((0, 0, 90)), (0, 0, 0))["rotation_deg"], (0, 0, -90))
-    with pytest.raises(ValueError, match="not a rotation matrix"):
-        opencv_pose(np.diag([1, 1, -1]), (0, 0, 0))
-    with pytest.raises(ValueError, match="3 numbers"):
-        opencv_pose((0, 0), (0, 0, 0))
-
-
 # Calibration files
 
-_OPENCV_YAML = """%YAML:1.0
+_SIZE = "image_width: 64\nimage_height: 48\n"
+_OPENCV_YAML = f"""%YAML:1.0
 ---
-image_width: 64
-image_height: 48
-camera_matrix: !!opencv-matrix
+{_SIZE}camera_matrix: !!opencv-matrix
    rows: 3
    cols: 3
    dt: d
@@ -141,42 +130,25 @@ distortion_coefficients: !!opencv-matrix
    dt: d
    data: [ -2.8e-01, 0.07, 0., 0., -0.01 ]
 """
-_ROS_YAML = """image_width: 64
-image_height: 48
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [61.0, 0, 29.2, 0, 63.5, 25.1, 0, 0, 1]
-distortion_model: plumb_bob
-distortion_coefficients:
-  rows: 1
-  cols: 5
-  data: [-0.28, 0.07, 0, 0, -0.01]
-"""
-_OPENCV_JSON = """{"image_width": 64, "image_height": 48,
- "camera_matrix": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d",
-                   "data": [61.0, 0.0, 29.2, 0.0, 63.5, 25.1, 0.0, 0.0, 1.0]},
+_MATRICES = {"camera_matrix": "3 3 [61.0, 0, 29.2, 0, 63.5, 25.1, 0, 0, 1]"}
+_MATRICES["distortion_coefficients"] = "1 5 [-0.28, 0.07, 0, 0, -0.01]"
+_ROS_YAML = f"{_SIZE}distortion_model: plumb_bob\n" + "".join(
+    "{}:\n  rows: {}\n  cols: {}\n  data: {}\n".format(name, *text.split(" ", 2)) for name, text in _MATRICES.items()
+)
+_OPENCV_JSON = """{"image_width": 64, "image_height": 48, "camera_matrix": {"type_id": "opencv-matrix",
+  "rows": 3, "cols": 3, "dt": "d", "data": [61.0, 0.0, 29.2, 0.0, 63.5, 25.1, 0.0, 0.0, 1.0]},
  "distortion_coefficients": {"type_id": "opencv-matrix", "rows": 5, "cols": 1, "dt": "d",
                              "data": [-0.28, 0.07, 0.0, 0.0, -0.01]}}"""
 _PLAIN_JSON = '{"K": [[61.0, 0, 29.2], [0, 63.5, 25.1], [0, 0, 1]], "dist": [[-0.28, 0.07, 0, 0, -0.01, 0, 0, 0]]}'
-
-
 _OPENCV_XML = """<?xml version="1.0"?>
-<opencv_storage>
-<image_width>64</image_width>
-<image_height>48</image_height>
+<opencv_storage><image_width>64</image_width><image_height>48</image_height>
 <camera_matrix type_id="opencv-matrix">
-  <rows>3</rows>
-  <cols>3</cols>
-  <dt>d</dt>
+  <rows>3</rows><cols>3</cols><dt>d</dt>
   <data>
     61. 0. 29.2 0. 6.3500e+01 25.1 0.
     0. 1.</data></camera_matrix>
 <distortion_coefficients type_id="opencv-matrix">
-  <rows>1</rows>
-  <cols>5</cols>
-  <dt>d</dt>
-  <data>-0.28 0.07 0. 0. -0.01</data></distortion_coefficients>
+  <rows>1</rows><cols>5</cols><dt>d</dt><data>-0.28 0.07 0. 0. -0.01</data></distortion_coefficients>
 </opencv_storage>
 """
 
@@ -240,28 +212,23 @@ def test_calibrations_that_are_missing_or_too_long_are_refused_before_they_are_p
 def test_opencv_reads_our_calibration_and_we_read_opencvs(tmp_path, ending):
     cv2 = pytest.importorskip("cv2")
     camera = Camera(**INTRINSICS, distortion=LENSES["barrel"])
-    path = save_calibration(camera, tmp_path / f"camera{ending}")
-    again = Camera(calibration=str(path), aperture_diameter=camera.aperture_diameter)
-    assert again == camera
+    path, theirs = save_calibration(camera, tmp_path / f"camera{ending}"), tmp_path / f"theirs{ending}"
 
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    size = tuple(int(storage.getNode(f"image_{name}").real()) for name in ("width", "height"))
-    matrix, lens = (storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
+    size = {name: int(storage.getNode(name).real()) for name in ("image_width", "image_height")}
+    both = {name: storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients")}
     storage.release()
-    assert size == (camera.width, camera.height)
+    assert tuple(size.values()) == (camera.width, camera.height)
     points = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.5]])
-    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), *both.values())
     np.testing.assert_allclose(pixels[:, 0], image_points(camera, points[:, :2] / points[:, 2:]) - 0.5, atol=1e-9)
 
-    storage = cv2.FileStorage(str(tmp_path / f"theirs{ending}"), cv2.FILE_STORAGE_WRITE)
-    storage.write("calibration_time", "Mon 01 Jan 2024")
-    storage.write("image_width", camera.width)
-    storage.write("image_height", camera.height)
-    storage.write("camera_matrix", matrix)
-    storage.write("distortion_coefficients", lens)
+    storage = cv2.FileStorage(str(theirs), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"calibration_time": "Mon 01 Jan 2024", **size, **both}.items():
+        storage.write(name, value)
     storage.release()
-    theirs = Camera(calibration=str(tmp_path / f"theirs{ending}"), aperture_diameter=camera.aperture_diameter)
-    assert theirs == camera
+    for file in (path, theirs):
+        assert Camera(calibration=str(file), aperture_diameter=camera.aperture_diameter) == camera
 
 
 def test_files_beside_a_scene_are_found_from_anywhere(tmp_path):

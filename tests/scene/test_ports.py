@@ -11,9 +11,9 @@ from reference import refraction
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.scene import Scene
 from spadwarp.scene.port import air_indices, window_indices
+from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sections import PRESETS
 from spadwarp.scene.sight import depth_from_time, lines_of_sight, pixel_directions
-from spadwarp.values import ConfigError
 
 SEAWATER = WATER | {"phase_index": "seawater", "group_index": "seawater"}
 WINDOW = {"distance": 0.05, "thickness": 0.01, "material": "BK7"}
@@ -22,28 +22,20 @@ CAMERA = {"width": 12, "height": 10, "horizontal_fov_deg": 60.0, "aperture_diame
 
 
 def ported(port, laser_port=None, **sections):
-    laser = {"position": [0.01, 0.0, 0.0]} | ({} if laser_port is None else {"port": laser_port})
-    return scene(**{"medium": SEAWATER, "camera": CAMERA | {"port": port}, "laser": laser} | sections)
+    behind, laser = ({} if one is None else {"port": one} for one in (port, laser_port))
+    laser |= {"position": [0.01, 0.0, 0.0]}
+    return scene(**{"medium": SEAWATER, "camera": CAMERA | behind, "laser": laser} | sections)
 
 
-@pytest.mark.parametrize(
-    ("material", "wavelength", "index"),
-    [
-        ("BK7", 587.56, 1.51680),
-        ("BK7", 486.13, 1.52238),
-        ("fused silica", 589.29, 1.45840),
-        ("sapphire", 589.3, 1.76817),
-        ("acrylic", 587.6, 1.4906),
-        ("polycarbonate", 587.6, 1.5849),
-    ],
-)
+PUBLISHED = [("BK7", 587.56, 1.51680), ("BK7", 486.13, 1.52238), ("fused silica", 589.29, 1.45840)]
+PUBLISHED += [("sapphire", 589.3, 1.76817), ("acrylic", 587.6, 1.4906), ("polycarbonate", 587.6, 1.5849)]
+
+
+@pytest.mark.parametrize(("material", "wavelength", "index"), PUBLISHED)
 def test_indices_of_windows_are_those_of_their_sources(material, wavelength, index):
     found, group = window_indices(material, wavelength)
     assert found == pytest.approx(index, abs=2e-4)
-    step = 0.01
-    slope = (window_indices(material, wavelength + step)[0] - window_indices(material, wavelength - step)[0]) / (
-        2 * step
-    )
+    slope = np.subtract(*(window_indices(material, wavelength + step)[0] for step in (0.01, -0.01))) / 0.02
     assert group == pytest.approx(found - wavelength * slope, abs=1e-8)
 
 
@@ -53,30 +45,6 @@ def test_air():
     assert index - 1.0 == pytest.approx(2.7717e-4, rel=1e-3)
     slope = (air_indices(590.3)[0] - air_indices(588.3)[0]) / 2.0
     assert group == pytest.approx(index - 589.3 * slope, abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("port", "text"),
-    [
-        ({"thickness": 0.01, "material": "BK7"}, "camera.port needs distance with shape = 'flat'"),
-        ({"shape": "dome"}, "camera.port needs radius with shape = 'dome'"),
-        (WINDOW | {"radius": 0.1}, "camera.port.radius = 0.1 goes with shape = 'dome' only"),
-        (WINDOW | {"index": 1.5}, "camera.port needs either material or index"),
-        ({"distance": 0.05, "thickness": 0.01}, "camera.port needs material or index and a thickness > 0, or neither"),
-        (DOME | {"normal": [0.0, 0.1, 1.0]}, "normal = .* goes with shape = 'flat' only"),
-        (WINDOW | {"group_index": 1.6}, "camera.port.group_index = 1.6 goes with index only"),
-    ],
-)
-def test_what_is_no_port_is_refused_by_name(port, text):
-    with pytest.raises(ConfigError, match=text):
-        ported(port)
-
-
-def test_combinations_that_are_refused():
-    with pytest.raises(ConfigError, match=r"acrylic' is known for \[436.8, 1052\] nm, not for 355 nm"):
-        ported(DOME, laser={"wavelength_nm": 355.0})
-    with pytest.raises(ConfigError, match=r"scan.mode = 'confocal' behind a port needs laser.port"):
-        ported(WINDOW, scan={"mode": "confocal"})
 
 
 def test_presets_overrides_and_files_of_scenes():
@@ -101,53 +69,39 @@ CASES = {
 }
 
 
-def reference_paths(one, camera_port, laser_port, points):
-    """Path of light from the laser by each point to the lens [m of water], by rays that find their way in float64."""
-    total = np.zeros(len(points))
-    for port, place in ((laser_port, np.array(one.laser.position)), (camera_port, np.zeros(3))):
-        if port is None:
-            total += np.linalg.norm(points - place, axis=1)
-            continue
-        from spadwarp.scene.scene import camera_port as geometry_of
-
-        behind = geometry_of(one if camera_port is not None else one.with_overrides({"camera.port": port}))
-        normal = np.array(behind.normal)
-        flat = behind.shape == "flat"
-        faces = (
-            refraction.flat_faces(normal, behind.distance, behind.thickness)
-            if flat
-            else refraction.dome_faces(np.array(behind.centre), behind.radius, behind.thickness)
-        )
-        water = behind.group_index[2]
-        for k, point in enumerate(points):
-            start = place - point
-            _, _, lengths, _, _ = refraction.connect(
-                faces, behind.index[::-1], point, place, start / np.linalg.norm(start)
-            )
-            total[k] += lengths[0] + (lengths[1] * behind.group_index[1] + lengths[2] * behind.group_index[0]) / water
-    return total
+def reference_paths(one, port, place, points):
+    """Paths of light from points to a place behind the port [m of water], by rays that find their way in float64."""
+    if port is None:
+        return np.linalg.norm(points - place, axis=1)
+    behind, total = camera_port(one.with_overrides({"camera.port": port})), []
+    if behind.shape == "flat":
+        faces = refraction.flat_faces(np.array(behind.normal), behind.distance, behind.thickness)
+    else:
+        faces = refraction.dome_faces(np.array(behind.centre), behind.radius, behind.thickness)
+    for point in points:
+        start = place - point
+        lengths = refraction.connect(faces, behind.index[::-1], point, place, start / np.linalg.norm(start))[2]
+        total.append(np.dot(lengths, behind.group_index[::-1]) / behind.group_index[2])
+    return np.array(total)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_depth_of_a_plane_is_recovered_over_the_field(name):
     """Within 0.1 mm, from times of rays that know nothing of lines of sight."""
-    camera_port, laser_port = CASES[name]
-    one = ported(camera_port, laser_port)
-    if camera_port is None:
-        one = scene(medium=SEAWATER, camera=CAMERA, laser={"position": [0.01, 0.0, 0.0], "port": laser_port})
+    port, laser_port = CASES[name]
+    one = ported(port, laser_port)
     truth = spadwarp.truth_maps(one, device="cpu")
-    depth = truth.depth
-    assert np.nanmax(np.abs(depth - 2.2)) < 1e-5
+    depth = np.full(truth.depth.shape, 2.2)
+    assert np.nanmax(np.abs(truth.depth - 2.2)) < 1e-5
     lines = lines_of_sight(one)
-    points = lines.points(lines.range_from_depth(np.full(depth.shape, 2.2)))
+    points = lines.points(lines.range_from_depth(depth))
     assert points[..., 2] == pytest.approx(2.2)
-    assert truth.range == pytest.approx(lines.range_from_depth(np.full(depth.shape, 2.2)), rel=1e-6)
-    own = one.laser.port if isinstance(laser_port, str) else laser_port
-    own = camera_port if own == "camera" else own
-    path = reference_paths(one, camera_port, own, points.reshape(-1, 3)).reshape(depth.shape)
+    assert truth.range == pytest.approx(lines.range_from_depth(depth), rel=1e-6)
+    own = port if laser_port == "camera" else laser_port
+    ends = ((port, np.zeros(3)), (own, np.array(one.laser.position)))
+    path = sum(reference_paths(one, *end, points.reshape(-1, 3)) for end in ends).reshape(depth.shape)
     assert lines.path_from_range(truth.range.astype(np.float64)) == pytest.approx(path, abs=2e-6)
-    found = depth_from_time(path / one.medium.pulse_speed, scene=one)
-    assert np.abs(found - 2.2).max() < 1e-4
+    assert np.abs(depth_from_time(path / one.medium.pulse_speed, scene=one) - 2.2).max() < 1e-4
 
 
 def test_what_a_model_without_the_port_makes_of_its_times():
@@ -175,10 +129,7 @@ def test_a_lens_focuses_on_what_it_sees_through_the_port():
     (n_air, _), (n_glass, _) = one.camera.port.indices(532.0)
     expected = 0.05 + 0.01 * n_air / n_glass + 4.94 * n_air / 1.3415
     assert focus_distance(one, build_mesh(one)) == pytest.approx(expected, rel=1e-6)
-    assert (
-        math.isinf(focus_distance(ported(WINDOW, targets=[]), None))
-        or focus_distance(ported(WINDOW, targets=[]), None) > 1e5
-    )
+    assert focus_distance(ported(WINDOW, targets=[]), None) > 1e5
 
 
 def test_check_knows_the_port():

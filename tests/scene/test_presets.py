@@ -5,17 +5,21 @@ import pytest
 from spadwarp.scene import Camera, Medium, presets
 from spadwarp.water import pure_water_absorption
 
-MEDIA = presets("medium")
+PUBLISHED = {
+    **{"petzold-autec-8": 0.151, "petzold-haoce-11": 0.398, "petzold-nuc-2040": 2.190, "petzold-nuc-2240": 1.330},
+    **{"uwoc-pure-sea": 0.056, "uwoc-clear": 0.149, "uwoc-coastal": 0.304, "uwoc-harbour": 2.17},
+    **{"jerlov-IB-williamson": 0.177, "jerlov-5C-williamson": 1.376, "jerlov-I-solonenko": 0.0525},
+    **{"jerlov-III-solonenko": 1.0926, "jerlov-9C-solonenko": 3.714, "lu2024": 0.035},
+}
+TANKS = {"1.7m-1.2": 1.2, "1.7m-4.4": 4.4, "1.7m-5.7": 5.7, "3m-7.5": 7.5}  # attenuation lengths
 
 
 def test_every_preset_names_its_source():
     for name, preset in presets().items():
-        assert name == f"{preset.section}.{preset.name}"
-        assert len(preset.source) > 30
-        assert preset.values
+        assert name == f"{preset.section}.{preset.name}" and len(preset.source) > 30 and preset.values
 
 
-@pytest.mark.parametrize("name", sorted(MEDIA))
+@pytest.mark.parametrize("name", sorted(presets("medium")))
 def test_every_medium_adds_up_and_all_but_the_papers_absorb_as_pure_water_does_or_more(name):
     medium = Medium(preset=name)
     assert medium.absorption + medium.scattering == pytest.approx(medium.extinction, rel=1e-12)
@@ -24,50 +28,30 @@ def test_every_medium_adds_up_and_all_but_the_papers_absorb_as_pure_water_does_o
         assert medium.absorption >= pure_water_absorption(530.0)
 
 
+def test_extinctions_are_the_published_ones():
+    for name, extinction in PUBLISHED.items():
+        assert Medium(preset=name).extinction == pytest.approx(extinction, abs=1e-12), name
+    for name, lengths in TANKS.items():
+        distance = float(name.split("m-")[0])
+        assert Medium(preset=f"maccarone-{name}").extinction * distance == pytest.approx(lengths, abs=0.01), name
+
+
 @pytest.mark.parametrize(
-    ("name", "extinction"),
+    "series",
     [
-        ("petzold-autec-8", 0.151),
-        ("petzold-haoce-11", 0.398),
-        ("petzold-nuc-2040", 2.190),
-        ("petzold-nuc-2240", 1.330),
-        ("uwoc-pure-sea", 0.056),
-        ("uwoc-clear", 0.149),
-        ("uwoc-coastal", 0.304),
-        ("uwoc-harbour", 2.17),
-        ("jerlov-IB-williamson", 0.177),
-        ("jerlov-5C-williamson", 1.376),
-        ("jerlov-I-solonenko", 0.0525),
-        ("jerlov-III-solonenko", 1.0926),
-        ("jerlov-9C-solonenko", 3.714),
-        ("lu2024", 0.035),
+        "jerlov-{IB,II,III,1C,3C,5C}-williamson",
+        "jerlov-{I,IA,IB,II,III}-solonenko",
+        "jerlov-{1C,3C,5C,7C,9C}-solonenko",
     ],
 )
-def test_published_extinctions(name, extinction):
-    assert Medium(preset=name).extinction == pytest.approx(extinction, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("name", "lengths"), [("1.7m-1.2", 1.2), ("1.7m-4.4", 4.4), ("1.7m-5.7", 5.7), ("3m-7.5", 7.5)]
-)
-def test_the_tanks_attenuation_lengths(name, lengths):
-    distance = float(name.split("m-")[0])
-    assert Medium(preset=f"maccarone-{name}").extinction * distance == pytest.approx(lengths, abs=0.01)
-
-
-def test_water_gets_murkier_along_a_series():
-    for source, types in (
-        ("williamson", "IB II III 1C 3C 5C"),
-        ("solonenko", "I IA IB II III"),
-        ("solonenko", "1C 3C 5C 7C 9C"),
-    ):
-        series = [Medium(preset=f"jerlov-{name}-{source}").extinction for name in types.split()]
-        assert series == sorted(series)
+def test_water_gets_murkier_along_a_series(series):
+    before, types, after = series.replace("}", "{").split("{")
+    extinctions = [Medium(preset=f"{before}{one}{after}").extinction for one in types.split(",")]
+    assert extinctions == sorted(extinctions)
 
 
 def test_the_papers_camera_has_pixels_of_9_2_um_and_20_degrees():
     camera = Camera(preset="lu2024")
-    assert camera.focal_length is not None
     assert camera.focal_length * camera.pixel_tangent == pytest.approx(9.2e-6, rel=1e-3)
     assert camera.horizontal_fov_deg == 20.0
     assert camera.focal_length / (2 * camera.aperture_radius) == pytest.approx(2.0)

@@ -26,15 +26,13 @@ def test_holm_raises_each_p_by_the_hypotheses_left():
     assert holm([]) == []
 
 
-def test_z_of_few_batches_allows_for_their_uncertain_error():
+def test_z_allows_for_the_error_of_few_batches_and_for_a_rounded_reference():
     """Student's t of 3 with 7 degrees of freedom is as likely as a normal deviate of 2.327."""
     assert Quantity("", Estimate(3.0, 1.0, 7.0), 0.0).z == pytest.approx(2.327, abs=0.01)
     assert Quantity("", Estimate(3.0, 1.0), 0.0).z == 3.0
     assert Quantity("", Estimate(4.0, 3.0), -1.0, 4.0).z == 1.0  # both errors count
     assert two_sided_p(1.959964) == pytest.approx(0.05, abs=1e-7)
-
-
-def test_quantities_without_error_are_held_to_equality_and_a_rounded_reference_is_an_interval():
+    # Without an error: equality.
     assert Quantity("", Estimate(0.0, 0.0), 0.0).z == 0.0
     assert Quantity("", Estimate(1e-12, 0.0), 0.0).z == math.inf
     near, far = (Quantity("", Estimate(value, 0.1), 1.0, rounding=0.05) for value in (1.04, 0.75))
@@ -52,23 +50,25 @@ def test_means_in_blocks_are_those_of_the_whole():
 
 # The numbers that the cases are held to
 
+pytestmark = pytest.mark.physics
 
-@pytest.mark.physics
+
+def case_of(row):
+    return {"anisotropy": row.anisotropy, "albedo": row.albedo, "optical_depth": row.optical_depth}
+
+
 @pytest.mark.parametrize("row", references.SLABS, ids=lambda row: row.text)
 def test_slab_references(row):
-    solved = slab(anisotropy=row.anisotropy, albedo=row.albedo, optical_depth=row.optical_depth)
+    solved = slab(**case_of(row))
     assert (row.reflected, row.transmitted) == pytest.approx((solved.reflected, solved.transmitted), abs=6e-9)
 
 
-@pytest.mark.physics
 @pytest.mark.slow
 @pytest.mark.parametrize("row", references.SLAB_DERIVATIVES[1::3], ids=lambda row: row.text)
 def test_slab_derivative_references(row):
-    solved = slab_derivatives(anisotropy=row.anisotropy, albedo=row.albedo, optical_depth=row.optical_depth)
-    np.testing.assert_allclose([row.reflected, row.transmitted], solved, atol=6e-9)
+    np.testing.assert_allclose([row.reflected, row.transmitted], slab_derivatives(**case_of(row)), atol=6e-9)
 
 
-@pytest.mark.physics
 @pytest.mark.slow
 @pytest.mark.parametrize("row", references.STACKS, ids=lambda row: row.text)
 def test_stack_references(row):
@@ -76,30 +76,26 @@ def test_stack_references(row):
     assert (row.reflected, row.transmitted) == pytest.approx(solved, abs=6e-9)
 
 
-@pytest.mark.physics
-def test_exit_cosine_references():
+def test_exit_cosine_and_time_resolved_references():
     for row, face, fractions in references.EXIT_COSINES:
-        case = {"anisotropy": row.anisotropy, "albedo": row.albedo, "optical_depth": row.optical_depth}
-        both = exit_cosine_fractions(**case, edges=references.EXIT_COSINE_EDGES)
+        both = exit_cosine_fractions(**case_of(row), edges=references.EXIT_COSINE_EDGES)
         np.testing.assert_allclose(fractions, both[face == "exit_z_high"], atol=6e-9)
-
-
-@pytest.mark.physics
-def test_time_resolved_references():
     medium, edges = references.TIME_RESOLVED_MEDIUM, references.TIME_RESOLVED_EDGES
     until = [0.0, *(cumulative_reflectance(path, **medium, nodes=24) for path in edges[1:])]
     np.testing.assert_allclose(references.TIME_RESOLVED, np.diff(until), atol=2e-8)
 
 
-@pytest.mark.physics
-def test_moment_references():
+def test_moment_and_fluence_references():
     fixed = after_path(5.0, scattering=1.0, anisotropy=0.0)
     collided = after_collisions(5, extinction=1.0, anisotropy=0.924)
     assert pytest.approx((fixed.z, fixed.r2), abs=6e-7) == references.AFTER_PATH
     assert pytest.approx((collided.z, collided.r2, collided.cos_theta), abs=6e-7) == references.AFTER_COLLISIONS
+    path = references.FLUENCE_PATH
+    inside = isotropic_radial_cdf(references.FLUENCE_EDGES[1:-1], path=path, scattering=1.0)
+    fractions = np.diff([0.0, *inside, 1.0]) * math.exp(-references.FLUENCE_ABSORPTION * path)
+    np.testing.assert_allclose(references.FLUENCE, fractions, atol=2e-7)
 
 
-@pytest.mark.physics
 @pytest.mark.slow
 def test_references_of_the_rules_that_bias():
     for threshold, cosine in references.NEAR_AXIS.items():
@@ -112,35 +108,19 @@ def test_references_of_the_rules_that_bias():
         assert everything - lost == pytest.approx(reflected, abs=2e-7)
 
 
-@pytest.mark.physics
-def test_fluence_references():
-    path = references.FLUENCE_PATH
-    inside = isotropic_radial_cdf(references.FLUENCE_EDGES[1:-1], path=path, scattering=1.0)
-    fractions = np.diff([0.0, *inside, 1.0]) * math.exp(-references.FLUENCE_ABSORPTION * path)
-    np.testing.assert_allclose(references.FLUENCE, fractions, atol=2e-7)
-
-
-@pytest.mark.physics
-def test_single_scatter_references():
-    lidar = Lidar()
+def test_single_scatter_and_lambertian_references():
     for name, (rows, columns, fractions) in references.SINGLE_SCATTER.items():
         if name == "whole field":
-            expected = single_scatter_total(lidar)
+            expected = single_scatter_total(Lidar())
         else:
-            where = {"rows": np.r_[rows], "columns": np.r_[columns]}
-            expected = single_scatter(lidar, **where, order=32).sum(axis=(0, 1))
+            expected = single_scatter(Lidar(), rows=np.r_[rows], columns=np.r_[columns], order=32).sum(axis=(0, 1))
         np.testing.assert_allclose(fractions, expected, rtol=5e-5, atol=1e-20)
-
-
-@pytest.mark.physics
-def test_lambertian_references():
     lidar = Lidar(laser_position=(0.1, -0.05, 0.0), half_angle=math.radians(10.0))
     image = lambertian_plane(lidar, depth=5.0, reflectance=0.5)
     for rows, columns, fraction in references.LAMBERTIAN.values():
         assert fraction == pytest.approx(image[rows, columns].sum(), rel=1e-7)
 
 
-@pytest.mark.physics
 @pytest.mark.slow
 def test_fournier_forand_references():
     """The mean of 1 − cosθ is the integral of what lies above it."""
@@ -161,7 +141,7 @@ def test_fournier_forand_references():
 # The cases
 
 
-LONG = {"ledger", "mean-path", "white-vessel"}  # trace most
+LONG = {"ledger", "mean-path", "white-vessel"}  # trace most; the command's tests run the first
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +150,6 @@ def results():
     return run([name for name in CASES if name not in LONG], photons=10_000, seed=3, device="cpu")
 
 
-@pytest.mark.physics
 @pytest.mark.slow
 def test_engine_agrees_with_every_reference(results):
     failed = [f"{r.quantity}: {r.value} against {r.reference}, z {r.z:.1f}" for r in results if not r.passed]
@@ -178,22 +157,15 @@ def test_engine_agrees_with_every_reference(results):
     assert {r.name for r in results} == set(CASES) - LONG
 
 
-@pytest.mark.physics
 def test_deviations_are_standard_normal(results):
     """Too small an error would make them wide, too large a one narrow."""
     z = np.array([r.z for r in results if r.standard_error > 0])
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25
 
 
-@pytest.mark.physics
-def test_a_table_of_henyey_greenstein_passes_as_well():
-    cases = ["slab", "near-axis", "single-scatter", "layers"]
-    assert all(r.passed for r in run(cases, photons=10_000, seed=8, device="cpu", tabulated=True))
-
-
-@pytest.mark.physics
-def test_ledger_and_closed_walls():
-    assert all(r.passed for r in run(["ledger", "mean-path"], photons=1000, seed=4, device="cpu"))
+def test_a_table_of_henyey_greenstein_and_the_mean_path_pass_as_well():
+    found = run(["near-axis", "single-scatter"], photons=10_000, seed=8, device="cpu", tabulated=True)
+    assert all(r.passed for r in [*found, *run(["mean-path"], photons=1000, seed=4, device="cpu")])
 
 
 def test_wrong_physics_fails(monkeypatch):
@@ -211,7 +183,6 @@ def test_one_seed_gives_one_result():
     assert all(a.value != b.value for a, b in zip(first, other, strict=True))
 
 
-@pytest.mark.physics
 def test_reports(results, tmp_path):
     plain = json.loads(json_text(report(results, photons=10_000, seed=3)))
     assert plain["passed"] is True and len(plain["results"]) == len(results)
