@@ -350,8 +350,10 @@ class Fitter:
                 raise ArgumentError(f"prior: {name} is not an unknown of the whole exposure; these are {known}")
             if not (isinstance(pair, tuple | list) and len(pair) == 2):
                 raise ArgumentError(f"prior of {name} = {pair!r} is not (mean, standard deviation)")
-            mean = check_real(f"prior of {name}: mean", pair[0])
-            result[name] = (mean, check_real(f"prior of {name}: standard deviation", pair[1], "(0, inf)"))
+            mean = check_real(f"prior of {name}: mean", pair[0], "[-1e12, 1e12]")
+            if name == DEPTH:  # a shift is searched
+                mean -= _middle_depth(truth_maps(self.scene, device=self.device).depth)
+            result[name] = (mean, check_real(f"prior of {name}: standard deviation", pair[1], "[1e-12, 1e12]"))
         return result
 
     def fit(
