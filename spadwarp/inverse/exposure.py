@@ -159,7 +159,10 @@ def _check_countable(counts: NDArray[np.int64], pulses: int, detector: Detector,
         mode = f"a dead time of {detector.dead_time_ns:g} ns"
         of_pixel, of_bin = 1 + int(edges[-1] / dead_time), 1 + np.floor(np.diff(edges) / dead_time)
     pixel, most = counts.sum(axis=1), counts.max(axis=0)
-    for found, limit, part in ((pixel.max(), of_pixel, "pixel"), (most[(k := np.argmax(most / of_bin))], of_bin[k], "bin")):
+    for found, limit, part in (
+        (pixel.max(), of_pixel, "pixel"),
+        (most[(k := np.argmax(most / of_bin))], of_bin[k], "bin"),
+    ):
         if found > limit * pulses:
             raise ArgumentError(
                 f"{name}: {found} counts of one {part} in {pulses} pulses; {mode} has at most {limit * pulses:.0f}"

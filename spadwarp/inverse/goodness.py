@@ -9,24 +9,25 @@ of all pixels together and over the pixels with all bins together: the sums see 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.inverse.equations import Moments, Rows, Solution, pseudo_inverse
 from spadwarp.values import percent
 
 __all__ = ["Deviance", "Goodness"]
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.float32]
 
 _ENOUGH = 5.0  # counts that a cell expects: then noise of its mean is small against the mean
 _BAD = 1e-3  # p-value
 _LEAST = 1e-12  # mean counts of the table
-PARTS, COMPONENTS = ("pixels and bins", "time", "image"), ("target", "water", "noise")
+_TURNS = 30  # of an iteration for the amount of light
+COMPONENTS = ("target", "water", "noise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +85,9 @@ class Goodness:
     def summary(self) -> str:
         """One line."""
         name, worst = min(self.parts.items(), key=lambda item: item[1].p)
-        text = f"deviance of {name} {worst.deviance:.4g}, expected {worst.expected:.4g} ± {worst.standard_deviation:.2g}"
+        text = (
+            f"deviance of {name} {worst.deviance:.4g}, expected {worst.expected:.4g} ± {worst.standard_deviation:.2g}"
+        )
         return f"{text}, p = {self.p:.2g}"
 
     def warnings(self) -> list[str]:
@@ -102,32 +105,54 @@ class Goodness:
         ]
 
 
-def goodness(
-    counts: NDArray[np.integer], mean: Rows, variance: Rows, batches: Sequence[Rows], lowered: Floats, parts: Sequence[Rows]
+class Lost(NamedTuple):
+    """What fitted unknowns take of the deviance: tr(A F), with F the information of cells by two independent slopes."""
+
+    shared: Sequence[Floats]  # two slopes of the mean by the unknowns of all pixels, [S, pixel, bin]
+    own: Sequence[Floats]  # by those of each pixel, [Q, pixel, bin]
+    matrix: Floats  # A, [S, S]
+    own_matrix: Floats  # [pixel, Q, Q]
+
+    def of(self, mean: Floats, add_up: Callable[[Any], Any], pixel: NDArray[np.intp] | None) -> float:
+        """Of cells with a `mean`, of which `add_up` makes sums of `[…, pixel, bin]`; without `pixel` of all together."""
+        left, right = map(add_up, self.shared)
+        loss = float(np.einsum("ic,jc,ij->", left / mean, right, self.matrix, optimize=True))
+        most = len(self.matrix)
+        if pixel is not None and len(self.own[0]):
+            left, right = map(add_up, self.own)
+            loss += float(np.einsum("ic,jc,cij->", left / mean, right, self.own_matrix[pixel], optimize=True))
+            most += self.own_matrix[..., 0].size
+        return min(max(loss, 0.0), float(most))
+
+
+def goodness_of(
+    counts: NDArray[np.integer], mean: Rows, variance: Rows, batches: Sequence[Rows], lost: Lost, parts: Sequence[Rows]
 ) -> Goodness:
     """Goodness of a fit from counts `[H, W, T]`.
 
     Args:
         counts, mean, variance: Of the fitted model, float32 `[pixel, bin]`.
         batches: The mean by each batch of photons of it.
-        lowered: By how much the fitted unknowns lower the expected deviance of `parts`, in their order.
-        parts: Of the mean of light of the targets, of water and of noise.
+        lost: To the fitted unknowns.
+        parts: Of the mean, in the order of `COMPONENTS`.
     """
     image, rows = counts.shape[:2], counts.reshape(mean.shape)
-    pieces = np.stack([mean, variance, *batches, *parts]).astype(np.float64)
-    number = 2 + len(batches)
+    pieces, number = np.stack([mean, variance, *batches, *parts]).astype(np.float64), 2 + len(batches)
     first, pixel = _cells(pieces[0])
-    sums = np.add.reduceat(pieces.reshape(len(pieces), -1), first, axis=1)
-    cells = _Cells(np.add.reduceat(rows.ravel(), first), sums[:number])
-    in_time, of_image = pieces[:number].sum(axis=1), pieces[:number].sum(axis=2)
-    first = _cells(in_time[:1])[0]
-    time = _Cells(np.add.reduceat(rows.sum(axis=0), first), np.add.reduceat(in_time, first, axis=1))
-    found = dict(zip(PARTS, (cells, time, _Cells(rows.sum(axis=1), of_image)), strict=True))
-    deviances = {name: one.deviance(loss) for (name, one), loss in zip(found.items(), lowered, strict=True)}
+    first_time, _ = _cells(pieces[:1].sum(axis=1).reshape(1, -1))
+    ways: dict[str, tuple[Callable[[Any], Any], Any]] = {
+        "pixels and bins": (lambda x: np.add.reduceat(x.reshape(*x.shape[:-2], -1), first, axis=-1), pixel),
+        "time": (lambda x: np.add.reduceat(x.sum(axis=-2), first_time, axis=-1), None),
+        "image": (lambda x: x.sum(axis=-1), np.arange(len(rows))),
+    }
+    sums = ways["pixels and bins"][0](pieces)
+    found = {name: _Cells(add_up(rows), add_up(pieces[:number])) for name, (add_up, _) in ways.items()}
+    deviances = {name: one.deviance(lost.of(one.mean, *ways[name])) for name, one in found.items()}
+    cells = found["pixels and bins"]
     kinds = np.argmax(sums[number:], axis=0)
     excess, variances = (np.bincount(pixel, x) for x in (cells.each - cells.expected, cells.variance))
     # Cells are parts of pixels: what they have beyond these is independent of it.
-    whole, per_pixel = deviances[PARTS[0]], deviances["image"]
+    whole, per_pixel = deviances["pixels and bins"], deviances["image"]
     within = (getattr(whole, name) - getattr(per_pixel, name) for name in ("deviance", "expected", "variance"))
     known = [p for p in (_tail(*within), deviances["time"].p, per_pixel.p) if not np.isnan(p)]
     beyond = deviances["time"].deviance - deviances["time"].expected
@@ -149,12 +174,24 @@ def _cells(mean: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return first, first // mean.shape[1]
 
 
+def significance(counts: NDArray[np.integer], mean: Rows, light: Rows) -> Floats:
+    """Significance of light in counts, in standard deviations `[row]`, from the likelihood with as much of it as is
+    likeliest, over that without. `mean`, and the part of it that is `light`: `[row, bin]`."""
+    rest, total = np.maximum(mean - light, 1e-9).astype(np.float64), light.sum(axis=1, dtype=np.float64)
+    amount = np.ones((len(mean), 1))
+    for _ in range(_TURNS):  # expectation maximisation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            amount *= np.nan_to_num((counts * light / (rest + amount * light)).sum(axis=1) / total)[:, None]
+    ratio = 2.0 * (counts * np.log1p(amount * light / rest)).sum(axis=1) - 2.0 * amount[:, 0] * total
+    return np.sqrt(np.maximum(ratio, 0.0))
+
+
 class _Cells:
     """Counts of cells with the pieces mean, variance and batches of the mean, and the moments of their deviances."""
 
     def __init__(self, counts: NDArray[np.integer], pieces: Floats) -> None:
         self.counts, self.pieces, self.number = counts, pieces, len(pieces) - 2
-        mean = np.maximum(pieces[0], _LEAST)
+        self.mean = mean = np.maximum(pieces[0], _LEAST)
         self.each = 2.0 * (counts * np.log(np.maximum(counts, 1) / mean) * (counts > 0) - counts + mean)
         noise, share = pieces[2:].var(axis=0, ddof=1) / self.number, pieces[1] / mean
         first, second, bend = _poisson_moments(mean)
