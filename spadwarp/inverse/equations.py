@@ -288,7 +288,7 @@ def solve(
 
 
 def _of_batches(parts: Sequence[Floats], mixing: Floats, own: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Covariance of the scores of the shared unknowns and of those of each pixel, from batches `[batch, pixel, unknown]`
+    """Covariance of the scores of the shared unknowns and of each pixel's own, from batches `[batch, pixel, unknown]`
     less their means, of two halves; the score has half of each one's mean."""
     shared, pixels = np.zeros((mixing.shape[1],) * 2), np.zeros((len(mixing), own.size, own.size))
     for part in parts:

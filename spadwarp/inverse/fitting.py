@@ -425,9 +425,12 @@ class Fitter:
             self.law.slopes(half.batches[0], half.slopes[0].transpose(1, 0, 2), trials) * scales for half in halves
         ]
         shared, own = ([self.unknowns.index(unknown) for unknown in some] for some in (self.shared, self.own))
-        both = [[side[:, of].transpose(1, 0, 2) for side in slopes] for of in (shared, own)]
-        known = 2.0 * pseudo_inverse(solution.information) - solution.covariance
-        return Lost(*both, known, np.nan_to_num(2.0 * solution.pixel_bound - solution.pixel_covariance))
+        return Lost(
+            [side[:, shared].transpose(1, 0, 2) for side in slopes],
+            [side[:, own].transpose(1, 0, 2) for side in slopes],
+            2.0 * pseudo_inverse(solution.information) - solution.covariance,
+            np.nan_to_num(2.0 * solution.pixel_bound - solution.pixel_covariance),
+        )
 
     def _forget_unseen(self, expected: Rows, target: Rows, solution: Solution) -> list[str]:
         """Makes NaN of the solution's variances where the counts hold no light that depends on an unknown; returns the
@@ -436,7 +439,7 @@ class Fitter:
         assert counts is not None
         on_targets = [unknown.name == DEPTH or unknown.name.startswith("targets") for unknown in self.unknowns]
         if any(on_targets):
-            whole = significance(*(rows.reshape(1, -1) for rows in (counts, expected, target)))[0]
+            whole = significance(counts.reshape(1, -1), expected.reshape(1, -1), target.reshape(1, -1))[0]
             each = significance(counts, expected, target)
         for unknown, on_target in zip(self.unknowns, on_targets, strict=True):
             if unknown.per_pixel:

@@ -1,9 +1,9 @@
 """Whether a fit describes its counts: their deviance, and what it is in the mean if the fitted model is right.
 
-The deviance of counts n with mean m is D = 2 Σ [n ln(n/m) − n + m]. Where counts are few it is far from χ²: its mean and
-variance are sums over the Poisson distribution, for binomial counts times v/m and its square. Fitted unknowns lower the
-mean, the noise of the simulation in m raises it; both are computed. D is taken over all pixels and bins, over the bins
-of all pixels together and over the pixels with all bins together: the sums see what is small in each pixel.
+The deviance of counts n with mean m is D = 2 Σ [n ln(n/m) − n + m]. Of few counts it is not χ²: its mean and variance
+are sums over the Poisson distribution, for binomial counts times v/m and its square. Fitted unknowns lower the mean,
+noise of the simulation raises it, and both are computed. Besides that of all pixels and bins, there is one of the sums
+over the pixels and one of those over time: they see what is small in each pixel and bin.
 """
 
 from __future__ import annotations
@@ -47,10 +47,8 @@ class Deviance:
     p: float
     counts: int
 
-    @property
-    def variance(self) -> float:
-        """Square of `standard_deviation`."""
-        return self.standard_deviation**2
+    def __str__(self) -> str:
+        return f"{self.deviance:.4g}, expected {self.expected:.4g} ± {self.standard_deviation:.2g}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,23 +83,16 @@ class Goodness:
     def summary(self) -> str:
         """One line."""
         name, worst = min(self.parts.items(), key=lambda item: item[1].p)
-        text = (
-            f"deviance of {name} {worst.deviance:.4g}, expected {worst.expected:.4g} ± {worst.standard_deviation:.2g}"
-        )
-        return f"{text}, p = {self.p:.2g}"
+        return f"deviance of {name} {worst}, p = {self.p:.2g}"
 
     def warnings(self) -> list[str]:
         """The sentence on a bad fit."""
         if not self.is_bad:
             return []
-        shares = ", ".join(
-            f"{name} {one.deviance:.4g} ({one.expected:.4g} ± {one.standard_deviation:.2g} expected)"
-            for name, one in self.components.items()
-        )
+        shares = ", ".join(f"of {name} {one}" for name, one in self.components.items())
         return [
-            f"bad fit: {self.summary()}; the counts differ from it by {percent(self.misfit)} % beyond their noise. The "
-            f"scene is not that of the counts, and the standard errors do not contain what is wrong. Deviance by "
-            f"component: {shares}"
+            f"bad fit: {self.summary()} ({shares}): the counts differ from the fit by {percent(self.misfit)} % of them "
+            "beyond noise. The scene is not that of the counts; the standard errors do not contain what is wrong"
         ]
 
 
@@ -114,7 +105,7 @@ class Lost(NamedTuple):
     own_matrix: Floats  # [pixel, Q, Q]
 
     def of(self, mean: Floats, add_up: Callable[[Any], Any], pixel: NDArray[np.intp] | None) -> float:
-        """Of cells with a `mean`, of which `add_up` makes sums of `[…, pixel, bin]`; without `pixel` of all together."""
+        """Of cells with a `mean`, into which `add_up` adds `[…, pixel, bin]`; without `pixel` each has them all."""
         left, right = map(add_up, self.shared)
         loss = float(np.einsum("ic,jc,ij->", left / mean, right, self.matrix, optimize=True))
         most = len(self.matrix)
@@ -141,7 +132,7 @@ def goodness_of(
     first, pixel = _cells(pieces[0])
     first_time, _ = _cells(pieces[:1].sum(axis=1).reshape(1, -1))
     ways: dict[str, tuple[Callable[[Any], Any], Any]] = {
-        "pixels and bins": (lambda x: np.add.reduceat(x.reshape(*x.shape[:-2], -1), first, axis=-1), pixel),
+        "pixels and bins": (lambda x: np.add.reduceat(x.reshape(*x.shape[:-2], rows.size), first, axis=-1), pixel),
         "time": (lambda x: np.add.reduceat(x.sum(axis=-2), first_time, axis=-1), None),
         "image": (lambda x: x.sum(axis=-1), np.arange(len(rows))),
     }
@@ -153,8 +144,12 @@ def goodness_of(
     excess, variances = (np.bincount(pixel, x) for x in (cells.each - cells.expected, cells.variance))
     # Cells are parts of pixels: what they have beyond these is independent of it.
     whole, per_pixel = deviances["pixels and bins"], deviances["image"]
-    within = (getattr(whole, name) - getattr(per_pixel, name) for name in ("deviance", "expected", "variance"))
-    known = [p for p in (_tail(*within), deviances["time"].p, per_pixel.p) if not np.isnan(p)]
+    within = _tail(
+        whole.deviance - per_pixel.deviance,
+        whole.expected - per_pixel.expected,
+        whole.standard_deviation**2 - per_pixel.standard_deviation**2,
+    )
+    known = [p for p in (within, deviances["time"].p, per_pixel.p) if not np.isnan(p)]
     beyond = deviances["time"].deviance - deviances["time"].expected
     return Goodness(
         p=float(-np.expm1(len(known) * np.log1p(-min(known)))) if known and min(known) < 1.0 else 1.0,
@@ -169,8 +164,7 @@ def _cells(mean: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Neighbouring bins that together expect enough counts: the first of each in a flat `[pixel, bin]`, its pixel."""
     total = mean.sum(axis=1, keepdims=True)
     cell = np.minimum((np.cumsum(mean, axis=1) - mean) // _ENOUGH, np.maximum(total // _ENOUGH - 1.0, 0.0))
-    starts = np.diff(cell, axis=1, prepend=-1.0) > 0
-    first = np.flatnonzero(starts)
+    first = np.flatnonzero(np.diff(cell, axis=1, prepend=-1.0) > 0)
     return first, first // mean.shape[1]
 
 
@@ -193,10 +187,10 @@ class _Cells:
         self.counts, self.pieces, self.number = counts, pieces, len(pieces) - 2
         self.mean = mean = np.maximum(pieces[0], _LEAST)
         self.each = 2.0 * (counts * np.log(np.maximum(counts, 1) / mean) * (counts > 0) - counts + mean)
-        noise, share = pieces[2:].var(axis=0, ddof=1) / self.number, pieces[1] / mean
-        first, second, bend = _poisson_moments(mean)
-        self.expected = share * first + noise / mean * bend
-        self.variance = share**2 * second + 4.0 * share * noise / mean
+        noise, share = pieces[2:].var(axis=0, ddof=1) / self.number / mean, pieces[1] / mean
+        nodes, first, second = _poisson_table()
+        self.expected = share * np.interp(np.log(mean), nodes, first) + noise
+        self.variance = share**2 * np.interp(np.log(mean), nodes, second) + 4.0 * share * noise
 
     def of(self, chosen: NDArray[np.bool_]) -> _Cells:
         """Some of them."""
@@ -224,29 +218,13 @@ def _tail(deviance: float, expected: float, variance: float) -> float:
     return float(gamma.sf(deviance, expected**2 / variance, scale=variance / expected))
 
 
-def _poisson_moments(mean: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean and variance of the deviance of a Poisson count, and by how much the variance of its mean, over the mean,
-    raises D − E[D]."""
-    nodes, *tables = _poisson_table()
-    low, high = np.log(np.clip(mean, _LEAST, nodes[-1])), 1.0 / np.maximum(mean, nodes[-1])
-    beyond = (1.0 + high / 6.0, 2.0 + 2.0 * high / 3.0, 1.0 + 0.0 * high)
-    first, second, bend = (
-        np.where(mean > nodes[-1], far, np.interp(low, np.log(nodes), table))
-        for far, table in zip(beyond, tables, strict=True)
-    )
-    return first, second, bend
-
-
 @functools.cache
-def _poisson_table() -> tuple[Floats, ...]:
-    """Means, and of each the sums over the Poisson distribution."""
+def _poisson_table() -> tuple[Floats, Floats, Floats]:
+    """Logarithms of means, and of the deviance of a Poisson count mean and variance: sums over the distribution."""
     from scipy.special import gammaln
 
-    nodes, n = np.geomspace(_LEAST, 50.0, 800)[:, None], np.arange(160)
+    nodes, n = np.geomspace(_LEAST, 1e3, 800)[:, None], np.arange(1400)
     weights = np.exp(n * np.log(nodes) - nodes - gammaln(n + 1.0))
-    logarithm = n * np.log(np.maximum(n, 1))
-    each = 2.0 * (logarithm - n * np.log(nodes) - n + nodes)
-    first = (weights * each).sum(axis=1)
-    second = (weights * (each - first[:, None]) ** 2).sum(axis=1)
-    bend = 2.0 - nodes[:, 0] * (weights[:, :-2] @ np.diff(logarithm, 2))
-    return nodes[:, 0], first, second, bend
+    each = 2.0 * (n * np.log(np.maximum(n, 1) / nodes) - n + nodes)
+    mean = (weights * each).sum(axis=1)
+    return np.log(nodes[:, 0]), mean, (weights * (each - mean[:, None]) ** 2).sum(axis=1)

@@ -118,8 +118,7 @@ class Renderer:
         return groups
 
     def light(self, values: Values, *, photons: int, batches: int) -> tuple[list[Rows], list[Rows]]:
-        """λ of batches of so many photons each; and the parts of their mean that are light of the targets, of the water,
-        and noise."""
+        """λ of batches of so many photons each, and the parts of their mean: light of targets, of the water, noise."""
         scene = self._at(values)
         tracer = self._tracer(scene, photons, (), separate_targets=True)
         self.truth = tracer.truth
@@ -265,7 +264,7 @@ class _PlacedReceiver(NamedTuple):
     def target(self, light: ExpectedLight) -> Rows:
         """The part of λ that is light of the targets."""
         target: Rows = self.receiver.slope(light.target).numpy()
-        return target if self.delay is None else subbin_shift(target, self.delay) * self.factor[:, None]  # type: ignore
+        return target if self.delay is None else subbin_shift(target, self.delay) * self.factor[:, None]  # type: ignore[index]
 
     def noise(self) -> Rows:
         """The part of λ that is dark counts and ambient light, `[pixel, bin]`."""
