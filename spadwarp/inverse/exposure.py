@@ -111,11 +111,11 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
             f"{name}: bins of {width * 1e12:g} ps; the scene's gate.bin_width_ps, {gate.bin_width_ps:g}, has to be that"
         )
     window = Window.of(scene.detector, scene.laser, (start, cube.shape[1]), gate.bin_width, widths)
-    if widths is None and not isinstance(counts, Frames | FramesFile | Histograms):
+    _check_countable(cube, pulses * frames, scene.detector, window, name)
+    if not isinstance(counts, Frames | FramesFile | Histograms):
         gated = Window.of(scene.detector, scene.laser, (start, gate.bins), gate.bin_width, None).recorded
         if cube.shape[1] != gated:
             raise ArgumentError(f"{name}: {cube.shape[1]} bins; the detector has {gated} in the scene's gate")
-    _check_countable(cube, pulses * frames, scene.detector, window, name)
     return Exposure(
         counts=cube,
         pulses=pulses * frames,
