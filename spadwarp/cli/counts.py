@@ -290,6 +290,7 @@ def fit(
             for one in found.estimates.values()
         )
     lines = {f"{name} of each pixel": _of_pixels(one) for name, one in found.maps.items()}
+    lines["goodness of fit"] = found.goodness.summary()
     lines["counts"] = f"{count(found.counts.sum())} of {count(found.pulses)} pulses"
     lines["fit"] = (
         f"{'converged' if found.converged else 'not converged'} after {len(found.iterations)} renderings of "

@@ -79,6 +79,8 @@ class Equations:
     noise: Floats  # Σ w w v, its covariance by the counts, [pixel, unknown, unknown]
     simulation: list[Floats]  # Σ w m of batches of photons less their mean, of two halves [batch, pixel, unknown]
     weights: Rows  # the mean of both halves', float32 [pixel, unknown, bin], in units of the scene
+    # Σ w dm of batches less their mean, of two halves [batch, pixel, unknown, unknown].
+    slope_batches: Sequence[Floats] = ()
 
 
 class Moments:
@@ -101,21 +103,22 @@ class Moments:
         self.law, self.limits, self.image = law, limits, image
         self.rates = 0.5 * (halves[0].rates + halves[1].rates)
         self.trials = law.planned(self.rates, pulses) if trials is None else trials
-        pixels, unknowns = self.rates.shape[0], halves[0].slopes.shape[0]
+        pixels, unknowns = self.rates.shape[0], halves[0].slopes[0].shape[0]
 
         def rows() -> Rows:
             return np.empty((pixels, law.recorded), np.float32)
 
         self.variance = rows()
-        self.slopes = [np.empty((pixels, unknowns, law.recorded), np.float32) for _ in halves]
+        self.slopes = [[np.empty((pixels, unknowns, law.recorded), np.float32) for _ in half.slopes] for half in halves]
         self.batches = [[rows() for _ in half.batches] for half in halves]
         self.rest = None if counts is None else [rows(), rows()]  # counts less their mean
 
         def part(chosen: slice) -> None:
             trials = self.trials[chosen]
             for i, half in enumerate(halves):
-                slopes = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
-                self.slopes[i][chosen] = law.slopes(half.batches[0][chosen], slopes, trials)
+                for batch, rates, by_unknowns in zip(self.slopes[i], half.batches, half.slopes, strict=False):
+                    slopes = np.ascontiguousarray(by_unknowns[:, chosen].transpose(1, 0, 2))
+                    batch[chosen] = law.slopes(rates[chosen], slopes, trials)
                 for mean, rates in zip(self.batches[i], half.batches, strict=True):
                     mean[chosen] = law.mean(rates[chosen], trials)
                 if self.rest is not None and counts is not None:
@@ -130,16 +133,17 @@ class Moments:
         `cells`: of each unknown the rows, columns and bins over which its weights are averaged. Any weights give
         equations that are right in the mean; noisy ones are less precise. `scales` `[pixel, unknown]`: its unit.
         """
-        pixels, unknowns = self.slopes[0].shape[:2]
-        score, slope = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
-        noise = np.zeros_like(slope)
+        pixels, unknowns = self.slopes[0][0].shape[:2]
+        score, noise = np.zeros((pixels, unknowns)), np.zeros((pixels, unknowns, unknowns))
         simulation = [np.zeros((len(batches), pixels, unknowns)) for batches in self.batches]
+        slopes = [np.zeros((len(batches), pixels, unknowns, unknowns)) for batches in self.slopes]
         mean_weights = np.empty((pixels, unknowns, self.law.recorded), np.float32)
         weights = [self._weights(i, cells) for i in (0, 1)]
 
         def part(chosen: slice) -> None:
             for i, weight in enumerate(half[chosen] for half in weights):
-                slope[chosen] += 0.5 * np.matmul(weight, self.slopes[1 - i][chosen].transpose(0, 2, 1))
+                for batch, by_unknowns in enumerate(self.slopes[1 - i]):
+                    slopes[1 - i][batch, chosen] = np.matmul(weight, by_unknowns[chosen].transpose(0, 2, 1))
                 if self.rest is not None:
                     score[chosen] += 0.5 * np.matmul(weight, self.rest[1 - i][chosen, :, None])[..., 0]
                 for batch, mean in enumerate(self.batches[1 - i]):
@@ -149,14 +153,20 @@ class Moments:
             noise[chosen] = np.matmul(both * self.variance[chosen, None], both.transpose(0, 2, 1))
 
         _in_threads(part, _parts(pixels))
-        left, right = scales[:, :, None], scales[:, None, :]
+        units = scales[:, :, None] * scales[:, None, :]
+        slopes = [part * units for part in slopes]
+        slope = 0.5 * (slopes[0].mean(axis=0) + slopes[1].mean(axis=0))
         simulation = [(part - part.mean(axis=0)) * scales for part in simulation]
-        return Equations(score * scales, slope * left * right, noise * left * right, simulation, mean_weights)
+        slopes = [part - part.mean(axis=0) for part in slopes]
+        return Equations(score * scales, slope, noise * units, simulation, mean_weights, slopes)
 
     def _weights(self, number: int, cells: Sequence[Cell]) -> Rows:
         """By a half: derivatives of the mean over the variance, both added up in cells, `[pixel, unknown, bin]`."""
-        slopes, limits = self.slopes[number], self.limits
-        variance = self.law.variance(self.batches[number][0], self.trials)
+        # Mean and slopes by the same photons: what is rare in both does not show in the ratio.
+        scored, limits = self.slopes[number], self.limits
+        slopes: Rows = np.mean(scored, axis=0) if len(scored) > 1 else scored[0]
+        mean: Rows = np.mean(self.batches[number][: len(scored)], axis=0)
+        variance = self.law.variance(mean, self.trials)
         below = {cell: _in_cells(variance, self.image, cell) for cell in set(cells)}
         weights = np.empty_like(slopes)
 
@@ -239,15 +249,14 @@ def solve(
     mixing[:, np.arange(s.size), s] = 1.0
     mixing[:, :, q] = left
     by_counts = np.einsum("psi,pij,ptj->st", mixing, equations.noise, mixing, optimize=True) + np.diag(known_before)
-    by_simulation = np.zeros_like(by_counts)
-    pixel_simulation = np.zeros_like(inverse)
-    for part in equations.simulation:  # of batches less their means
-        if (batches := len(part)) > 1:  # the score has half of each half's mean
-            reduced, rest = np.einsum("psi,bpi->bs", mixing, part), part[..., q]
-            by_simulation += 0.25 * reduced.T @ reduced / (batches * (batches - 1))
-            pixel_simulation += 0.25 * np.einsum("bpi,bpj->pij", rest, rest) / (batches * (batches - 1))
     pixels = np.einsum("pij,pj->pi", inverse, score[:, q]) - right @ shared
-    pixel_simulation = inverse @ pixel_simulation @ inverse.transpose(0, 2, 1)
+    steps = np.empty(score.shape)
+    steps[:, s], steps[:, q] = shared, pixels
+    by_simulation, pixel_simulation = _of_batches(equations.simulation, mixing, q)
+    # Slopes of a batch are wrong, and the further the step goes, the more so is its end.
+    changes = [np.einsum("bpij,pj->bpi", part, steps) for part in equations.slope_batches]
+    by_slopes, pixel_slopes = _of_batches(changes, mixing, q)
+    pixel_simulation = inverse @ (pixel_simulation + pixel_slopes) @ inverse.transpose(0, 2, 1)
     pixel_noise = inverse @ equations.noise[:, q[:, None], q] @ inverse.transpose(0, 2, 1) + pixel_simulation
     covariance = inverse_matrix @ (by_counts + by_simulation) @ inverse_matrix.T
     pixel_covariance = pixel_noise + right @ covariance @ right.transpose(0, 2, 1)
@@ -255,9 +264,11 @@ def solve(
     if s.size:
         share = _largest_ratio(np.diag(simulation), np.diag(covariance - simulation))
         gain = 0.5 * float(shared @ np.linalg.pinv(covariance, rcond=1e-12) @ shared)
+        extra = inverse_matrix @ by_slopes @ inverse_matrix.T
+        covariance, simulation = covariance + extra, simulation + extra
     else:
-        variance, by_simulation = np.einsum("pii->pi", pixel_covariance), np.einsum("pii->pi", pixel_simulation)
-        share = _largest_ratio(np.nanmedian(by_simulation, axis=0), np.nanmedian(variance - by_simulation, axis=0))
+        variance, simulated = np.einsum("pii->pi", pixel_covariance), np.einsum("pii->pi", pixel_simulation)
+        share = _largest_ratio(np.nanmedian(simulated, axis=0), np.nanmedian(variance - simulated, axis=0))
         gains = np.divide(pixels**2, variance, out=np.zeros_like(pixels), where=variance > 0)
         gain = 0.5 * float(gains.sum(axis=1).mean())
     bound = 0.5 * (inverse_matrix + inverse_matrix.T)
@@ -274,6 +285,18 @@ def solve(
         simulation_share=share,
         gain=gain,
     )
+
+
+def _of_batches(parts: Sequence[Floats], mixing: Floats, own: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Covariance of the scores of the shared unknowns and of each pixel's own, from batches `[batch, pixel, unknown]`
+    less their means, of two halves; the score has half of each one's mean."""
+    shared, pixels = np.zeros((mixing.shape[1],) * 2), np.zeros((len(mixing), own.size, own.size))
+    for part in parts:
+        if (batches := len(part)) > 1:
+            reduced, rest = np.einsum("psi,bpi->bs", mixing, part), part[..., own]
+            shared += 0.25 * reduced.T @ reduced / (batches * (batches - 1))
+            pixels += 0.25 * np.einsum("bpi,bpj->pij", rest, rest) / (batches * (batches - 1))
+    return shared, pixels
 
 
 def _inverses(blocks: Floats) -> tuple[Floats, NDArray[np.bool_]]:

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
-from spadwarp.frames.spad import LIMIT
+from spadwarp.frames.spad import LIMIT, Window
 from spadwarp.scene import phase_function
 from spadwarp.transport import truth_maps
 from spadwarp.values import ArgumentError, check_integer
 
 if TYPE_CHECKING:
-    from spadwarp.scene import Scene
+    from spadwarp.scene import Detector, Scene
 
 __all__ = ["Exposure", "lidar_initial_guess", "read_exposure"]
 
@@ -26,6 +26,7 @@ __all__ = ["Exposure", "lidar_initial_guess", "read_exposure"]
 _LEAST_COUNTS, _LEAST_BINS = 200, 12
 _LEAST_SPAN = 1.3  # last over first range, for a slope that says something of the water
 _NEARER = 0.95  # of the range of the nearest target
+_MOST = 2**53  # counts: beyond it float64 is not exact
 _SHARE = 0.2  # of the scattering that the slope contains: most of it goes on forward
 
 
@@ -81,7 +82,7 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         facts: Of a measured file, as `spadwarp.frames.read_histograms` takes them.
 
     Raises:
-        ArgumentError: Counts that do not fit the scene, or are no counts.
+        ArgumentError: Counts that do not fit the scene, are no counts, or more than its detector can count.
         FileError: A file that cannot be read.
     """
     name, gate = "counts", scene.gate
@@ -109,6 +110,12 @@ def read_exposure(counts: Any, scene: Scene, *, pulses: int | None = None, **fac
         raise ArgumentError(
             f"{name}: bins of {width * 1e12:g} ps; the scene's gate.bin_width_ps, {gate.bin_width_ps:g}, has to be that"
         )
+    window = Window.of(scene.detector, scene.laser, (start, cube.shape[1]), gate.bin_width, widths)
+    _check_countable(cube, pulses * frames, scene.detector, window, name)
+    if not isinstance(counts, Frames | FramesFile | Histograms):
+        gated = Window.of(scene.detector, scene.laser, (start, gate.bins), gate.bin_width, None).recorded
+        if cube.shape[1] != gated:
+            raise ArgumentError(f"{name}: {cube.shape[1]} bins; the detector has {gated} in the scene's gate")
     return Exposure(
         counts=cube,
         pulses=pulses * frames,
@@ -130,8 +137,36 @@ def _added_up(values: Any, scene: Scene, name: str) -> tuple[NDArray[np.int64], 
         raise ArgumentError(f"{name}: rates, not whole counts; how sure they are is not known")
     if array.min() < 0:
         raise ArgumentError(f"{name}: {array.min()} is outside [0, inf)")
+    if (most := array.sum(dtype=np.float64)) > _MOST:
+        raise ArgumentError(f"{name}: {most:g} counts in all are outside [0, {_MOST}]")
     total = array.sum(axis=0, dtype=np.int64) if array.ndim == 4 else array.astype(np.int64)
     return total.reshape(-1, total.shape[-1]), len(array) if array.ndim == 4 else 1
+
+
+def _check_countable(counts: NDArray[np.int64], pulses: int, detector: Detector, window: Window, name: str) -> None:
+    """Refuses counts `[pixel, bin]` of bins that the detector does not have, or more than it can count in so many
+    pulses. Raises `ArgumentError`."""
+    if counts.shape[1] > window.recorded:
+        raise ArgumentError(
+            f"{name}: {counts.shape[1]} bins; the detector starts anew with each pulse, after {window.recorded} bins "
+            f"({1e9 * window.period:g} ns): leave out the later ones, or set detector.wrap = false"
+        )
+    dead_time, edges = 1e-9 * detector.dead_time_ns, window.edges[: window.recorded + 1]
+    mode, of_pixel, of_bin = "first-photon counting", 1, np.ones(window.recorded)
+    if detector.mode == "free_running":
+        if dead_time <= 0.0:
+            return
+        mode = f"a dead time of {detector.dead_time_ns:g} ns"
+        of_pixel, of_bin = 1 + int(edges[-1] / dead_time), 1 + np.floor(np.diff(edges) / dead_time)
+    pixel, most = counts.sum(axis=1), counts.max(axis=0)
+    for found, limit, part in (
+        (pixel.max(), of_pixel, "pixel"),
+        (most[(k := np.argmax(most / of_bin))], of_bin[k], "bin"),
+    ):
+        if found > limit * pulses:
+            raise ArgumentError(
+                f"{name}: {found} counts of one {part} in {pulses} pulses; {mode} has at most {limit * pulses:.0f}"
+            )
 
 
 def lidar_initial_guess(scene: Scene, exposure: Exposure, *, device: str | None = None) -> dict[str, float]:

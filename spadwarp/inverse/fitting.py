@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.frames.spad import DRAWN_EFFECTS
-from spadwarp.inverse.equations import Equations, Law, Moments, Solution, solve, solve_pooled
+from spadwarp.inverse.equations import Equations, Law, Moments, Solution, pseudo_inverse, solve, solve_pooled
 from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposure
+from spadwarp.inverse.goodness import Goodness, Lost, goodness_of, significance
 from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
 from spadwarp.scene import SceneLike, as_scene
@@ -44,6 +45,7 @@ Progress = Callable[[str, int, int], None]
 Prior = Mapping[str, tuple[float, float]]
 
 BATCHES = 4  # of photons in each half, and of a difference of depths
+_SCORED = 2  # of them with slopes: their difference says how wrong the slopes are
 SIMULATION = 0.1  # of the variance by the counts
 _PHOTONS = {"cpu": 20_000_000, "cuda": 400_000_000}
 
@@ -52,9 +54,8 @@ _COARSE, _FINE = 16, 8  # renderings at most
 _FEWEST, _FEWER, _FEW = 128, 32, 16  # divide the photons: of the first coarse rendering, the last, the first fine one
 _ACROSS = 4  # blocks along each side of the image in coarse steps; more of them are noisier
 _SETTLED = 0.3  # of the largest coarse step: from there Fisher scoring converges, and few photons say no more
-_CONVERGED = 1.0  # gain of the log-likelihood for each unknown: half of it is expected from the counts' own noise
+_CONVERGED = 0.25  # gain of the log-likelihood for each unknown: the slopes are noisy, so that long steps end wrong
 _PATIENCE = 3  # fine renderings, after which the depth's slope is looked at
-_LEFT = 0.01  # gain for each unknown that a further step would bring: a seventh of a standard error
 
 # The slope by the depth, over the interval that is stated for the depth.
 _WIDE = 0.7  # of the renderer's step: an interval of this size has the slope that is known already
@@ -67,6 +68,7 @@ _SURE = 3.0  # standard errors by which a slope has to differ from the wide one
 _ONE_SIDED = 0.5  # ratio of the slopes of both sides: below, the flatter one decides
 
 _NORMAL_95 = 1.959963984540054
+_SEEN = 3.719  # standard deviations of light, which noise alone has in 1 of 10 000 cases
 _CORRELATED, _UNSURE = 0.99, 0.5  # correlation, and standard error of a logarithm, from which a warning says so
 
 
@@ -79,7 +81,7 @@ class Estimate:
 
     Attributes:
         name: Of the unknown; depth is that of the target in the pixel nearest to the middle of the image.
-        value: The estimate, in SI units.
+        value: The estimate, in SI units; NaN, as its errors, where nothing was seen that depends on it.
         standard_error: Of counts and simulation together.
         interval: 95 %; of positive values from the standard error of the logarithm.
         simulation: The part of the variance that is noise of the simulation.
@@ -172,8 +174,9 @@ class Fit(Joint):
         iterations: In order.
         converged: Whether the last step promised less than the noise of the likelihood.
         warnings: What may mislead, in words.
+        goodness: Whether the fit describes the counts.
         depth: Depth of the targets by the fit, float64 `[H, W]` [m], NaN without a target; None unless it was unknown.
-        counts, expected: `[H, W, T]`: what was fitted, and its mean by the last rendering, float32.
+        counts, expected: `[H, W, T]`: what was fitted, and its mean by a rendering at the estimates, float32.
         edges: Of the bins in time of flight [s].
         pulses: In all.
         photons: Traced by the whole fit.
@@ -185,6 +188,7 @@ class Fit(Joint):
     maps: Mapping[str, EstimateMap]
     iterations: Sequence[Iteration]
     converged: bool
+    goodness: Goodness
     depth: Floats | None
     counts: NDArray[np.integer] = field(repr=False)
     expected: NDArray[np.float32] = field(repr=False)
@@ -201,6 +205,7 @@ class Fit(Joint):
             "estimates": {name: vars(item) for name, item in self.estimates.items()},
             **super().to_dict(),
             "converged": self.converged,
+            "goodness": self.goodness.to_dict(),
             "iterations": [{**vars(item), "values": dict(item.values)} for item in self.iterations],
             "counts": int(self.counts.sum()),
             "seconds": self.seconds,
@@ -350,8 +355,10 @@ class Fitter:
                 raise ArgumentError(f"prior: {name} is not an unknown of the whole exposure; these are {known}")
             if not (isinstance(pair, tuple | list) and len(pair) == 2):
                 raise ArgumentError(f"prior of {name} = {pair!r} is not (mean, standard deviation)")
-            mean = check_real(f"prior of {name}: mean", pair[0])
-            result[name] = (mean, check_real(f"prior of {name}: standard deviation", pair[1], "(0, inf)"))
+            mean = check_real(f"prior of {name}: mean", pair[0], "[-1e12, 1e12]")
+            if name == DEPTH:  # a shift is searched
+                mean -= _middle_depth(truth_maps(self.scene, device=self.device).depth)
+            result[name] = (mean, check_real(f"prior of {name}: standard deviation", pair[1], "[1e-12, 1e12]"))
         return result
 
     def fit(
@@ -362,6 +369,8 @@ class Fitter:
         state = self._initial_state(dict(initial_guess or {}))
         begin, counts = state.means(), exposure.counts
         assert counts is not None
+        if not counts.any():
+            raise ArgumentError("counts: not one in any bin, so that nothing can be fitted")
 
         def report(text: str) -> None:
             if progress is not None:
@@ -371,26 +380,76 @@ class Fitter:
         if not near and self.shared:
             self._approach(state, trials, report)
         halves, solution, converged = self._refine(state, trials, report)
-        expected = self.law.mean(0.5 * (halves[0].rates + halves[1].rates), trials).reshape(*self.image, -1)
+        batch = max(state.iterations[-1].photons // (2 * BATCHES), 1)
+        rates, parts = self.render.light(state.values, photons=batch, batches=2 * BATCHES)
+        batches = [self.law.mean(one, trials) for one in rates]
+        expected: Rows = np.asarray(np.mean(batches, axis=0, dtype=np.float32))
+        total = np.maximum(np.sum(parts, axis=0), 1e-30)
+        parts = [expected * (part / total)[:, : self.law.recorded] for part in parts]
+        pixels = (*self.image, self.law.recorded)
+        agreement = goodness_of(
+            counts.reshape(pixels),
+            expected,
+            self.law.variance(expected, trials),
+            batches,
+            self._lost(state, halves, solution, trials),
+            parts,
+        )
+        unseen = self._forget_unseen(expected, parts[0], solution)
         estimates, maps, depth = self._estimates(state, begin, solution)
         found = Fit(
-            scene=with_values(self.scene, state.means()),
+            scene=with_values(self.scene, {k: v for k, v in state.means().items() if k not in unseen}),
             estimates=estimates,
             maps=maps,
             names=[unknown.name for unknown in self.shared],
             covariance=solution.covariance,
             iterations=tuple(state.iterations),
             converged=converged,
+            goodness=agreement,
             warnings=(),
             depth=depth,
-            counts=counts.reshape(*self.image, -1),
-            expected=expected,
+            counts=counts.reshape(pixels),
+            expected=expected.reshape(pixels),
             edges=self.render.window.start + self.render.window.edges[: self.law.recorded + 1],
             pulses=exposure.pulses,
             photons=self.render.photons - first,
             seconds=time.perf_counter() - began,
         )
-        return replace(found, warnings=tuple(self._warnings(found, solution)))
+        seen = [f"{name}: no light of the targets was seen in the counts, so that it has no value" for name in unseen]
+        return replace(found, warnings=(*agreement.warnings(), *seen, *self._warnings(found, solution)))
+
+    def _lost(self, state: State, halves: list[Half], solution: Solution, trials: Rows) -> Lost:
+        """What the fitted unknowns take of the deviance: 2 J⁻¹ − V, with V the covariance, and the slopes."""
+        scales = state.scales(self.unknowns, len(trials))[..., None]
+        slopes = [
+            self.law.slopes(half.batches[0], half.slopes[0].transpose(1, 0, 2), trials) * scales for half in halves
+        ]
+        shared, own = ([self.unknowns.index(unknown) for unknown in some] for some in (self.shared, self.own))
+        return Lost(
+            [side[:, shared].transpose(1, 0, 2) for side in slopes],
+            [side[:, own].transpose(1, 0, 2) for side in slopes],
+            2.0 * pseudo_inverse(solution.information) - solution.covariance,
+            np.nan_to_num(2.0 * solution.pixel_bound - solution.pixel_covariance),
+        )
+
+    def _forget_unseen(self, expected: Rows, target: Rows, solution: Solution) -> list[str]:
+        """Makes NaN of the solution's variances where the counts hold no light that depends on an unknown; returns the
+        names of such of the whole exposure. `expected`, `target`: mean counts, and those by light of the targets."""
+        counts, unseen = self.exposure.counts, list[str]()
+        assert counts is not None
+        on_targets = [unknown.name == DEPTH or unknown.name.startswith("targets") for unknown in self.unknowns]
+        if any(on_targets):
+            whole = significance(counts.reshape(1, -1), expected.reshape(1, -1), target.reshape(1, -1))[0]
+            each = significance(counts, expected, target)
+        for unknown, on_target in zip(self.unknowns, on_targets, strict=True):
+            if unknown.per_pixel:
+                column, seen = self.own.index(unknown), counts.any(axis=1)
+                solution.pixels[~(seen & (each >= _SEEN) if on_target else seen), column] = np.nan
+            elif on_target and not whole >= _SEEN:
+                row = self.shared.index(unknown)
+                solution.covariance[row, :] = solution.covariance[:, row] = np.nan
+                unseen.append(unknown.name)
+        return unseen
 
     def _initial_state(self, guess: dict[str, float]) -> State:
         names = {unknown.name for unknown in self.unknowns}
@@ -420,7 +479,7 @@ class Fitter:
             photons = max(photons, 1000)
             (half,) = self.render(state.values, photons=photons, halves=1)
             scales, limits = state.scales(self.shared, 1)[0], self.render.limits[columns]
-            half = half._replace(slopes=half.slopes[columns])
+            half = half._replace(slopes=[half.slopes[0][columns]])
             blocks = _in_blocks(self.law, half, trials, self.exposure.counts, scales, limits, self.image)
             step, error = _coarse_step(*blocks, largest, self.prior_at(state))
             gain = 0.5 * float(np.sum((step / np.maximum(error, 1e-12)) ** 2))
@@ -435,17 +494,17 @@ class Fitter:
         photons, level, bent = max(self.photons // _FEW, 8000), None, False
         for number in range(_FINE):
             batch = photons // (2 * BATCHES)
-            halves = self.render(state.values, photons=batch, batches=BATCHES)
+            halves = self.render(state.values, photons=batch, batches=BATCHES, scored=_SCORED)
             level, equations, solution = self.solve(state, halves, trials, level)
             if bent or number >= _PATIENCE or self._converged(solution):
                 solution = self._locally_solved(equations, solution, state, halves, trials, batch)
             bent = bent or solution.slope_ratio != 1.0
-            converged, left = self._converged(solution), self._left(solution)
+            converged = self._converged(solution)
             iteration = Iteration(values=state.means(), gain=solution.gain, photons=photons, coarse=False)
             steps = zip((*self.shared, *self.own), (*solution.shared, *solution.pixels.T), strict=True)
             report(state.step(iteration, {unknown.name: step for unknown, step in steps}))
             needed = int(photons * max(solution.simulation_share / (0.8 * SIMULATION), 1.0))
-            more = min(needed, self.photons, needed if left <= _CONVERGED * max(len(self.shared), 1) else 4 * photons)
+            more = min(needed, self.photons, 4 * photons)
             noisy = solution.simulation_share > SIMULATION and more > 1.2 * photons
             if converged and not noisy:
                 break
@@ -467,24 +526,8 @@ class Fitter:
         return lambda equations: solve(equations, is_per_pixel, prior)
 
     def _converged(self, solution: Solution) -> bool:
-        """Whether the step gains less than the noise of the counts, or leaves next to nothing."""
-        size = max(len(self.shared), 1)
-        return solution.gain <= _CONVERGED * size or self._left(solution) <= _LEFT * size
-
-    def _left(self, solution: Solution) -> float:
-        """What the log-likelihood can still gain after the step.
-
-        Newton's error is the square of the step; of the depth also what the slope changes within its error.
-        """
-        if len(self.shared) < len(self.unknowns):
-            return solution.gain
-        bend = abs(1.0 - 1.0 / solution.slope_ratio) if solution.slope_ratio > 0.0 else 1.0
-        straight = [
-            0.5 if unknown.is_positive else self.render.depth_step if unknown.name == DEPTH else 0.025
-            for unknown in self.shared
-        ]
-        parts = [step / size for step, size in zip(solution.shared, straight, strict=True)]
-        return solution.gain * min(float(np.max(np.square([*parts, bend]))), 1.0)
+        """Whether the step gains little; a noisy rendering asks for a step even from the solution."""
+        return solution.gain <= (_CONVERGED + min(solution.simulation_share, 1.0)) * max(len(self.shared), 1)
 
     def prior_at(self, state: State) -> tuple[Floats, Floats]:
         """Score and information of the priors on the searched scale, `[S]` both."""
@@ -584,6 +627,10 @@ class Fitter:
                 offset, depth = _middle_depth(truth.depth), truth.depth + values[DEPTH]
             variance = solution.covariance[row, row]
             value, error = values[unknown.name] + offset, math.sqrt(max(variance, 0.0))
+            if math.isnan(variance):  # nothing was seen
+                value = error = math.nan
+                if unknown.name == DEPTH:
+                    depth = np.full_like(truth.depth, np.nan, np.float64)
             if unknown.is_positive:  # the error is of the logarithm
                 factor = math.exp(min(_NORMAL_95 * error, 700.0))
                 interval, error = (value / factor, value * factor), error * value
@@ -600,7 +647,8 @@ class Fitter:
             )
         for column, unknown in enumerate(self.own):
             errors = np.sqrt(np.maximum(solution.pixel_covariance[:, column, column], 0.0)) * state.scale(unknown)
-            value = np.where(np.isnan(solution.pixels[:, column]), np.nan, values[unknown.name]).reshape(self.image)
+            errors = errors + 0.0 * solution.pixels[:, column]  # NaN where there is no value
+            value = (values[unknown.name] + 0.0 * solution.pixels[:, column]).reshape(self.image)
             if unknown.name == DEPTH:
                 value = depth = value + truth.depth
             errors = errors.reshape(self.image)
@@ -638,7 +686,7 @@ def _in_blocks(
     slopes = np.zeros((len(scales), *shape))
     for block in range(shape[0]):
         chosen = np.flatnonzero(blocks == block)
-        by_unknowns = np.ascontiguousarray(half.slopes[:, chosen].transpose(1, 0, 2))
+        by_unknowns = np.ascontiguousarray(half.slopes[0][:, chosen].transpose(1, 0, 2))
         observed[block] = counts[chosen].sum(axis=0)
         mean[block] = law.mean(half.rates[chosen], trials[chosen]).sum(axis=0)
         slopes[:, block] = law.slopes(half.rates[chosen], by_unknowns, trials[chosen]).sum(axis=0) * scales[:, None]

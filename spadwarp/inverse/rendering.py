@@ -32,7 +32,7 @@ class Half(NamedTuple):
     """Rates and derivatives by one group of photons."""
 
     rates: Rows  # λ, expected detections per pulse, float32 [pixel, bin]: the mean of the batches
-    slopes: Rows  # dλ/d(unknown), float32 [unknown, pixel, bin], of the first batch
+    slopes: list[Rows]  # dλ/d(unknown), float32 [unknown, pixel, bin], of the first batches
     batches: list[Rows]  # λ of each batch
 
 
@@ -88,29 +88,48 @@ class Renderer:
         """
         return np.array([1.0 / self.depth_step if one.name == DEPTH else 1e30 for one in self.unknowns], np.float32)
 
-    def __call__(self, values: Values, *, photons: int, halves: int = 2, batches: int = 1) -> list[Half]:
-        """Groups of `photons` · `batches` photons each, which are independent of each other."""
+    def __call__(
+        self, values: Values, *, photons: int, halves: int = 2, batches: int = 1, scored: int = 1
+    ) -> list[Half]:
+        """Groups of `photons` · `batches` photons each, which are independent of each other; of the first batches so
+        many are `scored`: have slopes."""
         scene = self._at(values)
         names = [unknown.name for unknown in self.unknowns if unknown.is_light]
-        scored = self._tracer(scene, photons, names)
-        plain = scored if batches == 1 or not names else self._tracer(scene, photons, ())
+        tracer = self._tracer(scene, photons, names)
+        plain = tracer if batches == scored or not names else self._tracer(scene, photons, ())
         depth = None
         if any(unknown.name == DEPTH for unknown in self.unknowns):
             depth = self._depth_difference(scene, self.depth_step, photons)
-        self.truth = scored.truth
+        self.truth = tracer.truth
         receiver = self._placed(scene, values)
         groups = []
         for _ in range(halves):
-            number = self._take(photons)
-            light, slopes = scored(number, photons)
-            if depth is not None:
-                slopes[DEPTH] = depth(number)
-            group = [receiver.rates(light)]
-            for _ in range(batches - 1):
-                group.append(receiver.rates(plain(self._take(photons), photons)[0]))
+            group, by_unknowns = list[Rows](), list[Rows]()
+            for batch in range(batches):
+                number = self._take(photons)
+                light, slopes = (tracer if batch < scored else plain)(number, photons)
+                group.append(receiver.rates(light))
+                if batch < scored:
+                    if depth is not None:
+                        slopes[DEPTH] = depth(number)
+                    by_unknowns.append(receiver.slopes(slopes, self.unknowns))
             rates: Rows = group[0] if batches == 1 else np.asarray(np.mean(group, axis=0, dtype=np.float32))
-            groups.append(Half(rates, receiver.slopes(slopes, self.unknowns), group))
+            groups.append(Half(rates, by_unknowns, group))
         return groups
+
+    def light(self, values: Values, *, photons: int, batches: int) -> tuple[list[Rows], list[Rows]]:
+        """λ of batches of so many photons each, and the parts of their mean: light of targets, of the water, noise."""
+        scene = self._at(values)
+        tracer = self._tracer(scene, photons, (), separate_targets=True)
+        self.truth = tracer.truth
+        receiver = self._placed(scene, values)
+        lights = [tracer(self._take(photons), photons)[0] for _ in range(batches)]
+        rates, target = [receiver.rates(light) for light in lights], receiver.target(lights[0]) / batches
+        for light in lights[1:]:
+            target += receiver.target(light) / batches
+        noise = receiver.noise()
+        mean: Rows = np.asarray(np.mean(rates, axis=0, dtype=np.float32))
+        return rates, [target, np.maximum(mean - target - noise, 0.0), noise]
 
     def depth_slopes(self, values: Values, *, shift: float, step: float, photons: int, batches: int) -> list[Rows]:
         """dλ/d(depth) `[pixel, bin]` by differences over `shift` ± `step` [m], each of so many photons of its own."""
@@ -145,9 +164,10 @@ class Renderer:
         first, self.photons = self.photons, self.photons + photons
         return first
 
-    def _tracer(self, scene: Scene, photons: int, names: Sequence[str]) -> LightTracer:
+    def _tracer(self, scene: Scene, photons: int, names: Sequence[str], **choices: Any) -> LightTracer:
         kept = self._kept.setdefault("scored" if names else "plain", {})
-        tracer = LightTracer(scene, photons=photons, derivatives=names, mesh_cache=kept, **self._choices)
+        choices = {**self._choices, **choices}
+        tracer = LightTracer(scene, photons=photons, derivatives=names, mesh_cache=kept, **choices)
         self._tally = tracer.tally
         return tracer
 
@@ -241,13 +261,20 @@ class _PlacedReceiver(NamedTuple):
                 row[:] = self._with_change(self.receiver.slope(light.total).numpy(), light)
         return result
 
+    def target(self, light: ExpectedLight) -> Rows:
+        """The part of λ that is light of the targets."""
+        target: Rows = self.receiver.slope(light.target).numpy()
+        return target if self.delay is None else subbin_shift(target, self.delay) * self.factor[:, None]  # type: ignore[index]
+
+    def noise(self) -> Rows:
+        """The part of λ that is dark counts and ambient light, `[pixel, bin]`."""
+        return np.multiply.outer(self.receiver.noise.numpy(), np.diff(self.receiver.window.edges)).astype(np.float32)
+
     def _with_change(self, rows: Rows, light: ExpectedLight) -> Rows:
         """With the light of the targets in its new place, less that in the old."""
         if self.delay is None:
             return rows
-        assert light.target is not None and self.factor is not None
-        target: Rows = self.receiver.slope(light.target).numpy()
-        return rows + (subbin_shift(target, self.delay) * self.factor[:, None] - target)
+        return rows + (self.target(light) - self.receiver.slope(light.target).numpy())
 
 
 def _bins_per_metre(scene: Scene) -> NDArray[np.float64]:

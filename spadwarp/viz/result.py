@@ -84,7 +84,7 @@ def draw_analytic(result: AnalyticResult, path: str | Path, *, width: float = PA
 
 
 def draw_fit(fit: Fit, path: str | Path, *, width: float = PAGE) -> Path:
-    """Counts, fit and residuals of a fit: over the image and over time; `width` [inch]; returns the path."""
+    """Counts, fit, residuals and deviance of a fit: over the image and over time; `width` [inch]; returns the path."""
     return save(plot(fit, width=width), path)
 
 
@@ -509,11 +509,12 @@ _MOST_POINTS = 160  # bins are added up to at most so many
 
 def _fit_figure(fit: Fit, width: float) -> Figure:
     counts, expected = fit.counts.sum(axis=2), fit.expected.sum(axis=2, dtype=np.float64)
-    panels = Panels(counts.shape, 2 if fit.depth is None else 3, width=width, below=(1.6, 0.9))
+    panels = Panels(counts.shape, 3 if fit.depth is None else 4, width=width, below=(1.6, 0.9))
     panels.show_intensity(counts, "Counts", "counts in the exposure")
     residual = (counts - expected) / np.sqrt(np.maximum(expected, 1e-12))
     residual[expected <= 0] = np.nan
     panels.show(residual, "Residual", "(counts − fit) / √fit", style.ERROR_MAP, (-3.0, 3.0))
+    panels.show(fit.goodness.pixels, "Deviance", "(deviance − expected) / σ", style.ERROR_MAP, (-4.0, 4.0))
     if fit.depth is not None:
         panels.show_depth(fit.depth, "Depth", shown_limits(fit.depth))
     top, bottom = panels.below()
@@ -538,5 +539,6 @@ def _fit_figure(fit: Fit, width: float) -> Figure:
         f"{item.name} = {rounded(item.value, item.standard_error)} ± {item.standard_error:.2g} {item.unit}".rstrip()
         for item in fit.estimates.values()
     ]
-    panels.figure.caption("; ".join([*values, f"{spaced(fit.pulses)} pulses"]))
+    good = f"{'BAD FIT: ' * fit.goodness.is_bad}{fit.goodness.summary()}"
+    panels.figure.caption("; ".join([good, *values, f"{spaced(fit.pulses)} pulses"]))
     return panels.figure

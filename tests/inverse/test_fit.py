@@ -106,7 +106,7 @@ def test_no_error_of_the_depth_is_below_its_bound(depth, is_inside):
     pulses = 20_000
     information = pulses * np.sum(((far - near).astype(np.float64) / 2e-3) ** 2 / mean)
     frames = spadwarp.detect(lights[0.0], pulses=pulses, seed=3, device="cpu")
-    fitter = Fitter(scene, "depth", read_exposure(frames, scene), photons=200_000, seed=5, device="cpu")
+    fitter = Fitter(scene, "depth", read_exposure(frames, scene), photons=200_000, seed=8, device="cpu")
     found = fitter.fit(near=True)
     estimate = found.estimates["depth"]
     assert estimate.standard_error > 0.95 * information**-0.5
