@@ -3,10 +3,7 @@
 import json
 import math
 import os
-import resource
-import signal
-import subprocess
-import sys
+import shutil
 import time
 import tomllib
 
@@ -17,8 +14,8 @@ import trimesh
 from scipy import stats
 
 import spadwarp
-from helpers.cli import DEVICE, ENVIRONMENT, ROOT, run, tables
-from helpers.datasets import FRACTIONS, TABLES, checksums, make, recipe, written
+from helpers.cli import DEVICE, ROOT, run, small_files, tables
+from helpers.datasets import FRACTIONS, TABLES, checksums, make, making, recipe, written
 from spadwarp.dataset import (
     FIELDS,
     SPLITS,
@@ -40,6 +37,14 @@ from spadwarp.values import SPEED_OF_LIGHT
 def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("dataset") / "data"
     make(recipe(), place)
+    return place
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """The same, of other shards and splits."""
+    place = tmp_path_factory.mktemp("dataset") / "other"
+    make(recipe(scenes_per_shard=2, **{"targets.validation": []}), place)
     return place
 
 
@@ -110,22 +115,24 @@ def test_realised_fraction_is_the_requested_one(folder):
     assert min(values) > 1e-3 / len(values)
 
 
-def test_a_sample_is_the_same_in_any_dataset_around_it(folder, tmp_path):
+def test_a_sample_is_the_same_in_any_dataset_around_it(folder, other):
     """Not its shard, not the number of scenes beside it, not the split of other targets changes a scene's frames."""
-    other = {**TABLES, "scenes_per_shard": 2, "targets": {**TABLES["targets"], "validation": []}}
-    make(Recipe.from_dict(other), tmp_path / "other")
-    first = {item["sample"]: item for item in FrameReader(folder, "test")}
-    second = {item["sample"]: item for item in FrameReader(tmp_path / "other", "test")}
+    first, second = ({item["sample"]: item for item in FrameReader(place, "test")} for place in (folder, other))
     assert first.keys() == second.keys()
     for sample, item in first.items():
         for name, value in item.items():
             np.testing.assert_array_equal(value, second[sample][name])
 
 
-def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(tmp_path):
-    place, whole = tmp_path / "data", recipe(**{"frames.per_scene": 1})
-    make(whole, place)
-    before = checksums(place)
+def test_a_split_without_frames_is_named_at_once(other):
+    for reader in (FrameReader, SpadDataset, iterate_dataset):
+        with pytest.raises(ValueError, match=r"split = 'validation': .*other has no frames in it; it has train, test"):
+            reader(other, "validation")
+
+
+def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(small, whole, tmp_path):
+    """And removes what a process that was killed between the first byte of a shard and the last has left."""
+    place, before = shutil.copytree(whole, tmp_path / "data"), checksums(whole)
     (place / "frames-00001.h5").unlink()
     damaged = bytearray((place / "frames-00002.h5").read_bytes())
     damaged[-100] ^= 1
@@ -135,21 +142,22 @@ def test_rerun_makes_what_is_missing_or_broken_and_gives_the_same_bytes(tmp_path
     wrong = "\n".join(verify_dataset(place))
     for name in ("frames-00001.h5: missing", "frames-00002.h5: damaged", "scenes-00004.h5: damaged"):
         assert name in wrong
-    report = make(whole, place)
+    for left in (".frames-00001.h5.0123456789abcdef.tmp", "shards/.00001.json.0123456789abcdef.tmp"):
+        (place / left).write_bytes(b"begun")
+    report = make(small, place)
     assert report.made == tuple(f"frames-0000{k}.h5" for k in (1, 2, 3, 4)) and len(report.kept) == 2
     assert checksums(place) == before and not verify_dataset(place)
 
 
-def test_parts_make_one_dataset(tmp_path):
-    whole = recipe(**{"frames.per_scene": 1})
-    make(whole, tmp_path / "one")
+def test_parts_make_one_dataset(small, whole, tmp_path):
+    out = tmp_path / "data"
     for part in (2, 1):
         if part == 1:
             with pytest.raises(spadwarp.FileError, match="not finished"):
-                FrameReader(tmp_path / "two")
-        report = make(whole, tmp_path / "two", part=(part, 2))
+                FrameReader(out)
+        report = make(small, out, part=(part, 2))
         assert len(report.made) == 3 and len(report.missing) == (3 if part == 2 else 0)
-    assert checksums(tmp_path / "one") == checksums(tmp_path / "two")
+    assert checksums(out) == checksums(whole)
 
 
 def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
@@ -174,64 +182,32 @@ def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):
     assert any(np.array_equal(a, b, equal_nan=True) for a in windows for b in rotated)
 
 
-MAKE = """
-import sys, spadwarp
-spadwarp.dataset.make_dataset(spadwarp.dataset.load_recipe(sys.argv[1]), sys.argv[2], device="cpu")
-"""
-
-
-def start(path, out, **options):
-    command = [sys.executable, "-c", MAKE, str(path), str(out)]
-    return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, **options)
-
-
 @pytest.mark.slow
-def test_kills_lose_nothing_but_the_shard_in_hand(tmp_path):
-    small = recipe(**{"frames.per_scene": 1, "scenes_per_target": 4})
-    path, out, generator = written(small, tmp_path), tmp_path / "cut", np.random.default_rng(5)
-    make(small, tmp_path / "whole")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="kills forked processes")
+def test_kills_lose_nothing_but_the_shard_in_hand(small, whole, tmp_path):
+    out, generator = tmp_path / "data", np.random.default_rng(5)
 
     def records():
         return {path.name: path.stat().st_mtime_ns for path in out.glob("shards/*.json")}
 
-    for shards in (2, 8):
-        process = start(path, out)
-        while len(records()) < shards and process.poll() is None:
-            time.sleep(0.01)
-        time.sleep(generator.uniform(0.0, 0.3))
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
+    for shards in (1, 4):
+        with making(small, out) as process:
+            while len(records()) < shards and process.is_alive():
+                time.sleep(0.002)
+            time.sleep(generator.uniform(0.0, 0.1))
         before = records()
     make(small, out)
-    assert checksums(out) == checksums(tmp_path / "whole")
+    assert checksums(out) == checksums(whole)
     assert before and before.items() <= records().items()
 
 
-def test_what_a_killed_process_left_unfinished_is_removed_with_its_shard(tmp_path):
-    """A process may be killed between the first byte and the last of a shard's frames or of its record."""
-    small, out = recipe(**{"frames.per_scene": 1}), tmp_path / "data"
-    make(small, out, part=(1, 6))
-    for left in (".frames-00001.h5.0123456789abcdef.tmp", "shards/.00001.json.0123456789abcdef.tmp"):
-        (out / left).write_bytes(b"begun")
-    make(small, out, part=(2, 6))
-    assert (out / "frames-00001.h5").is_file() and not list(out.rglob(".*.tmp"))
-
-
-@pytest.mark.slow
-def test_a_full_disk_is_reported_and_loses_nothing_else(tmp_path):
-    """A limit on the size of files stands for the full disk: writing beyond it fails in the middle of a shard."""
-    small, out = recipe(**{"frames.per_scene": 1}), tmp_path / "data"
+@pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
+def test_a_full_disk_is_reported_and_loses_nothing_else(small, tmp_path):
+    out = tmp_path / "data"
     make(small, out, part=(1, 6))
     before = checksums(out)
-
-    def limit():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
-
-    process = start(written(small, tmp_path), out, preexec_fn=limit)
-    last = process.communicate()[1].decode().splitlines()[-1]
-    assert process.returncode == 1
-    assert "FileError" in last and "cannot be written" in last and "-00001.h5" in last
+    with small_files(5000), pytest.raises(spadwarp.FileError, match=r"-00001\.h5: cannot be written"):
+        make(small, out)
     assert checksums(out) == before and not list(out.rglob(".*.tmp"))
 
 
@@ -336,12 +312,12 @@ def test_a_mesh_in_another_unit_is_named_before_the_first_scene(side, words, tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("start", ["fork", "spawn"])
-def test_a_torch_loader_gives_the_same_items_from_any_kind_of_worker(folder, start):
+@pytest.mark.parametrize(("start", "workers"), [("fork", 2), ("spawn", 1)])
+def test_a_torch_loader_gives_the_same_items_from_any_kind_of_worker(folder, start, workers):
     torch = pytest.importorskip("torch")
     pairs = SpadDataset(folder, "train", crop=16, augment=True, repeats=3)
     alone = list(torch.utils.data.DataLoader(pairs, batch_size=4))
-    options = {"num_workers": 2, "multiprocessing_context": start, "persistent_workers": True}
+    options = {"num_workers": workers, "multiprocessing_context": start, "persistent_workers": True}
     loader = torch.utils.data.DataLoader(pairs, batch_size=4, **options)
     for _ in range(2):
         for batch, expected in zip(loader, alone, strict=True):
@@ -349,11 +325,10 @@ def test_a_torch_loader_gives_the_same_items_from_any_kind_of_worker(folder, sta
                 assert torch.equal(batch[name].nan_to_num(-1.0), values.nan_to_num(-1.0)), name
 
 
-def test_scenes_follow_a_trajectory(tmp_path):
+def test_scenes_follow_a_trajectory(small, tmp_path):
     rows = "".join(f"{0.1 * n},{0.2 * n},{-n}\n" for n in range(3))
     (tmp_path / "poses.csv").write_text("time,camera.position[0],targets[0].rotation_deg[1]\n" + rows)
-    still = recipe(**{"scenes_per_target": 3, "frames.per_scene": 1, "trajectory": "poses.csv"})
-    path = written(still, tmp_path)
+    path = written(small.with_overrides({"scenes_per_target": 3, "trajectory": "poses.csv"}), tmp_path)
     make(path, tmp_path / "data")
     reader = FrameReader(tmp_path / "data", "test", fields=("clean",))
     assert len(reader) == 3
@@ -364,13 +339,6 @@ def test_scenes_follow_a_trajectory(tmp_path):
         np.testing.assert_array_equal(reader[number]["clean"][0], truth)
     with pytest.raises(spadwarp.ConfigError, match=r"3 rows are fewer than scenes_per_target = 4"):
         Plan(load_recipe(path).with_overrides({"scenes_per_target": 4}))
-
-
-def test_a_split_without_frames_is_named_at_once(folder, tmp_path):
-    make(recipe(**{"targets.validation": [], "frames.per_scene": 1}), tmp_path / "data")
-    for reader in (FrameReader, SpadDataset, iterate_dataset):
-        with pytest.raises(ValueError, match=r"split = 'validation': .*data has no frames in it; it has train, test"):
-            reader(tmp_path / "data", "validation")
 
 
 def test_depth_maps_of_an_engine_become_targets(tmp_path):
