@@ -3,7 +3,7 @@
 import random
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from fuzz import command_lines, mutations
@@ -17,20 +17,12 @@ CALIBRATED = ("phase.csv", "beam.npy", "camera.yaml", "irf.csv", "target.obj", "
 
 @dataclass(frozen=True)
 class Case:
-    """A command in a folder.
+    """A command in a folder."""
 
-    Attributes:
-        arguments: Of `spadwarp`, or the name of a check in `executed` and a file.
-        files: Content by name; a name without content is a folder or file of the corpus that is copied.
-        outputs: Names that the command may create or change, folders with all that is in them.
-        injected: Whether a number of a text became NaN or infinite, so that success has to be looked into.
-    """
-
-    arguments: tuple[str, ...]
-    files: dict[str, bytes | None]
-    outputs: tuple[str, ...] = ()
-    injected: bool = False
-    about: str = field(default="", compare=False)
+    arguments: tuple[str, ...]  # of `spadwarp`, or the name of a check in `executed` and a file
+    files: dict[str, bytes | None]  # content by name; what has none is a folder or file of the corpus
+    outputs: tuple[str, ...] = ()  # what the command may create or change, folders with all that is in them
+    injected: bool = False  # a number of a text became NaN or infinite, so that success has to be looked into
 
 
 def _scene(r: random.Random, corpus: Corpus) -> Case:
