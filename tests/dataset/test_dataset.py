@@ -361,7 +361,7 @@ def test_depth_maps_of_an_engine_become_targets(tmp_path):
         Plan(traced)
 
 
-def test_errors_of_recipes_name_each_field():
+def test_every_problem_of_a_recipe_is_named():
     wrong = {
         "pose": {"distance": -1.0, "yaw": 3.0},
         "water": {"attenuation_lengths": {"low": 2.0, "high": 1.0}},
@@ -374,49 +374,43 @@ def test_errors_of_recipes_name_each_field():
     for words in ("pose.distance", "[1e-9, 1e9]", "pose.yaw", "did you mean 'yaw_deg'", "low = 2.0", "1.5", "exposure"):
         assert words in text
     assert "literal[" not in text and "function-" not in text  # pydantic's names of a choice's branches
-    with pytest.raises(spadwarp.ConfigError, match=r"scene: camera\.pixels"):
-        Recipe.from_dict({**TABLES, "scene": {**TABLES["scene"], "camera": {"pixels": 3}}})
-    for names in ({"test": ["boat"]}, {"test": ["car"], "validation": ["car"]}, {"builtin": ["boat"]}):
-        with pytest.raises(spadwarp.ConfigError, match=r"targets\."):
-            Plan(Recipe.from_dict({**TABLES, "targets": {**TABLES["targets"], **names}}))
-    # Traced scenes that are described, of which there are none.
+    # Traced scenes that are described, of which there are none unless it is said so.
     with pytest.raises(spadwarp.ConfigError, match=r"monte_carlo.*share is missing"):
         Recipe.from_dict({**TABLES, "monte_carlo": {"photons": 1000}})
     assert Recipe.from_dict({**TABLES, "monte_carlo": {"photons": 1000, "share": 0.0}}).monte_carlo.share == 0.0
 
 
 INF, NAN = math.inf, math.nan
+PLUME = {"probability": 0.5, "optical_depth": {"low": 0.5, "high": 2.0}, "cells": 12, "size": 1.5}
+LAYERS = [{"start": 1.0, "extinction": 1.0, "albedo": 0.5}]
+WRONG = [
+    ({"scene.camera.pixels": 3}, r"camera\.pixels"),
+    ({"targets.test": ["boat"]}, r"targets\."),
+    ({"targets.test": ["car"], "targets.validation": ["car"]}, r"targets\."),
+    ({"targets.builtin": ["boat"]}, r"targets\."),
+    # What varies is tried when the recipe is read.
+    ({"vary": {"medium.extinction": [0.1, NAN]}}, r"vary\.medium\.extinction holds"),
+    ({"vary": {"medium.extinction": [0.1, -1.0]}}, r"vary: medium\.extinction = -1\.0"),
+    ({"vary": {"medium.extinction": {"low": 0.1, "high": 1e7}}}, r"vary: medium\.extinction = 10000000\.0"),
+    ({"vary": {"medium.extinction": {"low": 5e-324, "high": 1.0, "log": True}}}, "too far apart"),
+    ({"vary": {"laser.preset": ["lu2024", "none"]}}, r"vary: laser\.preset = 'none'"),
+    ({"vary": {"x": 3}}, "vary: x is not a known section"),
+    ({"vary": {"medium.haze": 3}}, r"vary: medium\.haze is not a known field"),
+    ({"plume": {**PLUME, "shape": ["fog"]}}, r"plume\.shape"),
+    ({"plume": {**PLUME, "probability": 1.5}}, r"plume\.probability = 1\.5 .*is outside"),
+    ({"plume": PLUME, "scene.medium.layers": LAYERS}, "cannot be combined with layers"),
+]
+for field in ("pose.distance", "pose.shift", "pose.reflectance", "exposure.signal_photons"):
+    for value in (NAN, INF, -INF, [0.5, NAN], [NAN, 0.5], [0.5, INF], {"low": NAN, "high": 1.0}):
+        WRONG.append(({field: value}, f"^{field}"))
+WRONG += [({"frames.backscatter_fraction": value}, "^frames.backscatter_fraction") for value in (NAN, [0.5, 1e300])]
+WRONG += [({"pose.distance": value}, r"^pose\.distance") for value in ([0.5, 1e300], {"low": 0.1, "high": INF})]
 
 
-WRONG = (NAN, INF, -INF, [0.5, NAN], [NAN, 0.5], [0.5, INF], [0.5, 1e300])
-WRONG += ({"low": NAN, "high": 1.0}, {"low": 0.1, "high": INF})
-
-
-@pytest.mark.parametrize(
-    "field",
-    ["pose.distance", "pose.shift", "pose.reflectance", "exposure.signal_photons", "frames.backscatter_fraction"],
-)
-def test_distributions_are_finite_whatever_the_order(field):
-    for value in WRONG:
-        with pytest.raises(spadwarp.ConfigError, match=f"^{field}"):
-            Recipe.from_dict(TABLES).with_overrides({field: value})
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "problem"),
-    [
-        ("medium.extinction", [0.1, NAN], r"vary\.medium\.extinction holds"),
-        ("medium.extinction", [0.1, -1.0], r"vary: medium\.extinction = -1\.0"),
-        ("medium.extinction", {"low": 0.1, "high": 1e7}, r"vary: medium\.extinction = 10000000\.0"),
-        ("medium.extinction", {"low": 5e-324, "high": 1.0, "log": True}, "too far apart"),
-        ("laser.preset", ["lu2024", "none"], r"vary: laser\.preset = 'none'"),
-        ("x", 3, "vary: x is not a known section"),
-        ("medium.haze", 3, r"vary: medium\.haze is not a known field"),
-    ],
-)
-def test_what_varies_is_tried_when_the_recipe_is_read(field, value, problem):
+@pytest.mark.parametrize(("changes", "problem"), WRONG)
+def test_recipes_that_cannot_be_are_refused(changes, problem):
     with pytest.raises(spadwarp.ConfigError, match=problem):
-        Recipe.from_dict({**TABLES, "vary": {field: value}})
+        Plan(recipe(**changes))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs/datasets").glob("*.toml")), ids=lambda path: path.stem)
@@ -433,6 +427,23 @@ def test_recipes_in_configs(path):
         drawn = plan.scene(index)
         far = drawn.scene.gate.stop * SPEED_OF_LIGHT / drawn.scene.medium.group_index / 2.0
         assert codes[0] < 0.97 * (far - 2.0) and far < codes[1]
+
+
+def test_part_of_the_scenes_have_a_plume_of_the_optical_depth_that_was_drawn():
+    plain = Plan(load_recipe("small"))
+    plan = Plan(plain.recipe.with_overrides({"plume": PLUME}))
+    found = []
+    for index in range(min(plan.scene_count, 24)):
+        drawn, without = plan.scene(index), plain.scene(index)
+        grid, depth = drawn.scene.medium.grid, drawn.scene.medium.extinction * drawn.distance
+        # Everything else is as it was.
+        assert drawn.scene.with_overrides({"medium.grid": None}) == without.scene and drawn.seed == without.seed
+        if grid is not None:
+            found.append(drawn.scene.optical_depth((0.0, 0.0, 0.0), (0.0, 0.0, drawn.distance)) - depth)
+            assert 0.3 * drawn.distance <= grid.translation[2] <= 0.8 * drawn.distance
+            assert plan.scene(index).scene == drawn.scene
+    assert 4 <= len(found) <= 20
+    assert 0.49 < min(found) < max(found) < 2.01
 
 
 @pytest.mark.slow
