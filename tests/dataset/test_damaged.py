@@ -31,10 +31,9 @@ def change(folder, path, value):
     manifest = json.loads((folder / "manifest.json").read_text())
     *outer, last = path.split(".")
     table = functools.reduce(dict.get, outer, manifest)
+    table[last] = value
     if value is ...:
         del table[last]
-    else:
-        table[last] = value
     (folder / "manifest.json").write_text(json.dumps(manifest))
 
 

@@ -11,7 +11,7 @@ from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
 
 ROOM = {"targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0]}]}
-SCENE_FUNCTIONS = {
+OF_SCENES = {
     "simulate": lambda one: spadwarp.simulate(one, photons=1000, device="cpu").tallies,
     "truth_maps": lambda one: spadwarp.truth_maps(one, device="cpu").depth,
     "check": lambda one: [str(message) for message in spadwarp.check(one)],
@@ -19,32 +19,7 @@ SCENE_FUNCTIONS = {
     "sweep": lambda one: spadwarp.sweep(one, vary="medium.extinction=0.2", device="cpu").column("signal"),
     "simulate_analytic": lambda one: spadwarp.simulate_analytic(one, device="cpu").signal,
 }
-
-
-@pytest.fixture(scope="module")
-def scene_path(tmp_path_factory):
-    path = tmp_path_factory.mktemp("scene") / "scene.toml"
-    path.write_text(scene(**ROOM).to_toml())
-    return path
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory):
-    found = spadwarp.simulate(scene(**ROOM), photons=1000, device="cpu")
-    return found, found.save(tmp_path_factory.mktemp("run") / "result.h5").parent
-
-
-@pytest.mark.parametrize("name", SCENE_FUNCTIONS)
-def test_a_scene_may_be_its_path(name, scene_path):
-    expected = SCENE_FUNCTIONS[name](spadwarp.load_scene(scene_path))
-    for one in (scene_path, str(scene_path)):
-        np.testing.assert_array_equal(SCENE_FUNCTIONS[name](one), expected)
-    for wrong in (None, 5, {}, [1.0], object):
-        with pytest.raises(spadwarp.ArgumentError, match=r"scene = .* is neither a Scene nor the path of a scene file"):
-            SCENE_FUNCTIONS[name](wrong)
-
-
-RESULT_FUNCTIONS = {
+OF_RESULTS = {
     "detect": lambda one: spadwarp.detect(one, pulses=10, seed=1, device="cpu").counts,
     "crlb": lambda one: spadwarp.crlb(one, device="cpu"),
     "merge": lambda one: spadwarp.merge([one]).tallies,
@@ -52,19 +27,30 @@ RESULT_FUNCTIONS = {
         spadwarp.simulate(scene(**ROOM), photons=1500, device="cpu", run=spadwarp.RunOptions(resume=one)).tallies
     ),
 }
+NO_SCENE, NO_RESULT = (None, 5, {}, [1.0], object), (5, {}, np.zeros((2, 2, 3)))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Of a run and its scene."""
+    place = tmp_path_factory.mktemp("run")
+    (place / "scene.toml").write_text(scene(**ROOM).to_toml())
+    spadwarp.simulate(scene(**ROOM), photons=1000, device="cpu").save(place / "result.h5")
+    return place
 
 
 @pytest.mark.filterwarnings("ignore::spadwarp.values.SpadwarpWarning")
-@pytest.mark.parametrize("name", RESULT_FUNCTIONS)
-def test_a_result_may_be_its_path(name, result):
-    found, folder = result
-    expected = RESULT_FUNCTIONS[name](found)
-    for one in (folder, folder / "result.h5", str(folder / "result.h5")):
-        np.testing.assert_array_equal(RESULT_FUNCTIONS[name](one), expected)
-    for wrong in () if name == "detect" else (5, {}, np.zeros((2, 2, 3))):
-        with pytest.raises(spadwarp.ArgumentError, match=r" is neither a Result nor the path of one"):
-            RESULT_FUNCTIONS[name](wrong)
-    for wrong in ("a.h5", None, 5):
+@pytest.mark.parametrize("name", [*OF_SCENES, *OF_RESULTS])
+def test_a_scene_or_a_result_may_be_its_path(name, folder):
+    function, file = (OF_SCENES | OF_RESULTS)[name], folder / ("scene.toml" if name in OF_SCENES else "result.h5")
+    expected = function((spadwarp.load_scene if name in OF_SCENES else spadwarp.load_result)(file))
+    for one in (file, str(file), *([] if name in OF_SCENES else [folder])):
+        np.testing.assert_array_equal(function(one), expected)
+    words = "a Scene nor the path of a scene file" if name in OF_SCENES else "a Result nor the path of one"
+    for wrong in NO_SCENE if name in OF_SCENES else () if name == "detect" else NO_RESULT:
+        with pytest.raises(spadwarp.ArgumentError, match=f" is neither {words}"):
+            function(wrong)
+    for wrong in ("a.h5", None, 5) if name == "merge" else ():
         with pytest.raises(spadwarp.ArgumentError, match="is not a list of results"):
             spadwarp.merge(wrong)
 
