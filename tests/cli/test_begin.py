@@ -29,6 +29,9 @@ def test_init_writes_a_scene_that_works(tmp_path, monkeypatch):
     assert "mine.toml exists; --overwrite" in run("init", "mine", code=2).stderr
     run("init", "mine", "--example", "harbour_5m", "--overwrite")
     assert spadwarp.load_scene("mine.toml") == spadwarp.load_scene("harbour_5m")
+    printed = run("init", "--schema", "scene").stdout
+    assert "#:schema ./scene.schema.json" in printed and "even-better-toml" in printed
+    assert tables("scene.schema.json") == json.loads(json.dumps(json_schema(spadwarp.Scene)))
 
 
 def test_every_choice_in_the_template_is_valid():
@@ -117,13 +120,6 @@ def test_all_configurations_fit_their_schema_which_describes_every_field(kind):
 )
 def test_a_schema_takes_what_a_scene_takes(text, fits):
     assert validator("scenes").is_valid(tomllib.loads(text)) is fits
-
-
-def test_schema_tells_editors_where_it_is(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    printed = run("init", "--schema", "scene").stdout
-    assert "#:schema ./scene.schema.json" in printed and "even-better-toml" in printed
-    assert tables("scene.schema.json") == json.loads(json.dumps(json_schema(spadwarp.Scene)))
 
 
 def test_help_shows_every_command_once_by_stage_with_an_example_and_all_its_options():
