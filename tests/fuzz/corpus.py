@@ -154,7 +154,7 @@ def make_corpus(folder: Path) -> None:
     options = {"global_resolution": 50e-9, "tcspc_resolution": 2e-10}
     ptufile.imwrite(folder / "counts.ptu", COUNTS, **options)
     depth = np.full((8, 10), 2.0, np.float32)
-    write_exr(folder / "depth.exr", {"Z": depth, "A": depth, "R": depth}, {"content": "test"})
+    write_exr(folder / "depth.exr", {"Z": depth, "A": depth, "Y": 0.2 * depth}, {"content": "test"})
     weights = Path(spadwarp.__file__).parent / "denoise" / "weights" / "usdn.safetensors"
     (folder / "usdn.safetensors").write_bytes(weights.read_bytes())
 
