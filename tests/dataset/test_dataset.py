@@ -240,6 +240,9 @@ def test_traced_scenes_hold_their_histograms(tmp_path):
     for form in ("sparse", "dense"):
         make(recipe(**changes, **{"monte_carlo.counts": form}), tmp_path / form)
         assert not verify_dataset(tmp_path / form)
+        with h5py.File(tmp_path / form / "scenes.h5") as file:
+            profile, edges = file["backscatter_profile"][...], file["profile_edges"][...]
+        np.testing.assert_allclose((profile * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
         fields = ("noisy", "clean", "label", "intensity", "counts", "expected")
         items = list(iterate_dataset(tmp_path / form, "test", fields=fields))
         totals[form] = [item["counts"] for item in items]
