@@ -1,13 +1,17 @@
-"""One rule for what commands write: nothing is replaced that was not named for output, and nothing that is read."""
+"""One rule for what commands write: nothing is replaced that was not named for output, and nothing that is read. On a
+full disk, nothing is lost."""
 
 import os
 import subprocess
 import sys
+import threading
 
+import numpy as np
 import pytest
 
 import spadwarp
-from helpers.cli import DEVICE, ENVIRONMENT, run, tables
+from helpers.cli import DEVICE, ENVIRONMENT, run, small_files, tables
+from helpers.datasets import make, recipe
 from spadwarp.io.paths import lock
 
 
@@ -15,7 +19,6 @@ def refused(*arguments, words=()):
     outcome = run(*arguments, code=2)
     printed = " ".join(outcome.stderr.replace("│", "").split())
     assert all(str(word) in printed for word in words), printed
-    return printed
 
 
 @pytest.mark.parametrize(
@@ -61,38 +64,29 @@ def test_a_command_that_fails_leaves_no_empty_folder(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.npy", "kept"] and not list(kept.iterdir())
 
 
-@pytest.mark.parametrize("name", ["page.html", "light.gif"])
-def test_a_page_or_a_video_never_replaces_what_it_shows(name, done, tmp_path):
+def test_what_is_read_is_never_replaced(done, tmp_path):
     pytest.importorskip("plotly")
-    command, before = ("view",), (done / "result.h5").read_bytes()
-    for overwrite in ((), ("--overwrite",)):
-        refused(*command, done, "--out", done / "result.h5", *overwrite, words=("--out", "result.h5"))
-    link = tmp_path / "link"
-    link.symlink_to(done)
-    refused(*command, link, "--out", done / "result.h5", "--overwrite", words=("is read by this command",))
-    assert (done / "result.h5").read_bytes() == before
-
-    path = tmp_path / name
-    path.write_text("mine")
-    refused(*command, done, "--out", path, words=("--out", "exists"))
-    run(*command, done, "--out", path, "--overwrite")
-    assert path.read_bytes()[:4] != b"mine"
-
-
-def test_a_run_is_not_merged_into_one_of_its_parts(done):
-    before = (done / "result.h5").read_bytes()
-    refused("merge", done, "--out", done, "--overwrite", words=("result.h5", "is read by this command"))
-    assert (done / "result.h5").read_bytes() == before
-
-
-def test_depth_is_not_written_over_what_it_is_estimated_from(done, tmp_path):
+    source = done / "result.h5"
     run("export", done, "--format", "npy", "--out", tmp_path)
-    source = (tmp_path / "result.npy").rename(tmp_path / "depth.npy")
-    before = source.read_bytes()
-    options = ("--input", "bin_width=100ps", "--overwrite")
-    refused("depth", source, "--out", tmp_path, *options, words=("depth.npy", "is read by this command"))
-    refused("depth", done, "--out", tmp_path / "out", "--ply", source, words=("--ply", "exists"))
-    assert source.read_bytes() == before
+    depth = (tmp_path / "result.npy").rename(tmp_path / "depth.npy")
+    before = source.read_bytes(), depth.read_bytes()
+    (tmp_path / "link").symlink_to(done)
+    refused("view", done, "--out", source, words=("--out", "result.h5"))
+    for command in (
+        ("view", done, "--out", source),
+        ("view", tmp_path / "link", "--out", source),
+        ("merge", done, "--out", done),
+        ("depth", depth, "--out", tmp_path, "--input", "bin_width=100ps"),
+    ):
+        refused(*command, "--overwrite", words=("is read by this command",))
+    refused("depth", done, "--out", tmp_path / "out", "--ply", depth, words=("--ply", "exists"))
+    assert (source.read_bytes(), depth.read_bytes()) == before
+    for name, options in {"page.html": (), "light.gif": ("--pictures", 3)}.items():
+        path = tmp_path / name
+        path.write_text("mine")
+        refused("view", done, "--out", path, words=("--out", "exists"))
+        run("view", done, "--out", path, *options, "--overwrite")
+        assert path.read_bytes()[:4] != b"mine"
 
 
 def test_what_appears_while_a_command_runs_is_not_replaced(done, tmp_path, monkeypatch):
@@ -122,20 +116,21 @@ def test_links_are_replaced_and_never_written_through(scene, tmp_path):
 
 @pytest.mark.skipif(os.name != "posix", reason="pipes and devices of POSIX")
 def test_pipes_and_devices_are_written_to_as_they_are(tmp_path):
-    command = [sys.executable, "-m", "spadwarp", "water", "532", "--json"]
-    piped = subprocess.run([*command, "/dev/stdout"], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    command = [sys.executable, "-m", "spadwarp", "water", "532", "--json", "/dev/stdout"]
+    piped = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert '"extinction"' in piped.stdout and "group index" in piped.stdout
     with (tmp_path / "file").open("w") as file:  # as a shell does for `> file`
-        subprocess.run([*command, "/dev/stdout"], env=ENVIRONMENT, stdout=file, check=True)
+        subprocess.run(command, env=ENVIRONMENT, stdout=file, check=True)
     assert (tmp_path / "file").read_text() == piped.stdout
 
-    pipe = tmp_path / "pipe"
+    pipe, read = tmp_path / "pipe", []
     os.mkfifo(pipe)
-    process = subprocess.Popen([*command, pipe], env=ENVIRONMENT, stdout=subprocess.DEVNULL)
-    assert '"extinction"' in pipe.read_text()
-    assert process.wait() == 0 and pipe.is_fifo()
-    full = subprocess.run([*command, "/dev/full"], env=ENVIRONMENT, capture_output=True, text=True)
-    assert full.returncode == 1 and "/dev/full: cannot be written" in full.stderr
+    reader = threading.Thread(target=lambda: read.append(pipe.read_text()), daemon=True)
+    reader.start()
+    run("water", "532", "--json", pipe)
+    reader.join(60)
+    assert '"extinction"' in read[0] and pipe.is_fifo()
+    assert "/dev/full: cannot be written" in run("water", "532", "--json", "/dev/full", code=1).stderr
 
 
 def test_two_commands_do_not_write_to_one_directory(scene, tmp_path):
@@ -149,8 +144,6 @@ def test_two_commands_do_not_write_to_one_directory(scene, tmp_path):
 
 
 def test_a_dataset_is_no_output(tmp_path):
-    from helpers.datasets import make, recipe
-
     folder = tmp_path / "data"
     small = {"targets.builtin": ["staircase"], "targets.validation": [], "frames.per_scene": 1, "scenes_per_target": 1}
     make(recipe(**small), folder)
@@ -165,3 +158,61 @@ def test_a_dataset_is_no_output(tmp_path):
     assert (folder / "manifest.json").read_bytes() == before and not (folder / "x.json").exists()
     run("view", tmp_path / "nosuch", "--out", tmp_path / "nosuch" / "preview.png", code=1)
     assert not (tmp_path / "nosuch").exists()
+
+
+@pytest.mark.filterwarnings("ignore:Monte Carlo noise")
+@pytest.mark.skipif(os.name != "posix", reason="limits of POSIX")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("view", "--out", "old", "--overwrite"),
+        ("export", "--format", "npy", "--out", ".", "--overwrite"),
+        ("detect", "--pulses", "1000", "--out", ".", "--overwrite", *DEVICE),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_full_disk_leaves_the_old_files(words, done, tmp_path, monkeypatch):
+    if words[0] == "detect":  # its kernels are loaded then: in the cache there is no room for them either
+        run("detect", done, "--pulses", "1000", "--out", tmp_path / "before", *DEVICE)
+    place = tmp_path / "place"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    old = dict.fromkeys(("old", "result.npy", "frames.h5"), "old")
+    for name, text in old.items():
+        (place / name).write_text(text)
+    command, *rest = words
+    with small_files(2000):
+        last = run(command, done, *rest, code=1).stderr.splitlines()[-1]
+    assert last.startswith("error: ") and "cannot be written" in last
+    assert {path.name: path.read_text() for path in place.iterdir()} == old
+
+
+def test_a_directory_below_a_file_or_of_too_long_a_name_is_refused(done, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for words in (
+        ("view", done, "--out", tmp_path / "file" / "page.html"),
+        ("detect", done, "--out", tmp_path / "file" / "frames"),
+        ("info", done, "--json", tmp_path / "file" / "info.json"),
+    ):
+        assert "cannot be written" in run(*words, code=1).stderr
+    assert (tmp_path / "file").read_text() == "mine"
+    for words in (("info", tmp_path / ("x" * 300)), ("view", done, "--out", tmp_path / ("x" * 300))):
+        assert run(*words, code=1).stderr.startswith("error: ")
+
+
+def test_arrays_that_are_not_what_their_name_says(tmp_path):
+    histograms = np.zeros((2, 2, 8))
+    np.save(tmp_path / "good.npy", histograms)
+    content = (tmp_path / "good.npy").read_bytes()
+    with (tmp_path / "zip.npy").open("wb") as file:
+        np.savez(file, histograms)
+    np.save(tmp_path / "pickle.npy", np.array([{"a": 1}], object))
+    np.save(tmp_path / "text.npy", np.array(["a", "b"]))
+    (tmp_path / "cut.npy").write_bytes(content[:-8])
+    (tmp_path / "bomb.npy").write_bytes(content.replace(b"(2, 2, 8), }" + b" " * 10, b"(2, 99999999999, 8), }"))
+    (tmp_path / "deep.npy").write_bytes(content.replace(b"(2, 2, 8)", b"((((((((("))
+    words = {"zip": ".npz archive", "pickle": "object", "text": "<U1", "cut": "cut", "bomb": "", "deep": ""}
+    options = ("--input", "bin_width=100ps,gate_start=0,group_index=1", "--out", tmp_path / "out")
+    for name, expected in words.items():
+        complaint = run("depth", tmp_path / f"{name}.npy", *options, code=1).stderr
+        assert f"{name}.npy" in complaint and expected in complaint, complaint

@@ -15,15 +15,15 @@ SMALL = {"targets.builtin": ["staircase"], "targets.validation": [], "frames.per
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("whole") / "data"
+def one_shard(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("one") / "data"
     make(recipe(**SMALL), folder)
     return folder
 
 
 @pytest.fixture
-def folder(whole, tmp_path):
-    return shutil.copytree(whole, tmp_path / "data")
+def folder(one_shard, tmp_path):
+    return shutil.copytree(one_shard, tmp_path / "data")
 
 
 def change(folder, path, value):
@@ -31,10 +31,9 @@ def change(folder, path, value):
     manifest = json.loads((folder / "manifest.json").read_text())
     *outer, last = path.split(".")
     table = functools.reduce(dict.get, outer, manifest)
+    table[last] = value
     if value is ...:
         del table[last]
-    else:
-        table[last] = value
     (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
@@ -80,13 +79,13 @@ def test_a_manifest_that_is_no_table_is_refused(text, folder):
 @pytest.mark.parametrize(
     "text", ["[]", "{", '{"../x.h5": {"bytes": 1, "sha256": "0"}}', '{"frames-00000.h5": 3}', "9" * 5000]
 )
-def test_a_record_that_is_not_whole_is_made_again(text, whole, folder):
+def test_a_record_that_is_not_whole_is_made_again(text, one_shard, folder):
     (folder / "shards" / "00000.json").write_text(text)
     (folder / "manifest.json").unlink()
     assert any("00000.json" in line or "not the record" in line for line in verify_dataset(folder))
     report = make(recipe(**SMALL), folder)
     assert report.made == ("frames-00000.h5",) and len(report.broken) == 1
-    assert read_manifest(folder) == read_manifest(whole)
+    assert read_manifest(folder) == read_manifest(one_shard)
 
 
 @pytest.mark.parametrize(

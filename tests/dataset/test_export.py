@@ -141,12 +141,11 @@ def test_features_find_the_return_and_a_second_one(folder):
         np.testing.assert_allclose(np.delete(found, 3, axis=0), np.delete(depth, 3, axis=0), rtol=1e-5)
 
 
-def test_what_cannot_be_exported_is_named(folder, tmp_path):
-    make(recipe(**{"frames.per_scene": 1}), tmp_path / "analytic")
+def test_what_cannot_be_exported_is_named(folder, whole, tmp_path):
     for dataset, arguments, problem in (
         (folder, {"fields": ("depth",)}, "'depth' is not one of 'noisy'"),
         (folder, {"format": "csv"}, "'csv' is not"),
-        (tmp_path / "analytic", {"fields": ("counts",)}, "it has no histograms"),
+        (whole, {"fields": ("counts",)}, "it has no histograms"),
     ):
         with pytest.raises(ArgumentError, match=problem):
             export_dataset(dataset, tmp_path / "a", **arguments)

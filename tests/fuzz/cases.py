@@ -2,162 +2,117 @@
 
 import random
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from fuzz import command_lines, mutations
 from fuzz.corpus import Corpus
 
-CPU = ("--device", "cpu")
-QUIETLY = ("--out", "out", "--quiet", *CPU)
-_MEDIAN = ("--model", "median", "--out", "out", *CPU)
 CALIBRATED = ("phase.csv", "beam.npy", "camera.yaml", "irf.csv", "target.obj", "target.mtl", "target.png")
+
+# Commands on a file {0}, of which one is chosen.
+RUN = "simulate {0} --photons 100 --out out --quiet --device cpu"
+CHECK_OR_RUN = ("check {0}", RUN)
+ON_A_SCENE = (*CHECK_OR_RUN, "check {0} --json out.json", "load_scene {0}")
+ON_A_SCENE += ("sweep {0} --vary range=1,2 --out out --device cpu",)
+ON_A_MESH = ("info {0}", "check scene.toml --mesh {0}", RUN.replace("{0}", "scene.toml --mesh {0}"))
+MEDIAN = "denoise {0} --model median --out out --device cpu"
+RENDERED = (
+    "analytic scene.toml --out out --quiet --device cpu --rendered depth={0},depth_channel=Z,depth_scale=1,albedo="
+)
+ON_AN_EXR = (MEDIAN, MEDIAN, RENDERED + "0.5", RENDERED + "{0}")
+ON_HDF5 = ("info {0}", "info {0} --json out.json", "load {0}", "depth {0} --out out --device cpu")
+ON_HDF5 += ("view {0} --out out.html --device cpu",)
+ON_HDF5 += tuple(f"export {{0}} --out out --format {name}" for name in ("npy", "mat", "ptu", "exr"))
+ON_A_RESULT = (
+    "detect {0} --pulses 50 --method peak --out out --device cpu",
+    "merge {0} other.h5 --out out --device cpu",
+    "simulate --photons 2500 --resume {0} --device cpu",
+    "view {0} --out out.gif --pictures 3",
+)
+ON_A_DATASET = ("info data", "info data --verify", "view data --out out.png", "export data --format npy --out out")
+ON_A_DATASET += ("load data",)
+TAGS, KNOWN = "tag_unit=200ps,", " --input bin_width=200ps,gate_start=10ns,group_index=1.3"
+DEPTH = "depth {0} --out out --device cpu" + KNOWN
+ON_COUNTS = (MEDIAN + KNOWN, *(f"{DEPTH},irf=300ps --method {name}" for name in ("peak", "centroid", "likelihood")))
+WITH_A_RESPONSE = (DEPTH.format("counts.npy") + ",irf={0} --method matched",)
+WITH_WEIGHTS = ("denoise depth.npy --model usdn --weights {0} --out out --device cpu",)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A command in a folder.
+    """A command in a folder."""
 
-    Attributes:
-        arguments: Of `spadwarp`, or the name of a check in `executed` and a file.
-        files: Content by name; a name without content is a folder or file of the corpus that is copied.
-        outputs: Names that the command may create or change, folders with all that is in them.
-        injected: Whether a number of a text became NaN or infinite, so that success has to be looked into.
-    """
+    arguments: tuple[str, ...]  # of `spadwarp`, or the name of a check in `executed` and a file
+    files: dict[str, bytes | None]  # content by name; what has none is a folder or file of the corpus
+    outputs: tuple[str, ...] = ()  # what the command may create or change, folders with all that is in them
+    injected: bool = False  # a number of a text became NaN or infinite, so that success has to be looked into
 
-    arguments: tuple[str, ...]
-    files: dict[str, bytes | None]
-    outputs: tuple[str, ...] = ()
-    injected: bool = False
-    about: str = field(default="", compare=False)
+
+def _case(r: random.Random, commands: Sequence[str], name: str, damaged: bytes, *others: str, **options: Any) -> Case:
+    outputs = ("out", "out.json", "out.html", "out.gif", "out.png")
+    words = tuple(r.choice(commands).format(name).split())
+    outputs += (".",) * ("--resume" in words)  # a run that is resumed is written where it is
+    return Case(words, {**dict.fromkeys(others), name: damaged}, outputs, **options)
 
 
 def _scene(r: random.Random, corpus: Corpus) -> Case:
-    name = r.choice(("scene.toml", "scene.toml", "calibrated.toml"))
-    injected = r.random() < 0.25
+    name, injected = r.choice(("scene.toml", "scene.toml", "calibrated.toml")), r.random() < 0.25
     damaged = (mutations.non_finite if injected else mutations.in_text)(r, corpus[name])
-    others = {} if name == "scene.toml" else dict.fromkeys(CALIBRATED)
-    command = r.choice((
-        ("check", name),
-        ("check", name, "--json", "out.json"),
-        ("simulate", name, "--photons", "200", *QUIETLY),
-        ("sweep", name, "--vary", "range=1,2", "--out", "out", *CPU),
-        ("load_scene", name),
-    ))  # fmt: skip
-    return Case(command, {name: damaged, **others}, ("out", "out.json"), injected)
-
-
-def _beside_a_scene(*names: str) -> Callable[[random.Random, Corpus], Case]:
-    """Files that a scene names: calibrations, tables, responses, profiles, meshes with colours."""
-
-    def case(r: random.Random, corpus: Corpus) -> Case:
-        name = r.choice(names)
-        damage = mutations.in_bytes if name.rpartition(".")[2] in ("npy", "png") else mutations.in_text
-        scene = corpus["calibrated.toml"]
-        if name.startswith("camera"):
-            scene = scene.replace(b"camera.yaml", name.encode())
-        files = {**dict.fromkeys(CALIBRATED), "calibrated.toml": scene, name: damage(r, corpus[name])}
-        return Case(_check_or_run(r, "calibrated.toml"), files, ("out",))
-
-    return case
-
-
-def _check_or_run(r: random.Random, *words: str) -> tuple[str, ...]:
-    return r.choice((("check", *words), ("simulate", *words, "--photons", "100", *QUIETLY)))
-
-
-def _grid(r: random.Random, corpus: Corpus) -> Case:
-    name = r.choice(("cells.npz", "cells.h5"))
-    files = {"grid.toml": corpus["grid.toml"].replace(b"cells.npz", name.encode())}
-    files[name] = mutations.in_bytes(r, corpus[name])
-    return Case(_check_or_run(r, "grid.toml"), files, ("out",))
+    return _case(r, ON_A_SCENE, name, damaged, *(() if name == "scene.toml" else CALIBRATED), injected=injected)
 
 
 def _recipe(r: random.Random, corpus: Corpus) -> Case:
-    name = r.choice(("recipe.toml", "recipe.toml", "training.toml"))
-    injected = r.random() < 0.3
+    name, injected = r.choice(("recipe.toml", "recipe.toml", "training.toml")), r.random() < 0.3
     damaged = (mutations.non_finite if injected else mutations.in_text)(r, corpus[name])
-    return Case(("load_" + name.partition(".")[0], name), {name: damaged}, (), injected)
+    return _case(r, (f"load_{name.partition('.')[0]} {{0}}",), name, damaged, injected=injected)
+
+
+def _beside_a_scene(*names: str) -> Callable[[random.Random, Corpus], Case]:
+    """Files that a scene names: calibrations, tables, responses, profiles, meshes with colours, cells."""
+
+    def case(r: random.Random, corpus: Corpus) -> Case:
+        name = r.choice(names)
+        damage = mutations.in_bytes if name.endswith((".npy", ".png", ".npz", ".h5")) else mutations.in_text
+        scene = "grid.toml" if name.startswith("cells") else "calibrated.toml"
+        made = _case(r, CHECK_OR_RUN, scene, corpus[scene], *CALIBRATED)
+        text = made.files[scene].replace(b"cells.npz", name.encode())
+        text = text.replace(b"camera.yaml", name.encode()) if name.startswith("camera") else text
+        return replace(made, files={**made.files, scene: text, name: damage(r, corpus[name])})
+
+    return case
 
 
 def _mesh(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("box.stl", "box.ascii.stl", "box.ply", "box.off", "box.glb", "target.obj"))
     is_text = name in ("box.ascii.stl", "box.off", "target.obj")
     damaged = (mutations.in_text if is_text or r.random() < 0.3 else mutations.in_bytes)(r, corpus[name])
-    command = ("info", name) if r.random() < 0.3 else _check_or_run(r, "scene.toml", "--mesh", name)
-    return Case(command, {name: damaged, **dict.fromkeys(("scene.toml", "target.mtl", "target.png"))}, ("out",))
-
-
-def _exr(r: random.Random, corpus: Corpus) -> Case:
-    rendered = "depth=depth.exr,depth_channel=Z,depth_scale=1,albedo=" + r.choice(("0.5", "depth.exr"))
-    command = r.choice(
-        (("analytic", "scene.toml", "--rendered", rendered, *QUIETLY), ("denoise", "depth.exr", *_MEDIAN))
-    )
-    return Case(command, {"depth.exr": mutations.in_bytes(r, corpus["depth.exr"]), "scene.toml": None}, ("out",))
+    return _case(r, ON_A_MESH, name, damaged, "scene.toml", "target.mtl", "target.png")
 
 
 def _hdf5(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("result.h5", "frames.h5", "analytic.h5", "records.h5"))
-    commands = [
-        ("info", name),
-        ("info", name, "--json", "out.json"),
-        ("depth", name, "--out", "out", *CPU),
-        ("view", name, "--out", "out.html", *CPU),
-        ("export", name, "--format", r.choice(("npy", "mat", "ptu", "exr")), "--out", "out"),
-        ("load", name),
-    ]
-    if name == "result.h5":
-        commands += [
-            ("detect", name, "--pulses", "50", "--method", "peak", "--out", "out", *CPU),
-            ("merge", name, "other.h5", "--out", "out", *CPU),
-            ("simulate", "scene.toml", "--photons", "2000", "--resume", "result.h5", "--out", "out", *CPU),
-            ("view", name, "--out", "out.gif", "--pictures", "3"),
-        ]
-    files = {name: mutations.in_hdf5(r, corpus[name]), "scene.toml": None}
-    if name == "result.h5":
-        files["other.h5"] = corpus["result.h5"]
-    return Case(r.choice(commands), files, ("out", "out.json", "out.html", "out.gif"))
+    commands = ON_HDF5 + (ON_A_RESULT if name == "result.h5" else ())
+    made = _case(r, commands, name, mutations.in_hdf5(r, corpus[name]), "scene.toml")
+    return replace(made, files={**made.files, "other.h5": corpus["result.h5"]})
 
 
 def _dataset(r: random.Random, corpus: Corpus) -> Case:
     name = r.choice(("manifest.json", "frames-00000.h5", "scenes.h5", "scenes/scenes-00001.h5", "recipe.toml"))
     damage = mutations.in_hdf5 if name.endswith(".h5") else mutations.in_text
-    command = r.choice((
-        ("info", "data"),
-        ("info", "data", "--verify"),
-        ("view", "data", "--out", "out.png"),
-        ("export", "data", "--format", "npy", "--out", "out"),
-        ("load", "data"),
-    ))  # fmt: skip
-    return Case(command, {"data": None, f"data/{name}": damage(r, corpus[f"data/{name}"])}, ("out", "out.png"))
+    return _case(r, ON_A_DATASET, f"data/{name}", damage(r, corpus[f"data/{name}"]), "data")
 
 
-_KNOWN = ("--input", "bin_width=200ps,gate_start=10ns,group_index=1.3")
-
-
-def _measured(*names: str) -> Callable[[random.Random, Corpus], Case]:
+def _damaged(commands: Sequence[str], *names: str, others: tuple[str, ...] = ()) -> Callable:
     def case(r: random.Random, corpus: Corpus) -> Case:
         name = r.choice(names)
-        tags = ("--input", "tag_unit=200ps") if name == "tags.mat" else ()
-        method = ("--input", "irf=300ps", "--method", r.choice(("peak", "centroid", "likelihood")))
-        depth = ("depth", name, "--out", "out", *_KNOWN, *tags, *method, *CPU)
-        command = r.choice((depth, ("denoise", name, *_MEDIAN, *_KNOWN, *tags)))
-        if name == "depth.npy":
-            command = ("denoise", name, *_MEDIAN)
-        if name in ("response.npy", "irf.csv"):
-            method = ("--input", f"irf={name}", "--method", "matched")
-            command = ("depth", "counts.npy", "--out", "out", *_KNOWN, *method, *CPU)
         damage = mutations.in_text if name.endswith(".csv") else mutations.in_bytes
-        return Case(command, {"counts.npy": None, name: damage(r, corpus[name])}, ("out",))
+        command = [one.replace("gate_start", f"{TAGS * (name == 'tags.mat')}gate_start") for one in commands]
+        return _case(r, command, name, damage(r, corpus[name]), *others)
 
     return case
-
-
-def _weights(r: random.Random, corpus: Corpus) -> Case:
-    damaged = mutations.in_bytes(r, corpus["usdn.safetensors"])
-    command = ("denoise", "depth.npy", "--model", "usdn", "--weights", "own.safetensors", "--out", "out", *CPU)
-    return Case(command, {"own.safetensors": damaged, "depth.npy": None}, ("out",))
 
 
 def _command_line(r: random.Random, corpus: Corpus) -> Case:
@@ -169,19 +124,20 @@ def _command_line(r: random.Random, corpus: Corpus) -> Case:
 CATEGORIES: dict[str, Callable[[random.Random, Corpus], Case]] = {
     "scene": _scene,
     "recipe": _recipe,
-    "grid": _grid,
+    "grid": _beside_a_scene("cells.npz", "cells.h5"),
     "calibration": _beside_a_scene("camera.yaml", "camera.json", "camera.xml"),
     "table": _beside_a_scene("phase.csv", "irf.csv", "beam.npy"),
     "mesh": _mesh,
     "picture": _beside_a_scene("target.png", "target.mtl", "target.obj"),
-    "exr": _exr,
+    "exr": _damaged(ON_AN_EXR, "depth.exr", others=("scene.toml",)),
     "hdf5": _hdf5,
     "dataset": _dataset,
-    "npy": _measured("counts.npy", "depth.npy", "response.npy"),
-    "csv": _measured("irf.csv"),
-    "mat": _measured("counts.mat", "packed.mat", "tags.mat", "sparse.mat"),
-    "ptu": _measured("counts.ptu"),
-    "weights": _weights,
+    "counts": _damaged(ON_COUNTS, "counts.npy"),
+    "depth": _damaged((MEDIAN,), "depth.npy"),
+    "response": _damaged(WITH_A_RESPONSE, "irf.csv", "response.npy", others=("counts.npy",)),
+    "mat": _damaged(ON_COUNTS, "counts.mat", "packed.mat", "tags.mat", "sparse.mat"),
+    "ptu": _damaged(ON_COUNTS, "counts.ptu"),
+    "weights": _damaged(WITH_WEIGHTS, "usdn.safetensors", others=("depth.npy",)),
     "command": _command_line,
 }
 

@@ -51,24 +51,13 @@ seed = 3
 [output]
 png = false
 """
+GRID = SCENE + b'[medium.grid]\nfile = "cells.npz"\ntranslation = [0.0, 0.0, 1.0]\n'
 
-CALIBRATED = b"""[medium]
-extinction = 0.5
-albedo = 0.8
-phase_function = "tabulated"
-phase_table = "phase.csv"
-[laser]
-profile = "measured"
-profile_image = "beam.npy"
-half_angle_deg = 10
-[camera]
-calibration = "camera.yaml"
-aperture_diameter = 0.02
-[gate]
-bin_width_ps = 200.0
-bins = 30
-[detector]
-irf = "irf.csv"
+CALIBRATED = b"""medium = {extinction = 0.5, albedo = 0.8, phase_function = "tabulated", phase_table = "phase.csv"}
+laser = {profile = "measured", profile_image = "beam.npy", half_angle_deg = 10}
+camera = {calibration = "camera.yaml", aperture_diameter = 0.02}
+gate = {bin_width_ps = 200.0, bins = 30}
+detector = {irf = "irf.csv"}
 [[targets]]
 mesh = "target.obj"
 translation = [0, 0, 2.0]
@@ -76,8 +65,6 @@ reflectance = "from_file"
 [transport]
 photons = 500
 """
-
-GRID = SCENE.replace(b"[laser]", b'[medium.grid]\nfile = "cells.npz"\ntranslation = [0.0, 0.0, 1.0]\n[laser]', 1)
 
 CAMERA = b"""%YAML:1.0
 ---
@@ -88,36 +75,20 @@ camera_matrix: !!opencv-matrix
    cols: 3
    dt: d
    data: [ 17.0, 0.0, 3.0, 0.0, 17.0, 2.0, 0.0, 0.0, 1.0 ]
-distortion_coefficients: !!opencv-matrix
-   rows: 1
-   cols: 5
-   dt: d
-   data: [ -0.01, 0.001, 0.0, 0.0, 0.0 ]
+distortion_coefficients: !!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.01, 0.001, 0.0, 0.0, 0.0]}
 """
 
-CAMERA_XML = b"""<?xml version="1.0"?>
-<opencv_storage>
-<image_width>10</image_width>
-<image_height>8</image_height>
+CAMERA_XML = b"""<?xml version="1.0"?><opencv_storage><image_width>10</image_width><image_height>8</image_height>
 <camera_matrix type_id="opencv-matrix">
-  <rows>3</rows>
-  <cols>3</cols>
-  <dt>d</dt>
-  <data>17. 0. 3. 0. 17. 2. 0. 0. 1.</data></camera_matrix>
+  <rows>3</rows><cols>3</cols><dt>d</dt><data>17. 0. 3. 0. 17. 2. 0. 0. 1.</data></camera_matrix>
 <distortion_coefficients type_id="opencv-matrix">
-  <rows>1</rows>
-  <cols>5</cols>
-  <dt>d</dt>
-  <data>-0.01 0.001 0. 0. 0.</data></distortion_coefficients>
-</opencv_storage>
+  <rows>1</rows><cols>5</cols><dt>d</dt><data>-0.01 0.001 0. 0. 0.</data></distortion_coefficients></opencv_storage>
 """
 
 TRAINING = b"""model = "usdn"
 data = "none"
 seed = 4
-[noise]
-backscatter = [0.0, 0.5]
-photons = [1.0, 300.0]
+noise = {backscatter = [0.0, 0.5], photons = [1.0, 300.0]}
 [optimiser]
 steps = 6
 batch = 2
@@ -132,7 +103,7 @@ COUNTS = np.random.default_rng(1).poisson(1.0, (8, 10, 30)).astype(np.uint16)
 
 
 def make_corpus(folder: Path) -> None:
-    """Writes all files; takes a few seconds."""
+    """Writes all files."""
     matrix = [[17.0, 0.0, 3.0], [0.0, 17.0, 2.0], [0.0, 0.0, 1.0]]
     camera = {"image_width": 10, "image_height": 8, "camera_matrix": matrix, "distortion_coefficients": [-0.01] * 5}
     for name, content in {
@@ -141,12 +112,7 @@ def make_corpus(folder: Path) -> None:
         "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
     }.items():  # fmt: skip
         (folder / name).write_bytes(content)
-    _meshes(folder)
-    _ours(folder)
-    _theirs(folder)
-
-
-def _meshes(folder: Path) -> None:
+    # Meshes.
     box = trimesh.creation.box((1.0, 1.0, 0.2))
     box.visual.face_colors = np.arange(48, dtype=np.uint8).reshape(12, 4)
     for ending in ("stl", "ply", "off", "glb"):
@@ -158,10 +124,7 @@ def _meshes(folder: Path) -> None:
         "usemtl one\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"
     )
     Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(folder / "target.png")
-
-
-def _ours(folder: Path) -> None:
-    """HDF5 of every kind, and a dataset."""
+    # HDF5 of every kind, and a dataset.
     scene = spadwarp.load_scene(folder / "scene.toml")
     result = spadwarp.simulate(scene, photons=2000, seed=3, device="cpu", uncertainty=True)
     result.save(folder / "result.h5")
@@ -170,9 +133,7 @@ def _ours(folder: Path) -> None:
     save_records(trace(scene, photons=20, device="cpu"), folder / "records.h5", scene=scene)
     small = recipe(**{"scenes_per_target": 1, "frames.per_scene": 2, "gate.bins": 32})
     spadwarp.dataset.make_dataset(small, folder / "data", device="cpu")
-
-
-def _theirs(folder: Path) -> None:
+    # Arrays and histograms of others.
     np.save(folder / "counts.npy", COUNTS)
     cells = {"density": np.linspace(0.0, 2.0, 60).reshape(3, 4, 5), "cell_size": np.full(3, 0.1)}
     np.savez(folder / "cells.npz", **cells)
@@ -193,7 +154,7 @@ def _theirs(folder: Path) -> None:
     options = {"global_resolution": 50e-9, "tcspc_resolution": 2e-10}
     ptufile.imwrite(folder / "counts.ptu", COUNTS, **options)
     depth = np.full((8, 10), 2.0, np.float32)
-    write_exr(folder / "depth.exr", {"Z": depth, "A": depth, "R": depth}, {"content": "test"})
+    write_exr(folder / "depth.exr", {"Z": depth, "A": depth, "Y": 0.2 * depth}, {"content": "test"})
     weights = Path(spadwarp.__file__).parent / "denoise" / "weights" / "usdn.safetensors"
     (folder / "usdn.safetensors").write_bytes(weights.read_bytes())
 

@@ -15,31 +15,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SECONDS, BYTES = 20.0, 2 << 30
+SECONDS, BYTES = 60.0, 2 << 30  # kernels may have to be compiled
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a call ended.
-
-    Attributes:
-        kind: "done", "traceback" (an exception), "crash" (a signal), "hang" (no end within the time).
-        value: What the function returned, or the name of the exception or signal.
-        text: Of the exception, or what the child wrote to stderr as it crashed.
-        seconds: Wall-clock time.
-    """
+    """How a call ended: "done" with what it returned, or "traceback", "crash", "hang" with a name; seconds it took."""
 
     kind: str
     value: Any
-    text: str
+    text: str  # of the exception, or what the child wrote to stderr as it crashed
     seconds: float
 
 
 def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: int = BYTES) -> Outcome:
-    """What `call()` returns, from a forked child that may take `memory` bytes more than its parent has now.
-
-    The child's stderr goes to a file, so that a fault's stack is known.
-    """
+    """What `call()` returns, from a forked child that may take `memory` bytes more than its parent has now."""
     began = time.monotonic()
     source, sink = os.pipe()
     with tempfile.TemporaryFile() as log:
@@ -66,18 +56,13 @@ def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: i
 
 def _read(source: int, deadline: float) -> bytes | None:
     """All that comes until the pipe closes; None if it does not in time."""
-    parts = []
-    try:
-        while True:
-            ready, _, _ = select.select([source], [], [], max(deadline - time.monotonic(), 0.0))
-            if not ready:
-                return None
-            part = os.read(source, 1 << 16)
-            if not part:
-                return b"".join(parts)
-            parts.append(part)
-    finally:
-        os.close(source)
+    found = b""
+    with open(source, "rb", buffering=0) as pipe:
+        while select.select([pipe], [], [], max(deadline - time.monotonic(), 0.0))[0]:
+            if not (part := pipe.read(1 << 16)):
+                return found
+            found += part
+    return None
 
 
 def _live(call: Callable[[], Any], sink: int, log: int, memory: int) -> None:

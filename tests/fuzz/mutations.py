@@ -7,6 +7,8 @@ import re
 import h5py
 import numpy as np
 
+from helpers.hostile import WAYS
+
 NUMBER = re.compile(rb"(?<![\w.])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 
 NON_FINITE = (b"nan", b"inf", b"-inf", b"1e999", b"-1e400")
@@ -125,7 +127,7 @@ def in_hdf5(r: random.Random, data: bytes) -> bytes:
         for _ in range(r.choice((1, 1, 2))):
             try:
                 r.choice(_HDF5)(r, file, r.choice(names))
-            except (OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError):
+            except (OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError, AttributeError):
                 continue  # the library refuses this one
     return place.getvalue()
 
@@ -137,10 +139,6 @@ def _replace(file, name, value, **options):
     file.create_dataset(name, data=value, **options)
     for key, one in attributes.items():
         file[name].attrs[key] = one
-
-
-def _remove(r, file, name):
-    del file[name]
 
 
 def _shape(r, file, name):
@@ -187,28 +185,14 @@ def _attribute(r, file, name):
         place.attrs[key] = value
 
 
-def _link(r, file, name):
+def _hostile(r, file, name):
+    r.choice(WAYS)(file, name, r.choice(("other.h5", "/etc/passwd")))
+
+
+def _loop(r, file, name):
     del file[name]
-    file[name] = r.choice((h5py.ExternalLink("other.h5", "/a"), h5py.SoftLink("/nowhere"), h5py.SoftLink("/" + name)))
+    file[name] = h5py.SoftLink("/" + name)
 
 
-def _group(r, file, name):
-    del file[name]
-    file.create_group(name)
-
-
-def _huge(r, file, name):
-    shape = np.shape(file[name][()]) or (3,)
-    dtype = file[name].dtype
-    del file[name]
-    file.create_dataset(name, shape=(2**31, *shape[1:]), dtype=dtype if dtype.kind in "iuf" else "f4", chunks=True)
-
-
-def _outside(r, file, name):
-    shape, dtype = np.shape(file[name][()]), file[name].dtype
-    del file[name]
-    file.create_dataset(name, shape=shape, dtype=dtype, external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
-
-
-_HDF5 = (_remove, _shape, _shape, _kind, _values, _values, _text, _mutated_text, _mutated_text, _attribute, _attribute)
-_HDF5 += (_link, _group, _huge, _outside)
+_HDF5 = (_hostile,) * 5 + (_shape, _shape, _kind, _values, _values, _text, _mutated_text, _mutated_text)
+_HDF5 += (_attribute, _attribute, _loop)

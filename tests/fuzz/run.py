@@ -1,7 +1,7 @@
 # ruff: noqa: E402  (threads are switched off before anything is loaded)
 """The fuzzing harness by itself: `python tests/fuzz/run.py 20000 --out findings.jsonl`.
 
-Each case runs in a child process of its own, forked from this one in which everything is loaded, with 20 s and 2 GB.
+Each case runs in a child process of its own, forked from this one in which everything is loaded, with 60 s and 2 GB.
 """
 
 import argparse
@@ -84,9 +84,8 @@ def main() -> int:
                 findings += 1
                 print(f"{category} {number}: {verdict}: {about}\n{text}\n", file=sys.stderr, flush=True)
                 if options.out:
-                    finding = dict(case=number, category=category, verdict=verdict, about=about, text=text)
                     with open(options.out, "a") as file:
-                        file.write(json.dumps(finding) + "\n")
+                        print(json.dumps(dict(case=number, verdict=verdict, about=about, text=text)), file=file)
     verdicts = sorted({verdict for one in counts.values() for verdict in one}, key=lambda one: (one not in FINE, one))
     print(f"{'':12}" + "".join(f"{verdict:>12}" for verdict in verdicts))
     for name, one in counts.items():

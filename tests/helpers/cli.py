@@ -1,5 +1,6 @@
 """Commands of `spadwarp`, in this process or in one of their own."""
 
+import contextlib
 import json
 import os
 import subprocess
@@ -24,10 +25,35 @@ def run(*arguments, code=0):
     return outcome
 
 
+_started = []
+
+
 def start(*arguments, module="spadwarp"):
     """A module, the command line if none is named, in a process of its own."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": ENVIRONMENT}
+    _started.append(subprocess.Popen(command, **options))
+    return _started[-1]
+
+
+def end_started():
+    """Ends what still runs of them, for a test that failed."""
+    while _started:
+        with _started.pop() as process:
+            process.kill()
+
+
+@contextlib.contextmanager
+def small_files(size):
+    """A limit on the size of files stands for the full disk: writing beyond it fails in the middle of a file."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def tables(path):

@@ -1,5 +1,8 @@
 """A small dataset that the tests share."""
 
+import contextlib
+import multiprocessing
+
 from spadwarp.dataset import Recipe, make_dataset
 from spadwarp.dataset.shards import checksum
 
@@ -31,6 +34,19 @@ def recipe(**changes):
 
 def make(dataset, folder, **options):
     return make_dataset(dataset, folder, device="cpu", **options)
+
+
+@contextlib.contextmanager
+def making(dataset, folder, **options):
+    """A forked process that makes a dataset, and is killed at the end of the block if it has not ended."""
+    process = multiprocessing.get_context("fork").Process(target=make, args=(dataset, folder), kwargs=options)
+    process.start()
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.join()
+        process.close()
 
 
 def written(dataset, folder):

@@ -25,9 +25,7 @@ def test_what_fails_in_a_copy_is_made_here():
     here = os.getpid()
 
     def only_here():
-        if os.getpid() != here:
-            os._exit(3)
-        return "here"
+        return "here" if os.getpid() == here else os._exit(3)
 
     def fails():
         raise ValueError("as it says")
@@ -38,28 +36,21 @@ def test_what_fails_in_a_copy_is_made_here():
         forked.results()
 
 
-def test_none_outlives_its_context(tmp_path):
-    def slow():
-        time.sleep(1.0)
-        (tmp_path / "late").touch()
-
-    with pytest.raises(RuntimeError, match="full"), Forked([slow]):
-        raise RuntimeError("full")
-    time.sleep(1.2)
-    assert not (tmp_path / "late").exists()
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="calls are made here")
-def test_an_interrupt_while_results_are_awaited_is_raised_as_it_is(tmp_path, monkeypatch):
+def test_none_outlives_its_context(tmp_path, monkeypatch):
+    """Nor an interrupt while results are awaited, which is raised as it is."""
+
     def slow():
-        time.sleep(1.0)
+        time.sleep(0.5)
         (tmp_path / "late").touch()
 
     def interrupted(*_):
         raise KeyboardInterrupt
 
+    with pytest.raises(RuntimeError, match="full"), Forked([slow]):
+        raise RuntimeError("full")
     monkeypatch.setattr("multiprocessing.connection.Connection.poll", interrupted)
     with pytest.raises(KeyboardInterrupt), Forked([slow, slow]) as forked:
         forked.results()
-    time.sleep(1.2)
+    time.sleep(0.8)
     assert not (tmp_path / "late").exists()

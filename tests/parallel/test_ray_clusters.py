@@ -1,4 +1,4 @@
-"""Ray that spadwarp starts on this machine, and Ray over two nodes, one of which is lost."""
+"""Ray over two nodes, one of which is lost, and Ray that spadwarp starts on this machine."""
 
 import os
 import subprocess
@@ -12,23 +12,8 @@ import spadwarp
 from helpers.cli import ENVIRONMENT, ROOT
 from helpers.scenes import scene
 from spadwarp.parallel import Ray
-
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="removes a node by a signal")]
-
-HOST = """
-import os, subprocess, sys
-import ray
-from spadwarp.parallel import Ray
 from spadwarp.parallel.ray import RayWorkers
 
-with RayWorkers(Ray(workers=1), "cpu") as workers:
-    while not workers.idle:
-        workers.wait(0.5)
-    stranger = [sys.executable, "-c", sys.argv[1], ray.get_runtime_context().gcs_address]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}  # without token
-    environment["RAY_NUM_REDIS_GET_RETRIES"] = "2"  # attempts, one a second
-    print("joined", subprocess.run(stranger, env=environment, capture_output=True, text=True).stdout)
-"""
 STRANGER = """
 import sys
 import ray
@@ -41,25 +26,18 @@ except ConnectionError:
 """
 
 
-def output_of(*command):
-    """Of a Python process of its own."""
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="removes a node by a signal")
+def test_a_lost_node_costs_no_bit_and_nobody_connects_without_the_token():
+    """In a process of its own: that of the tests has its own Ray."""
     pytest.importorskip("ray")
     path = os.pathsep.join([ENVIRONMENT["PYTHONPATH"], str(ROOT / "tests")])
     options = {"env": {**ENVIRONMENT, "PYTHONPATH": path}, "capture_output": True, "text": True, "timeout": 400}
-    process = subprocess.run([sys.executable, "-W", "ignore", *command], **options)
-    assert process.returncode == 0, process.stderr[-3000:]
-    return process.stdout
+    process = subprocess.run([sys.executable, "-W", "ignore", __file__], **options)
+    assert process.stdout.split("\n")[:-1] == ["same bits", "refused"], process.stdout + process.stderr[-3000:]
 
 
-def test_nobody_connects_to_it_without_its_token():
-    assert output_of("-c", HOST, STRANGER).split() == ["joined", "refused"]
-
-
-def test_a_run_that_loses_a_node_has_the_bits_of_a_local_one():
-    assert "same bits" in output_of(__file__)
-
-
-def main():
+def lose_a_node():
     from ray.cluster_utils import Cluster
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": 100 << 20})
@@ -79,13 +57,25 @@ def main():
     found = spadwarp.simulate(scene(), **run, engine=Ray(cluster.address, workers=2), progress=progress)
     cluster.shutdown()
     alone = spadwarp.simulate(scene(), **run, device="cpu")
-    assert removed, remarks
-    assert any(remark.startswith("lost the worker") for remark in remarks), remarks
+    assert removed and any(remark.startswith("lost the worker") for remark in remarks), remarks
     assert np.array_equal(found.tallies, alone.tallies) and found.energy_balance == alone.energy_balance
     assert not found.partial and found.photons == run["photons"]
     print("same bits")
 
 
+def meet_a_stranger():
+    import ray
+
+    with RayWorkers(Ray(workers=1), "cpu") as workers:
+        while not workers.idle:
+            workers.wait(0.5)
+        stranger = [sys.executable, "-c", STRANGER, ray.get_runtime_context().gcs_address]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}  # no token
+        environment["RAY_NUM_REDIS_GET_RETRIES"] = "2"  # attempts, one a second
+        print(subprocess.run(stranger, env=environment, capture_output=True, text=True).stdout, end="")
+
+
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    main()
+    lose_a_node()
+    meet_a_stranger()

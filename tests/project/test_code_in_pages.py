@@ -1,5 +1,7 @@
-"""Code in the documentation runs, at a small size, or there is a reason why not."""
+"""Code in the pages and notebooks of the documentation runs, at a small size, or there is a reason why not."""
 
+import hashlib
+import json
 import os
 import re
 import runpy
@@ -13,14 +15,12 @@ import pytest
 import trimesh
 
 import spadwarp
-from helpers.cli import run
+from helpers.cli import ENVIRONMENT, run
 from helpers.coarse_pictures import coarse_pictures
+from helpers.pages import PAGES, README, ROOT, blocks, by_name, commands, lines, text_of
 
-ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
-
-_FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 # The same commands at a small size.
 SMALLER = {
@@ -58,25 +58,8 @@ LEFT_OUT = {
 }
 
 
-def by_name(path):
-    return path.name
-
-
-def blocks(page):
-    return _FENCE.findall(page.read_text(encoding="utf-8"))
-
-
-def lines(code):
-    """Commands of a shell block, one each, without comments."""
-    return [re.sub(r"\s+#.*", "", line).strip() for line in code.replace("\\\n", " ").splitlines()]
-
-
-def commands(page):
-    return [line for language, code in blocks(page) if language in ("sh", "bash") for line in lines(code)]
-
-
-WITH_PYTHON = [page for page in PAGES if page != TUTORIAL and "python" in dict(blocks(page))]
-WITH_COMMANDS = [page for page in PAGES if page != TUTORIAL and commands(page)]
+WITH_PYTHON = [page for page in (README, *PAGES) if page != TUTORIAL and blocks(page, "python")]
+WITH_COMMANDS = [page for page in (README, *PAGES) if page != TUTORIAL and commands(page)]
 
 
 @pytest.fixture
@@ -96,7 +79,7 @@ def checkout(tmp_path, monkeypatch):
 
 def program_of(page, folder):
     """The Python blocks of a page, one after the other, as a file: Warp reads the source of kernels."""
-    code = "\n".join(code for language, code in blocks(page) if language == "python")
+    code = "\n".join(code for _, code in blocks(page, "python"))
     for pattern, smaller in SMALLER_PYTHON.items():
         code = re.sub(pattern, smaller, code)
     (folder / "program.py").write_text(code, encoding="utf-8")
@@ -162,5 +145,49 @@ def test_tutorial_runs(checkout):
 
 
 def test_everything_that_is_left_out_stands_in_a_page():
-    text = [line for page in PAGES for line in commands(page)]
+    text = [line for page in (README, *PAGES) for line in commands(page)]
     assert not [pattern for pattern in LEFT_OUT if not any(re.search(pattern, line) for line in text)]
+
+
+# Notebooks
+
+
+def execute(path, folder, *, whole):
+    """The notebook with its outputs, executed in `folder`, at a small size or whole; an error in a cell is raised."""
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    notebook = nbformat.read(path, as_version=4)
+    for cell in () if whole else notebook.cells:
+        photons = re.sub(r"\b\d_000_000\b|\b\d00_000\b", "20_000", cell.source)
+        cell.source = photons.replace("optimiser.steps=50", "optimiser.steps=2")
+    client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
+    environment = {name: value for name, value in ENVIRONMENT.items() if name != "MPLBACKEND"}
+    return client.execute(env=environment)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of Jupyter's own packages
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)
+def test_notebook_runs(path, tmp_path):
+    folder = os.environ.get("SPADWARP_EXECUTED_NOTEBOOKS")  # where docs/hooks.py looks for them
+    executed = execute(path, tmp_path, whole=bool(folder))
+    if folder:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        pytest.importorskip("nbformat").write(executed, Path(folder) / f"{path.stem}-{digest}.ipynb")
+    outputs = [output for cell in executed.cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    said = "".join(output["text"] for output in outputs if output.get("name") == "stderr")
+    assert "Warning" not in said.replace("SpadwarpWarning: Monte Carlo noise", ""), said
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)
+def test_notebook_is_kept_without_outputs_and_leads_somewhere(path):
+    """And a page leads to it."""
+    cells = json.loads(text_of(path))["cells"]
+    assert not [cell for cell in cells if cell.get("outputs") or cell.get("execution_count")]
+    text = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    assert '-e ".[notebooks]"' in text
+    for link in re.findall(r"\]\(([^)#]+)(?:#[\w-]+)?\)", text):
+        assert (path.parent / link).is_file(), link
+    assert any(f"notebooks/{path.name})" in text_of(page) for page in (README, *PAGES))

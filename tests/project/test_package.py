@@ -4,21 +4,19 @@ import ast
 import importlib.resources
 import importlib.util
 import inspect
-import os
 import pkgutil
 import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 import yaml
 
 import spadwarp
 import spadwarp_kernels
+from helpers.cli import ENVIRONMENT, ROOT
 
-ROOT = Path(__file__).parents[2]
 BINARY = {".png", ".h5", ".exr", ".npz", ".safetensors", ".woff2"}
 
 
@@ -81,8 +79,8 @@ def test_a_type_checker_finds_planted_errors(tmp_path):
     program.write_text(_PLANTED)
     # NumPy's types take a minute
     options = ["--strict", "--follow-imports=silent", "--no-site-packages", "--ignore-missing-imports"]
-    environment = {**os.environ, "MYPYPATH": os.pathsep.join(map(str, (ROOT, ROOT / "kernels")))}
     command = [sys.executable, "-m", "mypy", "--cache-dir", "cache", *options, program]
+    environment = {**ENVIRONMENT, "MYPYPATH": ENVIRONMENT["PYTHONPATH"]}
     found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True).stdout
     wrong = {int(line.split(":")[1]) for line in found.splitlines() if ": error:" in line}
     planted = {number for number, line in enumerate(_PLANTED.splitlines(), 1) if "# wrong" in line}
