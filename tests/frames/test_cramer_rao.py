@@ -101,7 +101,7 @@ def test_noise_of_the_simulation_does_not_count_as_information(law, shared):
     Products of halves have no noise whatever the bins share; of events that leave light in four bins, variances alone
     would say too little noise.
     """
-    rng, events = np.random.default_rng(4), 40.0 if shared == 1 else 60.0
+    rng, events = np.random.default_rng(4), 30.0 if shared == 1 else 60.0
 
     def spread(cube):
         return sum(np.roll(cube, shift, axis=-1) for shift in range(shared)) / shared
