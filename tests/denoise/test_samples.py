@@ -193,22 +193,22 @@ def test_a_pool_beyond_the_memory_is_refused():
         sizes(pool=9_000_000, crop=64)
 
 
-@pytest.mark.parametrize(
-    ("clock", "count", "rests"),
-    [
-        # More than three seconds after the start, and not at the last piece.
-        (itertools.count(0.0, 1.6), 4, [(2, 3)]),
-        (itertools.count(0.0, 0.8), 4, []),
-        # Every half minute; the first piece, which here takes twenty times as long as the others, does not count.
-        (itertools.chain([0.0], itertools.count(20.0, 1.0)), 100, [(rest, rest) for rest in (98, 67, 36, 5)]),
-    ],
-)
-def test_how_long_samples_take_is_said(monkeypatch, clock, count, rests):
+CLOCKS = {
+    "late": (itertools.count(0.0, 1.6), 4, [2]),  # more than three seconds after the start, not at the last piece
+    "soon": (itertools.count(0.0, 0.8), 4, []),
+    # Every half minute; the first piece, which here takes twenty times as long as the others, does not count.
+    "long": (itertools.chain([0.0], itertools.count(20.0, 1.0)), 100, [98, 67, 36, 5]),
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_how_long_samples_take_is_said(monkeypatch, name):
     """Of a run whose next step needs so many samples."""
+    (clock, count, rests), heard = CLOCKS[name], []
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
     pieces = SimpleNamespace(prepare=lambda step: ((drawn, count) for drawn in range(1, count + 1)))
     workers = SimpleNamespace(rank=0, is_cuda=True, any=bool)
-    run, heard = SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces), []
+    run = SimpleNamespace(step=0, steps_here=0, workers=workers, samples=pieces)
     assert training._prepared(run, threading.Event(), heard.append)
     line = "{} of {} samples are still to be drawn before the next step, about {} s"
-    assert heard == [line.format(rest, count, seconds) for rest, seconds in rests]
+    assert heard == [line.format(rest, count, 3 if name == "late" else rest) for rest in rests]

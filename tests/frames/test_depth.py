@@ -85,37 +85,28 @@ def test_wrong_input_is_named(changes, message):
 
 
 COUNTS = np.random.default_rng(3).poisson(2.0, (3, 5, 40)).astype(np.uint16)
+NO_HISTOGRAMS = [
+    (r"\(5, 40\); real numbers \[H, W, T\]", COUNTS[0]),
+    ("not negative", COUNTS - 2.0),
+    ("holds NaN, as depth does", np.full((2, 2, 2), np.nan)),
+    ("complex128", COUNTS.astype(complex)),
+    (r"\(0, 2, 2\)", np.zeros((0, 2, 2))),
+    ("no such file", "missing.npy"),
+    *[("damaged or not readable", f"text.{ending}") for ending in ("npy", "mat", "ptu")],
+    ("not an HDF5 file", "text.h5"),
+    ("'.csv' is not one of .h5, .hdf5, .npy", "text.csv"),
+]
 
 
-@pytest.mark.parametrize(
-    ("array", "words"),
-    [
-        (COUNTS[0], r"\(5, 40\); real numbers \[H, W, T\]"),
-        (COUNTS - 2.0, "not negative"),
-        (np.full((2, 2, 2), np.nan), "holds NaN, as depth does"),
-        (COUNTS.astype(complex), "complex128"),
-        (np.zeros((0, 2, 2)), r"\(0, 2, 2\)"),
-    ],
-)
-def test_arrays_that_are_no_histograms(tmp_path, array, words):
-    np.save(tmp_path / "a.npy", array)
+@pytest.mark.parametrize(("words", "held"), NO_HISTOGRAMS)
+def test_files_that_hold_no_histograms(tmp_path, words, held):
+    path = tmp_path / (held if isinstance(held, str) else "a.npy")
+    if not isinstance(held, str):
+        np.save(path, held)
+    elif held.startswith("text"):
+        path.write_text("time,counts\n")
     with pytest.raises(spadwarp.FileError, match=words):
-        read_histograms(tmp_path / "a.npy", axes="yxt", gate_start=0.0)
-
-
-def test_files_that_cannot_be_read(tmp_path):
-    for name, words in (
-        ("missing.npy", "no such file"),
-        ("text.npy", "damaged or not readable"),
-        ("text.mat", "damaged or not readable"),
-        ("text.ptu", "damaged or not readable"),
-        ("text.h5", "not an HDF5 file"),
-        ("text.csv", "'.csv' is not one of .h5, .hdf5, .npy"),
-    ):
-        if name.startswith("text"):
-            (tmp_path / name).write_text("time,counts\n")
-        with pytest.raises(spadwarp.FileError, match=words):
-            read_histograms(tmp_path / name)
+        read_histograms(path, axes=None if isinstance(held, str) else "yxt", gate_start=0.0)
 
 
 def test_background_is_that_of_all_frames_together(tmp_path):

@@ -97,8 +97,6 @@ def test_frames_in_between_turn_the_shortest_way(base):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("t,camera.position[0]\n0,0\n", "is not time and names"),
-        ("time,camera.position[0]\n0,0\n0,1\n", "line 3: time = 0 is not after 0"),
         ("time,camera.position[0]\n0,0,1\n", "line 2: 3 values for 2 names"),
         ("time,camera.position[0]\n0,nan\n", "camera.position[0]"),
         ("time,camera.position[0],camera.position[0]\n0,0,0\n", "is there twice"),
