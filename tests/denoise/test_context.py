@@ -111,14 +111,14 @@ def test_two_returns_are_not_averaged():
 
 
 def test_few_photons_beside_an_edge_are_answered_better_with_the_wide_view(tmp_path):
-    """Two signal photons a pixel among ten of the background; over eight noises 0.75 ± 0.04 times the squared error."""
+    """Two signal photons a pixel among ten of the background; over six noises 0.75 ± 0.05 times the squared error."""
     torch.manual_seed(1)
     new = {f"context.{name}": value for name, value in Context().state_dict().items()}  # keeps the answer before
     save_file({**load_file(WEIGHTS / "histograms.safetensors"), **new}, tmp_path / "without", {"model": "histograms"})
     row, column = np.mgrid[:64, :64]
     place = np.where((row - 30) ** 2 + (column - 33) ** 2 < 400, 30.5, 60.5)
     errors = []
-    for seed in range(10, 18):
+    for seed in range(10, 16):
         counts = counts_of(place, 2.0, 10.0, seed=seed)
         both = (bins_of(found_in(counts, 10.0, weights=one).depth) for one in (tmp_path / "without", None))
         errors.append([np.mean((found - place) ** 2) for found in both])
@@ -153,7 +153,7 @@ def test_scattered_light_is_dimmer_and_later_than_a_target():
     assert left[8] > 0.9 and right[8] < 0.5 and left[10] < 0.01 and right[10] > 0.2
 
 
-@pytest.mark.parametrize(("size", "wrong"), [(64, 0.05), (256, 0.01)])
+@pytest.mark.parametrize(("size", "wrong"), [(64, 0.05), (192, 0.01)])
 def test_scattered_light_beside_a_bright_target_and_far_from_it_is_water(size, wrong):
     """A ball in open water, 800 counts a pixel, and three tenths more light that is late and beside.
 
