@@ -51,6 +51,14 @@ def test_networks_have_the_weights_and_the_cost_that_they_state():
     assert multiply_adds["dncnn"] == 64 * 64 * (9 * 64 * 2 + 15 * 9 * 64 * 64) > 6 * multiply_adds["pyramid"]
 
 
+def test_order_statistics_are_those_of_a_sort():
+    image = torch.rand(2, 1, 11, 9, generator=torch.Generator().manual_seed(1))
+    padded = torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate")[:, 0]
+    expected = padded.unfold(1, 3, 1).unfold(2, 3, 1).flatten(3).sort(dim=-1).values
+    for rank, values in zip((2, 4, 6), networks.ranks(image), strict=True):
+        assert torch.equal(values[:, 0], expected[..., rank])
+
+
 @pytest.mark.parametrize("model", ["pyramid", "histograms"])
 def test_pyramid_turns_with_its_frame(model):
     """All eight turns and reflections, with weights drawn at random; and the way with derivatives gives the same."""
