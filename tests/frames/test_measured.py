@@ -57,7 +57,7 @@ FLAT = COUNTS.transpose(1, 0, 2).reshape(15, 40).astype(float)  # pixels column 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """The same histograms as files of every kind, beside some that lack a fact."""
-    sparse, ptufile = pytest.importorskip("scipy.sparse"), pytest.importorskip("ptufile")
+    sparse = pytest.importorskip("scipy.sparse")
     folder, truth, flat = tmp_path_factory.mktemp("files"), np.ones((3, 5)), sparse.csc_array(FLAT)
     for name, values in {"counts": COUNTS, "floats": 1.0 * COUNTS, "rates": 0.5 * COUNTS}.items():
         np.save(folder / f"{name}.npy", values)
@@ -79,8 +79,13 @@ def files(tmp_path_factory):
     for name, arrays in {"camera": {"a/hits": COUNTS, "a/map": truth}, "two": {"a": COUNTS, "b": COUNTS}}.items():
         with h5py.File(folder / f"{name}.h5", "w") as file:
             file.update(arrays)
-    ptufile.imwrite(folder / "image.ptu", COUNTS, **PICOSECONDS)
     return folder
+
+
+@pytest.fixture(scope="module")
+def image(files):
+    pytest.importorskip("ptufile").imwrite(files / "image.ptu", COUNTS, **PICOSECONDS)
+    return files / "image.ptu"
 
 
 @pytest.mark.parametrize(
@@ -95,7 +100,9 @@ def files(tmp_path_factory):
         ("image.ptu", {}, 4e-12),
     ],
 )
-def test_every_kind_of_file_holds_the_same_histograms(files, name, options, bin_width):
+def test_every_kind_of_file_holds_the_same_histograms(files, request, name, options, bin_width):
+    if name == "image.ptu":
+        request.getfixturevalue("image")
     found = read_histograms(files / name, **START, **options)
     assert np.array_equal(found.values, COUNTS) and found.values.dtype.kind in "iu"
     assert found.bin_width == (bin_width if bin_width is None else pytest.approx(bin_width))
@@ -199,9 +206,9 @@ def test_axes_are_inferred_where_one_order_is_clear(shape, order, tmp_path):
 
 
 @pytest.mark.parametrize("markers", ["pixels", "lines"])
-def test_a_scan_of_t3_records_with_markers(files, markers, tmp_path):
+def test_a_scan_of_t3_records_with_markers(image, markers, tmp_path):
     """A point measurement in whose records markers begin the pixels or the lines, without an image's header."""
-    header = (files / "image.ptu").read_bytes()
+    header = image.read_bytes()
     header = header[: header.index(b"Header_End") + 48].replace(b"ImgHdr_Dimensions", b"Nobody_Dimensions")
     records, sync = [], 0
     for y, x in np.ndindex(3, 5):
@@ -259,7 +266,7 @@ DAMAGED += [(side, 10**9, ".") for side in ("ImgHdr_PixX", "ImgHdr_PixY")]
 
 
 @pytest.mark.parametrize(("tag", "value", "words"), DAMAGED)
-def test_a_ptu_of_which_one_number_was_changed_is_refused_soon(files, tag, value, words, tmp_path):
-    (tmp_path / "frames.ptu").write_bytes(changed((files / "image.ptu").read_bytes(), tag, value))
+def test_a_ptu_of_which_one_number_was_changed_is_refused_soon(image, tag, value, words, tmp_path):
+    (tmp_path / "frames.ptu").write_bytes(changed(image.read_bytes(), tag, value))
     with pytest.raises(spadwarp.SpadwarpError, match=words):
         read_histograms(tmp_path / "frames.ptu")
