@@ -36,9 +36,8 @@ from spadwarp.scene.medium import WATER_INDICES, grid_cells
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sections import field_unit
-from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
+from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes, within_port
 from spadwarp.transport import points_per_flight
-from spadwarp.transport.model import check_places
 from spadwarp.values import (
     ArgumentError,
     ConfigError,
@@ -90,7 +89,7 @@ class Survey:
     def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
         if mesh is None and scene.targets:
             mesh = build_mesh(scene)
-        self.scene, self.mesh, self.messages, laser = scene, mesh, list[CheckMessage](), scene.beam
+        self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
         # The faces of each target in the camera frame `[F, 3, 3]` [m].
         self.targets = [] if mesh is None else [triangles[mesh.target == i] for i in range(len(scene.targets))]
@@ -112,6 +111,8 @@ class Survey:
         # Nearest and farthest point from the lens that is in view and beam [m], first and last unscattered return from
         # them [ns], optical depth and light of the nearest; None if there are none, or it lies at the lens centre.
         self.target_range = self.target_arrival_ns = self.optical_depth = self.on_axis = None
+        if found := within_port(scene, triangles):
+            self.warn(*found.split(": " if found.startswith("camera") else " = ", 1))
         illuminated = self.illuminated_part(triangles)
         if len(illuminated):
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
@@ -218,7 +219,6 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     """
     survey = Survey(as_scene(scene), mesh)
     points_per_flight(survey.scene)
-    check_places(survey.scene, survey.mesh)
     try:  # read here, since only depth and counts need it: at the end of a run it would be too late
         detector_response(survey.scene.detector, survey.scene.laser)
     except ArgumentError as error:

@@ -126,14 +126,6 @@ class Scene(Document):
         through, position = camera_port(self), list(self.beam.position)
         if through is not None and (why := through.outside((0.0, 0.0, 0.0))):
             yield f"camera.port: the lens is outside: {why}; change offset or radius"
-        lens = self.camera
-        wide = 0.5 * lens.pixel_tangent * math.hypot(lens.width, lens.height)
-        radius = 0.0 if lens.pinhole else lens.aperture_radius
-        if through is not None and laser is None and through.houses(position, wide, radius):
-            yield (
-                f"laser.position = {position} is inside camera.port: laser.port = 'camera' lets it shine through that "
-                "window, a table [laser.port] through one of its own; in the water it stands in front or beside"
-            )
         if (through := laser_port(self)) is not None and (why := through.outside(position)):
             is_shared = laser == "camera"
             hint = "move the laser, or give it a port of its own: [laser.port]" if is_shared else "change it"

@@ -244,12 +244,23 @@ def points_inside(triangles: Floats, planes: Floats) -> Floats:
 
 
 def within_port(scene: Scene, triangles: Floats) -> str:
-    """Which part of triangles reaches into the housing or the window of the camera's port; empty where none does."""
-    if (port := camera_port(scene)) is None or not len(triangles):
+    """What is in the housing or the window of the camera's port and is not meant for it: a laser that shines through no
+    port, or parts of triangles; empty where nothing is."""
+    port, camera, laser = camera_port(scene), scene.camera, scene.beam
+    if port is None or len(set(port.index)) == 1:
+        return ""
+    radius = 0.0 if camera.pinhole else camera.aperture_radius
+    wide = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)
+    if laser.port is None and port.houses(laser.position, wide, radius):
+        return (
+            f"laser.position = {list(laser.position)} is inside camera.port: laser.port = 'camera' lets it shine through"
+            " that window, a table [laser.port] through one of its own; in the water it stands in front or beside"
+        )
+    if not len(triangles):
         return ""
     nearest = port.nearest * (1.0 - 1e-6)
     if port.shape == "flat":
-        planes = np.vstack([view_planes(scene.camera), [*(-np.array(port.normal)), nearest]])
+        planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), nearest]])
         inside = points_inside(triangles, planes)
     else:
         from trimesh.triangles import closest_point
@@ -257,7 +268,8 @@ def within_port(scene: Scene, triangles: Floats) -> str:
         found = closest_point(triangles, np.broadcast_to(port.centre, (len(triangles), 3)))
         outer = (port.radius + port.thickness) * (1.0 - 1e-6)
         inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
-    return f"a target is at {inside[0].round(6).tolist()} m in the camera's frame" if len(inside) else ""
+    where = "camera.port: a target is within the housing or the window, at {} m in the camera's frame"
+    return where.format(inside[0].round(6).tolist()) if len(inside) else ""
 
 
 def _spread(triangles: Floats) -> Floats:
