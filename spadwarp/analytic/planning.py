@@ -86,103 +86,59 @@ _STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
 
 @dataclass(frozen=True, kw_only=True)
 class Pilot:
-    """Detections in a window of the image, medians over its pixels with a target unless said otherwise.
+    """Detections in a window of the image, medians over its pixels with a target unless said otherwise."""
 
-    Attributes:
-        pixels: Their number.
-        unscattered, target: Detections of the target per pulse in the gate, without scattered light and with it.
-        backscatter, noise: Of backscatter, and of dark counts and ambient light.
-        brightest: Detections of light per pulse of the brightest hundredth of the pixels; of the brightest one, where
-            so short a run has light in fewer.
-        bound: Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N.
-        shot_noise: The same without background and pile-up.
-        information_noise: Part of the runs' information on the depth that was their noise, which `bound` and
-            `shot_noise` leave out.
-        floor: Estimator → median |error| of depth that is left after any number of pulses [m].
-        bias: Estimator → median error, positive if too far [m].
-        unscattered_floor: The same as `floor`, of unscattered light alone: slopes and edges within a pixel, bins.
-        pile_up: Estimator → change of depth by pile-up, median [m]; 0 in free-running mode.
-        run_noise: Median |error| of `floor` in a pixel that comes from the shortness of the runs [m].
-        peak, level: Detections per pulse of the return within ±3σ of its peak, and of background per σ under it, σ
-            that of the response.
-        photons: Of both runs.
-    """
-
-    pixels: int
-    unscattered: float
-    target: float
-    backscatter: float
-    noise: float
-    brightest: float
-    bound: float
-    shot_noise: float
-    information_noise: float
-    floor: dict[str, float]
-    bias: dict[str, float]
-    unscattered_floor: dict[str, float]
-    pile_up: dict[str, float]
-    run_noise: float
-    peak: float
-    level: float
-    photons: int
+    pixels: int  # their number
+    unscattered: float  # detections of the target per pulse in the gate, without scattered light
+    target: float  # the same with it
+    backscatter: float  # of backscatter
+    noise: float  # of dark counts and ambient light
+    brightest: float  # of light in the brightest hundredth of the pixels, or the brightest one if fewer have light
+    bound: float  # Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N
+    shot_noise: float  # the same without background and pile-up
+    information_noise: float  # part of the runs' information on depth that was their noise; both bounds leave it out
+    floor: dict[str, float]  # estimator → median |error| of depth that is left after any number of pulses [m]
+    bias: dict[str, float]  # estimator → median error, positive if too far [m]
+    unscattered_floor: dict[str, float]  # `floor` of unscattered light alone: slopes, edges within a pixel, bins
+    pile_up: dict[str, float]  # estimator → change of depth by pile-up, median [m]; 0 in free-running mode
+    run_noise: float  # median |error| of `floor` in a pixel that comes from the shortness of the runs [m]
+    peak: float  # detections per pulse of the return within ±3σ of its peak, σ that of the response
+    level: float  # of background per σ under it
+    photons: int  # of both runs
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Proposal:
-    """A proposed experiment.
+    """A proposed experiment."""
 
-    Attributes:
-        scene: The scene with the proposed gate, pulses, repetition rate and pulse energy, ready to simulate.
-        depth_error, time: Asked for [m]; longest time for a depth frame [s].
-        method: Estimator whose floor counts.
-        target_range: Least and largest range of the target [m].
-        optical_depth: Of the water before the nearest of it, one way, along the axis.
-        gate_range: Ranges at the ends of the gate, laser at the lens and behind its port [m].
-        unambiguous_range: At the proposed repetition rate [m].
-        largest_rate: Repetition rate up to which the gate ends before the next pulse [Hz].
-        pile_up_energy: Pulse energy at which the brightest pixels detect `PILE_UP` photons a pulse [J].
-        eye: Limit of laser power for the eye.
-        energy_limit: What sets the pulse energy: "" (the scene's own), "pile-up" or "eye".
-        irradiance: On the beam's axis at the nearest range of the target, unscattered light, mean over time [W/m²].
-        pulses: Of a depth frame: for the depth error where it can be reached, else those after which more gain little.
-        pulses_for: What sets them: "depth error"; "false peaks", fewer than 1 % of them; "floor", where the depth error
-            is out of reach; "out of reach", where 2³¹ pulses are too few.
-        frame_time: For these pulses [s], at all positions of a scan.
-        reached: Whether the depth error is reached, within the time.
-        terms: Name → part of the depth error at these pulses [m], "total" last; squares add up.
-        limit: The largest of them.
-        advice: What would help.
-        pilot: What was measured by Monte Carlo.
-        channels: The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera
-            without one.
-        largest_range: For a plane square to the axis, depth error and time as asked for [m]; NaN: not sought, 0: none.
-        range_limit: What limits it.
-    """
-
-    scene: Scene
-    depth_error: float
-    time: float
-    method: str
-    target_range: tuple[float, float]
-    optical_depth: float
-    gate_range: tuple[float, float]
-    unambiguous_range: float
-    largest_rate: float
-    pile_up_energy: float
-    eye: EyeLimit
-    energy_limit: str
-    irradiance: float
-    pulses: int
+    scene: Scene  # the scene with the proposed gate, pulses, repetition rate and pulse energy, ready to simulate
+    depth_error: float  # asked for [m]
+    time: float  # longest for a depth frame [s]
+    method: str  # estimator whose floor counts
+    target_range: tuple[float, float]  # least and largest range of the target [m]
+    optical_depth: float  # of the water before the nearest of it, one way, along the axis
+    gate_range: tuple[float, float]  # ranges at the ends of the gate, laser at the lens and behind its port [m]
+    unambiguous_range: float  # at the proposed repetition rate [m]
+    largest_rate: float  # repetition rate up to which the gate ends before the next pulse [Hz]
+    pile_up_energy: float  # pulse energy at which the brightest pixels detect `PILE_UP` photons a pulse [J]
+    eye: EyeLimit  # limit of laser power for the eye
+    energy_limit: str  # what sets the pulse energy: "" (the scene's own), "pile-up" or "eye"
+    irradiance: float  # on the beam's axis at the nearest range of the target, unscattered light, mean over time [W/m²]
+    pulses: int  # of a depth frame: for the depth error if it can be reached, else those after which more gain little
     pulses_for: str
-    frame_time: float
-    reached: bool
-    terms: dict[str, float]
-    limit: str
-    advice: str
-    pilot: Pilot
+    """What sets them: "depth error"; "false peaks", fewer than 1 % of them; "floor", where the depth error is out of
+    reach; "out of reach", where 2³¹ pulses are too few."""
+    frame_time: float  # for these pulses [s], at all positions of a scan
+    reached: bool  # whether the depth error is reached, within the time
+    terms: dict[str, float]  # name → part of the depth error at these pulses [m], "total" last; squares add up
+    limit: str  # the largest of them
+    advice: str  # what would help
+    pilot: Pilot  # what was measured by Monte Carlo
     channels: dict[str, Pilot] = field(default_factory=dict)
-    largest_range: float = math.nan
-    range_limit: str = ""
+    """The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera without
+    one."""
+    largest_range: float = math.nan  # of a plane square to the axis, as asked for [m]; NaN: not sought, 0: none
+    range_limit: str = ""  # what limits it
 
     def __repr__(self) -> str:
         error, pulses = 1e3 * self.terms["total"], self.pulses

@@ -86,45 +86,25 @@ class AnalyticResult:
 
     Maps are float64 `[H, W]`, NaN where there is no estimate: nothing hit, not illuminated, or the return outside the
     gate.
-
-    Attributes:
-        scene: The scene.
-        truth: Depth, range, normal and reflectance that the maps come from.
-        signal: S, expected detections of the return per pulse (eq 7); 0 without a return.
-        arrival: μ [s] after the pulse left the laser; NaN where nothing is hit.
-        backscatter: Expected backscatter detections per pulse within the gate.
-        daylight: Detections of daylight [1/s]; 0 without `[daylight]`.
-        alpha: α, all expected detections per pulse within the gate (integral of eq 8).
-        fisher: F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate.
-        sigma_time: σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons.
-        sigma_depth: The bound of planar depth [m].
-        signal_to_backscatter: Both per pulse within the gate; infinite where there is no backscatter.
-        background_level: Background detections per pulse and σ of the response, under the return.
-        outlier_probability: Of a false peak: a maximum-likelihood fit takes background for the return, and `sigma_time`
-            is not reached.
-        background_probability: That a frame's pixel reports a background photon.
-        depth: Frames, float32 `[N, H, W]` [m]; NaN for no estimate.
-        labels: bool `[N, H, W]`, where a frame's pixel reports a background photon.
-        seed: Of the frames.
     """
 
-    scene: Scene
-    truth: Truth
-    signal: Map
-    arrival: Map
-    backscatter: Map
-    daylight: Map
-    alpha: Map
-    fisher: Map
-    sigma_time: Map
-    sigma_depth: Map
-    signal_to_backscatter: Map
-    background_level: Map
-    outlier_probability: Map
-    background_probability: Map
-    depth: NDArray[np.float32]
-    labels: NDArray[np.bool_]
-    seed: int
+    scene: Scene  # the scene
+    truth: Truth  # depth, range, normal and reflectance that the maps come from
+    signal: Map  # S, expected detections of the return per pulse (eq 7); 0 without a return
+    arrival: Map  # μ [s] after the pulse left the laser; NaN where nothing is hit
+    backscatter: Map  # expected backscatter detections per pulse within the gate
+    daylight: Map  # detections of daylight [1/s]; 0 without `[daylight]`
+    alpha: Map  # α, all expected detections per pulse within the gate (integral of eq 8)
+    fisher: Map  # F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate
+    sigma_time: Map  # σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons
+    sigma_depth: Map  # the bound of planar depth [m]
+    signal_to_backscatter: Map  # both per pulse within the gate; infinite where there is no backscatter
+    background_level: Map  # background detections per pulse and σ of the response, under the return
+    outlier_probability: Map  # of a false peak: a fit takes background for the return, `sigma_time` is not reached
+    background_probability: Map  # that a frame's pixel reports a background photon
+    depth: NDArray[np.float32]  # frames, float32 `[N, H, W]` [m]; NaN for no estimate
+    labels: NDArray[np.bool_]  # bool `[N, H, W]`, where a frame's pixel reports a background photon
+    seed: int  # of the frames
     # When background photons arrive: the part that is flat over the gate, and the table of the rest.
     _flat_share: NDArray[np.float32]
     _table: BackscatterTable
@@ -383,23 +363,14 @@ def _check_truth(truth: Truth, scene: Scene) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class AnalyticFile:
-    """A file of the analytic simulator; depth frames are read when they are asked for, the rest is in memory.
+    """A file of the analytic simulator; depth frames are read when they are asked for, the rest is in memory."""
 
-    Attributes:
-        path: The file.
-        frames: Their number.
-        seed: Of the frames.
-        scene: The scene.
-        truth: Depth, range, normal and reflectance.
-        maps: Name → float64 `[H, W]`, as the attributes of `AnalyticResult`.
-    """
-
-    path: Path
-    frames: int
-    seed: int
-    scene: Scene
-    truth: Truth
-    maps: dict[str, NDArray[np.float64]]
+    path: Path  # the file
+    frames: int  # their number
+    seed: int  # of the frames
+    scene: Scene  # the scene
+    truth: Truth  # depth, range, normal and reflectance
+    maps: dict[str, NDArray[np.float64]]  # name → float64 `[H, W]`, as the attributes of `AnalyticResult`
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

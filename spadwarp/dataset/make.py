@@ -236,23 +236,14 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """The work of a call of `make_dataset`.
+    """The work of a call of `make_dataset`."""
 
-    Attributes:
-        folder: The dataset.
-        made: Names of the shards that were made.
-        kept: Those that were already complete.
-        missing: Those that are missing because they were not asked for.
-        broken: What was wrong with those that were made again.
-        frames: Number of frames that were made.
-    """
-
-    folder: Path
-    made: tuple[str, ...]
-    kept: tuple[str, ...]
-    missing: tuple[str, ...]
-    broken: tuple[str, ...]
-    frames: int
+    folder: Path  # the dataset
+    made: tuple[str, ...]  # names of the shards that were made
+    kept: tuple[str, ...]  # those that were already complete
+    missing: tuple[str, ...]  # those that are missing because they were not asked for
+    broken: tuple[str, ...]  # what was wrong with those that were made again
+    frames: int  # number of frames that were made
 
 
 def make_dataset(

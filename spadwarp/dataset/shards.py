@@ -41,22 +41,14 @@ _COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
 
 @dataclass(frozen=True)
 class Column:
-    """A dataset of a file, or a field of a frame.
+    """A dataset of a file, or a field of a frame."""
 
-    Attributes:
-        kind: Its type; `object`: text; a tuple: one of them.
-        unit, meaning: In words.
-        source: The attribute of a `RenderedScene` with its value; "": it is computed, or is none of a scene's.
-        shape: Of a row.
-        axis: Name of the first dimension of an image that has three.
-    """
-
-    kind: Any
+    kind: Any  # its type; `object`: text; a tuple: one of them
     unit: str
     meaning: str
-    source: str = ""
-    shape: tuple[int, ...] = ()
-    axis: str = ""
+    source: str = ""  # the attribute of a `RenderedScene` with its value; "": it is computed, or is none of a scene's
+    shape: tuple[int, ...] = ()  # of a row
+    axis: str = ""  # name of the first dimension of an image that has three
 
     @property
     def is_text(self) -> bool:

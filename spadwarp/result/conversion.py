@@ -34,21 +34,14 @@ class TorchTruth(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorchResult:
-    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`. Methods as of `Result`, of float64.
+    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`. Methods as of `Result`, of float64."""
 
-    Attributes:
-        scene, unit, photons: As in `Result`.
-        tallies: int64 `[3, H, W, T]`, value = tally · `tally_value`.
-        tally_value: Fraction of the photons per tally unit, float64 `[H, W]`; see `Result.tally_value`.
-        truth: float32 maps on the device of the tallies.
-    """
-
-    scene: Scene
-    tallies: torch.Tensor
+    scene: Scene  # as in `Result`, as unit and photons
+    tallies: torch.Tensor  # int64 `[3, H, W, T]`, value = tally · `tally_value`
     unit: float
     photons: int
-    tally_value: torch.Tensor
-    truth: TorchTruth
+    tally_value: torch.Tensor  # fraction of the photons per tally unit, float64 `[H, W]`; see `Result.tally_value`
+    truth: TorchTruth  # float32 maps on the device of the tallies
 
     @cached_property
     def histogram(self) -> torch.Tensor:

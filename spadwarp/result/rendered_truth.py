@@ -18,22 +18,16 @@ __all__ = ["EXR_PRESETS", "ExrPreset", "load_truth_exr"]
 
 
 class ExrPreset(NamedTuple):
-    """How a program writes depth, normals and albedo.
-
-    Attributes:
-        depth_channels, normal_channels, albedo_channels: Where depth, the components of the world normal and albedo are
-            looked for, in this order; green first, in the middle of which lies 532 nm.
-        depth_scale: Metres per unit of depth.
-        sky: Stored depths from here on mean that nothing was hit.
-        axes: The camera's right, down and forward in the program's world, for a camera that is not rotated.
-    """
+    """How a program writes depth, normals and albedo."""
 
     depth_channels: Sequence[str]
-    depth_scale: float
-    sky: float
-    normal_channels: Sequence[tuple[str, str, str]]
-    albedo_channels: Sequence[str]
+    """Where depth is looked for, in this order."""
+    depth_scale: float  # metres per unit of depth
+    sky: float  # stored depths from here on mean that nothing was hit
+    normal_channels: Sequence[tuple[str, str, str]]  # the same of the components of the world normal
+    albedo_channels: Sequence[str]  # of albedo: green first, in the middle of which lies 532 nm
     axes: tuple[tuple[float, float, float], ...]
+    """The camera's right, down and forward in the program's world, for a camera that is not rotated."""
 
 
 _HALF_MAX = 65504.0  # the largest float16, which stands for infinity in files of float16

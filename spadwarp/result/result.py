@@ -91,19 +91,12 @@ def _check_array(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Truth:
-    """What the camera would see through clear water, at pixel centres; NaN where the line of sight hits nothing.
+    """What the camera would see through clear water, at pixel centres; NaN where the line of sight hits nothing."""
 
-    Attributes:
-        depth: float32 `[H, W]`, planar depth z [m].
-        range: float32 `[H, W]`, distance along the line of sight [m].
-        normal: float32 `[H, W, 3]`, unit normal on the camera's side, in the camera frame.
-        reflectance: float32 `[H, W]`, Lambertian reflectance in [0, 1].
-    """
-
-    depth: NDArray[np.float32]
-    range: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    reflectance: NDArray[np.float32]
+    depth: NDArray[np.float32]  # float32 `[H, W]`, planar depth z [m]
+    range: NDArray[np.float32]  # float32 `[H, W]`, distance along the line of sight [m]
+    normal: NDArray[np.float32]  # float32 `[H, W, 3]`, unit normal on the camera's side, in the camera frame
+    reflectance: NDArray[np.float32]  # float32 `[H, W]`, Lambertian reflectance in [0, 1]
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2:
@@ -122,43 +115,27 @@ class Truth:
 class ResultHead:
     """Which photons of which run a result holds: its fields without arrays, as in `Result`."""
 
-    scene: Scene
-    unit: float
-    photons: int
-    seed: int
-    energy_balance_unit: float
-    partial: bool = False
+    scene: Scene  # the scene that was simulated
+    unit: float  # fraction of one emitted photon per tally unit, a power of two
+    photons: int  # emitted photons, > 0
+    seed: int  # 64-bit seed of the run
+    energy_balance_unit: float  # photons per unit of `energy_balance`, a power of two
+    partial: bool = False  # whether the run was interrupted; `photons` then counts those that were done
     photon_ranges: Sequence[tuple[int, int]] = ()
-    batch_size: int = 0
-    requested: tuple[int, int] = (0, 0)
-    focus_distance: float | None = None
+    """The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`."""
+    batch_size: int = 0  # photons of a batch where errors were asked for, else 0; every range is whole batches then
+    requested: tuple[int, int] = (0, 0)  # ids [start, stop) that were asked for; an interrupted run has a part of them
+    focus_distance: float | None = None  # depth that the lens images sharply [m]; None: all of them, for a pinhole
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Result(ResultHead, Tallies):
-    """Expected photon histograms of one scene in fixed point, and all that is needed to interpret them.
+    """Expected photon histograms of one scene in fixed point, value = tally · unit / photons, see `tally_value`, and
+    all that is needed to interpret them; with the attributes of `Tallies`."""
 
-    The attributes of `Tallies`, of which value = tally · unit / photons, see `tally_value`, and:
-
-    Attributes:
-        scene: The scene that was simulated.
-        unit: Fraction of one emitted photon per tally unit, a power of two.
-        photons: Emitted photons, > 0.
-        seed: 64-bit seed of the run.
-        focus_distance: Depth that the lens images sharply [m], None if it is all of them, for a pinhole.
-        energy_balance_unit: Photons per unit of `energy_balance`, a power of two.
-        truth: Depth, range, normal and reflectance at pixel centres.
-        timing: Seconds of each stage.
-        provenance: Versions, device and date.
-        partial: Whether the run was interrupted; `photons` then counts those that were done.
-        photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
-        requested: The ids [start, stop) that were asked for; an interrupted run has only a part of them.
-        batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
-    """
-
-    truth: Truth
-    timing: Mapping[str, float] = field(default_factory=dict)
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    truth: Truth  # depth, range, normal and reflectance at pixel centres
+    timing: Mapping[str, float] = field(default_factory=dict)  # seconds of each stage
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # versions, device and date
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:

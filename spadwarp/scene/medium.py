@@ -383,21 +383,13 @@ def grid_cells(medium: Medium) -> GridCells:
 
 @dataclass(frozen=True, eq=False)
 class PhaseFunction:
-    """Probability density of the direction of scattered light, of unit integral over the sphere.
+    """Probability density of the direction of scattered light, of unit integral over the sphere."""
 
-    Attributes:
-        name: `medium.phase_function`.
-        parameters: The medium's fields that it takes.
-        molecular_share: Part of the scattering that is the water's own and not of that name.
-        over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
-        first_angle: Of a table [rad]; below it the table is continued.
-    """
-
-    name: str
-    parameters: dict[str, float | str]
-    molecular_share: float
-    over_t: Callable[[Floats], Floats]
-    first_angle: float = 0.0
+    name: str  # `medium.phase_function`
+    parameters: dict[str, float | str]  # the medium's fields that it takes
+    molecular_share: float  # part of the scattering that is the water's own and not of that name
+    over_t: Callable[[Floats], Floats]  # the density [1/sr] over t = 1 - cosθ in (0, 2]
+    first_angle: float = 0.0  # of a table [rad]; below it the table is continued
 
     def density(self, angle: ArrayLike) -> Floats:
         """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""

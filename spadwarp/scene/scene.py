@@ -242,18 +242,12 @@ def template() -> str:
 
 
 class WaterLine(NamedTuple):
-    """A line of the light that passes the filter, in the water.
+    """A line of the light that passes the filter, in the water."""
 
-    Attributes:
-        share: Photons, over those of a pulse of one line at `laser.wavelength_nm`.
-        extinction, scattering: [1/m].
-        speed: Of a pulse [m/s].
-    """
-
-    share: float
-    extinction: float
-    scattering: float
-    speed: float
+    share: float  # photons, over those of a pulse of one line at `laser.wavelength_nm`
+    extinction: float  # [1/m]
+    scattering: float  # [1/m]
+    speed: float  # of a pulse [m/s]
 
 
 def water_lines(scene: Scene) -> list[WaterLine]:
@@ -302,19 +296,12 @@ _MOST_ROWS = 1_000_000
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trajectory:
-    """Values of fields of a scene at ascending times.
+    """Values of fields of a scene at ascending times."""
 
-    Attributes:
-        times: [s], `[N]`.
-        fields: As overrides name them, such as `camera.position[0]` or `targets[1].translation[2]`.
-        values: `[N, fields]`, in the units of the fields.
-        source: The file that they came from.
-    """
-
-    times: NDArray[np.float64]
-    fields: tuple[str, ...]
-    values: NDArray[np.float64]
-    source: str | None = None
+    times: NDArray[np.float64]  # [s], `[N]`
+    fields: tuple[str, ...]  # as overrides name them, such as `camera.position[0]` or `targets[1].translation[2]`
+    values: NDArray[np.float64]  # `[N, fields]`, in the units of the fields
+    source: str | None = None  # the file that they came from
 
     def __len__(self) -> int:
         return len(self.times)
