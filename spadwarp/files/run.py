@@ -72,15 +72,10 @@ class _Pictures:
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """The files of a run.
+    """The files of a run."""
 
-    Attributes:
-        written: Their paths.
-        depth: Depth frame [m], float64 `[H, W]`, by `output.depth_method`; NaN where nothing returned.
-    """
-
-    written: list[Path]
-    depth: NDArray[np.float64]
+    written: list[Path]  # their paths
+    depth: NDArray[np.float64]  # depth frame [m] `[H, W]`, by `output.depth_method`; NaN where nothing returned
 
 
 def write_run(result: Result, out: str | Path, *, device: str | None = None, keep: Sequence[str] = ()) -> RunFiles:

@@ -50,18 +50,13 @@ _LARGEST = 2e4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ParticleOptics(Coefficients):
-    """Optical properties at one wavelength of particles, or of water with particles in it.
+    """Optical properties at one wavelength of particles, or of water with particles in it."""
 
-    Attributes:
-        angles_deg: Scattering angles `[n]` [°], 0.01 to 180.
-        density: Phase function at them [1/sr], of unit integral over the sphere.
-        matrix: Elements m12, m22, m33, m34 and m44 of the scattering matrix at them, each over the phase function
-            `[n, 5]`; None where only the phase function is known (Kopelevich's components).
-    """
-
-    angles_deg: Floats
-    density: Floats
+    angles_deg: Floats  # scattering angles `[n]` [°], 0.01 to 180
+    density: Floats  # phase function at them [1/sr], of unit integral over the sphere
     matrix: Floats | None = None
+    """Elements m12, m22, m33, m34 and m44 of the scattering matrix at them, each over the phase function `[n, 5]`; None
+    where only the phase function is known (Kopelevich's components)."""
 
     @cached_property
     def mean_cosine(self) -> float:
