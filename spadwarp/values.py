@@ -25,8 +25,17 @@ from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
 
 __all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
 __all__ += ["DeviceError", "FileError", "Interval", "MeshError", "SpadwarpError", "SpadwarpWarning", "bounds"]
-__all__ += ["check_choice", "check_integer", "check_part", "check_real", "environment_integer", "in_words"]
-__all__ += ["parse_number", "path_from_time", "percent", "pulse_speed", "quantity", "range_from_time", "read_real"]
+__all__ += ["check_choice", "check_integer", "check_part", "check_real", "count", "environment_integer"]
+__all__ += [
+    "in_words",
+    "parse_number",
+    "path_from_time",
+    "percent",
+    "pulse_speed",
+    "quantity",
+    "range_from_time",
+    "read_real",
+]
 __all__ += ["rounded", "shown", "suggestion", "time_from_path", "time_from_range", "with_prefix"]
 
 __version__ = "0.1.0"
@@ -426,6 +435,11 @@ def quantity(text: str, unit: str) -> float:
         return float(Fraction(number) * given_factor / factor)
     except OverflowError:
         raise ValueError("is beyond the largest number, 1.8e308") from None
+
+
+def count(number: float) -> str:
+    """A whole number with a space between thousands: 2 000 000."""
+    return f"{number:,.0f}".replace(",", " ")
 
 
 def percent(share: float) -> str:

@@ -13,8 +13,8 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, count, progress, rows, show_table, write_json, written
-from spadwarp.values import ArgumentError, ConfigError, FileError, percent, range_from_time, rounded
+from spadwarp.cli.outputs import answer, check_outputs, progress, rows, show_table, write_json, written
+from spadwarp.values import ArgumentError, ConfigError, FileError, count, percent, range_from_time, rounded
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene

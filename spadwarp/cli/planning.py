@@ -17,7 +17,6 @@ from spadwarp.cli.options import command
 from spadwarp.cli.outputs import (
     answer,
     check_outputs,
-    count,
     in_percent,
     progress,
     readable,
@@ -27,7 +26,7 @@ from spadwarp.cli.outputs import (
     write_json,
     written,
 )
-from spadwarp.values import ArgumentError, shown, with_prefix
+from spadwarp.values import ArgumentError, count, shown, with_prefix
 
 if TYPE_CHECKING:
     from spadwarp import Scene

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +12,11 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import INTERRUPTED, complain, fail, note, running, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, count, progress
-from spadwarp.values import ArgumentError, ConfigError, address_space
+from spadwarp.cli.outputs import answer, check_outputs, progress
+from spadwarp.values import ArgumentError, ConfigError, address_space, count
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene
-    from spadwarp.analytic import AnalyticResult
     from spadwarp.cli.outputs import Report
     from spadwarp.files import RunFiles
 
@@ -359,23 +357,4 @@ def analytic(
     files = [result.save(out / "analytic.h5", frames=frames, device=device)]
     files.append(spadwarp.viz.draw_analytic(result, out / "analytic.png"))
     notes = spadwarp.analytic.model_notes(read)
-    answer({"frames": frames, "seed": seed, **_typical(result), "notes": notes, "files": files})
-
-
-_MEDIANS = ("signal", "backscatter", "alpha", "signal_to_backscatter", "sigma_time", "sigma_depth")
-_MEANS = ("outlier_probability", "background_probability")
-
-
-def _typical(result: AnalyticResult) -> dict[str, Any]:
-    """Numbers of pixels, and medians or means of those with an estimate."""
-    import numpy as np
-
-    known = result.fisher > 0
-    found: dict[str, Any] = {
-        "pixels": int(known.size),
-        "pixels_with_target": int(np.isfinite(result.truth.depth).sum()),
-        "pixels_with_estimate": int(known.sum()),
-    }
-    for names, average in ((_MEDIANS, np.median), (_MEANS, np.mean)):
-        found |= {name: float(average(getattr(result, name)[known])) if known.any() else math.nan for name in names}
-    return found
+    answer({**spadwarp.files.summary(result), "frames": frames, "notes": notes, "files": files})
