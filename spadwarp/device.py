@@ -8,7 +8,7 @@ import json
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -144,7 +144,7 @@ def _kernel_cache() -> Iterator[None]:
 def _init_quietly() -> None:
     import warp as wp
 
-    if _has_cuda_driver():
+    if cuda_driver() is not None:
         wp.init()
         return
     # The warning is written by native code, past Python's streams.
@@ -162,15 +162,12 @@ def _init_quietly() -> None:
         os.close(stderr)
 
 
-def _has_cuda_driver() -> bool:
-    """Whether the system's loader finds NVIDIA's driver library."""
+def cuda_driver() -> ctypes.CDLL | None:
+    """NVIDIA's driver library, where the system's loader finds it."""
     for library in ("nvcuda.dll",) if os.name == "nt" else ("libcuda.so", "libcuda.so.1"):
-        try:
-            ctypes.CDLL(library)
-        except OSError:
-            continue
-        return True
-    return False
+        with suppress(OSError):
+            return ctypes.CDLL(library)
+    return None
 
 
 def core_count() -> int:

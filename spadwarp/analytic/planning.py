@@ -511,12 +511,7 @@ def trace(
 
 
 def measure(
-    runs: tuple[Result, Result],
-    scene: Scene,
-    device: str | None = None,
-    *,
-    even: bool = False,
-    channel: Channel = "I",
+    runs: tuple[Result, Result], scene: Scene, device: str | None = None, *, even: bool = False, channel: Channel = "I"
 ) -> Pilot:
     """Numbers of `scene`, whose laser's energy and detector may differ from those of the runs, in a channel of an
     analyser.
@@ -540,8 +535,7 @@ def measure(
     seen = np.isfinite(both.truth.depth) & (signal.sum(axis=-1) > 0)
     if not seen.any():
         raise ConfigError(
-            "no light of the target reaches the pixels near the axis: `spadwarp check` says why",
-            source=scene.source,
+            "no light of the target reaches the pixels near the axis: `spadwarp check` says why", source=scene.source
         )
 
     def median(values: Any) -> float:

@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.analytic.model import (
-    BackscatterTable,
-    Map,
-    pixel_maps,
-    response_sigma,
-    scene_optics,
-    warn_of_model,
-)
+from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, response_sigma, scene_optics, warn_of_model
 from spadwarp.arrays import kernel_errors, labelled
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
