@@ -320,6 +320,24 @@ def shown(value: Any) -> str:
     return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
 
 
+# ---- What notebooks show.
+
+
+class Shown:
+    """Scenes and results, which `spadwarp.viz` draws."""
+
+    def plot(self, kind: Any = None, **options: Any) -> Any:
+        """A figure; of a result "depth", "intensity", "histogram" or "truth"; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(self, kind, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
+
+
 # ---- Constants, and the one place where the time of flight of a pulse becomes a length.
 
 

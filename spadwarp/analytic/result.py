@@ -19,7 +19,7 @@ from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
-from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer
+from spadwarp.values import SEED, ArgumentError, ConfigError, Shown, check_integer
 
 if TYPE_CHECKING:
     import xarray
@@ -74,7 +74,7 @@ def _coordinates(frames: int, shape: tuple[int, ...]) -> dict[str, Coordinate]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class AnalyticResult:
+class AnalyticResult(Shown):
     """Maps of a scene by the analytic model, and depth frames drawn from them.
 
     Maps are float64 `[H, W]`, NaN where there is no estimate: nothing hit, not illuminated, or the return outside the
@@ -106,17 +106,6 @@ class AnalyticResult:
         name = self.scene.source.stem if self.scene.source else "Python"
         height, width = self.truth.depth.shape
         return f"AnalyticResult({name}: {width} x {height} pixels, {len(self.depth)} depth frames, seed {self.seed})"
-
-    def plot(self, **options: Any) -> Any:
-        """A figure of the maps and a frame; see `spadwarp.viz.plot`."""
-        import spadwarp
-
-        return spadwarp.viz.plot(self, **options)
-
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
 
     @kernel_errors()
     def sample(

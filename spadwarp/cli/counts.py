@@ -85,7 +85,7 @@ def detect(
     )
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
-    files = [recording.file.path, spadwarp.viz.draw_recording(recording.file, out / "frame.png")]
+    files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 

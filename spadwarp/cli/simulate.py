@@ -355,6 +355,6 @@ def analytic(
         backscatter_profile=None if profile is None else opt.load_run(profile),
     )
     files = [result.save(out / "analytic.h5", frames=frames, device=device)]
-    files.append(spadwarp.viz.draw_analytic(result, out / "analytic.png"))
+    files.append(spadwarp.viz.draw(result, out / "analytic.png"))
     notes = spadwarp.analytic.model_notes(read)
     answer({**spadwarp.files.summary(result), "frames": frames, "notes": notes, "files": files})

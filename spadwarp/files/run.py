@@ -67,7 +67,7 @@ class _Pictures:
         """Draws that of a fit; returns its path."""
         import spadwarp
 
-        return spadwarp.viz.draw_fit(self.of, self.folder / "fit.png")
+        return spadwarp.viz.draw(self.of, self.folder / "fit.png")
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.values import ArgumentError, ConfigError, check_choice, percent
+from spadwarp.values import ArgumentError, ConfigError, Shown, check_choice, percent
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -129,7 +129,7 @@ class ResultHead:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Result(ResultHead, Tallies):
+class Result(Shown, ResultHead, Tallies):
     """Expected photon histograms of one scene in fixed point, value = tally · unit / photons, see `tally_value`, and
     all that is needed to interpret them; with the attributes of `Tallies`."""
 
@@ -390,17 +390,6 @@ class Result(ResultHead, Tallies):
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }
-
-    def plot(self, kind: Any = None, **options: Any) -> Any:
-        """A figure: "depth", "intensity", "histogram" or "truth"; see `spadwarp.viz.plot`."""
-        import spadwarp
-
-        return spadwarp.viz.plot(self, kind, **options)
-
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
 
     def to_xarray(self) -> Any:
         """Histograms, depth and truth with coordinates and units: see `spadwarp.result.to_xarray`."""

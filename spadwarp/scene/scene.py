@@ -29,6 +29,7 @@ from spadwarp.values import (
     ArgumentError,
     ConfigError,
     FileError,
+    Shown,
     check_integer,
     check_real,
     path_from_time,
@@ -42,7 +43,7 @@ __all__ += ["water_lines"]
 _DOWNWARDS = 0.999  # Cosine with the vertical, of the normal of a surface.
 
 
-class Scene(Document):
+class Scene(Shown, Document):
     """Everything a run depends on, checked and frozen."""
 
     medium: Medium
@@ -177,17 +178,6 @@ class Scene(Document):
         """Longest geometric path that counts [m]: `transport.max_path` or the gate's end, whichever is shorter."""
         gate_end = path_from_time(self.gate.stop, self.medium.group_index)
         return min(self.transport.max_path or gate_end, gate_end)
-
-    def plot(self, **options: Any) -> Any:
-        """A figure of what the camera sees through clear water; see `spadwarp.viz.plot`."""
-        import spadwarp
-
-        return spadwarp.viz.plot(self, **options)
-
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
 
     def __repr__(self) -> str:
         name = self.source.stem if self.source else "Python"

@@ -26,7 +26,7 @@ from spadwarp.values import ArgumentError, rounded
 from spadwarp.viz import style
 from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits, spaced
 
-__all__ = ["draw_analytic", "draw_denoised", "draw_depth", "draw_fit", "draw_recording", "draw_result", "plot"]
+__all__ = ["draw", "draw_denoised", "draw_depth", "draw_result", "plot"]
 
 KINDS = ("depth", "intensity", "histogram", "truth")
 """Figures of a result."""
@@ -78,19 +78,9 @@ def plot(
     return panels.figure
 
 
-def draw_analytic(result: AnalyticResult, path: str | Path, *, width: float = PAGE) -> Path:
-    """Maps of the model and a frame, its first one or one that is drawn now; `width` [inch]; returns the path."""
-    return save(plot(result, width=width), path)
-
-
-def draw_fit(fit: Fit, path: str | Path, *, width: float = PAGE) -> Path:
-    """Counts, fit and residuals of a fit: over the image and over time; `width` [inch]; returns the path."""
-    return save(plot(fit, width=width), path)
-
-
-def draw_recording(file: FramesFile, path: str | Path, *, width: float = PAGE) -> Path:
-    """The first of the frames that were recorded, with its depth; `width` [inch]; returns the path."""
-    return save(plot(file, width=width), path)
+def draw(shown: FramesFile | AnalyticResult | Fit | Scene, path: str | Path, **options: Any) -> Path:
+    """Writes the figure of `plot`, with its options; returns the path. Raises `FileError`."""
+    return save(plot(shown, **options), path)
 
 
 @paper()
