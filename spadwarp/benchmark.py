@@ -217,9 +217,8 @@ def run(
             once two seconds have been timed.
         progress, found: Called with each case before it is run, and with each result.
 
-    Raises:
-        ArgumentError: An unknown case, or a number out of range.
-        DeviceError: No such device, or one that is too small for a case.
+    Raises `ArgumentError`: an unknown case, or a number out of range; `DeviceError`: no such device, or one that is too
+    small for a case.
     """
     names = list(CASES) if cases is None else list(cases)
     for name in names:

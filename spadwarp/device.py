@@ -26,8 +26,7 @@ def pick_devices(names: str | None = None) -> list[wp.Device]:
 
     A device that is named twice is used twice, with tallies of its own each time.
 
-    Raises:
-        DeviceError: There is no such device; the text names those that exist.
+    Raises `DeviceError`: there is no such device; the text names those that exist.
     """
     import warp as wp
 
@@ -40,8 +39,7 @@ def pick_devices(names: str | None = None) -> list[wp.Device]:
 def pick_device(name: str | wp.Device | None = None) -> wp.Device:
     """The Warp device of that name, or as it is; by default the first GPU, else the CPU.
 
-    Raises:
-        DeviceError: There is no such device; the text names those that exist.
+    Raises `DeviceError`: there is no such device; the text names those that exist.
     """
     import warp as wp
 

@@ -58,8 +58,7 @@ def diagnose(
         self_test: Whether to run it: a few seconds, and as many again the first time to compile the kernels.
         progress: Called with the name of each step.
 
-    Raises:
-        DeviceError: No such device.
+    Raises `DeviceError`: no such device.
     """
     chosen = pick_device(device)
     problems: list[str] = []

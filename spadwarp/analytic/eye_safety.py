@@ -79,9 +79,8 @@ def eye_limit(of: Laser | Scene, *, distance: float = 0.1, exposure: float = 100
         exposure: [s], in [1e-6, 3e4]; 100 s is the standard's time base where nobody means to look into the beam,
             0.25 s the time within which one turns away from visible light.
 
-    Raises:
-        ArgumentError: A value out of its range, or a wavelength outside 400 to 1050 nm.
-        FileError: The image of a measured beam.
+    Raises `ArgumentError`: a value out of its range, or a wavelength outside 400 to 1050 nm; `FileError`: the image of
+    a measured beam.
     """
     laser = of if isinstance(of, Laser) else of.laser
     exposure = check_real("exposure", exposure, "[1e-6, 3e4] s")

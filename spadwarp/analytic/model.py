@@ -90,9 +90,8 @@ def pixel_maps(
     Returns:
         float64 maps `[P]`, `daylight` [1/s] among them, and the table.
 
-    Raises:
-        ConfigError: A scene that the model does not cover.
-        ArgumentError: The scene's backscatter needs a profile.
+    Raises `ConfigError`: a scene that the model does not cover; `ArgumentError`: the scene's backscatter needs a
+    profile.
     """
     from spadwarp_kernels import analytic as kernels
 

@@ -211,9 +211,7 @@ def plan(
         device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
         progress: Called with ("trace", photons done, photons asked for) and the like.
 
-    Raises:
-        ConfigError: No target in view, or no light from it.
-        ArgumentError: An argument out of range.
+    Raises `ConfigError`: no target in view, or no light from it; `ArgumentError`: an argument out of range.
     """
     scene = as_scene(scene)
     photons = check_integer("photons", photons, field_range(Transport, "photons"))

@@ -167,8 +167,7 @@ class AnalyticResult(Shown):
     def to_xarray(self) -> xarray.Dataset:
         """Maps and truth (y, x) and depth frames (frame, y, x) with coordinates and units.
 
-        Raises:
-            FileError: xarray is not installed.
+        Raises `FileError`: xarray is not installed.
         """
         variables = {name: (_ARRAYS[at][0], self._array(at), *_ARRAYS[at][1:]) for name, at in _LABELLED.items()}
         axes = _coordinates(len(self.depth), self.truth.depth.shape)
@@ -183,8 +182,7 @@ class AnalyticResult(Shown):
             frames: Number of frames to draw and write in parts, however many; default: those that the result holds.
             device: Warp device that draws them.
 
-        Raises:
-            FileError: The file cannot be written.
+        Raises `FileError`: the file cannot be written.
         """
         from spadwarp.values import __version__
 
@@ -252,9 +250,8 @@ def simulate_analytic(
 
     A warning says where a scene's light is polarised, which the model leaves out.
 
-    Raises:
-        ConfigError: A scene that the model does not cover, or whose gate holds no return.
-        ArgumentError: A truth or profile of the wrong shape, or with impossible values.
+    Raises `ConfigError`: a scene that the model does not cover, or whose gate holds no return; `ArgumentError`: a truth
+    or profile of the wrong shape, or with impossible values.
     """
     scene = as_scene(scene)
     frames, seed = check_integer("frames", frames, "[0, 2147483647]"), check_integer("seed", seed, SEED)

@@ -133,9 +133,8 @@ def budget(
         A row for each water and range, in this order. A warning says where light is polarised, which the model leaves
         out.
 
-    Raises:
-        ConfigError: A water or scene that the model does not cover.
-        ArgumentError: Ranges or reflectance out of range.
+    Raises `ConfigError`: a water or scene that the model does not cover; `ArgumentError`: ranges or reflectance out of
+    range.
     """
     scene = as_scene(scene)
     distances = _distances(scene, ranges)
@@ -171,9 +170,8 @@ def sweep(
 
     Where no number depends on the field, or where light is polarised, which the model leaves out, a warning says so.
 
-    Raises:
-        ConfigError: An unknown field, a value out of its range, a scene that the model does not cover.
-        ArgumentError: `vary` or `of` not of the form above.
+    Raises `ConfigError`: an unknown field, a value out of its range, a scene that the model does not cover;
+    `ArgumentError`: `vary` or `of` not of the form above.
     """
     scene = as_scene(scene)
     row: Callable[[Scene, str | None], Any] = _central_row

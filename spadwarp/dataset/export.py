@@ -87,9 +87,8 @@ def export_dataset(
         overwrite: Whether an existing `out` is replaced.
         progress: Called with ("frames", frames written, frames to write).
 
-    Raises:
-        ArgumentError: An argument out of range, or a field that the dataset does not have.
-        FileError: No dataset, `out` exists or cannot be written, or a package is missing.
+    Raises `ArgumentError`: an argument out of range, or a field that the dataset does not have; `FileError`: no
+    dataset, `out` exists or cannot be written, or a package is missing.
     """
     check_choice("format", format, EXPORT_FORMATS)
     frames_per_file = check_integer("frames_per_file", frames_per_file, "[1, 1000000]")

@@ -95,9 +95,7 @@ def open_source(source: Any, *, result: Result | None = None, split: str = "all"
         result: From which `Frames` were drawn.
         split: Of a dataset.
 
-    Raises:
-        ArgumentError: A source of another type.
-        FileError: Not a file of ours, or damaged.
+    Raises `ArgumentError`: a source of another type; `FileError`: not a file of ours, or damaged.
     """
     check_choice("split", split, (*SPLITS, "all"))
     if isinstance(source, Frames):
@@ -262,9 +260,8 @@ def export(
     Returns:
         The files that were written.
 
-    Raises:
-        ArgumentError: No such frame, or what the format holds is not in the source.
-        FileError: A file cannot be read or written, or the package for its format is not installed.
+    Raises `ArgumentError`: no such frame, or what the format holds is not in the source; `FileError`: a file cannot be
+    read or written, or the package for its format is not installed.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -315,9 +312,8 @@ def export_sensor_fusion(
         factor: Pixels of the camera image in a pixel, each way, in [1, 64].
         frames, split, result: As for `export`.
 
-    Raises:
-        ArgumentError: No such frame, or no counts, or no scene of meshes.
-        FileError: A file cannot be read or written.
+    Raises `ArgumentError`: no such frame, or no counts, or no scene of meshes; `FileError`: a file cannot be read or
+    written.
     """
     opened, folder = open_source(source, result=result, split=split), Path(folder)
     if isinstance(opened, Result):

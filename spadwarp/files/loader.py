@@ -50,8 +50,7 @@ def load(path: str | os.PathLike[str]) -> Held:
     - `sequence.h5` of `simulate --trajectory`: a `SequenceFile`, which reads frames of a scene that moves when asked.
     - A directory with one of these files, such as that of a run: the same. A checkpoint counts if there is no result.
 
-    Raises:
-        FileError: Not a file of ours, damaged, or a directory that holds none or several of them.
+    Raises `FileError`: not a file of ours, damaged, or a directory that holds none or several of them.
     """
     place = locate(path)
     kind, is_shard = (None, True) if place.is_dir() else _format(place)

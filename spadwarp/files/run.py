@@ -90,9 +90,8 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
         device: Warp device for the depth frame.
         keep: Names of earlier files that are not removed.
 
-    Raises:
-        FileError: A file cannot be written; a result that does not fit goes to the folder for temporary files instead,
-            which the text names.
+    Raises `FileError`: a file cannot be written; a result that does not fit goes to the folder for temporary files
+    instead, which the text names.
     """
     folder, scene, output = Path(out), result.scene, result.scene.output
     written: list[Path] = []
@@ -206,10 +205,8 @@ def write_depth(
     Without a field of view the names begin with `range`. `ply`: the points of the first frame, with normals and
     intensity, in the frame `ply_frame`, which a comment of the file names.
 
-    Raises:
-        ArgumentError: A point cloud was asked for and the field of view is not known, or in the world where the
-            camera's pose is not known.
-        FileError: A file cannot be written.
+    Raises `ArgumentError`: a point cloud was asked for and the field of view is not known, or in the world where the
+    camera's pose is not known; `FileError`: a file cannot be written.
     """
     check_choice("ply_frame", ply_frame, tuple(_POINT_FRAMES))
     if ply is not None and reduction.lines is None:

@@ -93,8 +93,7 @@ def read_coloured_mesh(
     and the texels of images are decoded from sRGB unless `encoding` is "linear"; colours of materials, and of vertices
     in GLB, are linear already.
 
-    Raises:
-        MeshError: The file cannot be read, or has no colours.
+    Raises `MeshError`: the file cannot be read, or has no colours.
     """
     import trimesh
 

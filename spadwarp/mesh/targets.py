@@ -218,9 +218,8 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     about its own axes, first x, then the new y, then the new z (intrinsic; R = Rx·Ry·Rz). A mesh file's axes are taken
     as they are. Faces that have no area in float32 are dropped, those of a mesh file with a warning that counts them.
 
-    Raises:
-        ConfigError: An unknown built-in, or a size for one that has its own.
-        MeshError: Missing or unreadable file, or a mesh that is empty, not finite or has no area.
+    Raises `ConfigError`: an unknown built-in, or a size for one that has its own; `MeshError`: missing or unreadable
+    file, or a mesh that is empty, not finite or has no area.
     """
     return _load(target, field)[0]
 

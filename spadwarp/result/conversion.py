@@ -80,8 +80,7 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
     Returns:
         `TorchResult`, or `Frames` whose arrays are tensors.
 
-    Raises:
-        ArgumentError: The tensor is not int64 or has not as many elements as the result.
+    Raises `ArgumentError`: the tensor is not int64 or has not as many elements as the result.
     """
     import torch
 
@@ -119,8 +118,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
     `derivative`, of results that have some, has the dimension parameter before these, and `polarisation` the dimension
     channel. Attributes: photons, seed, partial and the scene as TOML.
 
-    Raises:
-        FileError: xarray is not installed.
+    Raises `FileError`: xarray is not installed.
     """
     cube = ("component", "y", "x", "time")
     values = np.stack([result.component(name) for name in COMPONENTS])

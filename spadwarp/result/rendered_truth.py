@@ -85,10 +85,9 @@ def load_truth_exr(
     Returns:
         Truth; NaN where the file has NaN, infinity, 0 or the sky's value.
 
-    Raises:
-        FileError: A file that cannot be read, without the channel (the message names those it has), of another size
-            than the camera's image, with negative depth or albedo outside [0, 1], or with nothing in view.
-        ArgumentError: An argument out of range.
+    Raises `FileError`: a file that cannot be read, without the channel (the message names those it has), of another
+    size than the camera's image, with negative depth or albedo outside [0, 1], or with nothing in view;
+    `ArgumentError`: an argument out of range.
     """
     check_choice("preset", preset, [*EXR_PRESETS])
     if camera.port is not None:

@@ -230,8 +230,7 @@ class Result(Shown, ResultHead, Tallies):
     def standard_error(self) -> Floats:
         """Standard error of `histogram` from the spread between batches, float64 `[H, W, T]`.
 
-        Raises:
-            ConfigError: The run has no batches, or only one.
+        Raises `ConfigError`: the run has no batches, or only one.
         """
         moments, batches = _batches_of(self)
         return standard_error(self.tallies, moments, batches) * self.tally_value[..., None]
@@ -630,9 +629,7 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
 
     The energy balance and the counters stay those of all light; from Stokes cubes the channel has no standard errors.
 
-    Raises:
-        ArgumentError: No such channel.
-        ConfigError: The result was simulated without channels.
+    Raises `ArgumentError`: no such channel; `ConfigError`: the result was simulated without channels.
     """
     if check_choice("channel", channel, CHANNELS) == "I":
         return result

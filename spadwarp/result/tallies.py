@@ -167,8 +167,7 @@ Ranges = tuple[Range, ...]
 def joined(ranges: Iterable[Range]) -> Ranges:
     """The ranges in order, adjoining ones made one.
 
-    Raises:
-        ConfigError: Ids are in more than one of them.
+    Raises `ConfigError`: ids are in more than one of them.
     """
     whole: list[Range] = []
     for start, stop in sorted(ranges):
@@ -202,8 +201,7 @@ def count(ranges: Iterable[Range]) -> int:
 def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
     """Part `shard[0]`, from 1, of `shard[1]` equal parts of a span of whole units.
 
-    Raises:
-        ConfigError: There are more parts than units.
+    Raises `ConfigError`: there are more parts than units.
     """
     (number, parts), (start, stop) = shard, span
     units = (stop - start) // unit

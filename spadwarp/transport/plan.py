@@ -48,8 +48,7 @@ _LARGEST_BATCH = 1 << 30
 class RunOptions:
     """How the photons of a run are divided, and what of the run is on disk; no choice changes the bits of a photon.
 
-    Raises:
-        ArgumentError: A number out of range.
+    Raises `ArgumentError`: a number out of range.
     """
 
     threads: int | None = None  # CPU threads; by default one a core; a GPU takes none

@@ -142,8 +142,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
         path: The file; an existing one is replaced when the new one is whole.
         scene: The scene they were traced in, to be stored with them.
 
-    Raises:
-        FileError: The file cannot be written.
+    Raises `FileError`: the file cannot be written.
     """
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, "reasons": list(records.reasons)}
     if records.derivatives:
@@ -167,8 +166,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
 def load_records(path: str | Path) -> PhotonRecords:
     """Reads what `save_records` wrote.
 
-    Raises:
-        FileError: No such file, not photon records, or damaged; says which.
+    Raises `FileError`: no such file, not photon records, or damaged; says which.
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         names: list[Any] = np.ravel(file.attribute("derivatives", [])).tolist()

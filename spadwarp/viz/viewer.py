@@ -86,9 +86,8 @@ def view(
         channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
         device: Warp device for the depth frame.
 
-    Raises:
-        FileError: plotly is not installed, or a file cannot be read or written.
-        ArgumentError: No such frame, method or channel.
+    Raises `FileError`: plotly is not installed, or a file cannot be read or written; `ArgumentError`: no such frame,
+    method or channel.
     """
     try:
         from plotly.offline import get_plotlyjs
@@ -350,9 +349,8 @@ def video(
         scale: "log" over four decades, or "linear".
         frame: Number of the frame, from 0, where the source holds frames.
 
-    Raises:
-        ArgumentError: An argument out of range, or another ending.
-        FileError: A file cannot be read or written, or ffmpeg is missing.
+    Raises `ArgumentError`: an argument out of range, or another ending; `FileError`: a file cannot be read or written,
+    or ffmpeg is missing.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):

@@ -145,9 +145,7 @@ def mie_particles(
         concentration: Volume of the particles [ppm], cm³ in a m³ of water.
         temperature, salinity: Of the water [°C], [g/kg].
 
-    Raises:
-        ArgumentError: A value out of its range.
-        FileError: miepython is not installed.
+    Raises `ArgumentError`: a value out of its range; `FileError`: miepython is not installed.
     """
     try:
         import miepython
@@ -193,8 +191,7 @@ def kopelevich_particles(wavelength_nm: float, *, small: float, large: float) ->
         small: v_s, mineral particles below 1 µm [ppm]; the sea has 0.01 to 0.2.
         large: v_l, organic particles above 1 µm [ppm]; the sea has 0.01 to 0.4.
 
-    Raises:
-        ArgumentError: A value out of its range, or no particles.
+    Raises `ArgumentError`: a value out of its range, or no particles.
     """
     check_ranges(wavelength_nm=wavelength_nm)
     small, large = check_real("small", small, "[0, 1e4] ppm"), check_real("large", large, "[0, 1e4] ppm")
