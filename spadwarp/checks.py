@@ -116,7 +116,7 @@ class Survey:
             self.target_range = float(ranges.min()), float(ranges.max())
             self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
             self.optical_depth = scene.optical_depth((0.0, 0.0, 0.0), illuminated[ranges.argmin()].tolist())
-            if self.target_range[0]:
+            if self.target_range[0] > 1e-5:
                 self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
 
     def warn(self, field: str, text: str, **values: float) -> None:
@@ -164,7 +164,9 @@ class Survey:
 
     def _on_axis(self, distance: float, optical_depth: float) -> OnAxis:
         scene, passed, port = self.scene, math.exp(-optical_depth), self.camera_port
-        ballistic = self._pixel_share(distance) * passed
+        # Of the beam within one pixel's footprint on its axis, without water; of a measured one where it is brightest.
+        footprint = (scene.camera.pixel_tangent * distance) ** 2 * _narrowed(port)
+        ballistic = min(1.0, footprint * axis_fluence(scene, distance)) * passed
         # Lambertian, towards the lens
         collected = self.reflectance / math.pi * scene.camera.aperture_area / distance**2
         share = ballistic * passed * _transmission(port)
@@ -179,21 +181,6 @@ class Survey:
             photons_per_pixel=photons,
             signal_per_pulse=photons * scene.detections_per_photon,
         )
-
-    def _pixel_share(self, distance: float) -> float:
-        """Part of the beam within one pixel's footprint at `distance` [m], on the beam's axis, without water."""
-        laser, footprint = self.scene.laser, (self.scene.camera.pixel_tangent * distance) ** 2
-        footprint *= _narrowed(self.camera_port) / _narrowed(self.laser_port) * _transmission(self.laser_port)
-        if laser.profile == "uniform_cone":
-            area = 2.0 * math.pi * (1.0 - math.cos(laser.half_angle)) * distance**2
-        elif laser.profile == "gaussian":
-            area = 0.5 * math.pi * (math.tan(laser.half_angle) * distance) ** 2
-        elif laser.profile == "measured":
-            wide, tall = profile_extent(laser)
-            area = 4.0 * wide * tall * distance**2  # if it were even
-        else:
-            area = math.pi * laser.beam_radius**2
-        return min(1.0, footprint / area) if area > 0.0 else 1.0
 
 
 def _narrowed(port: PortGeometry | None) -> float:
