@@ -16,37 +16,16 @@ from numpy.typing import NDArray
 from spadwarp.analytic import PILE_UP, axis_fluence
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
-from spadwarp.scene import (
-    Laser,
-    Layer,
-    Medium,
-    Scene,
-    SceneLike,
-    as_scene,
-    daylight_rate,
-    downwelling_irradiance,
-    phase_function,
-    scattering_matrix,
-    spectral_lines,
-    water_lines,
-)
+from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwelling_irradiance
 from spadwarp.scene.camera import image_points, to_camera, to_world
-from spadwarp.scene.laser import profile_extent
-from spadwarp.scene.medium import WATER_INDICES, grid_cells
+from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
+from spadwarp.scene.medium import WATER_INDICES, Layer, Medium, grid_cells, phase_function, scattering_matrix
 from spadwarp.scene.port import Port, PortGeometry
-from spadwarp.scene.scene import camera_port, laser_port
+from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import field_unit
 from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
 from spadwarp.transport import points_per_flight
-from spadwarp.values import (
-    ArgumentError,
-    ConfigError,
-    path_from_time,
-    quantity,
-    range_from_time,
-    time_from_path,
-    with_prefix,
-)
+from spadwarp.values import ConfigError, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
 __all__ = ["CheckMessage", "check", "summary"]
@@ -205,7 +184,7 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     points_per_flight(survey.scene)
     try:  # read here, since only depth and counts need it: at the end of a run it would be too late
         detector_response(survey.scene.detector, survey.scene.laser)
-    except ArgumentError as error:
+    except ValueError as error:
         raise ConfigError(f"detector.irf: {error}", source=survey.scene.source) from None
     for find in _CHECKS:
         find(survey)

@@ -22,7 +22,7 @@ import spadwarp
 from spadwarp.cli.app import running, say, until_the_end, wrong
 from spadwarp.values import FileError
 
-__all__ = ["Report", "answer", "check_outputs", "in_bytes", "in_percent", "progress", "readable", "rows"]
+__all__ = ["Report", "answer", "check_outputs", "in_bytes", "progress", "readable", "rows"]
 __all__ += ["short", "show_table", "write_json", "written"]
 
 Report = Callable[[str, int, int], None]
@@ -34,13 +34,6 @@ Report = Callable[[str, int, int], None]
 def short(value: float) -> str:
     """A number to three digits; "-" for NaN."""
     return "-" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.3g}"
-
-
-def in_percent(value: float) -> str:
-    """A fraction in per cent."""
-    if math.isnan(value):
-        return "-"
-    return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
 
 
 def in_bytes(number: float) -> str:

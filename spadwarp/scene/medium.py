@@ -31,14 +31,8 @@ from spadwarp.scene.sections import (
     read_table,
 )
 from spadwarp.values import ConfigError, bounds, pulse_speed
-from spadwarp.water import (
-    molecular_density,
-    rayleigh_matrix,
-    read_matrix_table,
-    scaled_rayleigh_matrix,
-    voss_fry_matrix,
-)
-from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, water_optics
+from spadwarp.water import rayleigh_matrix, read_matrix_table, scaled_rayleigh_matrix, voss_fry_matrix
+from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, molecular_density, water_optics
 
 __all__ = ["Layer", "Matrix", "Medium", "PhaseFunction", "phase_function", "scattering_matrix"]
 

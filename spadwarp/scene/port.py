@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from spadwarp.scene.pose import vector_of
-from spadwarp.scene.sections import Direction, Section, Vector, field, unit_vector
+from spadwarp.scene.pose import unit_vector, vector_of
+from spadwarp.scene.sections import Direction, Section, Vector, field
 
 __all__: list[str] = []
 

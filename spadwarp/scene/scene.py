@@ -25,17 +25,7 @@ from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import interpolated_angles, rotation_matrix, vector_of
 from spadwarp.scene.sections import Document, Overrides, listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
-from spadwarp.values import (
-    ArgumentError,
-    ConfigError,
-    FileError,
-    Shown,
-    check_integer,
-    check_real,
-    path_from_time,
-    read_real,
-    shown,
-)
+from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_integer, check_real, read_real, shown
 
 __all__ = ["Scene", "SceneLike", "Trajectory", "WaterLine", "as_scene", "load_scene", "load_trajectory", "template"]
 __all__ += ["water_lines"]
@@ -176,7 +166,7 @@ class Scene(Shown, Document):
     @property
     def path_limit(self) -> float:
         """Longest geometric path that counts [m]: `transport.max_path` or the gate's end, whichever is shorter."""
-        gate_end = path_from_time(self.gate.stop, self.medium.group_index)
+        gate_end = self.gate.stop * self.medium.pulse_speed
         return min(self.transport.max_path or gate_end, gate_end)
 
     def __repr__(self) -> str:
