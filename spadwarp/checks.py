@@ -20,7 +20,7 @@ from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwellin
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
 from spadwarp.scene.medium import WATER_INDICES, Layer, Medium, grid_cells, phase_function, scattering_matrix
-from spadwarp.scene.port import Port, PortGeometry
+from spadwarp.scene.port import Port
 from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import field_unit
 from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
@@ -143,15 +143,18 @@ class Survey:
 
     def _on_axis(self, distance: float, optical_depth: float) -> OnAxis:
         scene, passed, port = self.scene, math.exp(-optical_depth), self.camera_port
+        through, footprint = 1.0, (scene.camera.pixel_tangent * distance) ** 2
+        if port is not None:  # a flat one makes solid angles smaller
+            narrowed = (port.index[0] / port.index[2]) ** 2
+            through = float(port.transmission(np.zeros(3), (0.0, 0.0, 1.0)))
+            through, footprint = (
+                (through, footprint * narrowed) if port.shape == "flat" else (through * narrowed, footprint)
+            )
         # Of the beam within one pixel's footprint on its axis, without water; of a measured one where it is brightest.
-        footprint = (scene.camera.pixel_tangent * distance) ** 2 * _narrowed(port)
         ballistic = min(1.0, footprint * axis_fluence(scene, distance)) * passed
         # Lambertian, towards the lens
         collected = self.reflectance / math.pi * scene.camera.aperture_area / distance**2
-        share = ballistic * passed * _transmission(port)
-        if port is not None and port.shape == "dome":
-            share *= (port.index[0] / port.index[2]) ** 2
-        photons = share * collected * scene.laser.photons_per_pulse
+        photons = ballistic * passed * through * collected * scene.laser.photons_per_pulse
         return OnAxis(
             distance=distance,
             optical_depth=optical_depth,
@@ -160,17 +163,6 @@ class Survey:
             photons_per_pixel=photons,
             signal_per_pulse=photons * scene.detections_per_photon,
         )
-
-
-def _narrowed(port: PortGeometry | None) -> float:
-    """By which a flat port makes a small solid angle about its normal smaller."""
-    return 1.0 if port is None or port.shape != "flat" else (port.index[0] / port.index[2]) ** 2
-
-
-def _transmission(port: PortGeometry | None) -> float:
-    """Of light that falls on a port at right angles."""
-    first, second, third = (1.0, 1.0, 1.0) if port is None else port.index
-    return (4.0 * first * second / (first + second) ** 2) * (4.0 * second * third / (second + third) ** 2)
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:

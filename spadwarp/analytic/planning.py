@@ -149,15 +149,8 @@ class Proposal:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, in numbers and text that JSON can hold."""
-        fields = {one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name != "scene"}
-        return {"values": self.values, **_plain(fields)}
-
-
-def _plain(value: Any) -> Any:
-    """Dicts of dicts and data classes as dicts."""
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return dataclasses.asdict(value) if isinstance(value, EyeLimit | Pilot) else value
+        fields = dataclasses.asdict(dataclasses.replace(self, scene=None))  # type: ignore[arg-type]
+        return {"values": self.values, **{name: value for name, value in fields.items() if name != "scene"}}
 
 
 def plan(

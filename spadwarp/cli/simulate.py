@@ -241,22 +241,16 @@ def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
     """A run in a few numbers."""
     import numpy as np
 
-    summary, frame = result.summary(), files.depth
+    summary, error = result.summary(), np.abs(files.depth - result.truth.depth)
+    error, returned = error[np.isfinite(error)], files.depth[np.isfinite(files.depth)]
     seconds, balance = result.timing.get("trace", 0.0), summary["energy_balance"]
-    error = np.abs(frame - result.truth.depth)
-    error, returned = error[np.isfinite(error)], frame[np.isfinite(frame)]
-    device = f"{result.provenance.get('device', 'unknown')}, {seconds:.3g} s"
-    found = {
-        "photons": result.photons,
-        "seed": result.seed,
-        "device": f"{device}, {result.photons / seconds:.3g} photons/s" if seconds > 0 else device,
-        "collected_fraction": summary["collected_fraction"],
-        "detections_per_pulse": summary["detections_per_pulse"],
+    rate = f", {result.photons / seconds:.3g} photons/s" if seconds > 0 else ""
+    names = ("photons", "seed", "collected_fraction", "detections_per_pulse", "derivatives")
+    found = {name: summary[name] for name in names if name in summary} | {
+        "device": f"{result.provenance.get('device', 'unknown')}, {seconds:.3g} s{rate}",
         "depth_m": [float(returned.min()), float(returned.max())] if returned.size else None,
         "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
     }
-    if result.derivatives:
-        found["derivatives"] = summary["derivatives"]
     if result.second_moment is not None and result.photons >= 2 * result.batch_size:
         found["relative_error"] = result.relative_error
     return {**found, "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"}

@@ -22,9 +22,9 @@ from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import ArgumentError, rounded
+from spadwarp.values import ArgumentError, count, percent, rounded
 from spadwarp.viz import style
-from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits, spaced
+from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits
 
 __all__ = ["draw", "draw_denoised", "draw_depth", "draw_result", "plot"]
 
@@ -245,7 +245,7 @@ def _range_axis(result: Result, axis: Axes, row: int, column: int) -> None:
 
 
 def _caption(result: Result) -> str:
-    photons = style.power_text(result.photons) if result.photons >= 1e6 else spaced(result.photons)
+    photons = style.power_text(result.photons) if result.photons >= 1e6 else count(result.photons)
     partial = ", interrupted" if result.partial else ""
     light = channel_text(result.provenance.get("channel"))
     return f"{photons} photons{partial}{light}; {_water_text(result.scene.medium)}; seed {result.seed}"
@@ -375,7 +375,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
     noise = noise_caption(shown.monte_carlo_noise)
-    panels.figure.caption(f"{which}: {spaced(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
+    panels.figure.caption(f"{which}: {count(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
     return panels.figure
 
 
@@ -482,9 +482,9 @@ def draw_denoised(
     else:
         target, found = np.isfinite(truth), np.isfinite(denoised)
         missed, invented = target & ~found, found & ~target
-        parts = (100 * some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
-        of_target, of_water = map(style.percent, parts)
-        label = f"depth z [m]\nblack: missed, {of_target}\nred: invented, {of_water}"
+        parts = (some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
+        of_target, of_water = map(percent, parts)
+        label = f"depth z [m]\nblack: missed, {of_target} %\nred: invented, {of_water} %"
         style.mark_pixels(panels.show_depth(denoised, "Denoised", limits, label), missed, invented)
         panels.show_depth(truth, "Truth", limits)
         panels.show_error(denoised - truth, "Denoised − truth")
@@ -528,5 +528,5 @@ def _fit_figure(fit: Fit, width: float) -> Figure:
         f"{item.name} = {rounded(item.value, item.standard_error)} ± {item.standard_error:.2g} {item.unit}".rstrip()
         for item in fit.estimates.values()
     ]
-    panels.figure.caption("; ".join([*values, f"{spaced(fit.pulses)} pulses"]))
+    panels.figure.caption("; ".join([*values, f"{count(fit.pulses)} pulses"]))
     return panels.figure

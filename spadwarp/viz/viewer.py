@@ -26,7 +26,7 @@ from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real, count
 from spadwarp.viz import style
 from spadwarp.viz.result import channel_text
 from spadwarp.viz.style import PaperFigure, colour_map, median_pixel, paper
@@ -126,7 +126,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     chosen: Any = method or "centroid"
     partial = ", interrupted" if result.partial else ""
     return _Page(
-        caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}{partial}"
+        caption=f"{count(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}{partial}"
         f"{channel_text(result.provenance.get('channel'))}; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),
@@ -154,7 +154,7 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
     background = np.broadcast_to(file.background, counts.shape)
     mode = file.scene.detector.mode.replace("_", "-")
     return _Page(
-        caption=f"frame {frame} of {file.frames}: {style.spaced(file.pulses)} pulses, {mode}, seed {file.seed}; "
+        caption=f"frame {frame} of {file.frames}: {count(file.pulses)} pulses, {mode}, seed {file.seed}; "
         f"expectations before pile-up{noise_caption(file.monte_carlo_noise)}",
         scene=file.scene,
         depth=file.depth(chosen, frame),
