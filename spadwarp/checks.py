@@ -144,12 +144,12 @@ class Survey:
     def _on_axis(self, distance: float, optical_depth: float) -> OnAxis:
         scene, passed, port = self.scene, math.exp(-optical_depth), self.camera_port
         through, footprint = 1.0, (scene.camera.pixel_tangent * distance) ** 2
-        if port is not None:  # a flat one makes solid angles smaller
-            narrowed = (port.index[0] / port.index[2]) ** 2
+        if port is not None:
             through = float(port.transmission(np.zeros(3), (0.0, 0.0, 1.0)))
-            through, footprint = (
-                (through, footprint * narrowed) if port.shape == "flat" else (through * narrowed, footprint)
-            )
+            if port.shape == "flat":  # makes solid angles smaller
+                footprint *= (port.index[0] / port.index[2]) ** 2
+            else:
+                through *= (port.index[0] / port.index[2]) ** 2
         # Of the beam within one pixel's footprint on its axis, without water; of a measured one where it is brightest.
         ballistic = min(1.0, footprint * axis_fluence(scene, distance)) * passed
         # Lambertian, towards the lens
