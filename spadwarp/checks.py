@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tomllib
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
@@ -233,37 +235,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
 
 # Values that are valid but far from what a SPAD camera, its laser, water and targets have: mostly a wrong unit
 
-# Field → lowest and highest plausible value in the field's own unit, and units that people take it for. 0 is always
-# allowed: it leaves something out. Lasers from picosecond diodes to Q-switched ones of 1 kHz, cameras from endoscopes
-# to telescopes, water from pure to milk; ports with a window, that of a calm surface may be far.
-_PLAUSIBLE: dict[str, tuple[float, float, tuple[str, ...]]] = {
-    "laser.pulse_energy": (1e-14, 0.1, ("nJ", "µJ")),
-    "laser.repetition_rate": (1e3, 1e10, ("kHz", "MHz")),
-    "laser.pulse_fwhm_ps": (1.0, 1e5, ("s", "ns")),
-    "laser.wavelength_nm": (200.0, 2000.0, ("m", "µm")),
-    "laser.linewidth_nm": (1e-7, 300.0, ("m", "µm")),
-    "laser.half_angle_deg": (1e-3, 180.0, ()),
-    "laser.beam_radius": (1e-5, 2.0, ("mm",)),
-    "camera.focal_length": (1e-4, 5.0, ("mm",)),
-    "camera.pixel_pitch_um": (0.5, 2000.0, ("m", "mm")),
-    "camera.aperture_diameter": (1e-5, 5.0, ("mm",)),
-    "camera.f_number": (0.3, 200.0, ()),
-    "detector.jitter_fwhm_ps": (0.5, 1e5, ("s", "ns")),
-    "detector.irf_tail_ps": (0.1, 1e6, ("s", "ns")),
-    "detector.dark_count_rate": (1e-4, 1e9, ()),
-    "detector.filter_centre_nm": (200.0, 2000.0, ("m", "µm")),
-    "detector.filter_fwhm_nm": (0.01, 500.0, ("m", "µm")),
-    "detector.dead_time_ns": (0.1, 1e6, ("s", "µs")),
-    "detector.afterpulsing_time_constant_ns": (0.1, 1e6, ("s", "µs")),
-    "gate.start_ns": (1e-3, 1e5, ("s", "µs", "ps")),
-    "gate.bin_width_ps": (0.1, 1e5, ("s", "ns", "fs")),
-    "medium.absorption": (1e-6, 1e3, ()),
-    "medium.scattering": (1e-6, 1e4, ()),
-    "medium.extinction": (1e-5, 1e4, ()),
-    "port.distance": (1e-4, 2.0, ("mm",)),
-    "port.radius": (1e-3, 2.0, ("mm",)),
-    "port.thickness": (1e-4, 0.5, ("mm",)),
-}
+_PLAUSIBLE = tomllib.loads((files("spadwarp") / "plausible.toml").read_text(encoding="utf-8"))
 _MOST_POWER = 100.0  # [W]
 _FARTHEST = 1000.0  # [m] of a laser, a camera or a target
 _MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
@@ -274,10 +246,10 @@ def _check_plausible(survey: Survey) -> None:
     scene, laser = survey.scene, survey.scene.laser
     ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
-    for field, plausible in _PLAUSIBLE.items():
-        section, _, name = field.partition(".")
+    for section, fields in _PLAUSIBLE.items():
         for place, model in (ports if section == "port" else {section: getattr(scene, section)}).items():
-            _check_value(survey, f"{place}.{name}", model, plausible)
+            for name, plausible in fields.items():
+                _check_value(survey, f"{place}.{name}", model, *plausible)
     if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
         energy, rate = with_prefix(laser.pulse_energy, "J"), with_prefix(laser.repetition_rate, "Hz")
         text = f"{energy} at {rate} are {with_prefix(laser.average_power, 'W')} on average"
@@ -293,8 +265,8 @@ def _check_plausible(survey: Survey) -> None:
             _check_mesh(survey, f"targets[{index}].scale", target.scale, np.ptp(triangles.reshape(-1, 3), axis=0))
 
 
-def _check_value(survey: Survey, field: str, model: Any, plausible: tuple[float, float, tuple[str, ...]]) -> None:
-    (low, high, units), name = plausible, field.rpartition(".")[2]
+def _check_value(survey: Survey, field: str, model: Any, low: float, high: float, *units: str) -> None:
+    name = field.rpartition(".")[2]
     value = getattr(model, name)
     if not isinstance(value, float) or value == 0.0 or low <= value <= high:
         return

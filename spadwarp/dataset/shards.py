@@ -68,20 +68,20 @@ class Column:
         return {"unit": self.unit, "description": self.meaning}
 
 
-def _columns(table: str, **sides: int) -> dict[str, Column]:
+def columns_of(table: str, **sides: int) -> dict[str, Column]:
     """The columns of a table of columns.toml, whose shapes name sides."""
 
     def column(kind: str | list[str], shape: Sequence[str | int] = (), **others: str) -> Column:
         types: Any = tuple(np.dtype(one).type for one in kind) if isinstance(kind, list) else kind
         if isinstance(kind, str) and kind[0] != "S":
-            types = np.dtype(kind).type
+            types = object if kind == "text" else np.dtype(kind).type
         return Column(types, shape=tuple(sides.get(str(side), side) for side in shape), **others)
 
     return {name: column(**entry) for name, entry in _TABLES[table].items()}
 
 
 _TABLES = tomllib.loads((importlib.resources.files("spadwarp.dataset") / "columns.toml").read_text(encoding="utf-8"))
-FRAME_COLUMNS, HISTOGRAM_COLUMNS, FIELDS = map(_columns, ("frames", "histograms", "items"))
+FRAME_COLUMNS, HISTOGRAM_COLUMNS, FIELDS = map(columns_of, ("frames", "histograms", "items"))
 """Datasets of a frames file and of a histograms file; images of an item, float32 `[1, H, W]` without another shape."""
 
 HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
@@ -90,7 +90,7 @@ HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
 
 def scene_columns(shape: tuple[int, int]) -> dict[str, Column]:
     """Datasets of `scenes.h5`; `shape`: height and width of the images."""
-    return _columns("scenes", height=shape[0], width=shape[1], bins=PROFILE_BINS, edges=PROFILE_BINS + 1)
+    return columns_of("scenes", height=shape[0], width=shape[1], bins=PROFILE_BINS, edges=PROFILE_BINS + 1)
 
 
 _SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "reflectance": "reflectance"}
