@@ -24,19 +24,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
 
 __all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
-__all__ += ["DeviceError", "FileError", "Interval", "MeshError", "SpadwarpError", "SpadwarpWarning", "bounds"]
-__all__ += ["check_choice", "check_integer", "check_part", "check_real", "count", "environment_integer"]
-__all__ += [
-    "in_words",
-    "parse_number",
-    "path_from_time",
-    "percent",
-    "pulse_speed",
-    "quantity",
-    "range_from_time",
-    "read_real",
-]
-__all__ += ["rounded", "shown", "suggestion", "time_from_path", "time_from_range", "with_prefix"]
+__all__ += ["DeviceError", "FileError", "Interval", "MeshError", "Shown", "SpadwarpError", "SpadwarpWarning"]
+__all__ += ["bounds", "check_choice", "check_integer", "check_part", "check_real", "count", "environment_integer"]
+__all__ += ["in_words", "parse_number", "path_from_time", "percent", "pulse_speed", "quantity", "range_from_time"]
+__all__ += ["read_real", "rounded", "shown", "suggestion", "time_from_path", "time_from_range", "with_prefix"]
 
 __version__ = "0.1.0"
 
@@ -228,9 +219,13 @@ def _inside(name: str, value: Any, number: Any, within: str | Interval) -> Any:
 
 
 def read_real(name: str, cell: Any, within: str | Interval) -> float:
-    """A number of a file, or a text that stands for one; as `check_real`, whose errors it raises."""
+    """A number, or a text that stands for one, with a unit if the range has one; as `check_real`, whose errors it
+    raises."""
+    unit = (Interval.read(within) if isinstance(within, str) else within).unit
     try:
-        return check_real(name, parse_number(cell) if isinstance(cell, str) else cell, within)
+        if isinstance(cell, str):
+            cell = quantity(cell, unit) if unit else parse_number(cell)
+        return check_real(name, cell, within)
     except ArgumentError:
         raise
     except ValueError as error:

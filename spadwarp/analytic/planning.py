@@ -36,9 +36,8 @@ from spadwarp.values import (
     ConfigError,
     check_choice,
     check_integer,
-    check_real,
-    quantity,
     range_from_time,
+    read_real,
     shown,
     time_from_path,
     time_from_range,
@@ -204,13 +203,13 @@ def plan(
     check_choice("method", method, METHODS)
     check_choice("channel", channel, CHANNELS)
     planner = _Planner(
-        depth_error=_real("depth_error", depth_error, "[1e-9, 1e9] m"),
-        time=_real("time", time, "[1e-9, 1e9] s"),
-        margin=_real("margin", margin, "[0, 1e6] m"),
+        depth_error=read_real("depth_error", depth_error, "[1e-9, 1e9] m"),
+        time=read_real("time", time, "[1e-9, 1e9] s"),
+        margin=read_real("margin", margin, "[0, 1e6] m"),
         method=method,
         full_power=full_power,
-        eye_distance=None if eye_distance is None else _real("eye_distance", eye_distance, "[0, 1e9] m"),
-        eye_exposure=_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"),
+        eye_distance=None if eye_distance is None else read_real("eye_distance", eye_distance, "[0, 1e9] m"),
+        eye_exposure=read_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"),
         seed=check_integer("seed", seed, SEED),
         device=device,
         channel=channel,
@@ -228,7 +227,7 @@ def plan(
     else:
         if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
             raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
-        span = _real("ranges", ranges[0], "(-inf, inf) m"), _real("ranges", ranges[1], "(-inf, inf) m")
+        span = read_real("ranges", ranges[0], "(-inf, inf) m"), read_real("ranges", ranges[1], "(-inf, inf) m")
         if not 0 < span[0] <= span[1] < math.inf:
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
         scene = with_plane(scene, span[1])
@@ -239,15 +238,6 @@ def plan(
         return proposal
     largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
     return dataclasses.replace(proposal, largest_range=largest, range_limit=limit)
-
-
-def _real(name: str, value: Any, interval: str) -> float:
-    """An argument that may be text with a unit, as a number within an interval and of its unit."""
-    try:
-        value = quantity(value, interval.split()[-1]) if isinstance(value, str) else value
-    except ValueError as error:
-        raise ArgumentError(f"{name} = {shown(value)} {error}") from None
-    return check_real(name, value, interval)
 
 
 @dataclass(frozen=True, kw_only=True)
