@@ -60,9 +60,8 @@ def pick_device(name: str | wp.Device | None = None) -> wp.Device:
 def devices() -> list[dict[str, Any]]:
     """Devices that `device=` may be, in plain values.
 
-    Returns:
-        For each device `name` ("cpu", "cuda:0"), `description`, `memory` [bytes], `compute_capability` (None for the
-        CPU), `threads` (CPU; None for a GPU) and `default`.
+    Returns for each device `name` ("cpu", "cuda:0"), `description`, `memory` [bytes], `compute_capability` (None for
+    the CPU), `threads` (CPU; None for a GPU) and `default`.
     """
     import warp as wp
 

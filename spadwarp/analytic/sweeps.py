@@ -129,12 +129,9 @@ def budget(
         reflectance: Of the face, in [0, 1]; default: the number that the scene's first target has, else 0.5.
         device: Warp device; default: the first GPU, else the CPU.
 
-    Returns:
-        A row for each water and range, in this order. A warning says where light is polarised, which the model leaves
-        out.
-
-    Raises `ConfigError`: a water or scene that the model does not cover; `ArgumentError`: ranges or reflectance out of
-    range.
+    Returns a row for each water and range, in this order. A warning says where light is polarised, which the model
+    leaves out. Raises `ConfigError`: a water or scene that the model does not cover; `ArgumentError`: ranges or
+    reflectance out of range.
     """
     scene = as_scene(scene)
     distances = _distances(scene, ranges)

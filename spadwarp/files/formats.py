@@ -257,11 +257,8 @@ def export(
         result: The result that the `Frames` were drawn from; `.mat` needs its truth.
         channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
 
-    Returns:
-        The files that were written.
-
-    Raises `ArgumentError`: no such frame, or what the format holds is not in the source; `FileError`: a file cannot be
-    read or written, or the package for its format is not installed.
+    Returns the files that were written. Raises `ArgumentError`: no such frame, or what the format holds is not in the
+    source; `FileError`: a file cannot be read or written, or the package for its format is not installed.
     """
     path = Path(path)
     ending = path.suffix.lower()

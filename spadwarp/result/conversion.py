@@ -77,10 +77,8 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         tallies: The caller's tensor that `spadwarp.simulate(…, tallies=…)` has filled, on any device; the result's
             tallies are then not read.
 
-    Returns:
-        `TorchResult`, or `Frames` whose arrays are tensors.
-
-    Raises `ArgumentError`: the tensor is not int64 or has not as many elements as the result.
+    Returns `TorchResult`, or `Frames` whose arrays are tensors. Raises `ArgumentError`: the tensor is not int64 or has
+    not as many elements as the result.
     """
     import torch
 

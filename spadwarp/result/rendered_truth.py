@@ -51,12 +51,9 @@ def load_truth_exr(
         axes: `[3, 3]`, the camera's right, down and forward as unit vectors of the program's world; the preset's are
             those of a camera without rotation.
 
-    Returns:
-        Truth; NaN where the file has NaN, infinity, 0 or the sky's value.
-
-    Raises `FileError`: a file that cannot be read, without the channel (the message names those it has), of another
-    size than the camera's image, with negative depth or albedo outside [0, 1], or with nothing in view;
-    `ArgumentError`: an argument out of range.
+    Returns Truth; NaN where the file has NaN, infinity, 0 or the sky's value. Raises `FileError`: a file that cannot be
+    read, without the channel (the message names those it has), of another size than the camera's image, with negative
+    depth or albedo outside [0, 1], or with nothing in view; `ArgumentError`: an argument out of range.
     """
     check_choice("preset", preset, [*_PRESETS])
     if camera.port is not None:

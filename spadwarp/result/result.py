@@ -335,9 +335,8 @@ class Result(Shown, ResultHead, Tallies):
     def energy_report(self) -> dict[str, Any]:
         """The energy balance as fractions of the emitted weight, and whether it is exact.
 
-        Returns:
-            `emitted` (photons, each of weight 1), `fractions` (name → signed fraction), `difference` (emitted − sum of
-            the entries, in their units, from integers) and `exact` (whether it is 0).
+        Returns `emitted` (photons, each of weight 1), `fractions` (name → signed fraction), `difference` (emitted − sum
+        of the entries, in their units, from integers) and `exact` (whether it is 0).
         """
         emitted = round(self.photons / self.energy_balance_unit)
         difference = emitted - sum(self.energy_balance.values())
@@ -554,10 +553,9 @@ def _short_names(names: Iterable[str]) -> list[str]:
 def component_errors(result: Result) -> dict[str, tuple[float, float]]:
     """How well the total of each component is known; empty without batches, and for components without light.
 
-    Returns:
-        By component the relative standard error of its light, all pixels and bins together, and the squared deviation
-        of the batch furthest from the mean, over the largest that it could have at the same variance, in [0, 1]: about
-        5/batches where many photons matter equally, near 1 where one decides.
+    Returns by component the relative standard error of its light, all pixels and bins together, and the squared
+    deviation of the batch furthest from the mean, over the largest that it could have at the same variance, in [0, 1]:
+    about 5/batches where many photons matter equally, near 1 where one decides.
     """
     return {
         name: (math.sqrt(spread / (n - 1)) / total, furthest * furthest / ((n - 1) * spread))
