@@ -21,7 +21,7 @@ import reprlib
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple, SupportsFloat, SupportsIndex
+from typing import Any, NamedTuple, SupportsFloat, SupportsIndex, cast
 
 __all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
 __all__ += ["DeviceError", "FileError", "Interval", "MeshError", "Shown", "SpadwarpError", "SpadwarpWarning"]
@@ -325,12 +325,12 @@ class Shown:
         """A figure; of a result "depth", "intensity", "histogram" or "truth"; see `spadwarp.viz.plot`."""
         import spadwarp
 
-        return spadwarp.viz.plot(self, kind, **options)
+        return spadwarp.viz.plot(cast(Any, self), kind, **options)
 
     def _repr_html_(self) -> str:
         import spadwarp
 
-        return spadwarp.viz.html(self)
+        return spadwarp.viz.html(cast(Any, self))
 
 
 # ---- Constants, and the one place where the time of flight of a pulse becomes a length.

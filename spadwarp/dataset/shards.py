@@ -75,7 +75,7 @@ def columns_of(table: str, **sides: int) -> dict[str, Column]:
         types: Any = tuple(np.dtype(one).type for one in kind) if isinstance(kind, list) else kind
         if isinstance(kind, str) and kind[0] != "S":
             types = object if kind == "text" else np.dtype(kind).type
-        return Column(types, shape=tuple(sides.get(str(side), side) for side in shape), **others)
+        return Column(types, shape=tuple(side if isinstance(side, int) else sides[side] for side in shape), **others)
 
     return {name: column(**entry) for name, entry in _TABLES[table].items()}
 

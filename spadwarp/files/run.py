@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spadwarp.frames import Reduction, detector_response
 from spadwarp.io.arrays import point_cloud, write_array, write_exr, write_ply
-from spadwarp.io.paths import file_within, remove_temporaries
+from spadwarp.io.paths import atomic_path, file_within, remove_temporaries
 from spadwarp.io.text import write_text
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
@@ -50,24 +50,13 @@ _POINT_FRAMES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
 class _Pictures:
-    """The pictures beside the files of a result or a fit."""
-
-    of: Any
-    folder: Path
-
-    def plot(self, **options: Any) -> list[Path]:
-        """Draws those of a result; returns their paths."""
+    @staticmethod
+    def plot(result: Result, folder: Path, **options: Any) -> list[Path]:
+        """Draws the pictures of a run; returns their paths."""
         import spadwarp
 
-        return spadwarp.viz.draw_result(self.of, self.folder, **options)
-
-    def save(self) -> Path:
-        """Draws that of a fit; returns its path."""
-        import spadwarp
-
-        return spadwarp.viz.draw(self.of, self.folder / "fit.png")
+        return spadwarp.viz.draw_result(result, folder, **options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +120,7 @@ def _depth(result: Result, device: str | None) -> NDArray[np.float64]:
 def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[Callable[[], list[Path]]]:
     output = result.scene.output
     formats = [ending for ending in _ENDINGS if getattr(output, ending)]
-    draw = functools.partial(_Pictures(result, folder).plot, depth=depth, method=output.depth_method, formats=formats)
+    draw = functools.partial(_Pictures.plot, result, folder, depth=depth, method=output.depth_method, formats=formats)
     return [functools.partial(draw, kinds=(kind,)) for kind in _KINDS] if formats else []
 
 
@@ -261,7 +250,9 @@ def write_fit(fit: Fit, directory: str | Path) -> list[Path]:
     Raises `FileError`.
     """
     folder = Path(directory)
-    written = [_Pictures(fit, folder).save(), write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
+    with atomic_path(folder / "fit.png") as temporary:
+        fit.plot().savefig(temporary, format="png")
+    written = [folder / "fit.png", write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
     for estimate in fit.maps.values():
         name = _file_name(estimate.name)
         written += [write_array(folder / f"{name}.npy", estimate.value)]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 
@@ -18,18 +19,9 @@ if TYPE_CHECKING:
 
     from spadwarp.scene import Scene
 
-__all__ = ["TorchResult", "TorchTruth", "to_torch", "to_xarray"]
+__all__ = ["TorchResult", "to_torch", "to_xarray"]
 
 Frames = TypeVar("Frames")
-
-
-class TorchTruth(NamedTuple):
-    """`spadwarp.result.Truth` as tensors: `depth`, `range`, `reflectance` `[H, W]`, `normal` `[H, W, 3]`, float32."""
-
-    depth: torch.Tensor
-    range: torch.Tensor
-    normal: torch.Tensor
-    reflectance: torch.Tensor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,7 +33,7 @@ class TorchResult:
     unit: float
     photons: int
     tally_value: torch.Tensor  # fraction of the photons per tally unit, float64 `[H, W]`; see `Result.tally_value`
-    truth: TorchTruth  # float32 maps on the device of the tallies
+    truth: SimpleNamespace  # the maps of `Truth` as float32 tensors on the device of the tallies
 
     @cached_property
     def histogram(self) -> torch.Tensor:
@@ -96,7 +88,7 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         unit=source.unit,
         photons=source.photons,
         tally_value=_shared(source.tally_value).to(tallies.device),
-        truth=TorchTruth(**maps),
+        truth=SimpleNamespace(**maps),
     )
 
 
