@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.sweeps import OUTLIERS, TOLERANCE, BudgetRow, Sweep
 from spadwarp.scene import Scene
+from spadwarp.scene.sections import field_unit, locate, parse_key
 from spadwarp.viz import style
 from spadwarp.viz.style import BLUE, PAGE, SERIES, log_axis, panel_grid, paper, save, wrapped
 
@@ -114,11 +114,9 @@ def _broken(label: str) -> str:
 
 def _unit(field: str) -> str:
     """` [1/m]` for `medium.extinction`: the unit in the field's description, or nothing."""
-    section, _, name = field.partition(".")
-    info = Scene.model_fields.get(section)
-    described = getattr(info.annotation, "model_fields", {}).get(name) if info else None
-    found = re.search(r" \[[^\]]+\]", getattr(described, "description", None) or "")
-    return found.group(0) if found else ""
+    info = locate(Scene, parse_key(field))[1]
+    unit = None if info is None else field_unit(info)
+    return "" if unit in (None, "1") else f" [{unit}]"
 
 
 def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool = False) -> None:
