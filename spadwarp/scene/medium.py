@@ -90,14 +90,8 @@ PHASE_FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "tabulated": (("phase_table",), ()),
 }
 
-# Tabulated phase functions: name -> (file in spadwarp/water/tables, source).
-PHASE_TABLES: dict[str, tuple[str, str]] = {
-    "petzold-average-particle": (
-        "petzold_average_particle.csv",
-        "Petzold 1972 (SIO Ref. 72-78), mean of three stations in San Diego harbour without the water's own "
-        "scattering, as tabulated by Mobley et al., Appl. Opt. 32, 7484 (1993)",
-    )
-}
+# Tabulated phase functions: name → file in spadwarp/water/tables, whose head has the source.
+PHASE_TABLES = {"petzold-average-particle": "petzold_average_particle.csv"}
 
 
 class Water(Section):
@@ -426,7 +420,7 @@ def phase_function(medium: Medium) -> PhaseFunction:
     if name == "tabulated":
         path = Path(str(medium.phase_table))
         if str(path) in PHASE_TABLES:
-            path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)][0]
+            path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)]
         angles, values = read_table("medium.phase_table", path, {"angle_deg": "[0, 180]", "value": "[0, 1e30]"})
         try:
             density = sk.interpolated_density(np.radians(angles), values)
