@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
@@ -290,7 +290,7 @@ def make_dataset(
     if engine is None:
         device = _processes(device, processes, len(missing))
     done = 0
-    jobs = [_Job(plan.recipe, folder, item.index) for item in missing]
+    jobs = [(plan.recipe, folder, item.index) for item in missing]
     with interruptible() as stopped:
         options: dict[str, Any] = {"engine": engine, "device": device, "stopped": stopped}
         for _, frames in run_jobs(_make_shard, jobs, note=lambda text: report(text, 0, 0), **options):
@@ -309,19 +309,14 @@ def make_dataset(
     )
 
 
-class _Job(NamedTuple):
-    recipe: Recipe
-    folder: Path
-    shard: int
-
-
-def _make_shard(job: _Job, worker: Worker) -> int:
-    """Makes a shard and its record, unless another process does; returns its frames."""
+def _make_shard(job: tuple[Recipe, Path, int], worker: Worker) -> int:
+    """Makes a shard, by its index, and its record, unless another process does; returns its frames."""
+    recipe, folder, index = job
     plan = worker.state.get("plan")
-    if plan is None or plan.recipe != job.recipe:
-        plan = worker.state["plan"] = Plan(job.recipe)
-    shard = plan.shards[job.shard]
-    record = _record_path(job.folder, shard)
+    if plan is None or plan.recipe != recipe:
+        plan = worker.state["plan"] = Plan(recipe)
+    shard = plan.shards[index]
+    record = _record_path(folder, shard)
     try:
         record.parent.mkdir(exist_ok=True)
     except OSError as error:
@@ -329,13 +324,13 @@ def _make_shard(job: _Job, worker: Worker) -> int:
     with lock(record.with_suffix(".lock"), wait=lambda: not worker.stopped.is_set()) as obtained:
         if not obtained:  # interrupted while another process was making it
             return 0
-        if _state(plan, job.folder, shard):
+        if _state(plan, folder, shard):
             try:
                 record.unlink(missing_ok=True)
             except OSError as error:
                 raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
             remove_temporaries(record)
-            written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
+            written = write_shard(plan, shard, folder, device=worker.device, threads=worker.threads)
             write_json(written, record, indent=1)
     return shard.scenes * plan.frames_per_scene
 
