@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.values import ArgumentError, FileError, shown
+from spadwarp.values import ArgumentError, FileError, guarded, shown
 
 __all__ = ["Variable", "as_warp", "caller_tallies", "histogram_rows", "in_torch_order", "is_torch", "labelled"]
 __all__ += ["on_host", "output_tensor", "real_array", "tensor_of", "to_pandas"]
@@ -249,3 +249,6 @@ def kernel_errors() -> Iterator[None]:
         yield
     except sk.ArgumentError as error:
         raise ArgumentError(str(error)) from error
+
+
+guarded(__name__, __all__)

@@ -27,7 +27,7 @@ from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import provenance, simulate, trace, truth_maps
 from spadwarp.transport.model import build_model, transport_spec
-from spadwarp.values import FileError, check_choice, check_integer
+from spadwarp.values import FileError, check_choice, check_integer, guarded
 
 if TYPE_CHECKING:
     import warp as wp
@@ -503,3 +503,6 @@ def newest_report(directory: str | Path, *, like: Mapping[str, Any], cases: Sequ
             return path
     threads = "" if like["threads"] is None else f" with {like['threads']} threads"
     raise FileError(f"{directory}: no report of {', '.join(cases)} from {like['device_name']}{threads}")
+
+
+guarded(__name__, __all__)

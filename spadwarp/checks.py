@@ -27,7 +27,7 @@ from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import field_unit
 from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
 from spadwarp.transport import points_per_flight
-from spadwarp.values import ConfigError, path_from_time, quantity, range_from_time, time_from_path, with_prefix
+from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
 __all__ = ["CheckMessage", "check", "summary"]
@@ -803,3 +803,6 @@ _CHECKS = (
     *(_check_daylight, _check_medium, _check_phase_table, _check_collisions, _check_grid),
     *(_check_polarisation, _check_statistics),
 )
+
+
+guarded(__name__, __all__)

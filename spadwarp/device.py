@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spadwarp.values import DeviceError, need_memory, shown
+from spadwarp.values import DeviceError, guarded, need_memory, shown
 
 if TYPE_CHECKING:
     import warp as wp
@@ -186,3 +186,6 @@ def nvidia_driver() -> str | None:
     except OSError:
         return None
     return next((word for word in words if word[0].isdigit() and "." in word), None)
+
+
+guarded(__name__, __all__)

@@ -19,6 +19,7 @@ from spadwarp.scene import Scene
 from spadwarp.transport import simulate
 from spadwarp.validate import references
 from spadwarp.validate.cases import PENCIL, Estimate, Quantity, Run, scene, slab_faces
+from spadwarp.values import __version__, guarded
 
 __all__ = ["Diagnosis", "SelfTest", "diagnose"]
 
@@ -71,8 +72,6 @@ def diagnose(
 
 def _system() -> dict[str, str]:
     import warp as wp
-
-    from spadwarp.values import __version__
 
     toolkit, driver = wp.get_cuda_toolkit_version(), _driver_cuda()
     return {
@@ -208,3 +207,6 @@ def _quantities(device: str, photons: int) -> list[Quantity]:
         Quantity("transmitted by the slab", transmitted, row.transmitted),
         Quantity("energy that is not accounted for", Estimate(float(result.energy_report()["difference"]), 0.0), 0.0),
     ]
+
+
+guarded(__name__, __all__)

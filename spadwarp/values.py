@@ -18,16 +18,19 @@ import operator
 import os
 import re
 import reprlib
-from collections.abc import Iterable, Sequence
+import sys
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple, SupportsFloat, SupportsIndex, cast
+from typing import Annotated, Any, Literal, NamedTuple, SupportsFloat, SupportsIndex, Union, cast, get_args, get_origin
 
 __all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
 __all__ += ["DeviceError", "FileError", "Interval", "MeshError", "Shown", "SpadwarpError", "SpadwarpWarning"]
 __all__ += ["bounds", "check_choice", "check_integer", "check_part", "check_real", "count", "environment_integer"]
-__all__ += ["in_words", "parse_number", "path_from_time", "percent", "pulse_speed", "quantity", "range_from_time"]
-__all__ += ["read_real", "rounded", "shown", "suggestion", "time_from_path", "time_from_range", "with_prefix"]
+__all__ += ["guarded", "in_words", "parse_number", "path_from_time", "percent", "pulse_speed", "quantity"]
+__all__ += ["range_from_time", "read_real", "rounded", "shown", "suggestion", "time_from_path", "time_from_range"]
+__all__ += ["with_prefix"]
 
 __version__ = "0.1.0"
 
@@ -124,6 +127,102 @@ def need_memory(gibibytes: float, name: str) -> None:
     limit = address_space()
     if limit is not None and limit < gibibytes * 2**30:
         raise MemoryError(f"{name} needs {gibibytes:g} GiB")
+
+
+# ---- Arguments of public functions
+
+
+def guarded(module: str, names: Iterable[str]) -> list[str]:
+    """Makes `ArgumentError` of what libraries raise when a public function of a module gets an argument that is not of
+    its annotated type; returns the names. Nothing is checked before something was raised: calls cost no time for it.
+    """
+    space, names = vars(sys.modules[module]), list(names)
+    for name in names:
+        found = space[name]
+        if isinstance(found, types.FunctionType):
+            space[name] = _guarded(found, module)
+        elif isinstance(found, type) and not issubclass(found, Exception):
+            for kind in found.__mro__:
+                if kind.__module__.startswith("spadwarp."):
+                    _guard_methods(kind)
+    return names
+
+
+def _guard_methods(kind: type) -> None:
+    for name, member in list(vars(kind).items()):
+        wrap = type(member) if isinstance(member, classmethod | staticmethod) else None
+        function = member.__func__ if wrap is not None else member
+        if isinstance(function, types.FunctionType) and (name == "__init__" or not name.startswith("_")):
+            guard = _guarded(function, function.__module__)
+            setattr(kind, name, guard if wrap is None else wrap(guard))
+
+
+def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
+    if hasattr(function, "__guarded__"):
+        return function
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        try:
+            return function(*arguments, **named)
+        except SpadwarpError:
+            raise
+        except Exception as error:
+            if problem := _wrong_argument(function, arguments, named):
+                raise ArgumentError(problem) from error
+            raise
+
+    call.__module__ = module  # where pickle finds it
+    call.__guarded__ = True  # type: ignore[attr-defined]
+    return call
+
+
+def _wrong_argument(function: Callable[..., Any], arguments: Sequence[Any], named: Mapping[str, Any]) -> str:
+    """The first argument that is not of the type that it is annotated with; empty if there is none."""
+    import inspect
+
+    signature = inspect.signature(function)
+    try:
+        given = signature.bind(*arguments, **named).arguments
+    except TypeError:  # one is missing or too many, as Python says
+        return ""
+    for name, value in given.items():
+        parameter = signature.parameters[name]
+        kind, text = parameter.annotation, str(parameter.annotation)
+        if isinstance(kind, str):
+            try:
+                kind = eval(kind, getattr(function, "__globals__", {}))
+            except Exception:  # a name for type checkers alone
+                continue
+        single = parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        if name not in ("self", "cls") and single and not _fits(value, kind):
+            return f"{name} = {shown(value)} is not of the type {text}"
+    return ""
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of an annotated type, as far as it can be seen without using it up."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, item) for item in inner)
+    if origin is Annotated:
+        return _fits(value, inner[0])
+    if origin is Literal:
+        return any(value is item or (isinstance(value, str | int) and value == item) for item in inner)
+    if kind is None:
+        return value is None
+    if kind is float or kind is int:
+        needed = "__float__" if kind is float else "__index__"
+        return hasattr(value, needed) or (kind is float and hasattr(value, "__index__"))
+    plain = origin or kind
+    if not isinstance(plain, type) or getattr(plain, "_is_protocol", False):
+        return True
+    if not isinstance(value, plain) or (inner and isinstance(value, str)):  # a text is no list of texts
+        return False
+    if isinstance(value, tuple) and plain is tuple and inner and inner[-1] is not Ellipsis:
+        return len(value) == len(inner) and all(_fits(*pair) for pair in zip(value, inner, strict=True))
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    return not inner or all(_fits(item, inner[len(inner) > 1 and isinstance(value, dict)]) for item in items)
 
 
 # ---- Numbers and words, as text or from Python: of their kind and within their range, or refused by name.

@@ -7,7 +7,8 @@ from spadwarp.analytic.model import *
 from spadwarp.analytic.planning import *
 from spadwarp.analytic.result import *
 from spadwarp.analytic.sweeps import *
+from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (eye_safety, model, planning, result, sweeps)
-    __all__ = sorted(name for module in _modules for name in module.__all__)
+    __all__ = guarded(__name__, sorted(name for module in _modules for name in module.__all__))

@@ -209,7 +209,7 @@ def _prepare_directory(out: Path, option: str, *, may_hold_files: bool, needed: 
     if out.exists() and not out.is_dir():
         wrong(f"{out} is a file; a directory is needed", option)
     _check_writable(out)
-    if not until_the_end(spadwarp.io.lock(out / ".lock")):
+    if not until_the_end(spadwarp.io.lock(out / ".spadwarp.lock")):
         raise FileError(f"{out}: another process is writing to this directory; wait for it, or name another one")
     if any(not path.name.startswith(".") for path in out.iterdir()) and not may_hold_files:
         wrong(f"{out} is not empty; --overwrite replaces results in it", option)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -127,24 +129,25 @@ def simulate(
     _prepare_directory(
         out, read, earlier, scene, derivatives=len(names), batches=batches, records=records, checkpoint=checkpoint > 0
     )
-    result = spadwarp.simulate(
-        read,
-        photons=None if earlier is None or photons is None else read.transport.photons,
-        device=devices,
-        engine=engine,
-        progress=_while_pictures_load(progress(), read),
-        uncertainty=uncertainty,
-        relative_error=relative_error,
-        derivatives=names,
-        run=spadwarp.RunOptions(
-            threads=threads,
-            first_photon=first_photon,
-            shard=shard,
-            resume=earlier,
-            checkpoint=out / spadwarp.files.CHECKPOINT if checkpoint > 0 else None,
-            checkpoint_every=checkpoint,
-        ),
-    )
+    with _while_pictures_load(progress(), read) as report:
+        result = spadwarp.simulate(
+            read,
+            photons=None if earlier is None or photons is None else read.transport.photons,
+            device=devices,
+            engine=engine,
+            progress=report,
+            uncertainty=uncertainty,
+            relative_error=relative_error,
+            derivatives=names,
+            run=spadwarp.RunOptions(
+                threads=threads,
+                first_photon=first_photon,
+                shard=shard,
+                resume=earlier,
+                checkpoint=out / spadwarp.files.CHECKPOINT if checkpoint > 0 else None,
+                checkpoint_every=checkpoint,
+            ),
+        )
     device = opt.one_device(devices, engine)
     files = spadwarp.files.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
     if records and not result.partial:
@@ -216,15 +219,17 @@ def _prepare_directory(out: Path, scene: Scene, earlier: Result | None, source: 
         files.remove_checkpoint(out)
 
 
-def _while_pictures_load(report: Report | None, scene: Scene) -> Report | None:
+@contextmanager
+def _while_pictures_load(report: Report | None, scene: Scene) -> Iterator[Report | None]:
     """Loads what draws the pictures in the end while kernels are loaded and photons traced; not before, since it would
-    hold up this thread.
+    hold up this thread. It is loaded at the end of the block, so that copies of this process can draw.
 
     The progress waits for it when all photons are traced: while Matplotlib is loaded, it takes the warnings of every
     thread for its own, those about the result too.
     """
     if not (scene.output.png or scene.output.pdf) or address_space() is not None:
-        return report
+        yield report
+        return
     loading = threading.Thread(target=importlib.import_module, args=("spadwarp.viz",), daemon=True)
     loading.start()
 
@@ -234,7 +239,10 @@ def _while_pictures_load(report: Report | None, scene: Scene) -> Report | None:
         if total and done >= total:
             loading.join()
 
-    return reported
+    try:
+        yield reported
+    finally:
+        loading.join()
 
 
 def _brief(result: Result, files: RunFiles) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from spadwarp.dataset.make import *
 from spadwarp.dataset.plan import *
 from spadwarp.dataset.read import *
 from spadwarp.dataset.recipe import *
+from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = [*recipe.__all__, *plan.__all__, *make.__all__, *read.__all__, *export.__all__]
+    __all__ = guarded(__name__, [*recipe.__all__, *plan.__all__, *make.__all__, *read.__all__, *export.__all__])

@@ -25,13 +25,14 @@ from spadwarp.dataset.plan import Plan, Shard
 from spadwarp.dataset.recipe import SPLITS, Recipe, load_recipe
 from spadwarp.dataset.shards import FORMAT_VERSION, checksum, write_scene_index, write_shard
 from spadwarp.device import core_count, pick_devices
-from spadwarp.io.paths import file_problem, lock, remove_temporaries
+from spadwarp.io.paths import file_problem, lock, remove_temporaries, sha256
 from spadwarp.io.text import parse_json, parse_toml, read_text, read_toml, write_json, write_text
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
 from spadwarp.values import ConfigError, FileError, check_integer, check_part, shown
 
 __all__ = ["DatasetReport", "make_dataset", "read_manifest", "verify_dataset"]
 
+_INPUTS = "inputs.json"
 _LARGEST_MANIFEST = 1 << 28  # bytes; a shard takes 400
 
 # Names of files in a dataset's folder: nothing else is opened, whatever a manifest says.
@@ -355,6 +356,7 @@ def _claim(plan: Plan, folder: Path) -> None:
                 return
             if any(not path.name.startswith(".") for path in folder.iterdir()):
                 raise FileError(f"{folder}: is not empty and holds no dataset; give another folder")
+            write_json(_inputs(plan), folder / _INPUTS, indent=1)
             write_text(plan.recipe.to_toml(), folder / "recipe.toml")
     except FileExistsError:
         raise FileError(f"{folder}: is a file; a folder is needed") from None
@@ -367,10 +369,26 @@ def _holds(plan: Plan, folder: Path) -> bool:
     path = folder / "recipe.toml"
     if not path.is_file():
         return False
+    same = False
     with suppress(ConfigError, FileError):  # not TOML, or not UTF-8
-        if read_toml(path) == parse_toml(plan.recipe.to_toml()):
-            return True
-    raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
+        same = read_toml(path) == parse_toml(plan.recipe.to_toml())
+    if not same:
+        raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
+    try:
+        before = parse_json(read_text(folder / _INPUTS))
+        changed = [name for name, content in _inputs(plan).items() if before[name] != content]
+    except (ValueError, TypeError, KeyError) as error:
+        raise FileError(f"{folder / _INPUTS}: not the hashes of the recipe's files; give another folder") from error
+    if changed:
+        text = f"its content has changed since {folder} was begun; give another folder"
+        raise FileError(f"{changed[0]} is another file than it was: {text}")
+    return True
+
+
+def _inputs(plan: Plan) -> dict[str, str]:
+    """The files that the dataset is made from, and the SHA-256 of each."""
+    targets = (path for target in plan.targets for path in (target.mesh, target.export) if path is not None)
+    return {str(path): sha256(path) for path in dict.fromkeys((*plan.recipe.files, *targets)) if path.is_file()}
 
 
 def _check_space(plan: Plan, folder: Path, frames: int) -> None:

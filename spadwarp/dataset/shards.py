@@ -7,7 +7,6 @@ to `event_start[n + 1]`.
 
 from __future__ import annotations
 
-import hashlib
 import importlib.resources
 import math
 import os
@@ -28,7 +27,7 @@ from spadwarp.dataset.plan import Plan, Shard
 from spadwarp.dataset.render import PROFILE_BINS, RenderedScene, render_analytic, render_transport
 from spadwarp.device import core_count, pick_device
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5, write_hdf5
-from spadwarp.io.paths import remove_temporaries
+from spadwarp.io.paths import remove_temporaries, sha256
 from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.sight import port_advance
 from spadwarp.values import DeviceError, FileError, SpadwarpError, range_from_time
@@ -98,9 +97,7 @@ _SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "reflec
 
 def checksum(path: Path) -> dict[str, Any]:
     """Size and SHA-256 of a file."""
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"bytes": path.stat().st_size, "sha256": digest}
+    return {"bytes": path.stat().st_size, "sha256": sha256(path)}
 
 
 # Writing

@@ -14,6 +14,7 @@ from spadwarp.denoise.network_files import *
 from spadwarp.denoise.photon_counts import *
 from spadwarp.denoise.recipe import *
 from spadwarp.denoise.report import *
+from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (
@@ -27,4 +28,4 @@ if not TYPE_CHECKING:  # type checkers follow the stars
         recipe,
         report,
     )
-    __all__ = sorted(name for module in _modules for name in module.__all__)
+    __all__ = guarded(__name__, sorted(name for module in _modules for name in module.__all__))

@@ -7,7 +7,8 @@ from spadwarp.inverse.exposure import *
 from spadwarp.inverse.fitting import *
 from spadwarp.inverse.tensors import *
 from spadwarp.inverse.unknowns import *
+from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (cramer_rao, exposure, fitting, tensors, unknowns)
-    __all__ = sorted(name for module in _modules for name in module.__all__)
+    __all__ = guarded(__name__, sorted(name for module in _modules for name in module.__all__))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
 import secrets
 import shutil
@@ -18,7 +19,7 @@ from typing import Any
 from spadwarp.values import FileError, SpadwarpError, suggestion
 
 __all__ = ["MESH_ENDINGS", "atomic_path", "check_apart", "example_or_path", "examples", "existing_file", "file_problem"]
-__all__ += ["file_within", "is_stream", "lock", "remove_temporaries", "similar", "used"]
+__all__ += ["file_within", "is_stream", "lock", "remove_temporaries", "sha256", "similar", "used"]
 
 KINDS = ("scenes", "datasets", "training")
 """Kinds of examples."""
@@ -103,6 +104,15 @@ def file_within(path: str | Path, names: Sequence[str]) -> Path:
         text = " and ".join(path.name for path in files) if files else f"no {' and no '.join(names)}"
         raise FileError(f"{path}: holds {text}; name the file")
     return files[0]
+
+
+def sha256(path: str | Path) -> str:
+    """Of a file's content, in hexadecimal digits. Raises `FileError`."""
+    try:
+        with existing_file(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def check_apart(output: str | Path, source: Any) -> None:

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from spadwarp.mesh.targets import *
+from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = targets.__all__
+    __all__ = guarded(__name__, targets.__all__)

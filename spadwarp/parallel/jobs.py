@@ -15,6 +15,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -189,7 +190,8 @@ class Forked:
 
     def results(self) -> list[Any]:
         """Of all calls, in their order; waits for them. Raises what they raise."""
-        found = [None if copy is None else _result(*copy) for copy in self._running]
+        end = time.monotonic() + _PATIENCE
+        found = [None if copy is None else _result(copy[1], end) for copy in self._running]
         return [call() if item is None else item[0] for call, item in zip(self._calls, found, strict=True)]
 
     def __enter__(self) -> Forked:
@@ -225,10 +227,10 @@ def _send(call: Callable[[], Any], source: Connection, target: Connection) -> No
         target.send((call(),))
 
 
-def _result(process: BaseProcess, source: Connection) -> tuple[Any] | None:
-    """What the call returned; None if it failed."""
+def _result(source: Connection, end: float) -> tuple[Any] | None:
+    """What the call returned; None if it failed, or not by then."""
     with suppress(EOFError, OSError):
-        if source.poll(_PATIENCE):
+        if source.poll(max(0.0, end - time.monotonic())):
             found: tuple[Any] = source.recv()
             return found
     return None

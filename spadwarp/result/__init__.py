@@ -8,7 +8,8 @@ from spadwarp.result.file import *
 from spadwarp.result.rendered_truth import *
 from spadwarp.result.result import *
 from spadwarp.result.tallies import *
+from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (conversion, file, rendered_truth, result, tallies)
-    __all__ = [name for module in _modules for name in module.__all__]
+    __all__ = guarded(__name__, [name for module in _modules for name in module.__all__])

@@ -206,6 +206,7 @@ def _head(file: Hdf5File) -> ResultHead:
         batch_size=file.integer("batch_size", default=0),
         photon_ranges=ranges,
         requested=(start, stop),
+        file_hashes=tuple(file.text_attribute("file_hashes", "").split()),
         focus_distance=None if np.isnan(focus) else focus,
     )
 
@@ -229,6 +230,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         "energy_balance_unit": result.energy_balance_unit,
         "partial": result.partial,
         "batch_size": result.batch_size,
+        "file_hashes": " ".join(result.file_hashes),
         "components": list(COMPONENTS),
         "gate_start": gate.start,
         "bin_width": gate.bin_width,

@@ -126,6 +126,7 @@ class ResultHead:
     batch_size: int = 0  # photons of a batch where errors were asked for, else 0; every range is whole batches then
     requested: tuple[int, int] = (0, 0)  # ids [start, stop) that were asked for; an interrupted run has a part of them
     focus_distance: float | None = None  # depth that the lens images sharply [m]; None: all of them, for a pinhole
+    file_hashes: tuple[str, ...] = ()  # SHA-256 of each of `scene.files` when the photons were traced
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -447,6 +448,9 @@ def difference(a: ResultHead, b: ResultHead) -> str:
     if one != other:
         sections = [name for name in type(one).model_fields if getattr(one, name) != getattr(other, name)]
         return f"the scene of the results differs in {', '.join(sections)}: only photons and output may differ"
+    for path, now, before in zip(a.scene.files, a.file_hashes, b.file_hashes, strict=False):
+        if now != before:
+            return f"{path} is another file than it was: its content has changed between the runs"
     pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit", "batch_size")}
     if isinstance(a, Result) and isinstance(b, Result):
         pairs["list of derivatives"] = tuple(a.derivatives), tuple(b.derivatives)

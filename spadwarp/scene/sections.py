@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 from pydantic.fields import FieldInfo
 from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
 
+from spadwarp.io.paths import sha256
 from spadwarp.io.text import parse_toml, read_columns
 from spadwarp.values import UNITS, ConfigError, FileError, Interval, bounds, parse_number, quantity, shown, suggestion
 
@@ -138,7 +139,24 @@ def presets(section: str | None = None) -> dict[str, Preset]:
     return {f"{section}.{name}": preset for section, rows in PRESETS.items() for name, preset in rows.items()}
 
 
-class Section(BaseModel):
+if TYPE_CHECKING:
+    _Model = BaseModel
+else:
+
+    class _Refusing(type(BaseModel)):
+        """Fields given in Python are refused as those of a file are."""
+
+        def __call__(cls, /, *arguments: Any, **fields: Any) -> Any:
+            try:
+                return super().__call__(*arguments, **fields)
+            except ValidationError as error:
+                raise ConfigError(describe(error, cls, {})) from None
+
+    class _Model(BaseModel, metaclass=_Refusing):
+        pass
+
+
+class Section(_Model):
     """One table of a scene: frozen, strict about types, unknown keys refused.
 
     A preset, `preset = "uwoc-harbour"`, lies under the section's own fields; it need not fill its section.
@@ -465,6 +483,10 @@ class Document(Section):
 
         with_paths(type(self), self.to_dict(), noted)
         return [path for path in found if path.suffix]
+
+    def file_hashes(self) -> tuple[str, ...]:
+        """SHA-256 of each of `files` as it is now. Raises `FileError`."""
+        return tuple(map(sha256, self.files))
 
     def to_toml(self, *, folder: FileName | None = None) -> str:
         """The full text that is read back to an equal document.

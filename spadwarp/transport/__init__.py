@@ -9,7 +9,8 @@ from spadwarp.transport.plan import *
 from spadwarp.transport.records import *
 from spadwarp.transport.simulation import *
 from spadwarp.transport.workers import *
+from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (derivatives, model, plan, records, simulation, workers)
-    __all__ = [name for module in _modules for name in module.__all__]
+    __all__ = guarded(__name__, [name for module in _modules for name in module.__all__])

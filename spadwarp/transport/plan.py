@@ -157,6 +157,7 @@ def make_plan(
         batch_size=batch_size,
         requested=ids,
         focus_distance=focus_distance(scene, mesh),
+        file_hashes=scene.file_hashes(),
         mesh=mesh,
         derivatives=names,
         launch_size=run.launch_size,

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from spadwarp.io import write_text
 from spadwarp.values import ArgumentError, FileError, check_integer, check_real
@@ -44,7 +44,7 @@ Floats = NDArray[np.float64]
 _ANGLES = np.concatenate([np.geomspace(0.01, 10.0, 181)[:-1], np.linspace(10.0, 180.0, 341)])  # [°]
 _PPM = 1e-6
 _DIAMETERS = "[1e-9, 1e-2] m"
-# Of a sphere's size parameter: beyond it Mie's series takes minutes.
+# Of a sphere's size parameter: beyond it a table has more than a million angles.
 _LARGEST = 2e4
 
 
@@ -52,7 +52,7 @@ _LARGEST = 2e4
 class ParticleOptics(Coefficients):
     """Optical properties at one wavelength of particles, or of water with particles in it."""
 
-    angles_deg: Floats  # scattering angles `[n]` [°], 0.01 to 180
+    angles_deg: Floats  # scattering angles `[n]` [°], ascending to 180
     density: Floats  # phase function at them [1/sr], of unit integral over the sphere
     matrix: Floats | None = None
     """Elements m12, m22, m33, m34 and m44 of the scattering matrix at them, each over the phase function `[n, 5]`; None
@@ -135,7 +135,8 @@ def mie_particles(
     """Homogeneous spheres in water by Mie's theory, computed by the library miepython (extra `mie`).
 
     b = Σ N(D)·πD²/4·Q_sca(D), a likewise with Q_ext − Q_sca; the phase function is the sum of (|S1|² + |S2|²)/2 over b,
-    and the scattering matrix follows from S1 and S2 in the same way (Bohren & Huffman 1983, eq 4.77).
+    and the scattering matrix follows from S1 and S2 in the same way (Bohren & Huffman 1983, eq 4.77). 1 - ⟨cosθ⟩ and
+    b_b are those of the series within 0.1 % up to a size parameter of 1000, 0.13 mm of diameter in green light.
 
     Args:
         distribution: `power_law`, `log_normal`, `single_size`, or numbers and diameters of your own.
@@ -165,20 +166,64 @@ def mie_particles(
         limit = _LARGEST * in_water / math.pi
         raise ArgumentError(f"distribution: diameter {diameters.max():.3g} m is above {limit:.3g} m")
     per_volume = concentration * _PPM / (numbers * math.pi / 6.0 * diameters**3).sum() * numbers  # [1/m³]
-    relative, cosines = complex(real, -absorbing), np.cos(np.radians(_ANGLES))
+    relative, cosines = complex(real, -absorbing), np.cos(_nodes(parameters.max()))
     lost = scattered = 0.0
-    pattern = np.zeros((6, _ANGLES.size))
+    pattern = np.zeros((6, cosines.size))
     for parameter, diameter, count in zip(parameters, diameters, per_volume, strict=True):
         q_lost, q_scattered, *_ = miepython.efficiencies_mx(relative, parameter)
         section = count * 0.25 * math.pi * diameter**2
         lost, scattered = lost + section * q_lost, scattered + section * q_scattered
-        s1, s2 = miepython.S1_S2(relative, parameter, cosines, norm="one")
-        both, across, along = s1 * s2.conj(), np.abs(s1) ** 2, np.abs(s2) ** 2
-        # m22 is m11 and m44 is m33, of each sphere. miepython's time runs as exp(+iωt), which sets the sign of m34.
+        s1, s2 = _amplitudes(miepython.coefficients(relative, parameter), cosines)
+        both, across, along = s2 * s1.conj(), np.abs(s1) ** 2, np.abs(s2) ** 2
+        # m22 is m11 and m44 is m33, of each sphere.
         elements = ((across + along) / 2, (along - across) / 2, (across + along) / 2, both.real, both.imag, both.real)
-        pattern += section * q_scattered * np.stack(elements)
-    m11, matrix = pattern[0], (pattern[1:] / pattern[0]).T
-    return _optics(wavelength_nm, max(float(lost - scattered), 0.0), float(scattered), m11, matrix)
+        pattern += section / parameter**2 * np.stack(elements)
+    angles = _angles(parameters.max())
+    m11, *others = (_between_nodes(element, angles) for element in pattern)
+    matrix = np.stack(others, axis=-1) / m11[:, None]
+    return _optics(wavelength_nm, max(float(lost - scattered), 0.0), float(scattered), angles, m11, matrix)
+
+
+# All elements of a sphere's scattering matrix are polynomials of cosθ, of twice the degree of its series, and thus
+# known everywhere from their values at as many angles in equal steps.
+
+
+def _nodes(parameter: float) -> Floats:
+    """Angles [rad] that determine the elements of spheres of a size parameter and of smaller ones."""
+    terms = 2 * math.ceil(parameter + 4.05 * parameter ** (1 / 3) + 10.0) + 1
+    return math.pi * (np.arange(terms) + 0.5) / terms
+
+
+def _between_nodes(values: Floats, angles_deg: Floats) -> Floats:
+    """An element with such values at other angles."""
+    from scipy.fft import dct, idct
+
+    fine = 1 << math.ceil(math.log2(256 * values.size))
+    cosines = np.zeros(fine)
+    cosines[: values.size] = dct(values, type=2, norm="ortho") * math.sqrt(fine / values.size)
+    return np.interp(np.radians(angles_deg), math.pi * (np.arange(fine) + 0.5) / fine, idct(cosines, norm="ortho"))
+
+
+def _angles(parameter: float) -> Floats:
+    """Angles of a table [°]: 32 and more within a ripple of the largest sphere's pattern, 180°/x, so that straight
+    lines between them keep 1 - g and b_b within 0.1 %, and a geometric sequence in its forward peak."""
+    step, first, ratio = min(0.5, 180.0 / (32.0 * parameter)), min(0.01, 4.0 / parameter), 1000.0 ** (1.0 / 180.0)
+    turn = min(step / (ratio - 1.0), 10.0)
+    peak = np.geomspace(first, turn, 1 + math.ceil(math.log(turn / first) / math.log(ratio)))
+    return np.concatenate([peak[:-1], np.linspace(turn, 180.0, 1 + math.ceil((180.0 - turn) / step))])
+
+
+def _amplitudes(series: Any, cosine: Floats) -> list[NDArray[np.complex128]]:
+    """S1 and S2 from the coefficients a and b of Mie's series (Bohren & Huffman 1983, eqs 4.47 and 4.74)."""
+    before, now = np.zeros_like(cosine), np.ones_like(cosine)
+    sums = [np.zeros(cosine.shape, complex), np.zeros(cosine.shape, complex)]
+    for n, (electric, magnetic) in enumerate(zip(*series, strict=True), start=1):
+        slope = n * cosine * now - (n + 1) * before
+        weight = (2 * n + 1) / (n * (n + 1))
+        sums[0] += weight * (electric * now + magnetic * slope)
+        sums[1] += weight * (electric * slope + magnetic * now)
+        before, now = now, ((2 * n + 1) * cosine * now - (n + 1) * before) / n
+    return sums
 
 
 def kopelevich_particles(wavelength_nm: float, *, small: float, large: float) -> ParticleOptics:
@@ -200,8 +245,8 @@ def kopelevich_particles(wavelength_nm: float, *, small: float, large: float) ->
     angles, *columns = table_columns("kopelevich_particles")
     ratio = 550.0 / wavelength_nm
     parts = ((1.34 * small * ratio**1.7, columns[0]), (0.312 * large * ratio**0.3, columns[1]))
-    pattern = sum(b * _between(angles, values) for b, values in parts)
-    return _optics(wavelength_nm, 0.0, parts[0][0] + parts[1][0], np.asarray(pattern))
+    pattern = sum(b * _between(angles, values, _ANGLES) for b, values in parts)
+    return _optics(wavelength_nm, 0.0, parts[0][0] + parts[1][0], _ANGLES, np.asarray(pattern))
 
 
 def mixture(
@@ -217,13 +262,12 @@ def mixture(
     nm = parts[0].wavelength_nm
     absorption = math.fsum(part.absorption for part in parts)
     weights = [part.scattering for part in parts]
-    patterns = [part.scattering * _between(part.angles_deg, part.density) for part in parts]
-    matrices = [_matrix_between(part) for part in parts]
+    angles = np.unique(np.concatenate([part.angles_deg for part in parts]))
+    patterns = [part.scattering * _between(part.angles_deg, part.density, angles) for part in parts]
+    matrices = [_matrix_between(part, angles) for part in parts]
     if water:
-        own, cosines = (
-            pure_water_scattering(nm, temperature=temperature, salinity=salinity),
-            np.cos(np.radians(_ANGLES)),
-        )
+        own = pure_water_scattering(nm, temperature=temperature, salinity=salinity)
+        cosines = np.cos(np.radians(angles))
         absorption += pure_water_absorption(nm)
         weights.append(own)
         patterns.append(own * molecular_density(1.0 - cosines))
@@ -232,7 +276,7 @@ def mixture(
     matrix = None
     if len(known) == len(matrices):
         matrix = np.sum([p[:, None] * m for p, m in zip(patterns, known, strict=True)], axis=0) / whole[:, None]
-    return _optics(nm, absorption, math.fsum(weights), whole, matrix)
+    return _optics(nm, absorption, math.fsum(weights), angles, whole, matrix)
 
 
 def save_phase_table(optics: ParticleOptics, path: str | os.PathLike[str]) -> Path:
@@ -260,41 +304,46 @@ def _save(
 ) -> Path:
     lines = [f"# {optics.wavelength_nm:g} nm: {head}", names]
     for angle, row in zip(angles, rows, strict=True):
-        lines.append(f"{angle:.6g},{','.join(f'{value:.8g}' for value in row)}")
+        lines.append(f"{angle:.9g},{','.join(f'{value:.8g}' for value in row)}")
     return write_text("\n".join(lines) + "\n", Path(path))
 
 
 def _optics(
-    wavelength_nm: float, absorption: float, scattering: float, pattern: ArrayLike, matrix: Floats | None = None
+    wavelength_nm: float,
+    absorption: float,
+    scattering: float,
+    angles_deg: Floats,
+    pattern: Floats,
+    matrix: Floats | None = None,
 ) -> ParticleOptics:
-    """With the pattern at `_ANGLES`, of any scale, as a density."""
+    """With the pattern at the angles, of any scale, as a density."""
     from spadwarp_kernels import interpolated_density
 
-    angles = np.radians(_ANGLES)
-    density = interpolated_density(angles, np.asarray(pattern, np.float64))(2.0 * np.sin(0.5 * angles) ** 2)
+    angles = np.radians(angles_deg)
+    density = interpolated_density(angles, pattern)(2.0 * np.sin(0.5 * angles) ** 2)
     return ParticleOptics(
         wavelength_nm=float(wavelength_nm),
         absorption=float(absorption),
         scattering=float(scattering),
-        angles_deg=_ANGLES,
+        angles_deg=angles_deg,
         density=density,
         matrix=matrix,
     )
 
 
-def _matrix_between(part: ParticleOptics) -> Floats | None:
-    """The scattering matrix of particles at `_ANGLES`, straight between theirs."""
+def _matrix_between(part: ParticleOptics, angles_deg: Floats) -> Floats | None:
+    """The scattering matrix of particles at other angles, straight between theirs."""
     if part.matrix is None:
         return None
-    return np.stack([np.interp(_ANGLES, part.angles_deg, column) for column in part.matrix.T], axis=-1)
+    return np.stack([np.interp(angles_deg, part.angles_deg, column) for column in part.matrix.T], axis=-1)
 
 
-def _between(angles_deg: Floats, values: Floats) -> Floats:
-    """A table of a phase function at `_ANGLES` as a density [1/sr]; its logarithm is straight between the points."""
+def _between(angles_deg: Floats, values: Floats, others: Floats) -> Floats:
+    """A table of a phase function at other angles as a density [1/sr]; its logarithm is straight between the points."""
     from spadwarp_kernels import sphere_integral
 
     def unscaled(t: Floats) -> Floats:
         degrees = np.degrees(2.0 * np.arcsin(np.sqrt(0.5 * np.asarray(t, np.float64))))
         return np.exp(np.interp(degrees, angles_deg, np.log(np.maximum(values, 1e-300))))
 
-    return unscaled(2.0 * np.sin(0.5 * np.radians(_ANGLES)) ** 2) / sphere_integral(unscaled)
+    return unscaled(2.0 * np.sin(0.5 * np.radians(others)) ** 2) / sphere_integral(unscaled)

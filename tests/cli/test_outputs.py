@@ -141,7 +141,7 @@ def test_pipes_and_devices_are_written_to_as_they_are(tmp_path):
 def test_two_commands_do_not_write_to_one_directory(scene, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    with lock(out / ".lock"):
+    with lock(out / ".spadwarp.lock"):
         outcome = run("simulate", scene, "--out", out, *DEVICE, code=1)
     assert f"{out}: another process is writing" in outcome.stderr
     run("simulate", scene, "--out", out, "--quiet", *DEVICE)
