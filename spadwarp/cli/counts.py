@@ -13,8 +13,8 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, count, progress, rows, show_table, write_json, written
-from spadwarp.values import ArgumentError, ConfigError, FileError, percent, range_from_time, rounded
+from spadwarp.cli.outputs import answer, check_outputs, progress, rows, show_table, write_json, written
+from spadwarp.values import ArgumentError, ConfigError, FileError, count, percent, range_from_time, rounded
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene
@@ -85,7 +85,7 @@ def detect(
     )
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
-    files = [recording.file.path, spadwarp.viz.draw_recording(recording.file, out / "frame.png")]
+    files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 

@@ -226,21 +226,22 @@ def beam_planes(laser: Laser) -> Floats:
 
 
 def points_inside(triangles: Floats, planes: Floats) -> Floats:
-    """Points of the triangles that are inside all planes, `[N, 3]`: none if and only if no triangle reaches in."""
+    """Points of the triangles that are inside all planes, or within 1 µm of it, `[N, 3]`: none if and only if no
+    triangle reaches in."""
+    from trimesh.intersections import slice_faces_plane
+
     whole, outside = np.ones(len(triangles), dtype=bool), np.zeros(len(triangles), dtype=bool)
     for plane in planes:
         distance = triangles @ plane[:3] + plane[3]
         whole &= (distance >= 0.0).all(axis=1)
         outside |= (distance < 0.0).all(axis=1)
-    found = [_spread(triangles[whole])]
-    for triangle in triangles[~whole & ~outside]:
-        polygon = _clip(triangle, planes)
-        if len(polygon):
-            fan = np.stack([np.broadcast_to(polygon[0], polygon[2:].shape), polygon[1:-1], polygon[2:]], axis=1)
-            found.append(_spread(fan))
-            if len(found) > 256:  # enough for every number that a check reports
-                break
-    return np.concatenate(found)
+    cut = triangles[~whole & ~outside]
+    for plane in planes if len(cut) else ():
+        faces, normal = np.arange(3 * len(cut)).reshape(-1, 3), plane[:3] / np.linalg.norm(plane[:3])
+        origin = -(plane[3] / np.linalg.norm(plane[:3]) + 1e-6) * normal
+        vertices, faces, _ = slice_faces_plane(cut.reshape(-1, 3), faces, normal, origin)
+        cut = np.asarray(vertices)[faces]
+    return np.concatenate([_spread(triangles[whole]), _spread(cut)])
 
 
 def within_port(scene: Scene, triangles: Floats) -> str:
@@ -253,8 +254,8 @@ def within_port(scene: Scene, triangles: Floats) -> str:
     wide = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)
     if laser.port is None and port.houses(laser.position, wide, radius):
         return (
-            f"laser.position = {list(laser.position)} is inside camera.port: laser.port = 'camera' lets it shine through"
-            " that window, a table [laser.port] through one of its own; in the water it stands in front or beside"
+            f"laser.position = {list(laser.position)} is inside camera.port: laser.port = 'camera' lets it shine "
+            "through that window, a table [laser.port] through one of its own; in the water it is in front or beside"
         )
     if not len(triangles):
         return ""
@@ -277,20 +278,3 @@ def _spread(triangles: Floats) -> Floats:
     steps = 6 if len(triangles) < 2000 else 1
     weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
     return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)
-
-
-def _clip(polygon: Floats, planes: Floats) -> Floats:
-    """The part of a convex polygon inside all planes (Sutherland & Hodgman 1974), `[K, 3]`, empty if there is none."""
-    for plane in planes:
-        distance = polygon @ plane[:3] + plane[3]
-        kept: list[Floats] = []
-        for i, (d, x) in enumerate(zip(distance, polygon, strict=True)):
-            before, y = distance[i - 1], polygon[i - 1]
-            if (d >= 0.0) != (before >= 0.0):
-                kept.append(y + (x - y) * (before / (before - d)))
-            if d >= 0.0:
-                kept.append(x)
-        if len(kept) < 3:
-            return np.zeros((0, 3))
-        polygon = np.array(kept)
-    return polygon

@@ -61,11 +61,9 @@ def build_model(
     will hold so many `copies` of the histogram on the device, for the check of its memory. `mesh_cache` has meshes of
     earlier scenes; one of the same faces is refitted and not built anew. `derivatives` are full names.
 
-    Raises:
-        ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
-            the phase function's table is not a density.
-        FileError: That table or the beam's profile cannot be read.
-        DeviceError: The device has too little memory.
+    Raises `ConfigError`: the histogram has more bins than an index can count, laser or camera stand outside the domain,
+    or the phase function's table is not a density; `FileError`: that table or the beam's profile cannot be read;
+    `DeviceError`: the device has too little memory.
     """
     _check_places(scene, mesh, camera)
     if camera:

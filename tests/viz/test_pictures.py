@@ -153,7 +153,7 @@ def draw_mesh(path, width, request):
 
 def draw_analytic(path, width, **_):
     maps = spadwarp.simulate_analytic(SCENE, frames=1, seed=1, device="cpu")
-    spadwarp.viz.draw_analytic(maps, path, width=width)
+    spadwarp.viz.draw(maps, path, width=width)
 
 
 def draw_narrow(path, width, **_):
