@@ -259,9 +259,8 @@ def within_port(scene: Scene, triangles: Floats) -> str:
         )
     if not len(triangles):
         return ""
-    nearest = port.nearest * (1.0 - 1e-6)
-    if port.shape == "flat":
-        planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), nearest]])
+    if port.shape == "flat":  # but for what touches it, which `points_inside` finds too
+        planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), port.nearest - 2e-6]])
         inside = points_inside(triangles, planes)
     else:
         from trimesh.triangles import closest_point
