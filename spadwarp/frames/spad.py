@@ -27,7 +27,7 @@ from spadwarp.arrays import (
     output_tensor,
     tensor_of,
 )
-from spadwarp.frames.depth import Method, arrival_time
+from spadwarp.frames.depth import Method, Returns, find_returns
 from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
 from spadwarp.io.hdf5 import PIXELS, image_coordinates
 from spadwarp.result.file import as_result
@@ -345,6 +345,7 @@ class Frames:
         monte_carlo_noise: Standard error of the simulation over the shot noise of a frame, at the 95th percentile of
             the pixels; None where nobody knows it. Above 0.5 `expected` is not smooth where few photons were traced,
             and no more are the counts that are drawn from it.
+        detector: The section of a scene.
         notes: What the source could not give, in words.
     """
 
@@ -362,6 +363,7 @@ class Frames:
     seed: int
     tags: TimeTags | None = None
     monte_carlo_noise: float | None = None
+    detector: Detector
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -403,28 +405,42 @@ class Frames:
         """Detections per pulse and bin without pile-up; see `coates`."""
         return coates(self.counts, pulses=self.exposure)
 
-    def arrival_time(
+    def arrival_time(self, method: Method = "centroid", **options: Any) -> NDArray[np.float64]:
+        """Arrival time of the return [s]: `time` of `find_returns`, whose options it takes."""
+        return self.find_returns(method, **options).time
+
+    def find_returns(
         self,
         method: Method = "centroid",
         *,
         irf: Any = None,
         undo_pile_up: bool = False,
         gate: tuple[float, float] | None = None,
+        min_significance: float | None = None,
         device: Any = None,
-    ) -> NDArray[np.float64]:
-        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing returned.
+    ) -> Returns:
+        """Arrival time of the return [s], NaN where nothing was detected, and significance: `[frames, H, W]` or
+        `[H, W]`.
 
         All bins count as equally wide, as in a camera without calibration. The estimator knows the background.
-        `method`, `gate` (start, stop) [s], `device`: as of `spadwarp.arrival_time`; `irf`: that the estimator assumes;
-        default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the counts.
+        `method`, `gate` (start, stop) [s], `device`: as of `spadwarp.frames.find_returns`; `irf`: that the estimator
+        assumes; default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the counts;
+        `min_significance`: default: that of the detector.
         """
-        histogram: Any = self.counts
-        if undo_pile_up:
-            corrected: Any = self.coates()
-            histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
-        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
-        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
-        return arrival_time(histogram, **axis, method=method, irf=irf, background=known, device=device)
+        least = self.detector.min_significance if min_significance is None else min_significance
+        options: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
+        options |= {"background": self.background * float(self.exposure), "irf": self.irf if irf is None else irf}
+        options |= {"method": method, "device": device}
+        pulses = self.exposure if self.detector.mode == "first_photon" else 0
+        found = find_returns(self.counts, **options, pulses=pulses, min_significance=least)
+        if not undo_pile_up:
+            return found
+        corrected: Any = self.coates()
+        histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
+        time: Any = find_returns(histogram, **options).time
+        significance: Any = found.significance
+        time[significance < least] = math.nan
+        return Returns(time, significance)
 
 
 def to_xarray(frames: Frames) -> xarray.Dataset:
@@ -656,6 +672,7 @@ def detect(
         period=seen.period if detector.wrap else None,
         irf=irf,
         tags=found,
+        detector=detector,
         notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
         monte_carlo_noise=None if noise is None else noise.ratio,
         **numbers,

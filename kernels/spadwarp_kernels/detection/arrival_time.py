@@ -9,10 +9,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_choice,
+    check_integer,
+    check_number,
+    check_numbers,
+)
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 
 from .counts import RATES
+from .significance import COUNTS, MIN_SIGNIFICANCE, DetectionTest
 
 __all__ = ["PHASES", "arrival_bins"]
 
@@ -50,6 +58,21 @@ class _Search:
     lowest_tap: int
     floor: float  # of the background, a part of the counts
     coarse_step: int  # of the first search [phases]
+    # Of a detection, where there is a threshold:
+    min_significance: float
+    reach: int  # half a window
+    peak_tap: int  # of the response, from the bin of the return
+
+
+@wp.func
+def _bins_to_search(search: _Search, significance: wp.array[float], window: wp.array[int], pixel: int) -> wp.vec2i:
+    """First bin and stop of what was detected, half a window on either side included; none where nothing was."""
+    if search.min_significance <= 0.0:
+        return wp.vec2i(search.first, search.stop)
+    if significance[pixel] < search.min_significance:
+        return wp.vec2i(0, 0)
+    first = window[pixel] - search.reach - search.peak_tap
+    return wp.vec2i(wp.max(first, search.first), wp.min(first + 4 * search.reach, search.stop))
 
 
 @wp.func
@@ -61,11 +84,19 @@ def _level(search: _Search, pixel: int, bin: int) -> float:
 @memoised
 def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
-    def peak(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
+    def peak(
+        first_pixel: int,
+        histogram: wp.array2d[dtype],
+        search: _Search,
+        significance: wp.array[float],
+        window: wp.array[int],
+        arrival: wp.array[float],
+    ):
         pixel = first_pixel + wp.tid()
+        bins = _bins_to_search(search, significance, window, pixel)
         peak_bin = int(-1)
         highest = float(0.0)
-        for k in range(search.first, search.stop):
+        for k in range(bins[0], bins[1]):
             excess = float(histogram[pixel, k]) - _level(search, pixel, k)
             if excess > highest:
                 highest = excess
@@ -160,16 +191,24 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     score_of = _make_score(dtype, likelihood)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def find(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
+    def find(
+        first_pixel: int,
+        histogram: wp.array2d[dtype],
+        search: _Search,
+        significance: wp.array[float],
+        window: wp.array[int],
+        arrival: wp.array[float],
+    ):
         pixel = first_pixel + wp.tid()
         coarse_step = search.coarse_step
+        bins = _bins_to_search(search, significance, window, pixel)
         total = float(0.0)
         for k in range(search.first, search.stop):
             total += float(histogram[pixel, k])
         least = search.floor * total
         best = wp.vec3(0.0, -1.0, -1.0)
         if total > 0.0:
-            for step in range(search.first * PHASES / coarse_step, search.stop * PHASES / coarse_step):
+            for step in range(bins[0] * PHASES / coarse_step, bins[1] * PHASES / coarse_step):
                 phases = step * coarse_step
                 score = score_of(histogram, search, pixel, phases, least, best[0])
                 if score > 0.0:
@@ -210,6 +249,12 @@ class ArrivalEstimator:
         first: int = 0,
         stop: int | None = None,
         half_width: int = 3,
+        *,
+        min_significance: float = 0.0,
+        width: float | None = None,
+        profile: wp.array | None = None,
+        pulses: int = 0,
+        pixels: int | None = None,
     ) -> None:
         check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
         self.device, self.method = wp.get_device(device), method
@@ -219,6 +264,11 @@ class ArrivalEstimator:
         search.stop = bins if stop is None else check_integer("stop", stop, first, bins)
         search.half_width = check_integer("half_width", half_width, 0, 2**24)
         search.lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
+        search.min_significance = check_number("min_significance", min_significance, "[0, 1e6]")
+        known = background if profile is None else None
+        window = (half_width / 1.5 if width is None else width, known, profile, pulses, pixels, first, stop)
+        self._test = DetectionTest(bins, self.device, *window)
+        search.reach = self._test.half_width
         if background is None:
             background = wp.zeros((1, 1), dtype=float, device=self.device)
         check_array("background", background, wp.float32, (None, None), self.device)
@@ -242,16 +292,27 @@ class ArrivalEstimator:
             if method == "matched":
                 # ln(h / floor): counts outside the response add the same to every delay.
                 taps = np.log(np.maximum(taps, floor) / floor)
+            search.peak_tap = lowest_tap + int(np.argmax(taps[0]))
         search.response = wp.array(taps.astype(np.float32), device=self.device)
 
-    def __call__(self, histogram: wp.array, arrival: wp.array) -> None:
-        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`."""
+    def __call__(
+        self,
+        histogram: wp.array,
+        arrival: wp.array,
+        significance: wp.array | None = None,
+        window: wp.array | None = None,
+    ) -> None:
+        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`; what `DetectionTest` writes into
+        the other two, which it needs where there is a threshold."""
         check_array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
         check_array("arrival", arrival, wp.float32, (pixels,), self.device)
         make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
         kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
-        launch_pixels(kernel, pixels, [histogram, self._search, arrival], device=self.device)
+        if self._search.min_significance > 0.0 or significance is not None:
+            self._test(histogram, significance, window)
+        inputs = [histogram, self._search, significance, window, arrival]
+        launch_pixels(kernel, pixels, inputs, device=self.device)
 
 
 def arrival_bins(
@@ -264,6 +325,9 @@ def arrival_bins(
     first: int = 0,
     stop: int | None = None,
     half_width: int = 3,
+    min_significance: float | None = None,
+    significance: wp.array | None = None,
+    **test: Any,
 ) -> wp.array:
     """Arrival time of every pixel [bins from the start of bin 0], NaN where there is none.
 
@@ -280,9 +344,16 @@ def arrival_bins(
         lowest_tap: bin of the first tap, relative to the bin of the return.
         first, stop: the bins looked at, [first, stop).
         half_width: of the centroid's window [bins].
+        min_significance: below this `detection_significance` a pixel has no arrival time, >= 0; in the others it is
+            looked for in the window that was detected, and half a window on either side. 0: every pixel reports, from
+            all bins. Default: 4, one false alarm in 10^4 pixels; 0 for rates, which have no significance.
+        significance: array to write that of each pixel into, float32 `[pixel]`.
+        test: the arguments `width` (default: `half_width` / 1.5), `profile`, `pulses` and `pixels` of
+            `detection_significance`. Without a profile the background is known, where there is one.
 
     Returns:
-        float32 `[pixel]` on the histogram's device. NaN: nothing returned (no counts, or none above the background).
+        float32 `[pixel]` on the histogram's device. NaN: nothing was detected, or there are no counts above the
+        background.
 
     Raises:
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
@@ -290,6 +361,15 @@ def arrival_bins(
     check_array("histogram", histogram, RATES, (None, None))
     bins, device = histogram.shape[1], histogram.device
     search = (method, background, response, lowest_tap, first, stop, half_width)
+    if min_significance is None:
+        min_significance = MIN_SIGNIFICANCE if histogram.dtype in COUNTS else 0.0
     arrival = wp.empty(histogram.shape[0], dtype=float, device=device)
-    ArrivalEstimator(bins, device, *search)(histogram, arrival)
+    window = None
+    if min_significance > 0.0 or significance is not None:
+        window = wp.empty(histogram.shape[0], dtype=int, device=device)
+        significance = (
+            wp.empty(histogram.shape[0], dtype=float, device=device) if significance is None else significance
+        )
+    estimate = ArrivalEstimator(bins, device, *search, min_significance=min_significance, **test)
+    estimate(histogram, arrival, significance, window)
     return arrival
