@@ -342,7 +342,7 @@ def _of_pixels(one: EstimateMap) -> str:
     return f"{text} {one.unit}".rstrip()
 
 
-_ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_second.npy", ".exr", ".png")
+_ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_significance.npy", "_second.npy", ".exr", ".png")
 _OF_IMAGES = {"group_index": opt.real_number, "channel": str, "scale": opt.real_number, "as_depth": bool}
 _DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _OF_IMAGES)]
 
@@ -358,6 +358,7 @@ def denoise(
     weights: Path | None = None,
     inputs: _DenoiseInputs | None = None,
     mask: float | None = None,
+    min_significance: float | None = None,
     device: str | None = None,
     precision: Literal["float32", "float16", "bfloat16"] | None = None,
 ) -> None:
@@ -365,7 +366,8 @@ def denoise(
 
     Writes for each file: NAME.npy (depth of all frames), NAME_target.npy and NAME_confidence.npy (the probabilities
     that a pixel sees a target, and that its depth is right), NAME.exr (all three of the first frame) and NAME.png.
-    Every pixel has a depth, also where there is only water; --mask leaves these out. Histograms become depth first:
+    Every pixel has a depth, also where there is only water; --mask leaves these out, and --min-significance those whose
+    counts are background alone (NAME_significance.npy). Histograms become depth first:
     counts by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then
     denoised with their histograms, and NAME_second.npy has second surfaces in a pixel; but those of a dataset, which
     does not keep their background. Needs pip install "spadwarp[denoise]".
@@ -385,6 +387,8 @@ def denoise(
         weights: Weights of spadwarp train. By default the package's.
         mask (P): Leave out pixels that see a target with less than this probability: 0.08 for PyramidNet of depth, 0.5
             for histograms.
+        min_significance (S): Of counts, leave out pixels where background alone gives more with a probability of 10^-S.
+            By default detector.min_significance of a simulation, 4 of measured histograms.
         precision: Of the layers of pyramid: float32, float16 (default on a GPU), bfloat16 (default on a CPU with AMX).
 
     \b
@@ -406,6 +410,7 @@ def denoise(
     names = [stem + ending for stem in stems for ending in _ENDINGS]
     check_outputs(out, names, inputs=(*paths, profile, weights, *files), needed=needed)
     settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
+    settings["min_significance"] = min_significance
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
     summary: list[dict[str, Any]] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,12 @@ from spadwarp.denoise.frames import (
     depth_values,
     narrowed_input,
 )
-from spadwarp.denoise.histograms import checked_histograms, features_of_histograms, target_bins
+from spadwarp.denoise.histograms import (
+    checked_histograms,
+    features_of_histograms,
+    significance_of_neighbours,
+    target_bins,
+)
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.values import ArgumentError, check_choice, check_real
 
@@ -54,11 +59,22 @@ class Estimate(NamedTuple):
             estimate it: 1 where the pixel reported, else 0.
         confidence: Probability that the depth is right to 1 % of the gate that holds the target; NaN for methods that
             do not estimate it.
+        significance: Of the detection, of counts: of the pixel alone for "likelihood", of 7 × 7 pixels for all others,
+            which use those around it; see `spadwarp.frames.find_returns`.
     """
 
     depth: NDArray[np.float32]
     target_probability: NDArray[np.float32]
     confidence: NDArray[np.float32]
+    significance: NDArray[np.float32] | None = None
+
+    def detected(self, significance: NDArray[np.float32] | None, least: float) -> Self:
+        """The same where the significance is not below the least; elsewhere no depth, and no target."""
+        if significance is None:
+            return self
+        seen = significance >= least
+        depth, probability = np.where(seen, self.depth, np.float32(np.nan)), np.where(seen, self.target_probability, 0)
+        return self._replace(depth=depth, target_probability=probability, significance=significance)
 
     def masked(self, probability: float) -> NDArray[np.float32]:
         """Depth, NaN where a target is less probable than `probability`."""
@@ -98,6 +114,7 @@ def estimate(
     counts: ArrayLike | None = None,
     background: ArrayLike | None = None,
     response: ArrayLike | None = None,
+    min_significance: float = 4.0,
     weights: str | Path | None = None,
     device: str | None = None,
     precision: Precision | None = None,
@@ -118,6 +135,8 @@ def estimate(
         background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`, as
             `spadwarp.frames.InstrumentResponse.per_bin` gives it.
+        min_significance: Of counts that are used, pixels below this significance have no depth, see
+            `Estimate.significance`; 0: every pixel has one.
         weights: File of `spadwarp train`; default: the weights of the package.
         device: torch device of the network; default: the first GPU, else the CPU.
         precision: Of the layers of PyramidNet for depth alone, "float16", "bfloat16" or "float32". Default: float16 on
@@ -164,7 +183,16 @@ def estimate(
             depth, cubes, levels, taps, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
             profile=profile, weights=weights, device=device,
         )  # fmt: skip
-    return Estimate(*(values.reshape(np.shape(depth)) for values in found))
+    found = Estimate(*(values.reshape(np.shape(depth)) for values in found[:3]))
+    if counts is None or model not in ("histograms", *CLASSICAL):
+        return found
+    least = check_real("min_significance", min_significance, "[0, 1000]")
+    return found.detected(significance_of_neighbours(cubes, levels, taps, side=significance_side(model)), least)
+
+
+def significance_side(model: str) -> int:
+    """Side of the window whose counts show whether a pixel has detected anything."""
+    return 1 if model == "likelihood" else 7
 
 
 def estimate_histograms(

@@ -265,10 +265,6 @@ class ArrivalEstimator:
         search.half_width = check_integer("half_width", half_width, 0, 2**24)
         search.lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
         search.min_significance = check_number("min_significance", min_significance, "[0, 1e6]")
-        known = background if profile is None else None
-        window = (half_width / 1.5 if width is None else width, known, profile, pulses, pixels, first, stop)
-        self._test = DetectionTest(bins, self.device, *window)
-        search.reach = self._test.half_width
         if background is None:
             background = wp.zeros((1, 1), dtype=float, device=self.device)
         check_array("background", background, wp.float32, (None, None), self.device)
@@ -286,6 +282,7 @@ class ArrivalEstimator:
             if not (np.isfinite(taps).all() and taps.min() >= 0.0 and largest > 0.0):
                 limits = "finite values >= 0 are needed, and one above"
                 raise ArgumentError(f"response holds {taps.min()} to {largest}; {limits}")
+            width = np.count_nonzero(taps[0] >= 0.5 * taps[0].max()) if width is None else width
             search.floor = floor = RESPONSE_FLOOR * float(largest)
             # A narrow response loses signal between the delays of the coarse search, a wide one does not.
             search.coarse_step = PHASES if largest < 0.25 else PHASES // 2 if largest < 0.5 else PHASES // 4
@@ -294,6 +291,10 @@ class ArrivalEstimator:
                 taps = np.log(np.maximum(taps, floor) / floor)
             search.peak_tap = lowest_tap + int(np.argmax(taps[0]))
         search.response = wp.array(taps.astype(np.float32), device=self.device)
+        known = background if profile is None else None
+        window = (half_width / 1.5 if width is None else width, known, profile, pulses, pixels, first, stop)
+        self._test = DetectionTest(bins, self.device, *window)
+        search.reach = self._test.half_width
 
     def __call__(
         self,
@@ -348,8 +349,8 @@ def arrival_bins(
             looked for in the window that was detected, and half a window on either side. 0: every pixel reports, from
             all bins. Default: 4, one false alarm in 10^4 pixels; 0 for rates, which have no significance.
         significance: array to write that of each pixel into, float32 `[pixel]`.
-        test: the arguments `width` (default: `half_width` / 1.5), `profile`, `pulses` and `pixels` of
-            `detection_significance`. Without a profile the background is known, where there is one.
+        test: the arguments `width` (default: that of the response, or `half_width` / 1.5), `profile`, `pulses` and
+            `pixels` of `detection_significance`. Without a profile the background is known, where there is one.
 
     Returns:
         float32 `[pixel]` on the histogram's device. NaN: nothing was detected, or there are no counts above the

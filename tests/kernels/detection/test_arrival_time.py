@@ -35,6 +35,7 @@ def _counts(signal, background, pixels=64, seed=5):
 
 
 def _run(counts, method, **options):
+    options.setdefault("min_significance", 0.0)
     if "background" in options:
         background = np.atleast_2d(np.asarray(options["background"], np.float32))
         options["background"] = wp.array(background, dtype=float, device="cpu")
