@@ -19,14 +19,8 @@ from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
 from spadwarp.denoise.baselines import CLASSICAL
 from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
-from spadwarp.denoise.histograms import dim_pixels, second_return, significance_of_neighbours, target_bins
-from spadwarp.denoise.inference import (
-    Estimate,
-    estimate_frames,
-    estimate_histograms,
-    significance_side,
-    target_threshold,
-)
+from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins
+from spadwarp.denoise.inference import Estimate, detected, estimate_frames, estimate_histograms, target_threshold
 from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
@@ -64,7 +58,6 @@ class DepthReading:
     source: str  # how the depth was obtained
     histograms: Histograms | None = None  # what it was estimated from: counts whose instrument response is known
     truth: NDArray[np.float32] | None = None  # true depth of the first frame, [H, W] [m]
-    every_depth: NDArray[np.float32] | None = None  # of counts, `depth` also where nothing was detected
 
 
 def read_depth(
@@ -76,7 +69,6 @@ def read_depth(
     method: Method | None = None,
     gate: tuple[float, float] | None = None,
     group_index: float | None = None,
-    min_significance: float | None = None,
     device: str | None = None,
     **measured: Any,
 ) -> DepthReading:
@@ -84,7 +76,8 @@ def read_depth(
 
     `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
     depth in `channel`. `.npy`, `.mat`, `.h5` of others: one frame `[H, W]` of depth, or histograms, see
-    `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
+    `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`,
+    in every pixel.
 
     Args:
         path: The file.
@@ -96,7 +89,6 @@ def read_depth(
             where the response is not known.
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
         group_index: Of measured histograms, see `depth_of`.
-        min_significance: Of counts, see `depth_of`.
         device: Warp device of the estimator.
         measured: What a file of measured histograms does not say, as `read_histograms` takes it.
 
@@ -145,8 +137,7 @@ def read_depth(
         histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32), level_known=False)
     if counted and gate is not None:
         histograms = _within(histograms, gate, float(group_index or 1.0))
-    read = _estimate_depth(histograms, counted, method, group_index, device, min_significance)
-    return dataclasses.replace(read, truth=truth)
+    return dataclasses.replace(_estimate_depth(histograms, counted, method, group_index, device), truth=truth)
 
 
 def _unused(held: Held) -> str:
@@ -184,25 +175,17 @@ def _stored_depth(
 
 
 def _estimate_depth(
-    histograms: Histograms,
-    counted: bool,
-    method: Method | None,
-    group_index: float | None,
-    device: str | None,
-    min_significance: float | None,
+    histograms: Histograms, counted: bool, method: Method | None, group_index: float | None, device: str | None
 ) -> DepthReading:
     method = method or ("likelihood" if counted else "matched")
     if method in ("matched", "likelihood") and histograms.response is None:
         method = "centroid"
-    options: dict[str, Any] = {"method": method, "group_index": group_index, "device": device}
-    reduced = depth_of(histograms, min_significance=min_significance, **options)
-    every = depth_of(histograms, min_significance=0.0, **options).values.astype(np.float32) if counted else None
+    reduced = depth_of(histograms, method=method, group_index=group_index, min_significance=0.0, device=device)
     scene = histograms.scene
     index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
     gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)
     depth = reduced.values.astype(np.float32)
-    for values in (depth, every) if every is not None else (depth,):
-        values[values <= 0.0] = np.nan  # a peak of noise at the time of the pulse
+    depth[depth <= 0.0] = np.nan  # a peak of noise at the time of the pulse
     dim = [] if counted else dim_pixels(histograms)
     return DepthReading(
         depth=depth,
@@ -211,7 +194,6 @@ def _estimate_depth(
         profile=backscatter_profile(histograms),
         source="; ".join([f"{reduced.quantity} by {method} from histograms", *histograms.notes, *dim]),
         histograms=histograms if counted else None,
-        every_depth=every,
     )
 
 
@@ -292,17 +274,17 @@ def denoise_file(
 
     Writes to `out`: `NAME.npy`, `NAME_target.npy`, `NAME_confidence.npy` (depth and the two probabilities of all
     frames), `NAME.exr` (all three of the first), and `NAME.png`, in which open water is left out. From counts also
-    `NAME_significance.npy`, of the detection, and `NAME_second.npy`, the depth of a second return in the same pixel,
-    NaN where there is none. In bright scenes this may be light that the water scattered into the pixel from another
-    part of the target.
+    `NAME_second.npy`, the depth of a second return in the same pixel, NaN where there is none. In bright scenes this
+    may be light that the water scattered into the pixel from another part of the target. `NAME_significance.npy`: that
+    of the counts.
 
     Args:
         path: A result or frames of spadwarp, depth as EXR, NumPy or MATLAB, or measured histograms.
         out: The folder.
         model, weights, device, precision: See `spadwarp.denoise.estimate`.
         mask: Pixels that see a target with less than this probability become NaN; default: every pixel has a depth.
-        min_significance: Of counts, pixels below this significance become NaN, see `Estimate`; default: that of the
-            scene's detector, 4 of measured histograms.
+        min_significance: Of counts, pixels below it become NaN, see `Estimate`; default: that of the scene's detector,
+            4 of measured histograms.
         gate: (start, stop) in depth [m]; of counts only the bins within it are used. Default: the file's, else all.
         profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
         reading: The other arguments of `read_depth`.
@@ -315,7 +297,7 @@ def denoise_file(
     if folder.resolve() == Path(path).resolve().parent:
         raise ArgumentError(f"out = {folder} is the folder of {path}; another is needed: nothing is overwritten")
     mask = None if mask is None else check_real("mask", mask, "[0, 1]")
-    read = read_depth(path, gate=gate, min_significance=min_significance, **reading)
+    read = read_depth(path, gate=gate, **reading)
     notes, gate = [read.source], gate or read.gate
     valid = read.depth[np.isfinite(read.depth) & (read.depth > 0)]
     if gate is None:
@@ -342,8 +324,12 @@ def denoise_file(
             second = None
             frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile)
             found = estimate_frames(frames, model=model, weights=weights, device=device, precision=precision)
-        if read.histograms is not None:
-            found = _where_detected(found, read.histograms, model, min_significance)
+        if (held := read.histograms) is not None and held.response is not None and held.background is not None:
+            if min_significance is None:
+                min_significance = 4.0 if held.scene is None else held.scene.detector.min_significance
+            test: dict[str, Any] = {"min_significance": min_significance, "level_known": held.level_known}
+            response = held.response.per_bin(float(held.bin_width or 0.0))
+            found = detected(found, held.values, held.background, response, model=model, **test)
         depth = found.depth if mask is None else found.masked(mask)
     notes += [str(warning.message) for warning in caught]
     if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
@@ -360,17 +346,6 @@ def denoise_file(
         depth=depth, target_probability=found.target_probability, threshold=threshold, confidence=found.confidence,
         gate=gate, files=tuple(files), notes=tuple(notes),
     )  # fmt: skip
-
-
-def _where_detected(found: Estimate, held: Histograms, model: str, min_significance: float | None) -> Estimate:
-    """`found` where the counts show that there is anything."""
-    if min_significance is None:
-        min_significance = 4.0 if held.scene is None else held.scene.detector.min_significance
-    assert held.response is not None and held.background is not None
-    response, side = held.response.per_bin(float(held.bin_width or 0.0)), significance_side(model)
-    options: dict[str, Any] = {"side": side, "level_known": held.level_known}
-    significance = significance_of_neighbours(held.values, held.background, response, **options)
-    return found.detected(None if significance is None else significance.reshape(found.depth.shape), min_significance)
 
 
 def _write(
@@ -416,9 +391,8 @@ def _from_counts(
 
     if profile is None or some.shape[-1] < counts.shape[-1]:
         profile = backscatter_profile(dataclasses.replace(histograms, values=some, background=level))
-    every = read.depth if read.every_depth is None else read.every_depth
     found = estimate_histograms(
-        every, counts, known, response, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
+        read.depth, counts, known, response, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
         profile=profile, weights=weights, device=device,
     )  # fmt: skip
     near, far = (to_depth(np.full_like(found.depth, place)) for place in (0.0, 1.0))

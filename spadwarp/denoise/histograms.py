@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.arrays import on_host, real_array
 from spadwarp.denoise.frames import POOLED, SIDES, bins_of_target
 from spadwarp.denoise.network_files import require_torch, torch_device
-from spadwarp.frames.depth import find_returns
 from spadwarp.frames.measured import Histograms
 from spadwarp.values import ArgumentError, percent
 
@@ -92,30 +91,6 @@ def target_bins(
     first, stop = bins_of_target(cubes, levels, taps)
     width = (gate[1] - gate[0]) / cubes.shape[-1]
     return first, stop, (gate[0] + first * width, gate[0] + stop * width)
-
-
-def significance_of_neighbours(
-    counts: NDArray[Any], background: NDArray[Any], response: NDArray[Any], *, side: int, level_known: bool = True
-) -> NDArray[np.float32] | None:
-    """Detection significance of the counts of `side` × `side` pixels about each, of those in the frame; None of rates.
-
-    Arguments are those of `spadwarp.denoise.estimate`, `level_known` as of `spadwarp.frames.find_returns`.
-    """
-    from scipy.ndimage import convolve1d
-
-    if counts.dtype.kind not in "biu" and not np.array_equal(counts, np.rint(counts)):
-        return None
-    window, found = np.ones(side, np.int64), []
-
-    def summed(cube: NDArray[Any]) -> NDArray[Any]:
-        return convolve1d(convolve1d(cube, window, axis=0, mode="constant"), window, axis=1, mode="constant")
-
-    known = summed(np.broadcast_to(background, counts.shape[-3:]))
-    for cube in counts.reshape(-1, *counts.shape[-3:]):
-        options: dict[str, Any] = {"background": known, "level_known": level_known, "irf": response}
-        axis: dict[str, Any] = {"gate_start": 0.0, "bin_width": 1e-12, "method": "peak", "device": "cpu"}
-        found.append(find_returns(summed(cube.astype(np.int64)), **axis, **options).significance)
-    return np.asarray(found, np.float32).reshape(counts.shape[:-1])
 
 
 def dim_pixels(histograms: Histograms) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from spadwarp.frames.response import InstrumentResponse
     from spadwarp.result import Result
 
-__all__ = ["METHODS", "Histograms", "Method", "Reduction", "Returns", "arrival_time", "depth_frame", "depth_of"]
-__all__ += ["find_returns"]
+__all__ = ["METHODS", "Histograms", "Method", "Reduction", "arrival_time", "depth_frame", "depth_of"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
@@ -45,7 +44,7 @@ class Histograms:
         bin_width: [s].
         gate_start: Time of flight at the lower edge of bin 0 [s].
         background: Expected background in the unit of `values`, of a shape that `arrival_time` takes.
-        level_known: Whether the background is known apart from these histograms, and not estimated from them.
+        level_known: Whether it is known apart from these values.
         pulses: Of each histogram, where each counts one photon at most; else 0.
         irf: The response that the histograms contain.
         response: The response to filter with; differs from `irf` for expected histograms of infinitely short pulses.
@@ -71,26 +70,8 @@ class Histograms:
         return known if known is not None and known.ndim and known.shape[-1] == self.values.shape[-1] else None
 
 
-class Returns(NamedTuple):
-    """Of every pixel, `histogram.shape[:-1]`; torch tensors from torch tensors.
-
-    Attributes:
-        time: Arrival time of the return [s], float64, NaN where nothing was detected.
-        significance: −log10 of the probability that background alone looks like it, float32; None of rates.
-    """
-
-    time: NDArray[np.float64]
-    significance: NDArray[np.float32] | None
-
-
 @kernel_errors()
-def arrival_time(histogram: Any, **options: Any) -> NDArray[np.float64]:
-    """Arrival time of the return in every pixel [s]: `time` of `find_returns`, whose arguments and errors it has."""
-    return find_returns(histogram, **options).time
-
-
-@kernel_errors()
-def find_returns(
+def arrival_time(
     histogram: Any,
     *,
     gate_start: float,
@@ -103,8 +84,10 @@ def find_returns(
     pulses: int = 0,
     gate: tuple[float, float] | None = None,
     min_significance: float | None = None,
-) -> Returns:
-    """The return in every pixel, in the histogram's own time, where the pixel has detected more than background.
+    significance: Any = None,
+) -> NDArray[np.float64]:
+    """Arrival time of the return in every pixel [s], in the histogram's own time: float64 `histogram.shape[:-1]`; NaN
+    where nothing was detected in the gate. From a torch tensor comes one, on its device.
 
     Args:
         histogram: `[..., bin]`, usually `[H, W, T]` or `[frames, H, W, T]`; NumPy, torch or Warp; counts (integer) or
@@ -120,15 +103,15 @@ def find_returns(
         device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
         background: Expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
             number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
-            does not use it. Without one, each pixel's level is taken from its counts, and the shape over time from all
-            pixels together, whose peaks narrower than about 12 FWHM of `irf` count as targets.
-        level_known: False: `background` is for the estimator, and that of the detection is found as without one.
-        pulses: Of each histogram of a detector that counts one photon a pulse at most: its pile-up is in the test of
-            detections. 0: any number of counts a pulse.
+            does not use it.
+        level_known: False: detections do not rely on `background`. As where there is none, the level of a pixel is then
+            that of its counts, and the shape over time that of all pixels, less peaks narrower than about 16 FWHM.
+        pulses: Of each histogram, where each counts one photon at most; 0: any number. For detections.
         gate: (start, stop) [s]: only bins whose centres lie in it are used.
-        min_significance: Pixels below this significance have no return, see `spadwarp_kernels.detection_significance`;
-            in the others it is looked for where it was detected. 0: every pixel reports, from all bins. Default: 4, one
-            false alarm in 10⁴ pixels, for counts (integers); 0 for rates, which have no significance.
+        min_significance: Pixels below this significance have no arrival time, see `spadwarp_kernels.DetectionTest`; the
+            others that of what was detected. 0: every pixel reports. Default: 4, one false alarm in 10⁴ pixels, for
+            counts (integers); 0 for rates, which have no significance.
+        significance: Array or tensor to write that of counts into, float32 `histogram.shape[:-1]`.
 
     Raises `ArgumentError`, which names the argument, its value and what is allowed.
     """
@@ -158,52 +141,21 @@ def find_returns(
             response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
         known = None if background is None else _background_rows(background, rows, frame)
         options: dict[str, Any] = {"first": first, "stop": stop, "half_width": half_width, "lowest_tap": lowest_tap}
-        counted = rows.dtype in (wp.int32, wp.int64)
-        options |= {"min_significance": _threshold(min_significance, counted), "significance": None}
-        if counted:
-            options["significance"] = wp.empty(rows.shape[0], dtype=float, device=rows.device)
+        if min_significance is not None:
+            options["min_significance"] = check_real("min_significance", min_significance, "[0, 1000]")
+        if rows.dtype in (wp.int32, wp.int64):
+            options["significance"] = tested = wp.empty(rows.shape[0], dtype=float, device=rows.device)
             options |= {"width": fwhm, "pulses": check_integer("pulses", pulses, "[0, 4611686018427387904]")}
             options["pixels"] = math.prod(frame[-2:])
             if known is None or not level_known:
-                options["profile"], options["pulses"] = _background_profile(rows, first, stop, fwhm), 0
+                options["profile"] = _background_profile(rows, first, stop, fwhm)
+        elif min_significance:
+            raise ArgumentError(f"min_significance = {min_significance} needs counts, integers; these are rates")
         found = kernels.arrival_bins(rows, method=method, background=known, response=response, **options)
-        as_torch = is_torch(histogram)
-        position: Any = tensor_of(found).double() if as_torch else found.numpy().astype(np.float64)
-        significance: Any = options["significance"]
-        if significance is not None:
-            significance = (tensor_of(significance) if as_torch else significance.numpy()).reshape(frame)
-    return Returns(gate_start + (position.reshape(frame) - offset) * bin_width, significance)
-
-
-def _threshold(min_significance: float | None, counted: bool) -> float:
-    from spadwarp_kernels import detection as kernels
-
-    if min_significance is None:
-        return kernels.MIN_SIGNIFICANCE if counted else 0.0
-    value = check_real("min_significance", min_significance, "[0, 1000]")
-    if value > 0 and not counted:
-        raise ArgumentError(f"min_significance = {value:g} needs counts, integers: rates have no significance")
-    return value
-
-
-def _background_profile(rows: Any, first: int, stop: int, fwhm: float) -> Any:
-    """Shape of the background over time, of all pixels together, float32 `[1, T]` on their device.
-
-    Counts of so many bins that they are 20 or more on average, at least a return's; the median over much longer times
-    takes peaks away, and leaves what rises or falls as it is. One count more keeps it from 0.
-    """
-    import warp as wp
-    from scipy.ndimage import median_filter, uniform_filter1d
-
-    bins = stop - first
-    total = rows.numpy()[:, first:stop].sum(axis=0, dtype=np.float64)
-    half = max(1, math.ceil(fwhm))
-    side = 2 * max(half, math.ceil(10.0 * bins / max(float(total.sum()), 1.0))) + 1
-    profile = np.ones(rows.shape[1])
-    if side < bins:
-        counts = side * uniform_filter1d(total, side, mode="nearest")
-        profile[first:stop] += median_filter(counts, min(8 * (side + 2 * half) + 1, 2 * bins + 1), mode="nearest")
-    return wp.array(profile[None], dtype=wp.float32, device=rows.device)
+        position: Any = tensor_of(found).double() if is_torch(histogram) else found.numpy().astype(np.float64)
+        if significance is not None and "significance" in options:
+            significance[...] = (tensor_of(tested) if is_torch(significance) else tested.numpy()).reshape(frame)
+    return gate_start + (position.reshape(frame) - offset) * bin_width
 
 
 def _bins_of_gate(gate: tuple[float, float], gate_start: float, bin_width: float, bins: int) -> tuple[int, int]:
@@ -231,6 +183,25 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
         raise ArgumentError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
     flat = background.float() if is_torch(background) else background
     return histogram_rows(flat.reshape((-1, shape[-1] if shape else 1)), name="background", device=rows.device)[0]
+
+
+def _background_profile(rows: Any, first: int, stop: int, fwhm: float) -> Any:
+    """Shape of the background over time, float32 `[1, T]` on the device of the counts.
+
+    Of all pixels, over so many bins that their counts are 20 or more on average; the median over much longer times
+    takes peaks away, and leaves what only rises or falls. One count more keeps it from 0.
+    """
+    import warp as wp
+    from scipy.ndimage import median_filter, uniform_filter1d
+
+    bins, profile = stop - first, np.ones(rows.shape[1])
+    total = rows.numpy()[:, first:stop].sum(axis=0, dtype=np.float64)
+    half = math.ceil(fwhm)
+    side = 2 * max(half, math.ceil(10.0 * bins / max(float(total.sum()), 1.0))) + 1
+    if side < bins:
+        counts = side * uniform_filter1d(total, side, mode="nearest")
+        profile[first:stop] += median_filter(counts, min(8 * (side + 2 * half) + 1, 2 * bins + 1), mode="nearest")
+    return wp.array(profile[None], dtype=wp.float32, device=rows.device)
 
 
 def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:
@@ -307,7 +278,7 @@ class Reduction:
     Attributes:
         quantity: `"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known.
         values, range: float64 `[frames, H, W]` [m], and the same along the line of sight; NaN where nothing returned.
-        significance: Of the detection, float32 `[frames, H, W]`, see `find_returns`; None of rates and of "stored".
+        significance: Of counts, float32 `[frames, H, W]`, see `spadwarp.arrival_time`.
         intensity: Sum over the bins, `[frames, H, W]`.
         lines: Lines of sight `[H, W]`, or None.
         method: Estimator of the arrival time, or "stored" for depth that was read.
@@ -359,7 +330,7 @@ def depth_of(
         horizontal_fov_deg: Full horizontal field of view of a measuring camera with square pixels, in (0, 180).
         background: Expected background per bin in the unit of the values, ≥ 0; `"median"`: the median bin of each
             pixel. Default: that of the file; else none, with `"likelihood"` the median.
-        min_significance: See `find_returns`; default: of counts of a scene its `detector.min_significance`.
+        min_significance: See `spadwarp.arrival_time`; default: of counts of a scene its `detector.min_significance`.
         device: Warp device.
 
     Raises `ArgumentError`: something that is needed is missing, given twice or out of range.
@@ -374,18 +345,18 @@ def depth_of(
     if filtered and response is None:
         raise ArgumentError(f"method = {method!r} needs an instrument response (irf)")
     known: Any = histograms.background if background is None else background
-    level_known = histograms.level_known if background is None else background != "median"
+    level_known = known is not None and (histograms.level_known if background is None else background != "median")
     if background == "median" or (known is None and method == "likelihood"):
         # Of all frames together: that of sparse counts would be 0.
         frames = values.reshape(-1, height, width, values.shape[-1])
         known = (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)
-        level_known = False
-    if min_significance is None and histograms.scene is not None and values.dtype.kind in "iu":
+    significance = np.empty(values.shape[:-1], np.float32) if values.dtype.kind in "iu" else None
+    if min_significance is None and histograms.scene is not None and significance is not None:
         min_significance = histograms.scene.detector.min_significance
     options: dict[str, Any] = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width, "method": method}
     options |= {"level_known": level_known, "pulses": histograms.pulses, "min_significance": min_significance}
-    found = find_returns(values, **options, irf=response, background=known, device=device)
-    path = path_from_time(found.time.reshape(-1, height, width), index)
+    time = arrival_time(values, irf=response, background=known, significance=significance, device=device, **options)
+    path = path_from_time(time.reshape(-1, height, width), index)
     distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
         quantity="range" if lines is None else "depth",
@@ -395,7 +366,7 @@ def depth_of(
         lines=lines,
         method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
-        significance=None if found.significance is None else found.significance.reshape(-1, height, width),
+        significance=None if significance is None else significance.reshape(-1, height, width),
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from spadwarp.arrays import Variable
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
-from spadwarp.frames.depth import METHODS, Method, Returns
+from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.frames.spad import Frames, MonteCarloNoise, detect, monte_carlo_noise
 from spadwarp.io.hdf5 import (
@@ -141,7 +141,7 @@ class _StoredFrames:
         return self._read(f"depth/{method}", np.float32, frame)
 
     def significance(self, frame: int | None = None) -> NDArray[np.float32]:
-        """Detection significance, see `spadwarp.frames.find_returns`, `[H, W]` or `[frames, H, W]`."""
+        """Detection significance, see `spadwarp.arrival_time`, `[H, W]` or `[frames, H, W]`."""
         return self._read("significance", np.float32, frame)
 
     def _check(self, frame: int | None) -> None:
@@ -297,24 +297,16 @@ class _Writer:
     def __init__(self, file: Any, frames: int) -> None:
         self._file, self._frames, self._written = file, frames, 0
 
-    def add(
-        self,
-        part: Frames,
-        scene: Scene,
-        returns: Mapping[Method, Returns],
-        depth: Mapping[Method, Map],
-        layout: _Layout,
-    ) -> None:
+    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], significance: Any, layout: _Layout) -> None:
         """Writes the next frames, their tags, and their depth by each estimator `[frames, H, W]` [m]."""
         every: dict[str, Variable] = {
             "counts": ((*_IMAGES, "time"), part.counts, "1", "detections in the bin"),
             "intensity": (_IMAGES, part.intensity, "1", "counts over all bins"),
+            "significance": (_IMAGES, significance, "1", "-log10 of the probability of a false alarm"),
             **layout.arrays,
         }
         for method, values in depth.items():
             every[f"depth/{method}"] = (_IMAGES, values.astype(np.float32), "m", f"planar depth by {method}")
-        for found in list(returns.values())[:1]:  # of all estimators the same
-            every["significance"] = (_IMAGES, found.significance, "1", "−log10 of the probability of a false alarm")
         for name, column in ({} if part.tags is None else part.tags._asdict()).items():
             every[f"tags/{name}"] = ((_DETECTION,), column.astype(_TAGS[name]), "1", f"{name} of the detection")
         if not self._written:
@@ -464,9 +456,12 @@ def record_frames(
         for start in range(0, frames, size):
             part = detect(result, frames=min(size, frames - start), first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
-            found = {method: part.find_returns(method, undo_pile_up=undo_pile_up, device=device) for method in methods}
-            depth = {method: depth_from_time(one.time, scene=scene) for method, one in found.items()}
-            writer.add(part, scene, found, depth, _still(result, part, frames, bound.sigma))
+            depth: dict[Method, Map] = {}
+            found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}
+            for method in methods:
+                time = part.arrival_time(method, undo_pile_up=undo_pile_up, **found)
+                depth[method] = depth_from_time(time, scene=scene)
+            writer.add(part, scene, depth, found["significance"], _still(result, part, frames, bound.sigma))
             detections += int(part.intensity.sum())
             errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
             if progress is not None:
@@ -582,9 +577,10 @@ def simulate_sequence(
                     warnings.simplefilter("ignore", SpadwarpWarning)
                 result = simulate(at, photons=photons, seed=frame_seed, device=device, mesh_cache=kept)
                 part = detect(result, first_frame=number, pulses=pulses, seed=seed, tags=tags, device=first)
-            found = {method: part.find_returns(method, device=first) for method in methods}
-            depth = {method: depth_from_time(one.time, scene=at) for method, one in found.items()}
-            writer.add(part, base, found, depth, _moving(result, part, moves, number, photons))
+            found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": first}
+            times = {method: part.arrival_time(method, **found) for method in methods}
+            depth = {method: depth_from_time(time, scene=at) for method, time in times.items()}
+            writer.add(part, base, depth, found["significance"], _moving(result, part, moves, number, photons))
             if progress is not None:
                 progress("frames", number + 1, len(scenes))
     return SequenceFile.load(path)

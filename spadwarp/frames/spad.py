@@ -27,7 +27,7 @@ from spadwarp.arrays import (
     output_tensor,
     tensor_of,
 )
-from spadwarp.frames.depth import Method, Returns, find_returns
+from spadwarp.frames.depth import Method, arrival_time
 from spadwarp.frames.response import InstrumentResponse, SparseResponse, detector_response, response_matrix
 from spadwarp.io.hdf5 import PIXELS, image_coordinates
 from spadwarp.result.file import as_result
@@ -358,12 +358,12 @@ class Frames:
     edges: NDArray[np.float64]
     period: float | None
     irf: InstrumentResponse
+    detector: Detector
     expected: NDArray[np.float32]
     background: NDArray[np.float32]
     seed: int
     tags: TimeTags | None = None
     monte_carlo_noise: float | None = None
-    detector: Detector
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -405,11 +405,7 @@ class Frames:
         """Detections per pulse and bin without pile-up; see `coates`."""
         return coates(self.counts, pulses=self.exposure)
 
-    def arrival_time(self, method: Method = "centroid", **options: Any) -> NDArray[np.float64]:
-        """Arrival time of the return [s]: `time` of `find_returns`, whose options it takes."""
-        return self.find_returns(method, **options).time
-
-    def find_returns(
+    def arrival_time(
         self,
         method: Method = "centroid",
         *,
@@ -417,30 +413,31 @@ class Frames:
         undo_pile_up: bool = False,
         gate: tuple[float, float] | None = None,
         min_significance: float | None = None,
+        significance: Any = None,
         device: Any = None,
-    ) -> Returns:
-        """Arrival time of the return [s], NaN where nothing was detected, and significance: `[frames, H, W]` or
-        `[H, W]`.
+    ) -> NDArray[np.float64]:
+        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing was detected.
 
         All bins count as equally wide, as in a camera without calibration. The estimator knows the background.
-        `method`, `gate` (start, stop) [s], `device`: as of `spadwarp.frames.find_returns`; `irf`: that the estimator
-        assumes; default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the counts;
-        `min_significance`: default: that of the detector.
+        `method`, `gate` (start, stop) [s], `significance`, `device`: as of `spadwarp.arrival_time`; `irf`: that the
+        estimator assumes; default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the
+        counts; `min_significance`: default: that of the detector.
         """
         least = self.detector.min_significance if min_significance is None else min_significance
-        options: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
-        options |= {"background": self.background * float(self.exposure), "irf": self.irf if irf is None else irf}
-        options |= {"method": method, "device": device}
-        pulses = self.exposure if self.detector.mode == "first_photon" else 0
-        found = find_returns(self.counts, **options, pulses=pulses, min_significance=least)
-        if not undo_pile_up:
-            return found
-        corrected: Any = self.coates()
-        histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
-        time: Any = find_returns(histogram, **options).time
-        significance: Any = found.significance
-        time[significance < least] = math.nan
-        return Returns(time, significance)
+        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
+        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
+        options = {**axis, "method": method, "irf": irf, "background": known, "device": device}
+        test: dict[str, Any] = {"min_significance": least, "significance": significance}
+        test["pulses"] = self.exposure if self.detector.mode == "first_photon" else 0
+        time = arrival_time(self.counts, **options, **test)
+        if undo_pile_up:
+            corrected: Any = self.coates()
+            histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
+            every: Any = arrival_time(histogram, **options)
+            if least > 0:
+                every[time != time] = math.nan
+            time = every
+        return time
 
 
 def to_xarray(frames: Frames) -> xarray.Dataset:

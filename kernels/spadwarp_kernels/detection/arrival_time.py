@@ -58,21 +58,23 @@ class _Search:
     lowest_tap: int
     floor: float  # of the background, a part of the counts
     coarse_step: int  # of the first search [phases]
-    # Of a detection, where there is a threshold:
+    # Of the detection:
     min_significance: float
-    reach: int  # half a window
+    significance: wp.array[float]
+    window: wp.array[int]
+    half_width_of_window: int
     peak_tap: int  # of the response, from the bin of the return
 
 
 @wp.func
-def _bins_to_search(search: _Search, significance: wp.array[float], window: wp.array[int], pixel: int) -> wp.vec2i:
-    """First bin and stop of what was detected, half a window on either side included; none where nothing was."""
+def _bins_to_search(search: _Search, pixel: int) -> wp.vec2i:
+    """First bin and stop: with a threshold the window that was detected, with half of it on either side, or none."""
     if search.min_significance <= 0.0:
         return wp.vec2i(search.first, search.stop)
-    if significance[pixel] < search.min_significance:
+    if search.significance[pixel] < search.min_significance:
         return wp.vec2i(0, 0)
-    first = window[pixel] - search.reach - search.peak_tap
-    return wp.vec2i(wp.max(first, search.first), wp.min(first + 4 * search.reach, search.stop))
+    first = search.window[pixel] - search.half_width_of_window - search.peak_tap
+    return wp.vec2i(wp.max(first, search.first), wp.min(first + 4 * search.half_width_of_window, search.stop))
 
 
 @wp.func
@@ -84,16 +86,9 @@ def _level(search: _Search, pixel: int, bin: int) -> float:
 @memoised
 def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
-    def peak(
-        first_pixel: int,
-        histogram: wp.array2d[dtype],
-        search: _Search,
-        significance: wp.array[float],
-        window: wp.array[int],
-        arrival: wp.array[float],
-    ):
+    def peak(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
-        bins = _bins_to_search(search, significance, window, pixel)
+        bins = _bins_to_search(search, pixel)
         peak_bin = int(-1)
         highest = float(0.0)
         for k in range(bins[0], bins[1]):
@@ -191,17 +186,10 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     score_of = _make_score(dtype, likelihood)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def find(
-        first_pixel: int,
-        histogram: wp.array2d[dtype],
-        search: _Search,
-        significance: wp.array[float],
-        window: wp.array[int],
-        arrival: wp.array[float],
-    ):
+    def find(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
         coarse_step = search.coarse_step
-        bins = _bins_to_search(search, significance, window, pixel)
+        bins = _bins_to_search(search, pixel)
         total = float(0.0)
         for k in range(search.first, search.stop):
             total += float(histogram[pixel, k])
@@ -235,8 +223,8 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
 
 
 class ArrivalEstimator:
-    """`arrival_bins` for histograms of so many bins on a device, with everything prepared: a call allocates nothing and
-    reads no value on the host. Arguments and errors are those of `arrival_bins`."""
+    """`arrival_bins` for histograms of so many bins on a device, with everything prepared: a call reads no value on the
+    host, and from the second one of as many pixels on allocates nothing. Arguments and errors: see `arrival_bins`."""
 
     def __init__(
         self,
@@ -249,12 +237,9 @@ class ArrivalEstimator:
         first: int = 0,
         stop: int | None = None,
         half_width: int = 3,
-        *,
-        min_significance: float = 0.0,
+        min_significance: float = MIN_SIGNIFICANCE,
         width: float | None = None,
-        profile: wp.array | None = None,
-        pulses: int = 0,
-        pixels: int | None = None,
+        **test: Any,
     ) -> None:
         check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
         self.device, self.method = wp.get_device(device), method
@@ -264,7 +249,6 @@ class ArrivalEstimator:
         search.stop = bins if stop is None else check_integer("stop", stop, first, bins)
         search.half_width = check_integer("half_width", half_width, 0, 2**24)
         search.lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
-        search.min_significance = check_number("min_significance", min_significance, "[0, 1e6]")
         if background is None:
             background = wp.zeros((1, 1), dtype=float, device=self.device)
         check_array("background", background, wp.float32, (None, None), self.device)
@@ -279,41 +263,39 @@ class ArrivalEstimator:
             if taps.ndim != 2 or taps.shape[0] != PHASES or taps.size == 0:
                 raise ArgumentError(f"response has shape {taps.shape}; ({PHASES}, taps) is needed")
             largest = taps.max()
+            width = np.count_nonzero(taps[0] >= 0.5 * taps[0].max()) if width is None else width
             if not (np.isfinite(taps).all() and taps.min() >= 0.0 and largest > 0.0):
                 limits = "finite values >= 0 are needed, and one above"
                 raise ArgumentError(f"response holds {taps.min()} to {largest}; {limits}")
-            width = np.count_nonzero(taps[0] >= 0.5 * taps[0].max()) if width is None else width
             search.floor = floor = RESPONSE_FLOOR * float(largest)
             # A narrow response loses signal between the delays of the coarse search, a wide one does not.
             search.coarse_step = PHASES if largest < 0.25 else PHASES // 2 if largest < 0.5 else PHASES // 4
             if method == "matched":
                 # ln(h / floor): counts outside the response add the same to every delay.
                 taps = np.log(np.maximum(taps, floor) / floor)
-            search.peak_tap = lowest_tap + int(np.argmax(taps[0]))
+            search.peak_tap = search.lowest_tap + int(np.argmax(taps[0]))
         search.response = wp.array(taps.astype(np.float32), device=self.device)
-        known = background if profile is None else None
-        window = (half_width / 1.5 if width is None else width, known, profile, pulses, pixels, first, stop)
-        self._test = DetectionTest(bins, self.device, *window)
-        search.reach = self._test.half_width
+        search.min_significance = check_number("min_significance", min_significance, "[0, 1e6]")
+        test = {"first": first, "stop": stop, "background": background if "profile" not in test else None, **test}
+        self._test = DetectionTest(bins, self.device, half_width / 1.5 if width is None else width, **test)
+        search.half_width_of_window = self._test.half_width
 
-    def __call__(
-        self,
-        histogram: wp.array,
-        arrival: wp.array,
-        significance: wp.array | None = None,
-        window: wp.array | None = None,
-    ) -> None:
-        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`; what `DetectionTest` writes into
-        the other two, which it needs where there is a threshold."""
+    def __call__(self, histogram: wp.array, arrival: wp.array, significance: wp.array | None = None) -> None:
+        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`, and of counts, where there is an
+        array for it or a threshold, the significance."""
         check_array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
         check_array("arrival", arrival, wp.float32, (pixels,), self.device)
         make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
         kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
-        if self._search.min_significance > 0.0 or significance is not None:
-            self._test(histogram, significance, window)
-        inputs = [histogram, self._search, significance, window, arrival]
-        launch_pixels(kernel, pixels, inputs, device=self.device)
+        search = self._search
+        if search.min_significance > 0.0 or significance is not None:
+            if search.window is None or search.window.shape != (pixels,):
+                search.window, search.significance = (wp.empty(pixels, kind, self.device) for kind in (int, float))
+            if significance is not None:
+                search.significance = significance
+            self._test(histogram, search.significance, search.window)
+        launch_pixels(kernel, pixels, [histogram, search, arrival], device=self.device)
 
 
 def arrival_bins(
@@ -345,32 +327,24 @@ def arrival_bins(
         lowest_tap: bin of the first tap, relative to the bin of the return.
         first, stop: the bins looked at, [first, stop).
         half_width: of the centroid's window [bins].
-        min_significance: below this `detection_significance` a pixel has no arrival time, >= 0; in the others it is
-            looked for in the window that was detected, and half a window on either side. 0: every pixel reports, from
-            all bins. Default: 4, one false alarm in 10^4 pixels; 0 for rates, which have no significance.
+        min_significance: pixels below this significance (`DetectionTest`) have no arrival time; in the others it is
+            looked for where they have detected something. 0: every pixel reports, from all bins. Default: 4, one false
+            alarm in 10^4 pixels; 0 for rates, which have no significance.
         significance: array to write that of each pixel into, float32 `[pixel]`.
-        test: the arguments `width` (default: that of the response, or `half_width` / 1.5), `profile`, `pulses` and
-            `pixels` of `detection_significance`. Without a profile the background is known, where there is one.
+        test: `width` (default: that of the response, or `half_width` / 1.5), `profile` (in place of the background, for
+            the test), `pulses` and `pixels` of `DetectionTest`.
 
     Returns:
-        float32 `[pixel]` on the histogram's device. NaN: nothing was detected, or there are no counts above the
-        background.
+        float32 `[pixel]` on the histogram's device. NaN: nothing detected, or no counts above the background.
 
     Raises:
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
     check_array("histogram", histogram, RATES, (None, None))
     bins, device = histogram.shape[1], histogram.device
-    search = (method, background, response, lowest_tap, first, stop, half_width)
     if min_significance is None:
         min_significance = MIN_SIGNIFICANCE if histogram.dtype in COUNTS else 0.0
+    search = (method, background, response, lowest_tap, first, stop, half_width, min_significance)
     arrival = wp.empty(histogram.shape[0], dtype=float, device=device)
-    window = None
-    if min_significance > 0.0 or significance is not None:
-        window = wp.empty(histogram.shape[0], dtype=int, device=device)
-        significance = (
-            wp.empty(histogram.shape[0], dtype=float, device=device) if significance is None else significance
-        )
-    estimate = ArrivalEstimator(bins, device, *search, min_significance=min_significance, **test)
-    estimate(histogram, arrival, significance, window)
+    ArrivalEstimator(bins, device, *search, **test)(histogram, arrival, significance)
     return arrival

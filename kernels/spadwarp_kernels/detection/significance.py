@@ -1,15 +1,12 @@
 """Whether a pixel has detected anything: the significance of the best window of its counts over the background.
 
-A window is two halves of some bins, and shares one with the next window. Of background alone its count n is Poisson
-about the expectation B; binomial of the pulses that have not counted yet, where a pulse counts once at most; binomial
-of the pixel's counts, where only the shape of the background is known. The best window has the largest deviance,
-n ln(n/B) − (n − B) or its binomial form, of those with n > B. Its tail P(N >= n) becomes that of K windows by Boole's
-inequality, less the pairs of neighbours whose counts all lie in the half that they share, a part 2^−n of them:
-P(n) = (1 + (K − 1)(1 − 2^−n)) P(N >= n).
-
-Counts are few, and P(n) leaps from one to the next. A randomised test (Lehmann and Romano, Testing Statistical
-Hypotheses, 3.2) keeps what is asked for: p = P(n + 1) + u (P(n) − P(n + 1)) is uniform for u uniform in (0, 1), which
-here is a hash of the pixel's number and counts: the same counts give the same answer.
+A window is two halves of some bins, and shares one with the next. Of background alone its count N is binomial: of the
+pulses that have not counted yet, where each counts one photon at most; of the pixel's counts, where the background's
+level is not known; Poisson, the limit of many trials, else. The best window has the largest deviance of those above
+their expectation. Boole's inequality makes its tail that of K windows, less the pairs of neighbours whose n counts all
+lie in the half that they share, 2^−n of them: P(n) = (1 + (K − 1)(1 − 2^−n)) P(N >= n). Since P leaps from one count
+to the next, the test is randomised (Lehmann and Romano, Testing Statistical Hypotheses, 3.2): P(n + 1) + u (P(n) −
+P(n + 1)) is uniform for u uniform in (0, 1), here a hash of the pixel's number and counts.
 """
 
 import math
@@ -19,9 +16,9 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_number
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
-from spadwarp_kernels.base.native import one_minus_exp
+from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO, log1p, one_minus_exp
 
-__all__ = ["MIN_SIGNIFICANCE", "detection_significance"]
+__all__ = ["MIN_SIGNIFICANCE", "DetectionTest"]
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,28 +26,21 @@ MIN_SIGNIFICANCE = 4.0
 """Default of all estimators of depth: one false alarm in 10^4 pixels."""
 
 COUNTS = (wp.int32, wp.int64)
-"""Types of rows of counts."""
 
-_HALF = 0.75
-"""Half a window over the FWHM of a return: 92 % of a Gaussian one lie in a window about it, 80 % in the worst place."""
-
-_LN10 = wp.constant(wp.float64(math.log(10.0)))
-_HALF_LN_2PI = wp.constant(wp.float64(0.5 * math.log(2.0 * math.pi)))
+_LN10, _LN_2PI = wp.constant(wp.float64(math.log(10.0))), wp.constant(wp.float64(math.log(2.0 * math.pi)))
+_MANY, _LEAST = wp.constant(wp.float64(1.0e9)), wp.constant(wp.float64(1.0e-30))
 _TERMS = wp.constant(64)  # of a tail, before the rest of it counts as a geometric series, which it stays below
-_SMALL = wp.constant(wp.float64(1.0e-30))
 _HASH_START, _HASH_FACTOR = wp.uint32(2166136261), wp.uint32(16777619)  # Fowler, Noll and Vo
-_MIX_1, _MIX_2 = wp.uint32(0x85EBCA6B), wp.uint32(0xC2B2AE35)
-_0 = wp.constant(wp.float64(0.0))
-_1 = wp.constant(wp.float64(1.0))
+_MIX_1, _MIX_2 = wp.uint32(0x85EBCA6B), wp.uint32(0xC2B2AE35)  # MurmurHash3
 
 
 @wp.struct
 class Windows:
-    """See `detection_significance`."""
+    """See `DetectionTest`."""
 
     background: wp.array2d[float]
     level_known: bool
-    pulses: wp.float64  # 0: any number of counts a pulse
+    pulses: wp.float64
     first: int
     stop: int
     half_width: int
@@ -58,93 +48,57 @@ class Windows:
 
 
 @wp.func
-def _deviance(n: wp.float64, expected: wp.float64, trials: wp.float64) -> wp.float64:
-    """ln of the likelihood of n at its own expectation over that at `expected`; trials 0: Poisson."""
-    value = n * wp.log(n / expected)
-    if trials <= _0:
-        return value - (n - expected)
+def _deviance(n: wp.float64, mean: wp.float64, trials: wp.float64) -> wp.float64:
+    """ln of the likelihood of n at its own expectation over that at the mean, n >= 1."""
+    value = n * wp.log(n / mean)
     if n < trials:
-        value += (trials - n) * wp.log((trials - n) / (trials - expected))
+        value += (trials - n) * log1p((mean - n) / (trials - mean))
     return value
 
 
 @wp.func
 def _stirling_error(n: wp.float64) -> wp.float64:
     """ln n! less Stirling's formula, n >= 1, to 3e-4."""
-    return (_1 - _1 / (wp.float64(30.0) * n * n)) / (wp.float64(12.0) * n)
-
-
-@wp.func
-def _log_probability(n: wp.float64, expected: wp.float64, trials: wp.float64) -> wp.float64:
-    """ln P(N = n), n >= 1 (Loader 2000): the deviance, and Stirling's formula."""
-    half = wp.float64(0.5)
-    value = -_deviance(n, expected, trials)
-    left = trials - n
-    if trials <= _0:
-        return value - _HALF_LN_2PI - half * wp.log(n) - _stirling_error(n)
-    if left < half:
-        return value
-    value += half * wp.log(trials / (n * left)) - _HALF_LN_2PI
-    return value + _stirling_error(trials) - _stirling_error(n) - _stirling_error(left)
-
-
-@wp.func
-def _tail(n: wp.float64, expected: wp.float64, trials: wp.float64) -> wp.float64:
-    """P(N > n) / P(N = n), n > expected."""
-    total = _0
-    term = _1
-    ratio = _0
-    odds = expected
-    part = _0
-    if trials > _0:
-        part = _1 / trials
-        odds = expected / (_1 - expected * part)
-    j = n
-    for _ in range(_TERMS):
-        ratio = wp.max(odds * (_1 - j * part) / (j + _1), _0)
-        term *= ratio
-        total += term
-        j += _1
-        if term < wp.float64(1.0e-4) * total:
-            return total
-    return total + term * ratio / (_1 - ratio)
-
-
-@wp.func
-def _windows_in_effect(windows: wp.float64, n: wp.float64) -> wp.float64:
-    return _1 + (windows - _1) * (_1 - wp.exp(-n * wp.float64(0.6931471805599453)))
+    return (ONE - ONE / (wp.float64(30.0) * n * n)) / (wp.float64(12.0) * n)
 
 
 @wp.func
 def _significance(
-    n: wp.float64, expected: wp.float64, trials: wp.float64, windows: wp.float64, u: wp.float64, level_known: bool
+    n: wp.float64, mean: wp.float64, trials: wp.float64, windows: wp.float64, u: wp.float64, level_known: bool
 ) -> wp.float64:
-    """−log10 p of a pixel whose best window has n counts."""
-    more = _tail(n, expected, trials)
-    either = _windows_in_effect(windows, n) * (_1 + more)
-    above = _windows_in_effect(windows, n + _1) * more
-    one = _log_probability(n, expected, trials)
-    if one > wp.float64(-30.0):
-        # Not small: of Poisson counts windows are independent, of a given number of counts one of them holds each.
-        scale = wp.exp(one)
-        either = wp.where(level_known, _1 - wp.exp(-either * scale), wp.min(either * scale, _1))
-        above = wp.where(level_known, _1 - wp.exp(-above * scale), wp.min(above * scale, _1))
-        one = _0
-    return -(one + wp.log(above + u * (either - above))) / _LN10
-
-
-@wp.func
-def _hashed(state: wp.uint32, word: wp.uint32) -> wp.uint32:
-    return (state ^ word) * _HASH_FACTOR
+    """−log10 of the probability that one of the windows has n counts or more, randomised; n > mean."""
+    log_p = -_deviance(n, mean, trials)  # ln P(N = n): Loader, Fast and accurate computation of binomials, 2000
+    left = trials - n
+    if left >= HALF:
+        log_p += HALF * (wp.log(trials / (n * left)) - _LN_2PI)
+        log_p += _stirling_error(trials) - _stirling_error(n) - _stirling_error(left)
+    more = ZERO  # P(N > n) / P(N = n)
+    term = ONE
+    ratio = ZERO
+    for k in range(_TERMS):
+        j = n + wp.float64(k)
+        ratio = wp.max(mean * (trials - j) / ((j + ONE) * (trials - mean)), ZERO)
+        term *= ratio
+        more += term
+    more += term * ratio / (ONE - ratio)
+    shared = wp.pow(TWO, -n)
+    either = (ONE + (windows - ONE) * (ONE - shared)) * (ONE + more)
+    above = (ONE + (windows - ONE) * (ONE - HALF * shared)) * more
+    if log_p > wp.float64(-30.0):
+        # Not small: windows are independent, but of a given number of counts each is in one.
+        p = wp.exp(log_p)
+        either = wp.where(level_known, one_minus_exp(either * p), wp.min(either * p, ONE))
+        above = wp.where(level_known, one_minus_exp(above * p), wp.min(above * p, ONE))
+        log_p = ZERO
+    return wp.max(-(log_p + wp.log(above + u * (either - above))) / _LN10, ZERO)
 
 
 @wp.func
 def _uniform(state: wp.uint32) -> wp.float64:
-    """In (0, 1), by the last steps of MurmurHash3."""
+    """In (0, 1)."""
     mixed = (state ^ (state >> wp.uint32(16))) * _MIX_1
     mixed = (mixed ^ (mixed >> wp.uint32(13))) * _MIX_2
-    mixed = mixed ^ (mixed >> wp.uint32(16))
-    return (wp.float64(mixed) + wp.float64(0.5)) / wp.float64(4294967296.0)
+    return (wp.float64(mixed ^ (mixed >> wp.uint32(16))) + HALF) / wp.float64(4294967296.0)
 
 
 @memoised
@@ -159,78 +113,76 @@ def _significance_kernel(dtype: Any) -> wp.Kernel:
         window: wp.array[int],
     ):
         pixel = first_pixel + wp.tid()
-        background = search.background
-        row = pixel % background.shape[0]
-        columns = background.shape[1]
-        before = _0  # counts before the window
-        if search.pulses > _0:
-            for k in range(search.first):
-                before += wp.float64(counts[pixel, k])
-        total = _0
-        level = _0
+        background = search.background[pixel % search.background.shape[0]]
+        last_column = background.shape[0] - 1
+        before = ZERO  # counts before the window
+        for k in range(wp.where(search.pulses > ZERO, search.first, 0)):
+            before += wp.float64(counts[pixel, k])
+        total = ZERO
+        level = ONE
         if not search.level_known:
             for k in range(search.first, search.stop):
                 total += wp.float64(counts[pixel, k])
-                level += wp.float64(background[row, wp.min(k, columns - 1)])
-            level = total / wp.max(level, _SMALL)
-        state = _hashed(_HASH_START, wp.uint32(pixel % search.pixels))
+                level += wp.float64(background[wp.min(k, last_column)])
+            level = total / wp.max(level - ONE, _LEAST)
+        state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
         halves = (search.stop - search.first + search.half_width - 1) / search.half_width
-        last_n = _0
-        last_b = _0
-        best = _0
-        best_n = _0
-        best_expected = _1
-        best_trials = _0
+        last_n = ZERO
+        last_b = ZERO
+        best = wp.vec4d(ZERO, ZERO, ONE, ONE)  # deviance, counts, mean, trials
         window[pixel] = search.first
         for m in range(halves):
             start = search.first + m * search.half_width
-            n = _0
-            b = float(0.0)
+            n = last_n
+            own = ZERO
+            b = ZERO
             for k in range(start, wp.min(start + search.half_width, search.stop)):
-                count = counts[pixel, k]
-                if count > counts.dtype(0):
-                    n += wp.float64(count)
-                    state = _hashed(_hashed(state, wp.uint32(k)), wp.uint32(count))
-                b += background[row, wp.min(k, columns - 1)]
-            if m > 0 or halves == 1:
-                both = last_n + n
-                expected = last_b + wp.float64(b)
-                trials = total
-                if not search.level_known:
-                    expected = expected * level
-                elif search.pulses > _0:
-                    trials = wp.max(search.pulses - before, both)
-                    expected = trials * one_minus_exp(expected / search.pulses)
-                expected = wp.max(expected, _SMALL)
-                above = both - expected
-                variance = expected
-                if trials > _0:
-                    variance -= expected * expected / trials
-                # The deviance is at most the square of the excess over the variance: most windows end here.
-                if above > _0 and above * above > best * variance:
-                    value = _deviance(both, expected, trials)
-                    if value > best:
-                        best = value
-                        best_n = both
-                        best_expected = expected
-                        best_trials = trials
-                        window[pixel] = wp.max(start - search.half_width, search.first)
-                before += last_n
-            last_n = n
-            last_b = wp.float64(b)
+                if counts[pixel, k] > counts.dtype(0):
+                    own += wp.float64(counts[pixel, k])
+                    state = (((state ^ wp.uint32(k)) * _HASH_FACTOR) ^ wp.uint32(counts[pixel, k])) * _HASH_FACTOR
+                b += wp.float64(background[wp.min(k, last_column)])
+            n += own
+            mean = wp.max((last_b + b) * level, _LEAST)
+            trials = wp.where(search.level_known, _MANY * (n + mean), total)
+            if search.pulses > ZERO:
+                trials = wp.max(search.pulses - before, n)
+                mean = wp.max(trials * one_minus_exp(mean / search.pulses), _LEAST)
+            # The deviance is at most the square of the excess over the variance: most windows end here.
+            if (m > 0 or halves == 1) and n > mean and (n - mean) * (n - mean) > best[0] * mean * (ONE - mean / trials):
+                value = _deviance(n, mean, trials)
+                if value > best[0]:
+                    best = wp.vec4d(value, n, mean, trials)
+                    window[pixel] = wp.max(start - search.half_width, search.first)
+            before += last_n
+            last_n = own
+            last_b = b
         significance[pixel] = 0.0
-        if best > _0:
+        if best[0] > ZERO:
             number = wp.float64(wp.max(halves - 1, 1))
-            u = _uniform(state)
-            found = _significance(best_n, best_expected, best_trials, number, u, search.level_known)
-            significance[pixel] = wp.max(float(found), 0.0)
+            found = _significance(best[1], best[2], best[3], number, _uniform(state), search.level_known)
+            significance[pixel] = float(found)
 
     return significance_kernel
 
 
 class DetectionTest:
-    """`detection_significance` for histograms of so many bins on a device, with everything prepared: a call allocates
-    nothing and reads no value on the host. Arguments and errors are those of `detection_significance`."""
+    """Detection significance of the counts of every pixel: −log10 of the probability that background alone gives counts
+    as unlikely. Of background alone, a part 10^−s of the pixels has a significance of s or more.
+
+    Everything is prepared: a call allocates nothing and reads no value on the host.
+
+    Args:
+        bins, device: Of the histograms.
+        width: FWHM of a return [bins]; a window has 1.5 of it, an even number of bins, and 80 to 92 % of the return.
+        background: Expected counts of background, float32 `[1 or pixel, 1 or bin]`; the row is the pixel modulo the
+            rows. None: its level is that of the pixel's counts, and its shape over time `profile`, likewise, or flat.
+        pulses: Of a histogram, where each counts one photon at most and the background is known; 0: any number.
+        pixels: Of a frame, where the rows are those of several: a pixel's answer does not depend on the frame's number.
+        first, stop: The bins looked at, [first, stop).
+
+    Raises:
+        ArgumentError: An array of another kind, or bins outside the histogram.
+    """
 
     def __init__(
         self,
@@ -244,61 +196,26 @@ class DetectionTest:
         first: int = 0,
         stop: int | None = None,
     ) -> None:
-        self.device = wp.get_device(device)
-        self.bins = check_integer("bins", bins, 0)
+        self.device, self.bins = wp.get_device(device), check_integer("bins", bins, 0)
         self._windows = windows = Windows()
         windows.first = check_integer("first", first, 0, bins)
         windows.stop = bins if stop is None else check_integer("stop", stop, first, bins)
-        windows.half_width = self.half_width = max(1, math.ceil(_HALF * check_number("width", width, "[0, 1e6]")))
-        windows.pulses = float(check_integer("pulses", pulses, 0, 2**62))
-        windows.pixels = 2**31 - 1 if pixels is None else check_integer("pixels", pixels, 1)
-        if background is not None and profile is not None:
-            raise ArgumentError("background and profile: one of them is needed, not both")
+        windows.half_width = self.half_width = max(1, math.ceil(0.75 * check_number("width", width, "[0, 1e6]")))
         windows.level_known = background is not None
-        name = "profile" if background is None else "background"
-        rows = profile if background is None else background
-        if rows is None:
-            rows = wp.ones((1, 1), dtype=float, device=self.device)
-        check_array(name, rows, wp.float32, (None, None), self.device)
+        windows.pulses = float(check_integer("pulses", pulses, 0, 2**62)) if windows.level_known else 0.0
+        windows.pixels = 2**31 - 1 if pixels is None else check_integer("pixels", pixels, 1)
+        name, rows = ("profile", profile) if background is None else ("background", background)
+        rows = wp.ones((1, 1), dtype=float, device=self.device) if rows is None else rows
+        windows.background = check_array(name, rows, wp.float32, (None, None), self.device)
         if rows.shape[0] < 1 or rows.shape[1] not in (1, bins):
             raise ArgumentError(f"{name} has shape {rows.shape}; (1 or pixels, 1 or {bins}) is needed")
-        windows.background = rows
 
     def __call__(self, counts: wp.array, significance: wp.array, window: wp.array) -> None:
-        """Writes the significance, float32 `[pixel]`, and the first bin of the best window, int32 `[pixel]`."""
+        """Writes the significance, float32 `[pixel]`, and the first bin of the best window, int32 `[pixel]`, of counts
+        int32 or int64 `[pixel, bin]`."""
         check_array("counts", counts, COUNTS, (None, self.bins), self.device)
         shape = (counts.shape[0],)
         check_array("significance", significance, wp.float32, shape, self.device)
         check_array("window", window, wp.int32, shape, self.device)
-        kernel = _significance_kernel(counts.dtype)
-        launch_pixels(kernel, shape[0], [counts, self._windows, significance, window], device=self.device)
-
-
-def detection_significance(counts: wp.array, **options: Any) -> wp.array:
-    """Detection significance of every pixel, −log10 of the probability that background alone gives counts as unlikely.
-
-    A pixel of background alone has more than s with the probability 10^−s. The background of a real return is known
-    from a model of the sensor and the water, or from a recording without targets; otherwise its level is that of the
-    pixel, and `profile` its shape.
-
-    Args:
-        counts: `[pixel, bin]`, int32 or int64, not negative.
-        width: FWHM of a return [bins]: a window has 1.5 of it, rounded up to an even number of bins.
-        background: Expected counts of background, float32 `[1 or pixel, 1 or bin]`; the row is the pixel modulo the
-            rows.
-        profile: In its place the shape of the background alone, in any unit, of such a shape; by default flat.
-        pulses: Of a histogram, where each counts one photon at most and the background is known; 0: any number.
-        pixels: Of a frame, where the rows are those of several: a pixel's answer then does not depend on the frame's
-            number.
-        first, stop: The bins looked at, [first, stop).
-
-    Returns:
-        float32 `[pixel]` on the device of the counts; 0 where no window has more counts than its background.
-
-    Raises:
-        ArgumentError: An array of another kind, or bins outside the histogram.
-    """
-    check_array("counts", counts, COUNTS, (None, None))
-    found, window = (wp.empty(counts.shape[0], dtype=kind, device=counts.device) for kind in (float, int))
-    DetectionTest(counts.shape[1], counts.device, **options)(counts, found, window)
-    return found
+        inputs = [counts, self._windows, significance, window]
+        launch_pixels(_significance_kernel(counts.dtype), shape[0], inputs, device=self.device)

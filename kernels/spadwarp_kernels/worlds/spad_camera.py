@@ -108,7 +108,7 @@ class SpadConfig:
         method: Of the depth: "centroid", "peak", "matched" or "likelihood", see `arrival_bins`. The expected counts of
             an image without targets are taken as known background.
         min_significance: Of a pixel that has a depth, −log10 of the probability that background alone looks like it,
-            see `detection_significance`. 0: every pixel reports.
+            see `DetectionTest`. 0: every pixel reports.
         seed: 64-bit.
 
     Raises:
@@ -411,14 +411,12 @@ class WorldCameras:
         self._background = wp.array(background, dtype=float, device=device)
         self._rows = (self.cameras * config.height * config.width, config.bins)
         self._arrival = wp.empty(self._rows[0], dtype=float, device=device)
-        self._window = wp.empty(self._rows[0], dtype=int, device=device)
         self._dark = config.dark_rate * config.bin_path / config.speed
         known = wp.array(config.pulses * (background + self._dark), dtype=float, device=device)
         response, lowest_tap = config.response()
         taps = {"response": response, "lowest_tap": lowest_tap, "half_width": -lowest_tap - 1}
-        test = {"width": 2.355 * config._sigma_bins, "pulses": config.pulses}
-        test["min_significance"] = config.min_significance
-        self._estimate = ArrivalEstimator(config.bins, device, config.method, known, **taps, **test)
+        taps |= {"min_significance": config.min_significance, "width": 2.355 * config._sigma_bins}
+        self._estimate = ArrivalEstimator(config.bins, device, config.method, known, **taps, pulses=config.pulses)
 
     def _cast_rays(self, shapes: Shapes, camera_q: wp.array, body_q: wp.array | None) -> None:
         """Moves the shapes and casts a ray a pixel."""
@@ -442,7 +440,7 @@ class WorldCameras:
         config = self.config
         rates, counts = self.rates.reshape(self._rows), self.histogram.reshape(self._rows)
         first_photon_counts(rates, pulses=config.pulses, first_frame=self.step, seed=config.seed, counts=counts)
-        self._estimate(counts, self._arrival, self.significance.flatten(), self._window)
+        self._estimate(counts, self._arrival, self.significance.flatten())
         inputs = [self._arrival, self._view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
         outputs = [self.depth.flatten(), self.counts.flatten(), self.step]
         wp.launch(_depth_kernel, self._rows[0], [*inputs, counts], outputs, device=self.device)
