@@ -189,7 +189,8 @@ def write_depth(
     ply_frame: Literal["camera", "world"] = "camera",
     comment: str = "",
 ) -> list[Path]:
-    """Writes `depth.npy` (all frames, float32), `depth.exr` and `depth.png` (the first); returns the paths.
+    """Writes `depth.npy` (all frames, float32), `depth.exr` and `depth.png` (the first); returns the paths. Of counts
+    also `significance.npy`.
 
     Without a field of view the names begin with `range`. `ply`: the points of the first frame, with normals and
     intensity, in the frame `ply_frame`, which a comment of the file names.
@@ -214,6 +215,8 @@ def write_depth(
         write_exr(folder / f"{name}.exr", channels, metadata),
         reduction.plot(folder / f"{name}.png", label=label, title=f"{name.capitalize()} ({reduction.method})"),
     ]
+    if (found := reduction.significance) is not None:
+        written.append(write_array(folder / "significance.npy", found if reduction.frames > 1 else found[0]))
     return written if ply is None else [*written, _write_points(reduction, ply, ply_frame, comment)]
 
 

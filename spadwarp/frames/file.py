@@ -140,6 +140,10 @@ class _StoredFrames:
         """Depth by one of `methods` [m], `[H, W]` or `[frames, H, W]`."""
         return self._read(f"depth/{method}", np.float32, frame)
 
+    def significance(self, frame: int | None = None) -> NDArray[np.float32]:
+        """Detection significance, see `spadwarp.arrival_time`, `[H, W]` or `[frames, H, W]`."""
+        return self._read("significance", np.float32, frame)
+
     def _check(self, frame: int | None) -> None:
         if frame is not None and not 0 <= frame < self.frames:
             raise ArgumentError(f"frame = {frame} is outside [0, {self.frames}), the frames of {self.path}")
@@ -221,6 +225,7 @@ class FramesFile(_StoredFrames):
             first_frame=number,
             expected=self.expected,
             background=self.background,
+            detector=self.scene.detector,
             **{name: getattr(self, name) for name in _OF_A_FRAME},
         )
 
@@ -292,11 +297,12 @@ class _Writer:
     def __init__(self, file: Any, frames: int) -> None:
         self._file, self._frames, self._written = file, frames, 0
 
-    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], layout: _Layout) -> None:
+    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], significance: Any, layout: _Layout) -> None:
         """Writes the next frames, their tags, and their depth by each estimator `[frames, H, W]` [m]."""
         every: dict[str, Variable] = {
             "counts": ((*_IMAGES, "time"), part.counts, "1", "detections in the bin"),
             "intensity": (_IMAGES, part.intensity, "1", "counts over all bins"),
+            "significance": (_IMAGES, significance, "1", "-log10 of the probability of a false alarm"),
             **layout.arrays,
         }
         for method, values in depth.items():
@@ -451,10 +457,11 @@ def record_frames(
             part = detect(result, frames=min(size, frames - start), first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
             depth: dict[Method, Map] = {}
+            found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}
             for method in methods:
-                time = part.arrival_time(method, undo_pile_up=undo_pile_up, device=device)
+                time = part.arrival_time(method, undo_pile_up=undo_pile_up, **found)
                 depth[method] = depth_from_time(time, scene=scene)
-            writer.add(part, scene, depth, _still(result, part, frames, bound.sigma))
+            writer.add(part, scene, depth, found["significance"], _still(result, part, frames, bound.sigma))
             detections += int(part.intensity.sum())
             errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
             if progress is not None:
@@ -570,9 +577,10 @@ def simulate_sequence(
                     warnings.simplefilter("ignore", SpadwarpWarning)
                 result = simulate(at, photons=photons, seed=frame_seed, device=device, mesh_cache=kept)
                 part = detect(result, first_frame=number, pulses=pulses, seed=seed, tags=tags, device=first)
-            times = {method: part.arrival_time(method, device=first) for method in methods}
+            found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": first}
+            times = {method: part.arrival_time(method, **found) for method in methods}
             depth = {method: depth_from_time(time, scene=at) for method, time in times.items()}
-            writer.add(part, base, depth, _moving(result, part, moves, number, photons))
+            writer.add(part, base, depth, found["significance"], _moving(result, part, moves, number, photons))
             if progress is not None:
                 progress("frames", number + 1, len(scenes))
     return SequenceFile.load(path)

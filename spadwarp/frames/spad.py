@@ -345,6 +345,7 @@ class Frames:
         monte_carlo_noise: Standard error of the simulation over the shot noise of a frame, at the 95th percentile of
             the pixels; None where nobody knows it. Above 0.5 `expected` is not smooth where few photons were traced,
             and no more are the counts that are drawn from it.
+        detector: The section of a scene.
         notes: What the source could not give, in words.
     """
 
@@ -357,6 +358,7 @@ class Frames:
     edges: NDArray[np.float64]
     period: float | None
     irf: InstrumentResponse
+    detector: Detector
     expected: NDArray[np.float32]
     background: NDArray[np.float32]
     seed: int
@@ -410,21 +412,32 @@ class Frames:
         irf: Any = None,
         undo_pile_up: bool = False,
         gate: tuple[float, float] | None = None,
+        min_significance: float | None = None,
+        significance: Any = None,
         device: Any = None,
     ) -> NDArray[np.float64]:
-        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing returned.
+        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing was detected.
 
         All bins count as equally wide, as in a camera without calibration. The estimator knows the background.
-        `method`, `gate` (start, stop) [s], `device`: as of `spadwarp.arrival_time`; `irf`: that the estimator assumes;
-        default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the counts.
+        `method`, `gate` (start, stop) [s], `significance`, `device`: as of `spadwarp.arrival_time`; `irf`: that the
+        estimator assumes; default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the
+        counts; `min_significance`: default: that of the detector.
         """
-        histogram: Any = self.counts
+        least = self.detector.min_significance if min_significance is None else min_significance
+        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
+        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
+        options = {**axis, "method": method, "irf": irf, "background": known, "device": device}
+        test: dict[str, Any] = {"min_significance": least, "significance": significance}
+        test["pulses"] = self.exposure if self.detector.mode == "first_photon" else 0
+        time = arrival_time(self.counts, **options, **test)
         if undo_pile_up:
             corrected: Any = self.coates()
             histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
-        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
-        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
-        return arrival_time(histogram, **axis, method=method, irf=irf, background=known, device=device)
+            every: Any = arrival_time(histogram, **options)
+            if least > 0:
+                every[time != time] = math.nan
+            time = every
+        return time
 
 
 def to_xarray(frames: Frames) -> xarray.Dataset:
@@ -656,6 +669,7 @@ def detect(
         period=seen.period if detector.wrap else None,
         irf=irf,
         tags=found,
+        detector=detector,
         notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
         monte_carlo_noise=None if noise is None else noise.ratio,
         **numbers,

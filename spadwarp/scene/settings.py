@@ -177,6 +177,7 @@ class Detector(Section):
     wrap: bool = field(True, "time of flight modulo the pulse period (range aliasing), as a detector sees it")
     pulses_per_frame: Whole = field(20_000, "laser pulses in one frame of counts", "[1, 9223372036854775807]")
     max_count: Whole = field(0, "largest count a histogram bin holds; 0 is unlimited", "[0, 2147483647]")
+    min_significance: float = field(4.0, "of pixels with a depth, −log10 of false alarms a pixel; 0: all", "[0, 1000]")
 
     def _problems(self) -> Iterator[str]:
         for name in ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"):

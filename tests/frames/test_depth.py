@@ -117,7 +117,7 @@ def test_background_is_that_of_all_frames_together(tmp_path):
     histograms = read_histograms(tmp_path / "a.npy", gate_start=0.0)
     irf = spadwarp.frames.InstrumentResponse(sigma=80e-12)
     known = type(histograms)(values=counts, bin_width=1e-10, irf=irf, response=irf)
-    reduced = depth_of(known, method="likelihood", group_index=1.0, device="cpu")
+    reduced = depth_of(known, method="likelihood", group_index=1.0, min_significance=0, device="cpu")
     assert reduced.values.shape == (60, 2, 2) and reduced.quantity == "range"
     # 121.5 bins of 100 ps are 1.8212 m; the bound of eight photons is 80 ps / √8.
     assert np.median(reduced.values) == pytest.approx(1.8212, abs=4 * 80e-12 / np.sqrt(8 * 240) * 0.15e9)
