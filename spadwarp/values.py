@@ -217,7 +217,7 @@ def _fits(value: Any, kind: Any) -> bool:
         needed = "__float__" if kind is float else "__index__"
         return hasattr(value, needed) or (kind is float and hasattr(value, "__index__"))
     plain = origin or kind
-    if not isinstance(plain, type) or getattr(plain, "_is_protocol", False):
+    if plain is Any or not isinstance(plain, type) or getattr(plain, "_is_protocol", False):
         return True
     if not isinstance(value, plain) or (inner and isinstance(value, str)):  # a text is no list of texts
         return False
