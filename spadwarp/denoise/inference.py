@@ -47,22 +47,19 @@ _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a 
 
 
 class Estimate(NamedTuple):
-    """The answer of denoising, float32, each of the frames' shape.
-
-    Attributes:
-        depth: [m]; an answer for every pixel of PyramidNet, except in frames without any report (NaN).
-        target_probability: Probability that the pixel sees a target and not only water. For methods that do not
-            estimate it: 1 where the pixel reported, else 0.
-        confidence: Probability that the depth is right to 1 % of the gate that holds the target; NaN for methods that
-            do not estimate it.
-        significance: Of the counts of the pixel for "likelihood", of 7 × 7 pixels for the others, which use those
-            around it; see `spadwarp.arrival_time`. None without counts.
-    """
+    """The answer of denoising, float32, each of the frames' shape."""
 
     depth: NDArray[np.float32]
+    """[m]; an answer for every pixel of PyramidNet, except in frames without any report (NaN)."""
     target_probability: NDArray[np.float32]
+    """Probability that the pixel sees a target and not only water. For methods that do not estimate it: 1 where the
+    pixel reported, else 0."""
     confidence: NDArray[np.float32]
+    """Probability that the depth is right to 1 % of the gate that holds the target; NaN for methods that do not
+    estimate it."""
     significance: NDArray[np.float32] | None = None
+    """Of the counts of the pixel for "likelihood", of 7 × 7 pixels for the others, which use those around it; see
+    `spadwarp.arrival_time`. None without counts."""
 
     def masked(self, probability: float) -> NDArray[np.float32]:
         """Depth, NaN where a target is less probable than `probability`."""

@@ -37,31 +37,20 @@ METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Histograms:
-    """Histograms with what their file knows about them; None for what it does not.
+    """Histograms with what their file knows about them; None for what it does not."""
 
-    Attributes:
-        values: `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not.
-        bin_width: [s].
-        gate_start: Time of flight at the lower edge of bin 0 [s].
-        background: Expected background in the unit of `values`, of a shape that `arrival_time` takes.
-        level_known: Whether it is known apart from these values.
-        pulses: Of each histogram, where each counts one photon at most; else 0.
-        irf: The response that the histograms contain.
-        response: The response to filter with; differs from `irf` for expected histograms of infinitely short pulses.
-        scene: Of a simulation.
-        notes: What was inferred from the file, in words.
-    """
-
-    values: NDArray[Any]
-    bin_width: float | None = None
-    gate_start: float = 0.0
+    values: NDArray[Any]  # `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not
+    bin_width: float | None = None  # [s]
+    gate_start: float = 0.0  # time of flight at the lower edge of bin 0 [s]
     background: NDArray[np.float32] | None = None
-    level_known: bool = True
-    pulses: int = 0
-    irf: InstrumentResponse | None = None
+    """Expected background in the unit of `values`, of a shape that `arrival_time` takes."""
+    level_known: bool = True  # whether it is known apart from these values
+    pulses: int = 0  # of each histogram, where each counts one photon at most; else 0
+    irf: InstrumentResponse | None = None  # the response that the histograms contain
     response: InstrumentResponse | None = None
-    scene: Scene | None = None
-    notes: tuple[str, ...] = ()
+    """The response to filter with; differs from `irf` for expected histograms of infinitely short pulses."""
+    scene: Scene | None = None  # of a simulation
+    notes: tuple[str, ...] = ()  # what was inferred from the file, in words
 
     @property
     def background_per_bin(self) -> NDArray[np.float32] | None:
@@ -273,26 +262,17 @@ def depth_frame(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reduction:
-    """Depth of histograms.
-
-    Attributes:
-        quantity: `"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known.
-        values, range: float64 `[frames, H, W]` [m], and the same along the line of sight; NaN where nothing returned.
-        significance: Of counts, float32 `[frames, H, W]`, see `spadwarp.arrival_time`.
-        intensity: Sum over the bins, `[frames, H, W]`.
-        lines: Lines of sight `[H, W]`, or None.
-        method: Estimator of the arrival time, or "stored" for depth that was read.
-        camera: That of a simulation, with its pose in the world; else None.
-    """
+    """Depth of histograms."""
 
     quantity: Literal["depth", "range"]
-    values: NDArray[np.float64]
-    range: NDArray[np.float64]
-    intensity: NDArray[Any]
-    lines: LinesOfSight | None
-    method: str
-    camera: Camera | None = None
-    significance: NDArray[np.float32] | None = None
+    """`"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known."""
+    values: NDArray[np.float64]  # float64 `[frames, H, W]` [m]; NaN where nothing returned
+    range: NDArray[np.float64]  # the same along the line of sight
+    intensity: NDArray[Any]  # sum over the bins, `[frames, H, W]`
+    lines: LinesOfSight | None  # lines of sight `[H, W]`, or None
+    method: str  # estimator of the arrival time, or "stored" for depth that was read
+    camera: Camera | None = None  # that of a simulation, with its pose in the world; else None
+    significance: NDArray[np.float32] | None = None  # of counts, float32 `[frames, H, W]`, see `spadwarp.arrival_time`
 
     @property
     def frames(self) -> int:

@@ -67,14 +67,14 @@ class _StoredFrames:
     """Frames in a file; what `_own` does not read is read when it is asked for."""
 
     FORMAT: ClassVar[str]
-    path: Path
-    shape: tuple[int, int, int, int]
+    path: Path  # the file
+    shape: tuple[int, int, int, int]  # (frames, H, W, T)
     pulses: int
     seed: int
     gate_start: float
     bin_width: float
     period: float | None
-    methods: tuple[Method, ...]
+    methods: tuple[Method, ...]  # estimators whose depth frames the file holds
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -157,26 +157,17 @@ class _StoredFrames:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class FramesFile(_StoredFrames):
-    """Frames in a file. Counts and depth frames are read when they are asked for, the rest is in memory.
-
-    Attributes:
-        path: The file.
-        shape: (frames, H, W, T).
-        methods: Estimators whose depth frames the file holds.
-        scene, truth_depth: Of the result that the counts were drawn from; float32 `[H, W]` [m].
-        channel: Light that was counted: "I", all of it, or "co" or "cross" behind an analyser.
-        expected, background: As of `Frames`, as all others are; None in a file that does not hold them.
-    """
+    """Frames in a file. Counts and depth frames are read when they are asked for, the rest is in memory."""
 
     FORMAT = "spadwarp frames"
     edges: NDArray[np.float64]
     irf: InstrumentResponse
-    expected: NDArray[np.float32] | None
-    background: NDArray[np.float32] | None
-    scene: Scene
-    truth_depth: NDArray[np.float32]
+    expected: NDArray[np.float32] | None  # as of `Frames`, as all others are; None in a file that does not hold them
+    background: NDArray[np.float32] | None  # likewise
+    scene: Scene  # of the result that the counts were drawn from
+    truth_depth: NDArray[np.float32]  # of that result, float32 `[H, W]` [m]
     monte_carlo_noise: float | None = None
-    channel: str = "I"
+    channel: str = "I"  # light that was counted: "I", all of it, or "co" or "cross" behind an analyser
     notes: tuple[str, ...] = ()
 
     @classmethod
@@ -237,16 +228,11 @@ class FramesFile(_StoredFrames):
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class SequenceFile(_StoredFrames):
-    """Frames of a scene that moves. Arrays of a frame are read when they are asked for.
-
-    Attributes:
-        base: The scene before the trajectory.
-        trajectory: The row of each frame. All others: as of `FramesFile`.
-    """
+    """Frames of a scene that moves. Arrays of a frame are read when they are asked for."""
 
     FORMAT = "spadwarp sequence"
-    base: Scene
-    trajectory: Trajectory
+    base: Scene  # the scene before the trajectory
+    trajectory: Trajectory  # the row of each frame. All others: as of `FramesFile`.
 
     @classmethod
     def _own(cls, file: Hdf5File, scene: Scene, shape: tuple[int, ...]) -> dict[str, Any]:
@@ -394,23 +380,15 @@ class FrameErrors:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """Summary of what `record_frames` wrote.
+    """Summary of what `record_frames` wrote."""
 
-    Attributes:
-        file: The file, opened.
-        errors: Of depth, by estimator; of at most the first 256 MiB of counts.
-        bound: Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say.
-        bound_photons: Photons that would make the noise in the bound a tenth.
-        detections: Counts of all frames.
-        monte_carlo: Noise of the simulation against the shot noise of one frame, see `monte_carlo_noise`.
-    """
-
-    file: FramesFile
-    errors: dict[Method, FrameErrors]
-    bound: ResultBound
-    bound_photons: float
-    detections: int
+    file: FramesFile  # the file, opened
+    errors: dict[Method, FrameErrors]  # of depth, by estimator; of at most the first 256 MiB of counts
+    bound: ResultBound  # Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say
+    bound_photons: float  # photons that would make the noise in the bound a tenth
+    detections: int  # counts of all frames
     monte_carlo: MonteCarloNoise | None
+    """Noise of the simulation against the shot noise of one frame, see `monte_carlo_noise`."""
 
 
 def record_frames(
