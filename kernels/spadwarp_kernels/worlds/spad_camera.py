@@ -87,56 +87,38 @@ _RANGES = {
 class SpadConfig:
     """A pulsed laser beside a SPAD array in water: what `SpadCamera` and `SpadTracer` take.
 
-    Attributes:
-        width, height: Of the image [pixels].
-        horizontal_fov: Full angle [rad]; pixels are square. See `vertical_fov` for that of Newton and MuJoCo.
-        bins: Time bins of a histogram.
-        gate: What is recorded, as distance in this water along the optical axis [m].
-        pulses: Of a frame.
-        pulse_energy: [J].
-        wavelength: [m].
-        pde: Photon detection efficiency, PDP times fill factor.
-        dark_rate: Dark counts and ambient light of a pixel [1/s].
-        timing_sigma: Standard deviation of pulse and timing jitter together [s].
-        aperture_radius: [m].
-        laser_position: In the optical frame [m]: +x right, +y down, +z forward. The beam goes along +z.
-        laser_half_angle: Of its uniform cone [rad]; None covers the corners of the image.
-        absorption, scattering: Of the water [1/m]; both 0 in air.
-        anisotropy: g of its Henyey–Greenstein phase function.
-        group_index: c0 over the group velocity.
-        nearest: Distance below which the water's backscatter is left out [m].
-        method: Of the depth: "centroid", "peak", "matched" or "likelihood", see `arrival_bins`. The expected counts of
-            an image without targets are taken as known background.
-        min_significance: Of a pixel that has a depth, −log10 of the probability that background alone looks like it,
-            see `DetectionTest`. 0: every pixel reports.
-        seed: 64-bit.
-
     Raises:
         ArgumentError: A number out of range.
     """
 
-    width: int = 160
-    height: int = 120
+    width: int = 160  # of the image [pixels]
+    height: int = 120  # of the image [pixels]
     horizontal_fov: float = 1.2
-    bins: int = 256
-    gate: tuple[float, float] = (0.5, 10.0)
-    pulses: int = 20_000
-    pulse_energy: float = 2e-9
-    wavelength: float = 532e-9
-    pde: float = 0.25
-    dark_rate: float = 1000.0
-    timing_sigma: float = 200e-12
-    aperture_radius: float = 0.01
+    """Full angle [rad]; pixels are square. See `vertical_fov` for that of Newton and MuJoCo."""
+    bins: int = 256  # time bins of a histogram
+    gate: tuple[float, float] = (0.5, 10.0)  # what is recorded, as distance in this water along the optical axis [m]
+    pulses: int = 20_000  # of a frame
+    pulse_energy: float = 2e-9  # [J]
+    wavelength: float = 532e-9  # [m]
+    pde: float = 0.25  # photon detection efficiency, PDP times fill factor
+    dark_rate: float = 1000.0  # dark counts and ambient light of a pixel [1/s]
+    timing_sigma: float = 200e-12  # standard deviation of pulse and timing jitter together [s]
+    aperture_radius: float = 0.01  # [m]
     laser_position: tuple[float, float, float] = (0.05, 0.0, 0.0)
-    laser_half_angle: float | None = None
-    absorption: float = 0.1
-    scattering: float = 0.2
-    anisotropy: float = 0.924
-    group_index: float = 1.3638
-    nearest: float = 0.05
+    """In the optical frame [m]: +x right, +y down, +z forward. The beam goes along +z."""
+    laser_half_angle: float | None = None  # of its uniform cone [rad]; None covers the corners of the image
+    absorption: float = 0.1  # of the water [1/m]; 0 in air
+    scattering: float = 0.2  # of the water [1/m]; 0 in air
+    anisotropy: float = 0.924  # g of its Henyey–Greenstein phase function
+    group_index: float = 1.3638  # c0 over the group velocity
+    nearest: float = 0.05  # distance below which the water's backscatter is left out [m]
     method: str = "centroid"
+    """Of the depth: "centroid", "peak", "matched" or "likelihood", see `arrival_bins`. The expected counts of an image
+    without targets are taken as known background."""
     min_significance: float = MIN_SIGNIFICANCE
-    seed: int = 1
+    """Of a pixel that has a depth, −log10 of the probability that background alone looks like it, see `DetectionTest`.
+    0: every pixel reports."""
+    seed: int = 1  # 64-bit
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "bins"):
