@@ -170,13 +170,13 @@ def test_estimators_share_one_ledger(end, device):
     camera, laser = {"port": {"distance": 0.05}}, {"port": "camera"}
     if "termination" in end:  # in a tank, as the tests of its walls
         box["outside_index"] = {"z_high": 1.0}
-        camera["rotation_deg"], laser = [5.0, 0.0, 0.0], {}
+        camera["rotation_deg"], laser = [5.0, 0.0, 0.0], {"position": [-0.1, 0.0, 0.2]}
     one = scene(
         medium={"phase_index": 1.34, "layers": ELSEWHERE},
         domain=box,
         camera=camera,
         laser=laser,
-        targets=[{**PLATE, "reflectance": 0.3}, {**VESSEL, "size": [2.0, 4.0, 3.0], "reflectance": 0.3}],
+        targets=[{**PLATE, "reflectance": 0.3}, {**VESSEL, "size": [2.0, 4.0, 3.4], "reflectance": 0.3}],
         transport={"max_collisions": 8, "weight_cutoff": 0.2, **end},
     )
 
