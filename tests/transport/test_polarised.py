@@ -184,7 +184,7 @@ def test_rayleigh_atmospheres_are_those_of_the_tables(device):
 def agree(one, device):
     """Whether analog and guided have the same channels of each component and bin, in water clear at the lens."""
     found = []
-    for name, photons in (("analog", 30_000), ("guided", 15_000)):
+    for name, photons in (("analog", 20_000), ("guided", 10_000)):
         run = clear_at_the_lens(one).with_overrides({"transport.estimator": name})
         rows = [totals(simulate(run, photons=photons, seed=seed, device=device)).ravel() for seed in range(32)]
         found.append(np.array(rows))

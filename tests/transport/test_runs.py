@@ -335,7 +335,7 @@ def test_standard_error_is_the_spread_between_seeds(device):
     """The error from the batches of one run against the spread of 64 runs, both pooled over bins: equal within 10 %."""
     # A lens of 0.4 m, as in the other tests, sees much light from next to it, whose sums are skewed.
     one = scene(transport={"estimator": "guided"}, camera={"aperture_diameter": 0.05})
-    runs = [simulate(one, photons=2**15, seed=seed, device=device, uncertainty=True) for seed in range(64)]
+    runs = [simulate(one, photons=2**14, seed=seed, device=device, uncertainty=True) for seed in range(64)]
     values = np.array([run.histogram for run in runs])
     bright = values.mean(axis=0) > 0.05 * values.mean(axis=0).max()
     spread = values.var(axis=0, ddof=1)[bright]
@@ -394,7 +394,7 @@ def test_guided_warns_of_no_heavy_photons_where_next_event_does():
         one = spadwarp.load_scene("plane_5m", {"transport.estimator": estimator})
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            result = simulate(one, photons=100_000, seed=seed, device="cpu", uncertainty=True)
+            result = simulate(one, photons=50_000, seed=seed, device="cpu", uncertainty=True)
         texts = [str(warning.message) for warning in caught if "of the variance" in str(warning.message)]
         assert texts == list(result.warnings)
         return bool(texts)
