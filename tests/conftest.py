@@ -1,6 +1,7 @@
 """What all tests share: devices, markers, runs. Hypothesis draws the same examples each time, and nothing fails because
 a machine is slow."""
 
+import contextlib
 import os
 import sys
 
@@ -52,10 +53,22 @@ def whole():
 
 @pytest.fixture(scope="session")
 def cluster():
-    """Two cores of Ray for all tests of this process."""
+    """Two cores of Ray for all tests of this process. None of its processes stays, even of a Ray that did not start."""
     ray = pytest.importorskip("ray")
+    psutil = pytest.importorskip("psutil")
+    here, started = psutil.Process(), set()
+    before = set(here.children())
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
-        yield
-        ray.shutdown()
+        try:
+            try:
+                ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
+            finally:
+                started = set(here.children(recursive=True)) - before
+            yield
+        finally:
+            ray.shutdown()
+            for process in started:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    process.kill()
+            psutil.wait_procs(started, timeout=10)

@@ -2,13 +2,11 @@
 
 import ast
 import importlib
-from pathlib import Path
 
 import pytest
 
 import spadwarp_kernels as sk
-
-ROOT = Path(sk.__file__).parent
+from helpers.source_code import KERNELS, names_imported, tree_of
 
 # A package imports those before it.
 PACKAGES = (
@@ -27,24 +25,17 @@ PACKAGES = (
 )
 
 
-def packages_imported(path):
-    """Packages from which a file imports, its own aside."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level == 0 and (node.module or "").startswith("spadwarp_kernels"):
-            assert node.module != "spadwarp_kernels", f"{path.name} imports from the top"
-            yield node.module.split(".")[1]
-
-
 @pytest.mark.parametrize("package", PACKAGES)
 def test_arrows_point_one_way(package):
-    place = ROOT / package
-    for path in sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]:
-        later = {name for name in packages_imported(path) if PACKAGES.index(name) >= PACKAGES.index(package)}
-        assert not later, f"{path.name} imports {later}"
+    before = PACKAGES[: PACKAGES.index(package) + 1]
+    for path in (KERNELS / package).rglob("*.py"):
+        ours = [name.split(".")[1:] for name in names_imported(path) if name.startswith("spadwarp_kernels")]
+        # Neither from the top, nor from later packages.
+        assert all(len(parts) > 1 and parts[0] in before for parts in ours), f"{path.name} imports {ours}"
 
 
 def test_every_package_is_listed():
-    found = {path.stem for path in ROOT.iterdir() if path.stem[0] not in "_." and path.is_dir()}
+    found = {path.stem for path in KERNELS.iterdir() if path.stem[0] not in "_." and path.is_dir()}
     assert found == set(PACKAGES)
 
 
@@ -70,9 +61,9 @@ def test_fields_of_a_spec_have_one_owner():
 def test_fields_of_a_spec_are_read_by_their_owner(package):
     read = {
         node.attr
-        for path in (ROOT / package).rglob("*.py")
-        if path.relative_to(ROOT).as_posix() not in RESOLVING
-        for node in ast.walk(ast.parse(path.read_text()))
+        for path in (KERNELS / package).rglob("*.py")
+        if path.relative_to(KERNELS).as_posix() not in RESOLVING
+        for node in ast.walk(tree_of(path))
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "spec"
     }
     assert read & set(sk.TransportSpec._fields) <= set(OWNED.get(package, "").split())

@@ -1,6 +1,5 @@
 """The house: which way its arrows point, what it says about itself, and what it does not say."""
 
-import ast
 import importlib.resources
 import importlib.util
 import inspect
@@ -16,17 +15,15 @@ import yaml
 import spadwarp
 import spadwarp_kernels
 from helpers.cli import ENVIRONMENT, ROOT
+from helpers.source_code import KERNELS, names_imported
 
 BINARY = {".png", ".h5", ".exr", ".npz", ".safetensors", ".woff2"}
 
 
 def test_kernels_import_warp_numpy_and_the_standard_library_only():
     allowed = {"warp", "numpy", "spadwarp_kernels"} | sys.stdlib_module_names
-    for path in (ROOT / "kernels" / "spadwarp_kernels").rglob("*.py"):
-        nodes = list(ast.walk(ast.parse(path.read_text())))
-        names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-        names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and not node.level}
-        foreign = {name.split(".")[0] for name in names} - allowed
+    for path in KERNELS.rglob("*.py"):
+        foreign = {name.split(".")[0] for name in names_imported(path)} - allowed
         assert not foreign, f"{path.name} imports {foreign}"
 
 

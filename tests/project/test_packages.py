@@ -1,13 +1,11 @@
 """The packages, which way their imports point, and how many lines each may have."""
 
 import ast
-import functools
-from pathlib import Path
+import graphlib
 
 import pytest
 
-SPADWARP = Path(__file__).parents[2] / "spadwarp"
-KERNELS = Path(__file__).parents[2] / "kernels" / "spadwarp_kernels"
+from helpers.source_code import KERNELS, SPADWARP, imported, names_imported, tree_of
 
 # A package imports those further down this table only.
 LEVELS = (
@@ -38,27 +36,11 @@ ONE_LINE_METHODS = {"depth", "save", "plot", "_repr_html_", "to_xarray"}
 MODULES = sorted(path for path in SPADWARP.rglob("*.py") if path.parent != SPADWARP or path.stem in LEVEL)
 
 
-@functools.cache
-def tree_of(path):
-    return ast.parse(path.read_text())
-
-
-def imported(node):
-    """Full names that an import statement names; relative imports are not used."""
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    if isinstance(node, ast.ImportFrom):
-        assert node.level == 0, "imports are absolute"
-        return [f"{node.module}.{alias.name}" for alias in node.names]
-    return []
-
-
-def imports(tree):
-    """Names that a file imports, inside functions too, but not in the one-line methods."""
+def excepted(tree):
+    """Nodes of imports in the one-line methods."""
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     methods = [item for node in classes for item in node.body if getattr(item, "name", None) in ONE_LINE_METHODS]
-    excepted = {inner for method in methods for inner in ast.walk(method) if imported(inner) == ["spadwarp"]}
-    return [name for node in ast.walk(tree) if node not in excepted for name in imported(node)]
+    return {inner for method in methods for inner in ast.walk(method) if imported(inner) == ["spadwarp"]}
 
 
 def statements(function):
@@ -75,7 +57,7 @@ def test_every_package_is_in_the_table():
 def test_arrows_point_down():
     for path in MODULES:
         here = path.relative_to(SPADWARP).parts[0].removesuffix(".py")
-        for name in imports(tree_of(path)):
+        for name in names_imported(path, excepted(tree_of(path))):
             top, *parts = name.split(".")
             if top == "spadwarp_kernels":
                 assert len(parts) <= 2, f"{path.name}: {name} is not a public name of a package of the kernels"
@@ -89,45 +71,21 @@ def test_arrows_point_down():
                 assert parts[0] == here or LEVEL[here] < LEVEL[parts[0]], f"{path.name}: {here} imports {name}"
 
 
-def cycles(folder, package):
-    """Circles of files that import each other at import time or inside functions, type hints left out."""
+@pytest.mark.parametrize("folder", [SPADWARP, KERNELS], ids=lambda folder: folder.name)
+def test_no_file_imports_itself_by_way_of_others(folder):
+    """At import time or inside functions, type hints left out."""
     names = {
-        ".".join([package, *path.relative_to(folder).with_suffix("").parts]).removesuffix(".__init__"): path
+        ".".join(path.relative_to(folder.parent).with_suffix("").parts).removesuffix(".__init__"): path
         for path in folder.rglob("*.py")
     }
     arrows = {}
     for name, path in names.items():
-        here, found = name.split(".")[: None if path.name == "__init__.py" else -1], set()
-        tree = tree_of(path)
-        conditions = [node for node in ast.walk(tree) if isinstance(node, ast.If)]
+        conditions = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.If)]
         hints = {x for node in conditions if ast.unparse(node.test) == "TYPE_CHECKING" for x in ast.walk(node)}
-        for node in set(ast.walk(tree)) - hints:
-            if isinstance(node, ast.ImportFrom):
-                above = here[: len(here) - node.level + 1] if node.level else []
-                base = ".".join([*above, *filter(None, [node.module])])
-                full = [f"{base}.{alias.name}" for alias in node.names]
-                found.update(one if one in names else base for one in full)
-            elif isinstance(node, ast.Import):
-                found.update(alias.name for alias in node.names)
-        arrows[name] = (found & set(names)) - {name, package}
-    done, circles = set(), []
-
-    def visit(name, trail):
-        if name in trail:
-            circles.append([*trail[trail.index(name) :], name])
-        elif name not in done:
-            for other in sorted(arrows[name]):
-                visit(other, [*trail, name])
-            done.add(name)
-
-    for name in sorted(arrows):
-        visit(name, [])
-    return circles
-
-
-@pytest.mark.parametrize(("folder", "package"), [(SPADWARP, "spadwarp"), (KERNELS, "spadwarp_kernels")])
-def test_no_file_imports_itself_by_way_of_others(folder, package):
-    assert cycles(folder, package) == []
+        found = names_imported(path, hints)
+        found = {one if one in names else one.rpartition(".")[0] for one in found}
+        arrows[name] = (found & set(names)) - {name, folder.name}
+    list(graphlib.TopologicalSorter(arrows).static_order())  # or a CycleError that names the files
 
 
 def test_one_line_methods_have_one_line():

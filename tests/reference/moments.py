@@ -107,8 +107,3 @@ def isotropic_radial_cdf(radius: ArrayLike, *, path: float, scattering: float) -
     kr = k * (x * t)[:, None]
     twice = 2 / math.pi * ((np.sin(kr) - kr * np.cos(kr)) / k * (pole + cut) * weight).sum(1)
     return np.where(inside, math.exp(-t) * (t * once + twice), 1.0)
-
-
-def mean_path(volume: float, area: float) -> float:
-    """Mean path 4V/S through a convex body under cosine-law light, whatever the scattering (Blanco & Fournier 2003)."""
-    return 4 * volume / area

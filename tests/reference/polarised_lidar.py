@@ -33,23 +33,3 @@ def stokes_factor(
         return scattered(np.asarray(stokes, np.float64), emitted, before, after, seen, matrix)
 
     return factor
-
-
-def pencil(lidar: Lidar, factor: Factor, *, order: int = 16) -> NDArray[np.float64]:
-    """Light of a pencil beam along +z from `laser_position` that is scattered once, over the whole field: [bins, 4]."""
-    start = np.array(lidar.laser_position, np.float64)
-    x, y, z0 = start
-    tangent = math.tan(lidar.field_of_view / 2.0)
-    nearest = max(abs(x), abs(y)) / tangent
-    # path = (z − z0) + sqrt(x² + y² + z²)
-    reached = lidar.edges + z0
-    cuts = np.maximum((reached**2 - x * x - y * y) / (2.0 * reached), max(nearest, z0))
-    node, gauss = (v / 2.0 for v in np.polynomial.legendre.leggauss(order))
-    width = np.diff(cuts)[:, None]
-    z = cuts[:-1, None] + width * (node + 0.5)  # [bins, order]
-    point = np.stack(np.broadcast_arrays(x, y, z), -1)
-    r = np.linalg.norm(point, axis=-1)
-    after = -point / r[..., None]
-    before = np.broadcast_to(np.array([0.0, 0.0, 1.0]), point.shape)
-    value = lidar.scattered(z, (z - z0) + r, after[..., 2]) * lidar.aperture_area * (z / r) / r**2
-    return np.einsum("tn,tns->ts", value * width * gauss, factor(before, after))

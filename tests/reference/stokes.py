@@ -89,8 +89,3 @@ def analysed(stokes: ArrayLike, angle: float, *, extinction_ratio: float = np.in
     i, q, u, _ = np.moveaxis(np.asarray(stokes, np.float64), -1, 0)
     leak, along = 1.0 / extinction_ratio, q * np.cos(2.0 * angle) + u * np.sin(2.0 * angle)
     return 0.5 * np.stack([(1.0 + leak) * i + (1.0 - leak) * along, (1.0 + leak) * i - (1.0 - leak) * along], -1)
-
-
-def reciprocal(matrix: ArrayLike) -> NDArray:
-    """The Mueller matrix of the reversed way, P·Mᵀ·P (van de Hulst 1957, section 5.22)."""
-    return MIRROR @ np.swapaxes(np.asarray(matrix, np.float64), -1, -2) @ MIRROR

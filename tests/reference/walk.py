@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True)
 class Medium:
-    """extinction [1/m]; albedo 0–1 or "lu2024" (ω ~ U(0, 0.97) at each collision); Henyey–Greenstein anisotropy g."""
+    """extinction [1/m]; albedo 0–1; Henyey–Greenstein anisotropy g."""
 
     extinction: float
-    albedo: float | str
+    albedo: float
     anisotropy: float
 
 
@@ -24,8 +24,8 @@ class Medium:
 class Walk:
     """How every photon ended. N photons.
 
-    position, direction [N, 3]; weight, path [m], collisions [N]; reason [N]: "cutoff", "max_collisions", "max_path" or
-    the face, "x_low" … "z_high". absorbed: the weight left in the medium by all photons together.
+    position, direction [N, 3]; weight, path [m], collisions [N]; reason [N]: "max_collisions", "max_path" or the
+    face, "x_low" … "z_high".
     """
 
     position: NDArray[np.float64]
@@ -34,41 +34,21 @@ class Walk:
     path: NDArray[np.float64]
     collisions: NDArray[np.int64]
     reason: NDArray[np.str_]
-    absorbed: float
 
 
 _FACES = np.array(["x_low", "y_low", "z_low", "x_high", "y_high", "z_high"])
 
 
-def pencil(count: int, position: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[NDArray, NDArray]:
+def pencil(count: int) -> tuple[NDArray, NDArray]:
     """Positions and directions of a pencil beam along +z."""
-    return np.tile(np.asarray(position, float), (count, 1)), np.tile([0.0, 0.0, 1.0], (count, 1))
+    return np.zeros((count, 3)), np.tile([0.0, 0.0, 1.0], (count, 1))
 
 
-def isotropic(count: int, rng: np.random.Generator, position: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[NDArray, NDArray]:
+def isotropic(count: int, rng: np.random.Generator) -> tuple[NDArray, NDArray]:
     """Positions and directions of an isotropic point source."""
     cosine, phi = 2 * rng.random(count) - 1, 2 * math.pi * rng.random(count)
     sine = np.sqrt(1 - cosine**2)
-    return np.tile(np.asarray(position, float), (count, 1)), np.stack(
-        [sine * np.cos(phi), sine * np.sin(phi), cosine], 1
-    )
-
-
-def cosine_law_on_box(count: int, rng: np.random.Generator, size: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Uniform positions on the inner surface of the box [0, size] and inward directions by the cosine law."""
-    size = np.asarray(size, float)
-    area = np.prod(size) / size
-    axis = rng.choice(3, count, p=area / area.sum())
-    high = rng.random(count) < 0.5
-    position = rng.random((count, 3)) * size
-    position[np.arange(count), axis] = np.where(high, size[axis], 0.0)
-    cosine, phi = np.sqrt(rng.random(count)), 2 * math.pi * rng.random(count)
-    sine = np.sqrt(1 - cosine**2)
-    direction = np.empty((count, 3))
-    direction[np.arange(count), axis] = np.where(high, -cosine, cosine)
-    direction[np.arange(count), (axis + 1) % 3] = sine * np.cos(phi)
-    direction[np.arange(count), (axis + 2) % 3] = sine * np.sin(phi)
-    return position, direction
+    return np.zeros((count, 3)), np.stack([sine * np.cos(phi), sine * np.sin(phi), cosine], 1)
 
 
 def walk(
@@ -78,14 +58,13 @@ def walk(
     *,
     lower: ArrayLike = (-math.inf,) * 3,
     upper: ArrayLike = (math.inf,) * 3,
-    weight_cutoff: float = 0.0,
     max_collisions: int | None = None,
     max_path: float = math.inf,
     axis_threshold: float = 1.0,
 ) -> Walk:
-    """Follow every photon until it leaves [lower, upper], its weight falls below the cut-off, or it reaches a limit.
+    """Follow every photon until it leaves [lower, upper] or reaches a limit.
 
-    At a collision: weight, then the cut-off and the collision limit, then the new direction. A flight is cut where it
+    At a collision: weight, then the collision limit, then the new direction. A flight is cut where it
     leaves the domain or reaches max_path. axis_threshold < 1 snaps a direction with |u_z| >= threshold to the axis
     before scattering.
     """
@@ -94,7 +73,6 @@ def walk(
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     weight, path, collisions = np.ones(count), np.zeros(count), np.zeros(count, int)
     reason = np.full(count, "", dtype="U16")
-    absorbed = 0.0
     alive = np.arange(count)
     while alive.size:
         x, u = position[alive], direction[alive]
@@ -113,19 +91,14 @@ def walk(
         reason[ended] = np.where(wall <= left, _FACES[face], "max_path")[~collided]
         alive = alive[collided]
 
-        albedo = 0.97 * rng.random(alive.size) if medium.albedo == "lu2024" else float(medium.albedo)
-        before = weight[alive]
-        weight[alive] = before * albedo
-        absorbed += float((before - weight[alive]).sum())
+        weight[alive] *= medium.albedo
         collisions[alive] += 1
-        low = weight[alive] < weight_cutoff
-        many = np.zeros_like(low) if max_collisions is None else collisions[alive] >= max_collisions
+        many = collisions[alive] >= (math.inf if max_collisions is None else max_collisions)
         reason[alive[many]] = "max_collisions"
-        reason[alive[low]] = "cutoff"
         # The direction after the last collision is part of its record.
         direction[alive] = scatter(direction[alive], medium.anisotropy, rng, axis_threshold)
-        alive = alive[~(low | many)]
-    return Walk(position, direction, weight, path, collisions, reason, absorbed)
+        alive = alive[~many]
+    return Walk(position, direction, weight, path, collisions, reason)
 
 
 def scatter(u: NDArray, g: float, rng: np.random.Generator, axis_threshold: float = 1.0) -> NDArray:

@@ -161,6 +161,7 @@ def test_light_by_way_of_mirrors(device):
     """A closed box of mirrors: one scattering, any number of reflections, index 1."""
     one = scene(
         medium={"extinction": 0.3, "phase_index": 1.0},
+        laser={"position": [-0.1, 0.0, 1e-3]},
         camera={"port": {"shape": "flat", "distance": 1e-5, "inside_index": 1.0}},
         domain=MIRRORS,
         targets=[{**half, "translation": [0.0, 0.0, 40.0]} for half in HALVES],

@@ -69,7 +69,7 @@ def test_single_scattering_is_that_of_the_quadrature(estimator, device):
         layers=((1.2, 1.5, 0.6, 0.5), (1.7, 0.2, 0.9, 0.8)),
     )
     expected = single_scatter_total(reference, order=60).reshape(-1, 20).sum(axis=1)
-    mean, error, *_ = means(one, device, 50_000, 16)
+    mean, error, *_ = means(one, device, 30_000, 16)
     # 0.2 %: the quadrature, whose nodes do not know where the layers begin.
     assert (np.abs(mean - expected) < 4.0 * error + 0.002 * expected).all(), (mean - expected) / error
     assert (error < 0.05 * expected).all()

@@ -145,11 +145,12 @@ def atmosphere(table, mu, phi_deg):
 
 
 CASES = [(table, row) for table in TABLES for row in table.rows if row[0] == UPPER]
+ON_A_CPU = (2, 5, 10, 11, 12, 14, 17, 19)  # of each table two, one of them near the horizon
 
 
-def off_the_tables(case, photons, device):
+def off_the_tables(table, row, photons, device):
     """I, Q and U of a row less those of the table, and their standard errors, both over the table's I."""
-    table, (_face, mu, phi, *expected) = CASES[case]
+    _face, mu, phi, *expected = row
     result = simulate(atmosphere(table, mu, phi), photons=photons, device=device, uncertainty=True)
     # The lens has the part A µ/R² sr of the radiant intensity µ L/(π µ0) of the slab, for a flux of π.
     per_radiance = math.pi * (APERTURE / 2.0) ** 2 * (mu / FAR) ** 2 / (math.pi * table.mu0)
@@ -162,17 +163,20 @@ def off_the_tables(case, photons, device):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:ballistic")  # hardly any light passes a slab twice without scattering
 def test_rayleigh_atmospheres_are_those_of_the_tables(device):
-    """Every row within 4 standard errors: to a thousandth on a GPU. On a CPU with a twentieth of the photons, but all
-    rows together too: in the mean of I, which is known to 0.04 %, and in the sum of squares."""
-    counts = [(60_000_000 if row[1] <= 0.02 else 10_000_000) // (20 if device == "cpu" else 1) for _, row in CASES]
-    off, error = np.array([off_the_tables(case, count, device) for case, count in enumerate(counts)]).swapaxes(0, 1)
-    assert error.max() <= (4e-3 if device == "cpu" else 1e-3)
+    """Every row within 4 standard errors: on a GPU all rows, to a thousandth. On a CPU eight, to 0.4 %, but together
+    too: in the mean of I, which is known to 0.065 %, and in the sum of squares."""
+    cpu = device == "cpu"
+    cases = [CASES[case] for case in ON_A_CPU] if cpu else CASES
+    counts = [((1_300_000, 500_000) if cpu else (60_000_000, 10_000_000))[row[1] > 0.02] for _, row in cases]
+    found = [off_the_tables(*case, count, device) for case, count in zip(cases, counts, strict=True)]
+    off, error = np.array(found).swapaxes(0, 1)
+    assert error.max() <= (4e-3 if cpu else 1e-3)
     z = off / error
     assert np.abs(z).max() < 4.0, z
-    if device == "cpu":
+    if cpu:
         weight = error[:, 0] ** -2.0
         mean, mean_error = (weight @ off[:, 0]) / weight.sum(), weight.sum() ** -0.5
-        assert mean_error < 4e-4
+        assert mean_error < 6.5e-4
         assert abs(mean) < 4.0 * mean_error
         assert stats.chi2.sf((z**2).sum(), z.size) > 1e-4
 
@@ -180,7 +184,7 @@ def test_rayleigh_atmospheres_are_those_of_the_tables(device):
 def agree(one, device):
     """Whether analog and guided have the same channels of each component and bin, in water clear at the lens."""
     found = []
-    for name, photons in (("analog", 30_000), ("guided", 15_000)):
+    for name, photons in (("analog", 20_000), ("guided", 10_000)):
         run = clear_at_the_lens(one).with_overrides({"transport.estimator": name})
         rows = [totals(simulate(run, photons=photons, seed=seed, device=device)).ravel() for seed in range(32)]
         found.append(np.array(rows))

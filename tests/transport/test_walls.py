@@ -168,6 +168,7 @@ CASES = {
         {"next_event": 20_000, "guided": 20_000},
         tank(
             camera={**PORT, "rotation_deg": [12.0, -8.0, 25.0], "position": [0.05, 0.1, 0.1]},
+            laser={"position": [-0.1, 0.0, 0.25]},
             transport={"termination": "roulette", "weight_cutoff": 0.3},
         ),
     ),
