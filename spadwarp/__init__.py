@@ -33,54 +33,23 @@ _PACKAGES = {
     "device": (),
     "arrays": ("to_pandas",),
     "io": (),
-    "values": (
-        "ArgumentError",
-        "ConfigError",
-        "DeviceError",
-        "FileError",
-        "MeshError",
-        "SpadwarpError",
-        "SpadwarpWarning",
-    ),
+    "values": ("ArgumentError", "ConfigError", "DeviceError", "FileError", "MeshError", "SpadwarpError"),
 }
+_PACKAGES["values"] += ("SpadwarpWarning",)
 _HOMES = {name: package for package, names in _PACKAGES.items() for name in names}
 
 # Type checkers take "as" for public, and without `__getattr__` they find misspelled names.
 if TYPE_CHECKING:
-    from spadwarp import (
-        analytic as analytic,
-        arrays as arrays,
-        benchmark as benchmark,
-        checks as checks,
-        dataset as dataset,
-        denoise as denoise,
-        device as device,
-        doctor as doctor,
-        files as files,
-        frames as frames,
-        inverse as inverse,
-        io as io,
-        mesh as mesh,
-        parallel as parallel,
-        result as result,
-        scene as scene,
-        transport as transport,
-        validate as validate,
-        values as values,
-        viz as viz,
-        water as water,
-    )
+    from spadwarp import analytic as analytic, arrays as arrays, benchmark as benchmark, checks as checks
+    from spadwarp import dataset as dataset, denoise as denoise, device as device, doctor as doctor, files as files
+    from spadwarp import frames as frames, inverse as inverse, io as io, mesh as mesh, parallel as parallel
+    from spadwarp import result as result, scene as scene, transport as transport, validate as validate
+    from spadwarp import values as values, viz as viz, water as water
     from spadwarp.analytic import budget as budget, plan as plan, simulate_analytic as simulate_analytic, sweep as sweep
     from spadwarp.checks import check as check
-    from spadwarp.values import (
-        ArgumentError as ArgumentError,
-        ConfigError as ConfigError,
-        DeviceError as DeviceError,
-        FileError as FileError,
-        MeshError as MeshError,
-        SpadwarpError as SpadwarpError,
-        SpadwarpWarning as SpadwarpWarning,
-    )
+    from spadwarp.values import ArgumentError as ArgumentError, ConfigError as ConfigError, DeviceError as DeviceError
+    from spadwarp.values import FileError as FileError, MeshError as MeshError, SpadwarpError as SpadwarpError
+    from spadwarp.values import SpadwarpWarning as SpadwarpWarning
     from spadwarp.files import export as export, load as load
     from spadwarp.frames import Frames as Frames, arrival_time as arrival_time, crlb as crlb, detect as detect
     from spadwarp.arrays import to_pandas as to_pandas

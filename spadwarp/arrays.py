@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     """A contiguous Warp array of int32, int64, float32 or float64 from NumPy, torch or Warp; copies only if it must.
 
-    Raises:
-        TypeError: The data is of another kind (complex, text).
+    Raises `TypeError`: the data is of another kind (complex, text).
     """
     import warp as wp
 
@@ -72,9 +71,8 @@ def histogram_rows(
         shape: The shape in words, for the error.
         dimensions: Allowed numbers of dimensions.
 
-    Raises:
-        ArgumentError: No pixel or no bin, another number of dimensions, a negative or non-finite value.
-        TypeError: See `as_warp`.
+    Raises `ArgumentError`: no pixel or no bin, another number of dimensions, a negative or non-finite value;
+    `TypeError`: see `as_warp`.
     """
     from spadwarp_kernels.detection import first_invalid_row
 
@@ -145,8 +143,7 @@ def tensor_of(array: wp.array) -> torch.Tensor:
 def output_tensor(out: Any, *, name: str, shape: Sequence[int], device: wp.Device) -> torch.Tensor:
     """The caller's int32 tensor for an output, or a new one, inside `in_torch_order`.
 
-    Raises:
-        ArgumentError: It is not a tensor, of another type or shape, not contiguous, or on another device.
+    Raises `ArgumentError`: it is not a tensor, of another type or shape, not contiguous, or on another device.
     """
     import torch
     import warp as wp
@@ -167,8 +164,7 @@ def output_tensor(out: Any, *, name: str, shape: Sequence[int], device: wp.Devic
 def caller_tallies(tallies: Any, *, shape: Sequence[int], device: wp.Device) -> wp.array:
     """The caller's own tensor or Warp array as zeroed tallies, flat.
 
-    Raises:
-        ArgumentError: It is of another kind, type or size, not contiguous, or on another device.
+    Raises `ArgumentError`: it is of another kind, type or size, not contiguous, or on another device.
     """
     import warp as wp
 
@@ -223,9 +219,7 @@ def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
 
     For what `spadwarp.budget`, `sweep`, `check`, `scene.presets` and `analytic.plan` give: `to_pandas(budget(scene))`.
 
-    Raises:
-        FileError: pandas is not installed.
-        ArgumentError: Rows that are neither data classes nor dicts.
+    Raises `FileError`: pandas is not installed; `ArgumentError`: rows that are neither data classes nor dicts.
     """
     try:
         import pandas

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tomllib
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
@@ -16,39 +18,24 @@ from numpy.typing import NDArray
 from spadwarp.analytic import PILE_UP, axis_fluence
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
-from spadwarp.scene import (
-    Laser,
+from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwelling_irradiance
+from spadwarp.scene.camera import image_points, to_camera, to_world
+from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
+from spadwarp.scene.medium import (
+    NOTABLE_UNSEEN,
+    WATER_INDICES,
     Layer,
     Medium,
-    Scene,
-    SceneLike,
-    as_scene,
-    daylight_rate,
-    downwelling_irradiance,
+    grid_cells,
     phase_function,
     scattering_matrix,
-    spectral_lines,
-    water_lines,
 )
-from spadwarp.scene.camera import image_points, to_camera, to_world
-from spadwarp.scene.laser import profile_extent
-from spadwarp.scene.medium import NOTABLE_UNSEEN, WATER_INDICES, grid_cells
-from spadwarp.scene.port import Port, PortGeometry
-from spadwarp.scene.scene import camera_port, laser_port
+from spadwarp.scene.port import Port
+from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import field_unit
-from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes
+from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes, within_port
 from spadwarp.transport import points_per_flight
-from spadwarp.transport.model import check_places
-from spadwarp.values import (
-    ArgumentError,
-    ConfigError,
-    guarded,
-    path_from_time,
-    quantity,
-    range_from_time,
-    time_from_path,
-    with_prefix,
-)
+from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
 __all__ = ["CheckMessage", "check", "summary"]
@@ -90,7 +77,7 @@ class Survey:
     def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
         if mesh is None and scene.targets:
             mesh = build_mesh(scene)
-        self.scene, self.mesh, self.messages, laser = scene, mesh, list[CheckMessage](), scene.beam
+        self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
         # The faces of each target in the camera frame `[F, 3, 3]` [m].
         self.targets = [] if mesh is None else [triangles[mesh.target == i] for i in range(len(scene.targets))]
@@ -112,13 +99,15 @@ class Survey:
         # Nearest and farthest point from the lens that is in view and beam [m], first and last unscattered return from
         # them [ns], optical depth and light of the nearest; None if there are none, or it lies at the lens centre.
         self.target_range = self.target_arrival_ns = self.optical_depth = self.on_axis = None
+        if found := within_port(scene, triangles):
+            self.warn(*found.split(": " if found.startswith("camera") else " = ", 1))
         illuminated = self.illuminated_part(triangles)
         if len(illuminated):
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
             self.target_range = float(ranges.min()), float(ranges.max())
             self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
             self.optical_depth = scene.optical_depth((0.0, 0.0, 0.0), illuminated[ranges.argmin()].tolist())
-            if self.target_range[0]:
+            if self.target_range[0] > 1e-5:
                 self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
 
     def warn(self, field: str, text: str, **values: float) -> None:
@@ -166,13 +155,18 @@ class Survey:
 
     def _on_axis(self, distance: float, optical_depth: float) -> OnAxis:
         scene, passed, port = self.scene, math.exp(-optical_depth), self.camera_port
-        ballistic = self._pixel_share(distance) * passed
+        through, footprint = 1.0, (scene.camera.pixel_tangent * distance) ** 2
+        if port is not None:
+            through = float(port.transmission(np.zeros(3), (0.0, 0.0, 1.0)))
+            if port.shape == "flat":  # makes solid angles smaller
+                footprint *= (port.index[0] / port.index[2]) ** 2
+            else:
+                through *= (port.index[0] / port.index[2]) ** 2
+        # Of the beam within one pixel's footprint on its axis, without water; of a measured one where it is brightest.
+        ballistic = min(1.0, footprint * axis_fluence(scene, distance)) * passed
         # Lambertian, towards the lens
         collected = self.reflectance / math.pi * scene.camera.aperture_area / distance**2
-        share = ballistic * passed * _transmission(port)
-        if port is not None and port.shape == "dome":
-            share *= (port.index[0] / port.index[2]) ** 2
-        photons = share * collected * scene.laser.photons_per_pulse
+        photons = ballistic * passed * through * collected * scene.laser.photons_per_pulse
         return OnAxis(
             distance=distance,
             optical_depth=optical_depth,
@@ -181,32 +175,6 @@ class Survey:
             photons_per_pixel=photons,
             signal_per_pulse=photons * scene.detections_per_photon,
         )
-
-    def _pixel_share(self, distance: float) -> float:
-        """Part of the beam within one pixel's footprint at `distance` [m], on the beam's axis, without water."""
-        laser, footprint = self.scene.laser, (self.scene.camera.pixel_tangent * distance) ** 2
-        footprint *= _narrowed(self.camera_port) / _narrowed(self.laser_port) * _transmission(self.laser_port)
-        if laser.profile == "uniform_cone":
-            area = 2.0 * math.pi * (1.0 - math.cos(laser.half_angle)) * distance**2
-        elif laser.profile == "gaussian":
-            area = 0.5 * math.pi * (math.tan(laser.half_angle) * distance) ** 2
-        elif laser.profile == "measured":
-            wide, tall = profile_extent(laser)
-            area = 4.0 * wide * tall * distance**2  # if it were even
-        else:
-            area = math.pi * laser.beam_radius**2
-        return min(1.0, footprint / area) if area > 0.0 else 1.0
-
-
-def _narrowed(port: PortGeometry | None) -> float:
-    """By which a flat port makes a small solid angle about its normal smaller."""
-    return 1.0 if port is None or port.shape != "flat" else (port.index[0] / port.index[2]) ** 2
-
-
-def _transmission(port: PortGeometry | None) -> float:
-    """Of light that falls on a port at right angles."""
-    first, second, third = (1.0, 1.0, 1.0) if port is None else port.index
-    return (4.0 * first * second / (first + second) ** 2) * (4.0 * second * third / (second + third) ** 2)
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
@@ -218,10 +186,9 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessa
     """
     survey = Survey(as_scene(scene), mesh)
     points_per_flight(survey.scene)
-    check_places(survey.scene, survey.mesh)
     try:  # read here, since only depth and counts need it: at the end of a run it would be too late
         detector_response(survey.scene.detector, survey.scene.laser)
-    except ArgumentError as error:
+    except ValueError as error:
         raise ConfigError(f"detector.irf: {error}", source=survey.scene.source) from None
     for find in _CHECKS:
         find(survey)
@@ -278,37 +245,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
 
 # Values that are valid but far from what a SPAD camera, its laser, water and targets have: mostly a wrong unit
 
-# Field → lowest and highest plausible value in the field's own unit, and units that people take it for. 0 is always
-# allowed: it leaves something out. Lasers from picosecond diodes to Q-switched ones of 1 kHz, cameras from endoscopes
-# to telescopes, water from pure to milk; ports with a window, that of a calm surface may be far.
-_PLAUSIBLE: dict[str, tuple[float, float, tuple[str, ...]]] = {
-    "laser.pulse_energy": (1e-14, 0.1, ("nJ", "µJ")),
-    "laser.repetition_rate": (1e3, 1e10, ("kHz", "MHz")),
-    "laser.pulse_fwhm_ps": (1.0, 1e5, ("s", "ns")),
-    "laser.wavelength_nm": (200.0, 2000.0, ("m", "µm")),
-    "laser.linewidth_nm": (1e-7, 300.0, ("m", "µm")),
-    "laser.half_angle_deg": (1e-3, 180.0, ()),
-    "laser.beam_radius": (1e-5, 2.0, ("mm",)),
-    "camera.focal_length": (1e-4, 5.0, ("mm",)),
-    "camera.pixel_pitch_um": (0.5, 2000.0, ("m", "mm")),
-    "camera.aperture_diameter": (1e-5, 5.0, ("mm",)),
-    "camera.f_number": (0.3, 200.0, ()),
-    "detector.jitter_fwhm_ps": (0.5, 1e5, ("s", "ns")),
-    "detector.irf_tail_ps": (0.1, 1e6, ("s", "ns")),
-    "detector.dark_count_rate": (1e-4, 1e9, ()),
-    "detector.filter_centre_nm": (200.0, 2000.0, ("m", "µm")),
-    "detector.filter_fwhm_nm": (0.01, 500.0, ("m", "µm")),
-    "detector.dead_time_ns": (0.1, 1e6, ("s", "µs")),
-    "detector.afterpulsing_time_constant_ns": (0.1, 1e6, ("s", "µs")),
-    "gate.start_ns": (1e-3, 1e5, ("s", "µs", "ps")),
-    "gate.bin_width_ps": (0.1, 1e5, ("s", "ns", "fs")),
-    "medium.absorption": (1e-6, 1e3, ()),
-    "medium.scattering": (1e-6, 1e4, ()),
-    "medium.extinction": (1e-5, 1e4, ()),
-    "port.distance": (1e-4, 2.0, ("mm",)),
-    "port.radius": (1e-3, 2.0, ("mm",)),
-    "port.thickness": (1e-4, 0.5, ("mm",)),
-}
+_PLAUSIBLE = tomllib.loads((files("spadwarp") / "plausible.toml").read_text(encoding="utf-8"))
 _MOST_POWER = 100.0  # [W]
 _FARTHEST = 1000.0  # [m] of a laser, a camera or a target
 _MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
@@ -319,10 +256,10 @@ def _check_plausible(survey: Survey) -> None:
     scene, laser = survey.scene, survey.scene.laser
     ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
-    for field, plausible in _PLAUSIBLE.items():
-        section, _, name = field.partition(".")
+    for section, fields in _PLAUSIBLE.items():
         for place, model in (ports if section == "port" else {section: getattr(scene, section)}).items():
-            _check_value(survey, f"{place}.{name}", model, plausible)
+            for name, plausible in fields.items():
+                _check_value(survey, f"{place}.{name}", model, *plausible)
     if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
         energy, rate = with_prefix(laser.pulse_energy, "J"), with_prefix(laser.repetition_rate, "Hz")
         text = f"{energy} at {rate} are {with_prefix(laser.average_power, 'W')} on average"
@@ -338,8 +275,8 @@ def _check_plausible(survey: Survey) -> None:
             _check_mesh(survey, f"targets[{index}].scale", target.scale, np.ptp(triangles.reshape(-1, 3), axis=0))
 
 
-def _check_value(survey: Survey, field: str, model: Any, plausible: tuple[float, float, tuple[str, ...]]) -> None:
-    (low, high, units), name = plausible, field.rpartition(".")[2]
+def _check_value(survey: Survey, field: str, model: Any, low: float, high: float, *units: str) -> None:
+    name = field.rpartition(".")[2]
     value = getattr(model, name)
     if not isinstance(value, float) or value == 0.0 or low <= value <= high:
         return

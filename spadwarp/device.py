@@ -8,7 +8,7 @@ import json
 import os
 import platform
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +26,7 @@ def pick_devices(names: str | None = None) -> list[wp.Device]:
 
     A device that is named twice is used twice, with tallies of its own each time.
 
-    Raises:
-        DeviceError: There is no such device; the text names those that exist.
+    Raises `DeviceError`: there is no such device; the text names those that exist.
     """
     import warp as wp
 
@@ -40,8 +39,7 @@ def pick_devices(names: str | None = None) -> list[wp.Device]:
 def pick_device(name: str | wp.Device | None = None) -> wp.Device:
     """The Warp device of that name, or as it is; by default the first GPU, else the CPU.
 
-    Raises:
-        DeviceError: There is no such device; the text names those that exist.
+    Raises `DeviceError`: there is no such device; the text names those that exist.
     """
     import warp as wp
 
@@ -62,9 +60,8 @@ def pick_device(name: str | wp.Device | None = None) -> wp.Device:
 def devices() -> list[dict[str, Any]]:
     """Devices that `device=` may be, in plain values.
 
-    Returns:
-        For each device `name` ("cpu", "cuda:0"), `description`, `memory` [bytes], `compute_capability` (None for the
-        CPU), `threads` (CPU; None for a GPU) and `default`.
+    Returns for each device `name` ("cpu", "cuda:0"), `description`, `memory` [bytes], `compute_capability` (None for
+    the CPU), `threads` (CPU; None for a GPU) and `default`.
     """
     import warp as wp
 
@@ -144,7 +141,7 @@ def _kernel_cache() -> Iterator[None]:
 def _init_quietly() -> None:
     import warp as wp
 
-    if _has_cuda_driver():
+    if cuda_driver() is not None:
         wp.init()
         return
     # The warning is written by native code, past Python's streams.
@@ -162,15 +159,12 @@ def _init_quietly() -> None:
         os.close(stderr)
 
 
-def _has_cuda_driver() -> bool:
-    """Whether the system's loader finds NVIDIA's driver library."""
+def cuda_driver() -> ctypes.CDLL | None:
+    """NVIDIA's driver library, where the system's loader finds it."""
     for library in ("nvcuda.dll",) if os.name == "nt" else ("libcuda.so", "libcuda.so.1"):
-        try:
-            ctypes.CDLL(library)
-        except OSError:
-            continue
-        return True
-    return False
+        with suppress(OSError):
+            return ctypes.CDLL(library)
+    return None
 
 
 def core_count() -> int:

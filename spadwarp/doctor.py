@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spadwarp.device import devices, nvidia_driver, pick_device
+from spadwarp.device import cuda_driver, devices, nvidia_driver, pick_device
 from spadwarp.scene import Scene
 from spadwarp.transport import simulate
 from spadwarp.validate import references
@@ -59,8 +59,7 @@ def diagnose(
         self_test: Whether to run it: a few seconds, and as many again the first time to compile the kernels.
         progress: Called with the name of each step.
 
-    Raises:
-        DeviceError: No such device.
+    Raises `DeviceError`: no such device.
     """
     chosen = pick_device(device)
     problems: list[str] = []
@@ -125,14 +124,9 @@ def _dotted(version: int) -> str:
 
 def _driver_cuda() -> int | None:
     """1000 · major + 10 · minor of the newest CUDA that the driver runs; None without a driver."""
-    for library in ("nvcuda.dll",) if os.name == "nt" else ("libcuda.so.1", "libcuda.so"):
-        try:
-            driver = ctypes.CDLL(library)
-        except OSError:
-            continue
-        version = ctypes.c_int()
-        return version.value if driver.cuDriverGetVersion(ctypes.byref(version)) == 0 else None
-    return None
+    driver, version = cuda_driver(), ctypes.c_int()
+    failed = driver is None or driver.cuDriverGetVersion(ctypes.byref(version))
+    return None if failed else version.value
 
 
 def _gpu_reasons() -> list[str]:

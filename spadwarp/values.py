@@ -23,22 +23,14 @@ import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, SupportsFloat, SupportsIndex, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, SupportsFloat, SupportsIndex, Union, cast, get_args, get_origin
 
 __all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
-__all__ += ["DeviceError", "FileError", "Interval", "MeshError", "SpadwarpError", "SpadwarpWarning", "bounds"]
-__all__ += ["check_choice", "check_integer", "check_part", "check_real", "environment_integer", "in_words"]
-__all__ += [
-    "guarded",
-    "parse_number",
-    "path_from_time",
-    "percent",
-    "pulse_speed",
-    "quantity",
-    "range_from_time",
-    "read_real",
-]
-__all__ += ["rounded", "shown", "suggestion", "time_from_path", "time_from_range", "with_prefix"]
+__all__ += ["DeviceError", "FileError", "Interval", "MeshError", "Shown", "SpadwarpError", "SpadwarpWarning"]
+__all__ += ["bounds", "check_choice", "check_integer", "check_part", "check_real", "count", "environment_integer"]
+__all__ += ["guarded", "in_words", "parse_number", "path_from_time", "percent", "pulse_speed", "quantity"]
+__all__ += ["range_from_time", "read_real", "rounded", "shown", "suggestion", "time_from_path", "time_from_range"]
+__all__ += ["with_prefix"]
 
 __version__ = "0.1.0"
 
@@ -225,7 +217,7 @@ def _fits(value: Any, kind: Any) -> bool:
         needed = "__float__" if kind is float else "__index__"
         return hasattr(value, needed) or (kind is float and hasattr(value, "__index__"))
     plain = origin or kind
-    if not isinstance(plain, type) or getattr(plain, "_is_protocol", False):
+    if plain is Any or not isinstance(plain, type) or getattr(plain, "_is_protocol", False):
         return True
     if not isinstance(value, plain) or (inner and isinstance(value, str)):  # a text is no list of texts
         return False
@@ -328,9 +320,13 @@ def _inside(name: str, value: Any, number: Any, within: str | Interval) -> Any:
 
 
 def read_real(name: str, cell: Any, within: str | Interval) -> float:
-    """A number of a file, or a text that stands for one; as `check_real`, whose errors it raises."""
+    """A number, or a text that stands for one, with a unit if the range has one; as `check_real`, whose errors it
+    raises."""
+    unit = (Interval.read(within) if isinstance(within, str) else within).unit
     try:
-        return check_real(name, parse_number(cell) if isinstance(cell, str) else cell, within)
+        if isinstance(cell, str):
+            cell = quantity(cell, unit) if unit else parse_number(cell)
+        return check_real(name, cell, within)
     except ArgumentError:
         raise
     except ValueError as error:
@@ -418,6 +414,24 @@ def shown(value: Any) -> str:
     """A value as messages quote it, at most 60 characters."""
     text = _Short().repr(list(value) if isinstance(value, tuple) else value)
     return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
+
+
+# ---- What notebooks show.
+
+
+class Shown:
+    """Scenes and results, which `spadwarp.viz` draws."""
+
+    def plot(self, kind: Any = None, **options: Any) -> Any:
+        """A figure; of a result "depth", "intensity", "histogram" or "truth"; see `spadwarp.viz.plot`."""
+        import spadwarp
+
+        return spadwarp.viz.plot(cast(Any, self), kind, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(cast(Any, self))
 
 
 # ---- Constants, and the one place where the time of flight of a pulse becomes a length.
@@ -535,6 +549,11 @@ def quantity(text: str, unit: str) -> float:
         return float(Fraction(number) * given_factor / factor)
     except OverflowError:
         raise ValueError("is beyond the largest number, 1.8e308") from None
+
+
+def count(number: float) -> str:
+    """A whole number with a space between thousands: 2 000 000."""
+    return f"{number:,.0f}".replace(",", " ")
 
 
 def percent(share: float) -> str:

@@ -38,25 +38,15 @@ _FARTHEST = 1e4  # [m]
 
 @dataclass(frozen=True, kw_only=True)
 class EyeLimit:
-    """The largest laser power at which an eye in the beam is within the MPE.
+    """The largest laser power at which an eye in the beam is within the MPE."""
 
-    Attributes:
-        distance: Of the eye from where the beam begins [m].
-        exposure: How long it may look into the beam [s].
-        pulse_energy: Largest energy of a pulse at the laser's repetition rate and duration [J].
-        average_power: The same as average power [W].
-        criterion: Which of the limits decides: "single pulse", "average" or "pulse train".
-        hazard_distance: From where on the laser as it is keeps the limits [m]; 0: everywhere; infinite: nowhere.
-        standard: The standard, and how it was read.
-    """
-
-    distance: float
-    exposure: float
-    pulse_energy: float
-    average_power: float
-    criterion: str
-    hazard_distance: float
-    standard: str = STANDARD
+    distance: float  # of the eye from where the beam begins [m]
+    exposure: float  # how long it may look into the beam [s]
+    pulse_energy: float  # largest energy of a pulse at the laser's repetition rate and duration [J]
+    average_power: float  # the same as average power [W]
+    criterion: str  # which of the limits decides: "single pulse", "average" or "pulse train"
+    hazard_distance: float  # from where on the laser as it is keeps the limits [m]; 0: everywhere; infinite: nowhere
+    standard: str = STANDARD  # the standard, and how it was read
 
 
 def permissible_exposure(duration: float, wavelength_nm: float) -> float:
@@ -89,9 +79,8 @@ def eye_limit(of: Laser | Scene, *, distance: float = 0.1, exposure: float = 100
         exposure: [s], in [1e-6, 3e4]; 100 s is the standard's time base where nobody means to look into the beam,
             0.25 s the time within which one turns away from visible light.
 
-    Raises:
-        ArgumentError: A value out of its range, or a wavelength outside 400 to 1050 nm.
-        FileError: The image of a measured beam.
+    Raises `ArgumentError`: a value out of its range, or a wavelength outside 400 to 1050 nm; `FileError`: the image of
+    a measured beam.
     """
     laser = of if isinstance(of, Laser) else of.laser
     exposure = check_real("exposure", exposure, "[1e-6, 3e4] s")

@@ -87,12 +87,8 @@ def pixel_maps(
         gate: (start, stop) [s] instead of the scene's.
         outliers: Whether `outlier_probability` is wanted, which takes most of the time; else it is NaN.
 
-    Returns:
-        float64 maps `[P]`, `daylight` [1/s] among them, and the table.
-
-    Raises:
-        ConfigError: A scene that the model does not cover.
-        ArgumentError: The scene's backscatter needs a profile.
+    Returns float64 maps `[P]`, `daylight` [1/s] among them, and the table. Raises `ConfigError`: a scene that the model
+    does not cover; `ArgumentError`: the scene's backscatter needs a profile.
     """
     from spadwarp_kernels import analytic as kernels
 

@@ -21,15 +21,8 @@ from numpy.typing import NDArray
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
 from spadwarp.analytic.model import false_peaks
 from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
-from spadwarp.frames import (
-    METHODS,
-    Method,
-    detect,
-    detector_response,
-    first_photon_probabilities,
-    information_from_histogram,
-)
-from spadwarp.frames.depth import arrival_time
+from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
+from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import CHANNELS, Channel, analyser_channel, merge
 from spadwarp.scene import SceneLike, Transport, as_scene, noise_rate
@@ -43,9 +36,8 @@ from spadwarp.values import (
     ConfigError,
     check_choice,
     check_integer,
-    check_real,
-    quantity,
     range_from_time,
+    read_real,
     shown,
     time_from_path,
     time_from_range,
@@ -86,103 +78,59 @@ _STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
 
 @dataclass(frozen=True, kw_only=True)
 class Pilot:
-    """Detections in a window of the image, medians over its pixels with a target unless said otherwise.
+    """Detections in a window of the image, medians over its pixels with a target unless said otherwise."""
 
-    Attributes:
-        pixels: Their number.
-        unscattered, target: Detections of the target per pulse in the gate, without scattered light and with it.
-        backscatter, noise: Of backscatter, and of dark counts and ambient light.
-        brightest: Detections of light per pulse of the brightest hundredth of the pixels; of the brightest one, where
-            so short a run has light in fewer.
-        bound: Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N.
-        shot_noise: The same without background and pile-up.
-        information_noise: Part of the runs' information on the depth that was their noise, which `bound` and
-            `shot_noise` leave out.
-        floor: Estimator → median |error| of depth that is left after any number of pulses [m].
-        bias: Estimator → median error, positive if too far [m].
-        unscattered_floor: The same as `floor`, of unscattered light alone: slopes and edges within a pixel, bins.
-        pile_up: Estimator → change of depth by pile-up, median [m]; 0 in free-running mode.
-        run_noise: Median |error| of `floor` in a pixel that comes from the shortness of the runs [m].
-        peak, level: Detections per pulse of the return within ±3σ of its peak, and of background per σ under it, σ
-            that of the response.
-        photons: Of both runs.
-    """
-
-    pixels: int
-    unscattered: float
-    target: float
-    backscatter: float
-    noise: float
-    brightest: float
-    bound: float
-    shot_noise: float
-    information_noise: float
-    floor: dict[str, float]
-    bias: dict[str, float]
-    unscattered_floor: dict[str, float]
-    pile_up: dict[str, float]
-    run_noise: float
-    peak: float
-    level: float
-    photons: int
+    pixels: int  # their number
+    unscattered: float  # detections of the target per pulse in the gate, without scattered light
+    target: float  # the same with it
+    backscatter: float  # of backscatter
+    noise: float  # of dark counts and ambient light
+    brightest: float  # of light in the brightest hundredth of the pixels, or the brightest one if fewer have light
+    bound: float  # Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N
+    shot_noise: float  # the same without background and pile-up
+    information_noise: float  # part of the runs' information on depth that was their noise; both bounds leave it out
+    floor: dict[str, float]  # estimator → median |error| of depth that is left after any number of pulses [m]
+    bias: dict[str, float]  # estimator → median error, positive if too far [m]
+    unscattered_floor: dict[str, float]  # `floor` of unscattered light alone: slopes, edges within a pixel, bins
+    pile_up: dict[str, float]  # estimator → change of depth by pile-up, median [m]; 0 in free-running mode
+    run_noise: float  # median |error| of `floor` in a pixel that comes from the shortness of the runs [m]
+    peak: float  # detections per pulse of the return within ±3σ of its peak, σ that of the response
+    level: float  # of background per σ under it
+    photons: int  # of both runs
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Proposal:
-    """A proposed experiment.
+    """A proposed experiment."""
 
-    Attributes:
-        scene: The scene with the proposed gate, pulses, repetition rate and pulse energy, ready to simulate.
-        depth_error, time: Asked for [m]; longest time for a depth frame [s].
-        method: Estimator whose floor counts.
-        target_range: Least and largest range of the target [m].
-        optical_depth: Of the water before the nearest of it, one way, along the axis.
-        gate_range: Ranges at the ends of the gate, laser at the lens and behind its port [m].
-        unambiguous_range: At the proposed repetition rate [m].
-        largest_rate: Repetition rate up to which the gate ends before the next pulse [Hz].
-        pile_up_energy: Pulse energy at which the brightest pixels detect `PILE_UP` photons a pulse [J].
-        eye: Limit of laser power for the eye.
-        energy_limit: What sets the pulse energy: "" (the scene's own), "pile-up" or "eye".
-        irradiance: On the beam's axis at the nearest range of the target, unscattered light, mean over time [W/m²].
-        pulses: Of a depth frame: for the depth error where it can be reached, else those after which more gain little.
-        pulses_for: What sets them: "depth error"; "false peaks", fewer than 1 % of them; "floor", where the depth error
-            is out of reach; "out of reach", where 2³¹ pulses are too few.
-        frame_time: For these pulses [s], at all positions of a scan.
-        reached: Whether the depth error is reached, within the time.
-        terms: Name → part of the depth error at these pulses [m], "total" last; squares add up.
-        limit: The largest of them.
-        advice: What would help.
-        pilot: What was measured by Monte Carlo.
-        channels: The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera
-            without one.
-        largest_range: For a plane square to the axis, depth error and time as asked for [m]; NaN: not sought, 0: none.
-        range_limit: What limits it.
-    """
-
-    scene: Scene
-    depth_error: float
-    time: float
-    method: str
-    target_range: tuple[float, float]
-    optical_depth: float
-    gate_range: tuple[float, float]
-    unambiguous_range: float
-    largest_rate: float
-    pile_up_energy: float
-    eye: EyeLimit
-    energy_limit: str
-    irradiance: float
-    pulses: int
+    scene: Scene  # the scene with the proposed gate, pulses, repetition rate and pulse energy, ready to simulate
+    depth_error: float  # asked for [m]
+    time: float  # longest for a depth frame [s]
+    method: str  # estimator whose floor counts
+    target_range: tuple[float, float]  # least and largest range of the target [m]
+    optical_depth: float  # of the water before the nearest of it, one way, along the axis
+    gate_range: tuple[float, float]  # ranges at the ends of the gate, laser at the lens and behind its port [m]
+    unambiguous_range: float  # at the proposed repetition rate [m]
+    largest_rate: float  # repetition rate up to which the gate ends before the next pulse [Hz]
+    pile_up_energy: float  # pulse energy at which the brightest pixels detect `PILE_UP` photons a pulse [J]
+    eye: EyeLimit  # limit of laser power for the eye
+    energy_limit: str  # what sets the pulse energy: "" (the scene's own), "pile-up" or "eye"
+    irradiance: float  # on the beam's axis at the nearest range of the target, unscattered light, mean over time [W/m²]
+    pulses: int  # of a depth frame: for the depth error if it can be reached, else those after which more gain little
     pulses_for: str
-    frame_time: float
-    reached: bool
-    terms: dict[str, float]
-    limit: str
-    advice: str
-    pilot: Pilot
+    """What sets them: "depth error"; "false peaks", fewer than 1 % of them; "floor", where the depth error is out of
+    reach; "out of reach", where 2³¹ pulses are too few."""
+    frame_time: float  # for these pulses [s], at all positions of a scan
+    reached: bool  # whether the depth error is reached, within the time
+    terms: dict[str, float]  # name → part of the depth error at these pulses [m], "total" last; squares add up
+    limit: str  # the largest of them
+    advice: str  # what would help
+    pilot: Pilot  # what was measured by Monte Carlo
     channels: dict[str, Pilot] = field(default_factory=dict)
-    largest_range: float = math.nan
-    range_limit: str = ""
+    """The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera without
+    one."""
+    largest_range: float = math.nan  # of a plane square to the axis, as asked for [m]; NaN: not sought, 0: none
+    range_limit: str = ""  # what limits it
 
     def __repr__(self) -> str:
         error, pulses = 1e3 * self.terms["total"], self.pulses
@@ -200,15 +148,8 @@ class Proposal:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the scene, in numbers and text that JSON can hold."""
-        fields = {one.name: getattr(self, one.name) for one in dataclasses.fields(self) if one.name != "scene"}
-        return {"values": self.values, **_plain(fields)}
-
-
-def _plain(value: Any) -> Any:
-    """Dicts of dicts and data classes as dicts."""
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return dataclasses.asdict(value) if isinstance(value, EyeLimit | Pilot) else value
+        fields = dataclasses.asdict(dataclasses.replace(self, scene=None))  # type: ignore[arg-type]
+        return {"values": self.values, **{name: value for name, value in fields.items() if name != "scene"}}
 
 
 def plan(
@@ -255,22 +196,20 @@ def plan(
         device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
         progress: Called with ("trace", photons done, photons asked for) and the like.
 
-    Raises:
-        ConfigError: No target in view, or no light from it.
-        ArgumentError: An argument out of range.
+    Raises `ConfigError`: no target in view, or no light from it; `ArgumentError`: an argument out of range.
     """
     scene = as_scene(scene)
     photons = check_integer("photons", photons, field_range(Transport, "photons"))
     check_choice("method", method, METHODS)
     check_choice("channel", channel, CHANNELS)
     planner = _Planner(
-        depth_error=_real("depth_error", depth_error, "[1e-9, 1e9] m"),
-        time=_real("time", time, "[1e-9, 1e9] s"),
-        margin=_real("margin", margin, "[0, 1e6] m"),
+        depth_error=read_real("depth_error", depth_error, "[1e-9, 1e9] m"),
+        time=read_real("time", time, "[1e-9, 1e9] s"),
+        margin=read_real("margin", margin, "[0, 1e6] m"),
         method=method,
         full_power=full_power,
-        eye_distance=None if eye_distance is None else _real("eye_distance", eye_distance, "[0, 1e9] m"),
-        eye_exposure=_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"),
+        eye_distance=None if eye_distance is None else read_real("eye_distance", eye_distance, "[0, 1e9] m"),
+        eye_exposure=read_real("eye_exposure", eye_exposure, "[1e-6, 3e4] s"),
         seed=check_integer("seed", seed, SEED),
         device=device,
         channel=channel,
@@ -288,7 +227,7 @@ def plan(
     else:
         if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
             raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
-        span = _real("ranges", ranges[0], "(-inf, inf) m"), _real("ranges", ranges[1], "(-inf, inf) m")
+        span = read_real("ranges", ranges[0], "(-inf, inf) m"), read_real("ranges", ranges[1], "(-inf, inf) m")
         if not 0 < span[0] <= span[1] < math.inf:
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
         scene = with_plane(scene, span[1])
@@ -299,15 +238,6 @@ def plan(
         return proposal
     largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
     return dataclasses.replace(proposal, largest_range=largest, range_limit=limit)
-
-
-def _real(name: str, value: Any, interval: str) -> float:
-    """An argument that may be text with a unit, as a number within an interval and of its unit."""
-    try:
-        value = quantity(value, interval.split()[-1]) if isinstance(value, str) else value
-    except ValueError as error:
-        raise ArgumentError(f"{name} = {shown(value)} {error}") from None
-    return check_real(name, value, interval)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -555,12 +485,7 @@ def trace(
 
 
 def measure(
-    runs: tuple[Result, Result],
-    scene: Scene,
-    device: str | None = None,
-    *,
-    even: bool = False,
-    channel: Channel = "I",
+    runs: tuple[Result, Result], scene: Scene, device: str | None = None, *, even: bool = False, channel: Channel = "I"
 ) -> Pilot:
     """Numbers of `scene`, whose laser's energy and detector may differ from those of the runs, in a channel of an
     analyser.
@@ -584,8 +509,7 @@ def measure(
     seen = np.isfinite(both.truth.depth) & (signal.sum(axis=-1) > 0)
     if not seen.any():
         raise ConfigError(
-            "no light of the target reaches the pixels near the axis: `spadwarp check` says why",
-            source=scene.source,
+            "no light of the target reaches the pixels near the axis: `spadwarp check` says why", source=scene.source
         )
 
     def median(values: Any) -> float:

@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.analytic.model import (
-    BackscatterTable,
-    Map,
-    pixel_maps,
-    response_sigma,
-    scene_optics,
-    warn_of_model,
-)
+from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, response_sigma, scene_optics, warn_of_model
 from spadwarp.arrays import kernel_errors, labelled
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
@@ -26,7 +19,7 @@ from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import truth_maps
-from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer
+from spadwarp.values import SEED, ArgumentError, ConfigError, Shown, check_integer
 
 if TYPE_CHECKING:
     import xarray
@@ -81,50 +74,30 @@ def _coordinates(frames: int, shape: tuple[int, ...]) -> dict[str, Coordinate]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class AnalyticResult:
+class AnalyticResult(Shown):
     """Maps of a scene by the analytic model, and depth frames drawn from them.
 
     Maps are float64 `[H, W]`, NaN where there is no estimate: nothing hit, not illuminated, or the return outside the
     gate.
-
-    Attributes:
-        scene: The scene.
-        truth: Depth, range, normal and reflectance that the maps come from.
-        signal: S, expected detections of the return per pulse (eq 7); 0 without a return.
-        arrival: μ [s] after the pulse left the laser; NaN where nothing is hit.
-        backscatter: Expected backscatter detections per pulse within the gate.
-        daylight: Detections of daylight [1/s]; 0 without `[daylight]`.
-        alpha: α, all expected detections per pulse within the gate (integral of eq 8).
-        fisher: F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate.
-        sigma_time: σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons.
-        sigma_depth: The bound of planar depth [m].
-        signal_to_backscatter: Both per pulse within the gate; infinite where there is no backscatter.
-        background_level: Background detections per pulse and σ of the response, under the return.
-        outlier_probability: Of a false peak: a maximum-likelihood fit takes background for the return, and `sigma_time`
-            is not reached.
-        background_probability: That a frame's pixel reports a background photon.
-        depth: Frames, float32 `[N, H, W]` [m]; NaN for no estimate.
-        labels: bool `[N, H, W]`, where a frame's pixel reports a background photon.
-        seed: Of the frames.
     """
 
-    scene: Scene
-    truth: Truth
-    signal: Map
-    arrival: Map
-    backscatter: Map
-    daylight: Map
-    alpha: Map
-    fisher: Map
-    sigma_time: Map
-    sigma_depth: Map
-    signal_to_backscatter: Map
-    background_level: Map
-    outlier_probability: Map
-    background_probability: Map
-    depth: NDArray[np.float32]
-    labels: NDArray[np.bool_]
-    seed: int
+    scene: Scene  # the scene
+    truth: Truth  # depth, range, normal and reflectance that the maps come from
+    signal: Map  # S, expected detections of the return per pulse (eq 7); 0 without a return
+    arrival: Map  # μ [s] after the pulse left the laser; NaN where nothing is hit
+    backscatter: Map  # expected backscatter detections per pulse within the gate
+    daylight: Map  # detections of daylight [1/s]; 0 without `[daylight]`
+    alpha: Map  # α, all expected detections per pulse within the gate (integral of eq 8)
+    fisher: Map  # F, information on the delay per detected photon [1/s²] (eq 9); 0 where there is no estimate
+    sigma_time: Map  # σ* = 1/√(N·F) [s], the Cramér–Rao bound of one depth frame, N being its recorded photons
+    sigma_depth: Map  # the bound of planar depth [m]
+    signal_to_backscatter: Map  # both per pulse within the gate; infinite where there is no backscatter
+    background_level: Map  # background detections per pulse and σ of the response, under the return
+    outlier_probability: Map  # of a false peak: a fit takes background for the return, `sigma_time` is not reached
+    background_probability: Map  # that a frame's pixel reports a background photon
+    depth: NDArray[np.float32]  # frames, float32 `[N, H, W]` [m]; NaN for no estimate
+    labels: NDArray[np.bool_]  # bool `[N, H, W]`, where a frame's pixel reports a background photon
+    seed: int  # of the frames
     # When background photons arrive: the part that is flat over the gate, and the table of the rest.
     _flat_share: NDArray[np.float32]
     _table: BackscatterTable
@@ -133,17 +106,6 @@ class AnalyticResult:
         name = self.scene.source.stem if self.scene.source else "Python"
         height, width = self.truth.depth.shape
         return f"AnalyticResult({name}: {width} x {height} pixels, {len(self.depth)} depth frames, seed {self.seed})"
-
-    def plot(self, **options: Any) -> Any:
-        """A figure of the maps and a frame; see `spadwarp.viz.plot`."""
-        import spadwarp
-
-        return spadwarp.viz.plot(self, **options)
-
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
 
     @kernel_errors()
     def sample(
@@ -205,8 +167,7 @@ class AnalyticResult:
     def to_xarray(self) -> xarray.Dataset:
         """Maps and truth (y, x) and depth frames (frame, y, x) with coordinates and units.
 
-        Raises:
-            FileError: xarray is not installed.
+        Raises `FileError`: xarray is not installed.
         """
         variables = {name: (_ARRAYS[at][0], self._array(at), *_ARRAYS[at][1:]) for name, at in _LABELLED.items()}
         axes = _coordinates(len(self.depth), self.truth.depth.shape)
@@ -221,8 +182,7 @@ class AnalyticResult:
             frames: Number of frames to draw and write in parts, however many; default: those that the result holds.
             device: Warp device that draws them.
 
-        Raises:
-            FileError: The file cannot be written.
+        Raises `FileError`: the file cannot be written.
         """
         from spadwarp.values import __version__
 
@@ -290,9 +250,8 @@ def simulate_analytic(
 
     A warning says where a scene's light is polarised, which the model leaves out.
 
-    Raises:
-        ConfigError: A scene that the model does not cover, or whose gate holds no return.
-        ArgumentError: A truth or profile of the wrong shape, or with impossible values.
+    Raises `ConfigError`: a scene that the model does not cover, or whose gate holds no return; `ArgumentError`: a truth
+    or profile of the wrong shape, or with impossible values.
     """
     scene = as_scene(scene)
     frames, seed = check_integer("frames", frames, "[0, 2147483647]"), check_integer("seed", seed, SEED)
@@ -383,23 +342,14 @@ def _check_truth(truth: Truth, scene: Scene) -> None:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class AnalyticFile:
-    """A file of the analytic simulator; depth frames are read when they are asked for, the rest is in memory.
+    """A file of the analytic simulator; depth frames are read when they are asked for, the rest is in memory."""
 
-    Attributes:
-        path: The file.
-        frames: Their number.
-        seed: Of the frames.
-        scene: The scene.
-        truth: Depth, range, normal and reflectance.
-        maps: Name → float64 `[H, W]`, as the attributes of `AnalyticResult`.
-    """
-
-    path: Path
-    frames: int
-    seed: int
-    scene: Scene
-    truth: Truth
-    maps: dict[str, NDArray[np.float64]]
+    path: Path  # the file
+    frames: int  # their number
+    seed: int  # of the frames
+    scene: Scene  # the scene
+    truth: Truth  # depth, range, normal and reflectance
+    maps: dict[str, NDArray[np.float64]]  # name → float64 `[H, W]`, as the attributes of `AnalyticResult`
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -59,65 +59,38 @@ _FROM_MAPS = ("arrival", "signal", "alpha", "signal_to_backscatter", "sigma_time
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetRow:
-    """A pixel on the optical axis and a face square to it.
+    """A pixel on the optical axis and a face square to it."""
 
-    Attributes:
-        medium: Name of the water.
-        extinction: [1/m].
-        range: Distance of the face, behind a port the length of the bent ray [m].
-        optical_depth: Attenuation lengths of the way in the water, one way.
-        gate_start, gate_stop: The gate [s]: the scene's where all ranges fall into it, else one of the same length
-            around the return.
-        gate_moved: Whether it is not the scene's.
-        pulses: Of one depth frame, for which the bound holds: `Scene.pulses_per_depth_frame`, or those of
-            `analytic.frames` detector frames with a count law per frame.
-        arrival: Of the return [s].
-        signal: S, detections of the return per pulse.
-        background: Detections of backscatter, dark counts and ambient light per pulse within the gate.
-        alpha: All detections per pulse within the gate.
-        signal_to_backscatter: Both per pulse within the gate.
-        sigma_time: Cramér–Rao bound of a depth frame [s]; NaN: no estimate.
-        sigma_depth: The same in depth [m].
-        outlier_probability: Of a false peak.
-        pulses_for_1cm: Pulses until the bound is 1 cm and less than 1 % of the fits are outliers; infinite beyond 1e18.
-    """
-
-    medium: str
-    extinction: float
-    range: float
-    optical_depth: float
-    gate_start: float
-    gate_stop: float
-    gate_moved: bool
+    medium: str  # name of the water
+    extinction: float  # [1/m]
+    range: float  # distance of the face, behind a port the length of the bent ray [m]
+    optical_depth: float  # attenuation lengths of the way in the water, one way
+    gate_start: float  # [s]; the scene's gate where all ranges fall into it, else one as long around the return
+    gate_stop: float  # [s]
+    gate_moved: bool  # whether it is not the scene's
     pulses: float
-    arrival: float
-    signal: float
-    background: float
-    alpha: float
-    signal_to_backscatter: float
-    sigma_time: float
-    sigma_depth: float
-    outlier_probability: float
-    pulses_for_1cm: float
+    """Of one depth frame, for which the bound holds: `Scene.pulses_per_depth_frame`, or those of `analytic.frames`
+    detector frames with a count law per frame."""
+    arrival: float  # of the return [s]
+    signal: float  # S, detections of the return per pulse
+    background: float  # detections of backscatter, dark counts and ambient light per pulse within the gate
+    alpha: float  # all detections per pulse within the gate
+    signal_to_backscatter: float  # both per pulse within the gate
+    sigma_time: float  # Cramér–Rao bound of a depth frame [s]; NaN: no estimate
+    sigma_depth: float  # the same in depth [m]
+    outlier_probability: float  # of a false peak
+    pulses_for_1cm: float  # until the bound is 1 cm and less than 1 % of the fits are outliers; infinite beyond 1e18
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthErrorRow:
-    """Summary of the depth frames of a scene; statistics run over the pixels that have an estimate.
+    """Summary of the depth frames of a scene; statistics run over the pixels that have an estimate."""
 
-    Attributes:
-        sigma_depth: Median bound of depth [m].
-        sigma_depth_p90: 90th percentile of the bound [m].
-        outlier_probability: Mean over pixels.
-        estimate_fraction: Pixels with an estimate over pixels with a target.
-        signal_to_backscatter: Median.
-    """
-
-    sigma_depth: float
-    sigma_depth_p90: float
-    outlier_probability: float
-    estimate_fraction: float
-    signal_to_backscatter: float
+    sigma_depth: float  # median bound of depth [m]
+    sigma_depth_p90: float  # 90th percentile of the bound [m]
+    outlier_probability: float  # mean over pixels
+    estimate_fraction: float  # pixels with an estimate over pixels with a target
+    signal_to_backscatter: float  # median
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,13 +129,9 @@ def budget(
         reflectance: Of the face, in [0, 1]; default: the number that the scene's first target has, else 0.5.
         device: Warp device; default: the first GPU, else the CPU.
 
-    Returns:
-        A row for each water and range, in this order. A warning says where light is polarised, which the model leaves
-        out.
-
-    Raises:
-        ConfigError: A water or scene that the model does not cover.
-        ArgumentError: Ranges or reflectance out of range.
+    Returns a row for each water and range, in this order. A warning says where light is polarised, which the model
+    leaves out. Raises `ConfigError`: a water or scene that the model does not cover; `ArgumentError`: ranges or
+    reflectance out of range.
     """
     scene = as_scene(scene)
     distances = _distances(scene, ranges)
@@ -198,9 +167,8 @@ def sweep(
 
     Where no number depends on the field, or where light is polarised, which the model leaves out, a warning says so.
 
-    Raises:
-        ConfigError: An unknown field, a value out of its range, a scene that the model does not cover.
-        ArgumentError: `vary` or `of` not of the form above.
+    Raises `ConfigError`: an unknown field, a value out of its range, a scene that the model does not cover;
+    `ArgumentError`: `vary` or `of` not of the form above.
     """
     scene = as_scene(scene)
     row: Callable[[Scene, str | None], Any] = _central_row

@@ -13,8 +13,8 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, count, progress, rows, show_table, write_json, written
-from spadwarp.values import ArgumentError, ConfigError, FileError, percent, range_from_time, rounded
+from spadwarp.cli.outputs import answer, check_outputs, progress, rows, show_table, write_json, written
+from spadwarp.values import ArgumentError, ConfigError, FileError, count, percent, range_from_time, rounded
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene
@@ -45,8 +45,9 @@ def detect(
 ) -> None:
     """Frames of counts that the camera would record.
 
-    Writes frames.h5 (counts, depth of each estimator, intensity, the Cramér–Rao bound) and frame.png. --set takes
-    fields of detector and daylight, and of the laser energy or power, repetition_rate, pulse_fwhm_ps and spectrum.
+    Writes frames.h5 (counts, depth of each estimator, its significance, intensity, the Cramér–Rao bound) and frame.png.
+    Pixels below detector.min_significance have no depth. --set takes fields of detector and daylight, and of the laser
+    energy or power, repetition_rate, pulse_fwhm_ps and spectrum.
 
     Args:
         run (RUN): A result, or its directory.
@@ -85,7 +86,7 @@ def detect(
     )
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
-    files = [recording.file.path, spadwarp.viz.draw_recording(recording.file, out / "frame.png")]
+    files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png")]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 
@@ -156,15 +157,16 @@ def depth(
     channel: opt.Channel = "I",
     inputs: _DepthInputs | None = None,
     background: _Background | None = None,
+    min_significance: float | None = None,
     ply: Path | None = None,
     ply_frame: Literal["camera", "world"] = "camera",
     device: str | None = None,
 ) -> None:
     """Depth from histograms, simulated or measured.
 
-    Writes depth.npy (all frames), depth.exr and depth.png (the first). Measured histograms are arrays, sparse matrices,
-    cells of time tags, or T3 records; what was inferred is printed. Without a field of view, the output is the range
-    along the line of sight, for a laser in the lens.
+    Writes depth.npy (all frames), depth.exr and depth.png (the first), and of counts significance.npy. Measured
+    histograms are arrays, sparse matrices, cells of time tags, or T3 records; what was inferred is printed. Without a
+    field of view, the output is the range along the line of sight, for a laser in the lens.
 
     Args:
         path (FILE): A result or frames (.h5, or their directory), or measured: .npy, .mat, .h5, .ptu. Of an analytic
@@ -172,6 +174,9 @@ def depth(
         method: Estimator of the arrival time.
         background (COUNTS): Background per bin, or "median": each pixel's median bin. By default that of the file; for
             measured histograms none, with likelihood the median.
+        min_significance (S): Of counts, pixels whose significance is below S have no depth: background alone gives more
+            with a probability of 10^-S. 0: every pixel has one. By default detector.min_significance of a simulation, 4
+            of measured histograms.
         ply: Also write the points of the first frame, with normals.
         ply_frame: Frame of the points: the camera's, or the world for a simulation.
 
@@ -197,9 +202,11 @@ def depth(
             complain(text, "note")
     pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
     names = [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")]
+    names.append("significance.npy")
     check_outputs(out, names, files={"--ply": ply}, inputs=(path, *files), needed=32 * pixels)
     if reduced is None:
-        reduced = depth_of(histograms, method=method, background=background, device=device, **seen)
+        seen |= {"background": background, "min_significance": min_significance}
+        reduced = depth_of(histograms, method=method, device=device, **seen)
     comment = f"{path.name}, {reduced.method}"
     files = spadwarp.files.write_depth(reduced, out, ply=ply, ply_frame=ply_frame, comment=comment)
     found = reduced.first[np.isfinite(reduced.first)]
@@ -336,7 +343,7 @@ def _of_pixels(one: EstimateMap) -> str:
     return f"{text} {one.unit}".rstrip()
 
 
-_ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_second.npy", ".exr", ".png")
+_ENDINGS = (".npy", "_target.npy", "_confidence.npy", "_significance.npy", "_second.npy", ".exr", ".png")
 _OF_IMAGES = {"group_index": opt.real_number, "channel": str, "scale": opt.real_number, "as_depth": bool}
 _DenoiseInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _OF_IMAGES)]
 
@@ -352,6 +359,7 @@ def denoise(
     weights: Path | None = None,
     inputs: _DenoiseInputs | None = None,
     mask: float | None = None,
+    min_significance: float | None = None,
     device: str | None = None,
     precision: Literal["float32", "float16", "bfloat16"] | None = None,
 ) -> None:
@@ -359,7 +367,8 @@ def denoise(
 
     Writes for each file: NAME.npy (depth of all frames), NAME_target.npy and NAME_confidence.npy (the probabilities
     that a pixel sees a target, and that its depth is right), NAME.exr (all three of the first frame) and NAME.png.
-    Every pixel has a depth, also where there is only water; --mask leaves these out. Histograms become depth first:
+    Every pixel has a depth, also where there is only water; --mask leaves these out, and --min-significance those whose
+    counts are background alone (NAME_significance.npy). Histograms become depth first:
     counts by the likelihood, rates by the log-matched filter where the instrument response is known; counts are then
     denoised with their histograms, and NAME_second.npy has second surfaces in a pixel; but those of a dataset, which
     does not keep their background. Needs pip install "spadwarp[denoise]".
@@ -379,6 +388,8 @@ def denoise(
         weights: Weights of spadwarp train. By default the package's.
         mask (P): Leave out pixels that see a target with less than this probability: 0.08 for PyramidNet of depth, 0.5
             for histograms.
+        min_significance (S): Of counts, leave out pixels where background alone gives more with a probability of 10^-S.
+            By default detector.min_significance of a simulation, 4 of measured histograms.
         precision: Of the layers of pyramid: float32, float16 (default on a GPU), bfloat16 (default on a CPU with AMX).
 
     \b
@@ -400,6 +411,7 @@ def denoise(
     names = [stem + ending for stem in stems for ending in _ENDINGS]
     check_outputs(out, names, inputs=(*paths, profile, weights, *files), needed=needed)
     settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
+    settings["min_significance"] = min_significance
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
     summary: list[dict[str, Any]] = []

@@ -10,8 +10,8 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import note, running, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, count, progress, show_table, write_json, written
-from spadwarp.values import environment_integer
+from spadwarp.cli.outputs import answer, check_outputs, progress, show_table, write_json, written
+from spadwarp.values import count, environment_integer
 
 if TYPE_CHECKING:
     from spadwarp.denoise import Evaluation, HistogramScores, PhotonSweep, SceneScores

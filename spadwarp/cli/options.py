@@ -6,8 +6,10 @@ import enum
 import inspect
 import math
 import re
+import tomllib
 from collections.abc import Callable, Mapping
 from decimal import Decimal, InvalidOperation
+from importlib.resources import files
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -30,41 +32,8 @@ Method = Literal["peak", "centroid", "matched", "likelihood"]
 Channel = Literal["I", "co", "cross"]
 """`spadwarp.result.CHANNELS`, known without loading it."""
 
-# Options that mean the same in every command: metavar, help, and a name unlike that of the parameter.
-SHARED: dict[str, tuple[str, str] | tuple[str, str, str]] = {
-    "scene": ("SCENE", "Scene file (TOML), or the name of a scene of `spadwarp list scenes`."),
-    "out": ("DIR", "Directory for the output files."),
-    "mesh": (
-        "FILE",
-        "A mesh (STL, OBJ, PLY, OFF, GLB, USD) that replaces the scene's first target, with the same position, "
-        "rotation and reflectance; in metres, or in millimetres with --set 'targets[0].scale=0.001'.",
-    ),
-    "overrides": ("SECTION.FIELD=VALUE", "Overrides a field of SCENE or RECIPE; may be repeated.", "--set"),
-    "photons": ("N", "Photons to emit, such as 2e9. By default the scene's."),
-    "seed": ("N", "Key of the random numbers."),
-    "device": ("NAME", '"cpu", "cuda:0", ...; by default the first GPU, else the CPU.'),
-    "devices": (
-        "NAME",
-        '"cpu", "cuda:0", "cuda:0,cuda:2", "cuda:all" (every GPU here); by default the first GPU, else the CPU.',
-        "--device",
-    ),
-    "ray": ("ADDRESS", 'Workers of Ray: a running cluster, HOST:PORT or "auto", or "start" to start it here.'),
-    "workers": ("N", "Workers of Ray; by default one for each GPU, or one for each machine without a GPU."),
-    "channel": ("", "Light that counts where the camera has an analyser: I (all, without it), co or cross."),
-    "inputs": (
-        "NAME=VALUE,...",
-        "What a measured file does not hold: bin_width=55ps, gate_start=20ns (time of flight at bin 0 or tag 0; by "
-        "default 0, with a warning), group_index=1.3566 (1 in air, 1.3566 in fresh water, 1.3638 in seawater), "
-        "irf=200ps (FWHM of a Gaussian instrument response) or irf=FILE (.csv of time_ps, value; .csv or .npy of one "
-        "value for each bin), axes=tyx (y rows, x columns, t bins, n frames), dataset=NAME (of the array in a .mat or "
-        ".h5 file), image_size=640x480 (where pixels stand one after the other), tag_unit=8ps (of cells of a .mat "
-        "file), sum_frames (adds frames up), horizontal_fov_deg=60 (for planar depth and points).",
-        "--input",
-    ),
-    "overwrite": ("", "Replace output files that exist; allow a directory that is not empty."),
-    "quiet": ("", "Print only warnings and errors."),
-    "json": ("FILE", "Also write the output as JSON."),
-}
+SHARED = tomllib.loads((files("spadwarp.cli") / "options.toml").read_text(encoding="utf-8"))
+"""Options that mean the same in every command."""
 _COMMON = {"overwrite": bool, "quiet": bool, "json": Path | None}
 
 
@@ -87,9 +56,9 @@ def command(*, without: tuple[str, ...] = (), name: str | None = None) -> Callab
             if one not in without
         ]
         for one in (*inspect.signature(function).parameters.values(), *common):
-            metavar, about, *option = SHARED.get(one.name, ("", ""))
-            metavar, about = described.get(one.name, (metavar, about))
-            long = option[0] if option else "--" + one.name.rstrip("_").replace("_", "-")
+            shared = SHARED.get(one.name, {})
+            metavar, about = described.get(one.name, (shared.get("metavar", ""), shared.get("help", "")))
+            long = shared.get("option", "--" + one.name.rstrip("_").replace("_", "-"))
             names[one.name] = long if one.kind is inspect.Parameter.KEYWORD_ONLY else metavar.strip("[]")
             made.append(_parameter(one, hints[one.name], metavar, about, names[one.name]))
         defaults = {one.name: one.default for one in made}

@@ -14,20 +14,8 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import (
-    answer,
-    check_outputs,
-    count,
-    in_percent,
-    progress,
-    readable,
-    rows,
-    short,
-    show_table,
-    write_json,
-    written,
-)
-from spadwarp.values import ArgumentError, shown, with_prefix
+from spadwarp.cli.outputs import answer, check_outputs, progress, readable, rows, short, show_table, write_json, written
+from spadwarp.values import ArgumentError, count, shown, with_prefix
 
 if TYPE_CHECKING:
     from spadwarp import Scene
@@ -315,17 +303,24 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         "signal/backscatter": row.signal_to_backscatter,
         "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
-        "outliers": in_percent(row.outlier_probability),
+        "outliers": _in_percent(row.outlier_probability),
         "pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
     }
+
+
+def _in_percent(value: float) -> str:
+    """A fraction in per cent."""
+    if math.isnan(value):
+        return "-"
+    return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
 
 
 def _error_cells(row: DepthErrorRow) -> dict[str, Any]:
     return {
         "σ* median [mm]": 1e3 * row.sigma_depth,
         "σ* 90 % below [mm]": 1e3 * row.sigma_depth_p90,
-        "outliers": in_percent(row.outlier_probability),
-        "pixels with an estimate": in_percent(row.estimate_fraction),
+        "outliers": _in_percent(row.outlier_probability),
+        "pixels with an estimate": _in_percent(row.estimate_fraction),
         "signal/backscatter": row.signal_to_backscatter,
     }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,12 +14,11 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import INTERRUPTED, complain, fail, note, running, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import answer, check_outputs, count, progress
-from spadwarp.values import ArgumentError, ConfigError, address_space
+from spadwarp.cli.outputs import answer, check_outputs, progress
+from spadwarp.values import ArgumentError, ConfigError, address_space, count
 
 if TYPE_CHECKING:
     from spadwarp import Result, Scene
-    from spadwarp.analytic import AnalyticResult
     from spadwarp.cli.outputs import Report
     from spadwarp.files import RunFiles
 
@@ -256,22 +254,16 @@ def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
     """A run in a few numbers."""
     import numpy as np
 
-    summary, frame = result.summary(), files.depth
+    summary, error = result.summary(), np.abs(files.depth - result.truth.depth)
+    error, returned = error[np.isfinite(error)], files.depth[np.isfinite(files.depth)]
     seconds, balance = result.timing.get("trace", 0.0), summary["energy_balance"]
-    error = np.abs(frame - result.truth.depth)
-    error, returned = error[np.isfinite(error)], frame[np.isfinite(frame)]
-    device = f"{result.provenance.get('device', 'unknown')}, {seconds:.3g} s"
-    found = {
-        "photons": result.photons,
-        "seed": result.seed,
-        "device": f"{device}, {result.photons / seconds:.3g} photons/s" if seconds > 0 else device,
-        "collected_fraction": summary["collected_fraction"],
-        "detections_per_pulse": summary["detections_per_pulse"],
+    rate = f", {result.photons / seconds:.3g} photons/s" if seconds > 0 else ""
+    names = ("photons", "seed", "collected_fraction", "detections_per_pulse", "derivatives")
+    found = {name: summary[name] for name in names if name in summary} | {
+        "device": f"{result.provenance.get('device', 'unknown')}, {seconds:.3g} s{rate}",
         "depth_m": [float(returned.min()), float(returned.max())] if returned.size else None,
         "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
     }
-    if result.derivatives:
-        found["derivatives"] = summary["derivatives"]
     if result.second_moment is not None and result.photons >= 2 * result.batch_size:
         found["relative_error"] = result.relative_error
     return {**found, "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"}
@@ -370,25 +362,6 @@ def analytic(
         backscatter_profile=None if profile is None else opt.load_run(profile),
     )
     files = [result.save(out / "analytic.h5", frames=frames, device=device)]
-    files.append(spadwarp.viz.draw_analytic(result, out / "analytic.png"))
+    files.append(spadwarp.viz.draw(result, out / "analytic.png"))
     notes = spadwarp.analytic.model_notes(read)
-    answer({"frames": frames, "seed": seed, **_typical(result), "notes": notes, "files": files})
-
-
-_MEDIANS = ("signal", "backscatter", "alpha", "signal_to_backscatter", "sigma_time", "sigma_depth")
-_MEANS = ("outlier_probability", "background_probability")
-
-
-def _typical(result: AnalyticResult) -> dict[str, Any]:
-    """Numbers of pixels, and medians or means of those with an estimate."""
-    import numpy as np
-
-    known = result.fisher > 0
-    found: dict[str, Any] = {
-        "pixels": int(known.size),
-        "pixels_with_target": int(np.isfinite(result.truth.depth).sum()),
-        "pixels_with_estimate": int(known.sum()),
-    }
-    for names, average in ((_MEDIANS, np.median), (_MEANS, np.mean)):
-        found |= {name: float(average(getattr(result, name)[known])) if known.any() else math.nan for name in names}
-    return found
+    answer({**spadwarp.files.summary(result), "frames": frames, "notes": notes, "files": files})

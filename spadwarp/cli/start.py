@@ -11,8 +11,8 @@ import spadwarp
 from spadwarp.cli import options as opt
 from spadwarp.cli.app import fail, note, say, wrong
 from spadwarp.cli.options import command
-from spadwarp.cli.outputs import check_outputs, count, rows, write_json
-from spadwarp.values import suggestion
+from spadwarp.cli.outputs import check_outputs, rows, write_json
+from spadwarp.values import count, suggestion
 
 
 @command(without=("json",))

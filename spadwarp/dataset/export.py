@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.dataset.card import card, croissant
 from spadwarp.dataset.read import FrameReader
 from spadwarp.dataset.recipe import SPLITS
-from spadwarp.dataset.shards import FIELDS, FRAME_COLUMNS, HISTOGRAM_FIELDS, Column, checksum, scene_columns
+from spadwarp.dataset.shards import FIELDS, HISTOGRAM_FIELDS, Column, checksum, columns_of
 from spadwarp.io.text import write_json, write_text
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time
@@ -33,26 +33,12 @@ FEATURE_NAMES = ("peak_depth", "peak_counts", "second_depth", "second_counts", "
 
 EXPORT_FORMATS = ("parquet", "webdataset", "zarr")
 
-_MEANING = f"of the histogram, [{len(FEATURE_NAMES)}, height, width]: {', '.join(FEATURE_NAMES)}"
-EXPORT_FIELDS: dict[str, Column] = {
-    **FIELDS,
-    "label": replace(FIELDS["label"], kind=np.uint8),
-    "features": Column(np.float32, "", _MEANING, axis="feature"),
-}
-"""Images of an exported frame."""
+EXPORT_FIELDS, _NUMBERS = FIELDS | columns_of("exported"), columns_of("numbers")
+"""Images of an exported frame, and its numbers."""
 
 _DEFAULT = ("noisy", "clean", "label", "intensity", "bound")
 _OF_HISTOGRAMS = ("features", *HISTOGRAM_FIELDS)
 _ZARR_FRAMES = 16  # of a chunk
-_SCENE_COLUMNS = scene_columns((0, 0))
-_NUMBERS = {
-    "sample": FRAME_COLUMNS["sample"],
-    "scene": Column(np.int64, "1", "id of the scene"),
-    **{name: FRAME_COLUMNS[name] for name in ("backscatter_fraction", "attenuation_lengths", "distance")},
-    **{name: replace(_SCENE_COLUMNS[name], kind=np.float32) for name in ("gate_near", "gate_far")},
-    **{name: _SCENE_COLUMNS[name] for name in ("pulses", "photons")},
-    "target": Column(object, "1", "name of the target"),
-}
 
 Progress = Callable[[str, int, int], None]
 
@@ -87,9 +73,8 @@ def export_dataset(
         overwrite: Whether an existing `out` is replaced.
         progress: Called with ("frames", frames written, frames to write).
 
-    Raises:
-        ArgumentError: An argument out of range, or a field that the dataset does not have.
-        FileError: No dataset, `out` exists or cannot be written, or a package is missing.
+    Raises `ArgumentError`: an argument out of range, or a field that the dataset does not have; `FileError`: no
+    dataset, `out` exists or cannot be written, or a package is missing.
     """
     check_choice("format", format, EXPORT_FORMATS)
     frames_per_file = check_integer("frames_per_file", frames_per_file, "[1, 1000000]")

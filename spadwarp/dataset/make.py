@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, StringConstraints, TypeAdapter, ValidationError
 
@@ -237,23 +237,14 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """The work of a call of `make_dataset`.
+    """The work of a call of `make_dataset`."""
 
-    Attributes:
-        folder: The dataset.
-        made: Names of the shards that were made.
-        kept: Those that were already complete.
-        missing: Those that are missing because they were not asked for.
-        broken: What was wrong with those that were made again.
-        frames: Number of frames that were made.
-    """
-
-    folder: Path
-    made: tuple[str, ...]
-    kept: tuple[str, ...]
-    missing: tuple[str, ...]
-    broken: tuple[str, ...]
-    frames: int
+    folder: Path  # the dataset
+    made: tuple[str, ...]  # names of the shards that were made
+    kept: tuple[str, ...]  # those that were already complete
+    missing: tuple[str, ...]  # those that are missing because they were not asked for
+    broken: tuple[str, ...]  # what was wrong with those that were made again
+    frames: int  # number of frames that were made
 
 
 def make_dataset(
@@ -300,7 +291,7 @@ def make_dataset(
     if engine is None:
         device = _processes(device, processes, len(missing))
     done = 0
-    jobs = [_Job(plan.recipe, folder, item.index) for item in missing]
+    jobs = [(plan.recipe, folder, item.index) for item in missing]
     with interruptible() as stopped:
         options: dict[str, Any] = {"engine": engine, "device": device, "stopped": stopped}
         for _, frames in run_jobs(_make_shard, jobs, note=lambda text: report(text, 0, 0), **options):
@@ -319,19 +310,14 @@ def make_dataset(
     )
 
 
-class _Job(NamedTuple):
-    recipe: Recipe
-    folder: Path
-    shard: int
-
-
-def _make_shard(job: _Job, worker: Worker) -> int:
-    """Makes a shard and its record, unless another process does; returns its frames."""
+def _make_shard(job: tuple[Recipe, Path, int], worker: Worker) -> int:
+    """Makes a shard, by its index, and its record, unless another process does; returns its frames."""
+    recipe, folder, index = job
     plan = worker.state.get("plan")
-    if plan is None or plan.recipe != job.recipe:
-        plan = worker.state["plan"] = Plan(job.recipe)
-    shard = plan.shards[job.shard]
-    record = _record_path(job.folder, shard)
+    if plan is None or plan.recipe != recipe:
+        plan = worker.state["plan"] = Plan(recipe)
+    shard = plan.shards[index]
+    record = _record_path(folder, shard)
     try:
         record.parent.mkdir(exist_ok=True)
     except OSError as error:
@@ -339,13 +325,13 @@ def _make_shard(job: _Job, worker: Worker) -> int:
     with lock(record.with_suffix(".lock"), wait=lambda: not worker.stopped.is_set()) as obtained:
         if not obtained:  # interrupted while another process was making it
             return 0
-        if _state(plan, job.folder, shard):
+        if _state(plan, folder, shard):
             try:
                 record.unlink(missing_ok=True)
             except OSError as error:
                 raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
             remove_temporaries(record)
-            written = write_shard(plan, shard, job.folder, device=worker.device, threads=worker.threads)
+            written = write_shard(plan, shard, folder, device=worker.device, threads=worker.threads)
             write_json(written, record, indent=1)
     return shard.scenes * plan.frames_per_scene
 

@@ -42,20 +42,13 @@ _DEPTH_ENDING, _NORMAL_ENDING, _ALBEDO_ENDING = "_RGBD", "_Surf_Norm", "_Base_Co
 
 @dataclass(frozen=True)
 class TargetSource:
-    """A target of a dataset.
+    """A target of a dataset."""
 
-    Attributes:
-        name: Of the built-in shape, or of the file without its ending.
-        split: "train", "validation" or "test".
-        mesh, export: The mesh file, or the engine's depth map; neither for a built-in shape.
-        chosen: How the recipe scales and turns mesh files, and which program wrote the depth map.
-    """
-
-    name: str
-    split: str
-    mesh: Path | None
-    export: Path | None
-    chosen: Targets
+    name: str  # of the built-in shape, or of the file without its ending
+    split: str  # "train", "validation" or "test"
+    mesh: Path | None  # the mesh file
+    export: Path | None  # the engine's depth map; a built-in shape has neither
+    chosen: Targets  # how the recipe scales and turns mesh files, and which program wrote the depth map
 
     def placed(self, pose: dict[str, Any], *, fill: float | None, camera: Camera) -> dict[str, Any]:
         """The fields of a scene's target, its centre at the pose's translation, scaled as the recipe asks.
@@ -207,33 +200,20 @@ class Shard:
 
 @dataclass(frozen=True)
 class SceneDraw:
-    """One scene as it was drawn; an exposure that depends on the light that returns is found later.
+    """One scene as it was drawn; an exposure that depends on the light that returns is found later."""
 
-    Attributes:
-        index: Of the scene.
-        target: Index into `Plan.targets`.
-        source: That target.
-        scene: The scene; where `signal_photons` is given, its number of pulses is not final.
-        distance: Of the target's centre [m].
-        attenuation_lengths: Extinction times distance.
-        signal_photons: Of the median pixel, which decides the pulses; None: those of the scene.
-        fractions: Backscatter fraction of each frame; NaN where the photon rates decide, as with traced photons.
-        photons: Number to trace; None for the analytic model.
-        seed: Of photons and camera.
-        split_seed: Of the frames of the analytic model, together with their sample ids.
-    """
-
-    index: int
-    target: int
-    source: TargetSource
-    scene: Scene
-    distance: float
-    attenuation_lengths: float
-    signal_photons: float | None
+    index: int  # of the scene
+    target: int  # index into `Plan.targets`
+    source: TargetSource  # that target
+    scene: Scene  # the scene; where `signal_photons` is given, its number of pulses is not final
+    distance: float  # of the target's centre [m]
+    attenuation_lengths: float  # extinction times distance
+    signal_photons: float | None  # of the median pixel, which decides the pulses; None: those of the scene
     fractions: tuple[float, ...]
-    photons: int | None
-    seed: int
-    split_seed: int
+    """Backscatter fraction of each frame; NaN where the photon rates decide, as with traced photons."""
+    photons: int | None  # number to trace; None for the analytic model
+    seed: int  # of photons and camera
+    split_seed: int  # of the frames of the analytic model, together with their sample ids
 
     @property
     def samples(self) -> NDArray[np.int64]:

@@ -40,9 +40,7 @@ class FrameReader:
 
     Each process opens the files for itself when it first reads: workers of a `DataLoader` need no extra care.
 
-    Raises:
-        FileError: No dataset, or one that is not whole.
-        ArgumentError: An argument out of range.
+    Raises `FileError`: no dataset, or one that is not whole; `ArgumentError`: an argument out of range.
     """
 
     def __init__(

@@ -33,39 +33,23 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderedScene:
-    """A scene's maps and its frames.
+    """A scene's maps and its frames."""
 
-    Attributes:
-        draw: What was drawn for it.
-        scene: The scene with its final number of pulses.
-        truth: What the camera would see through clear water.
-        bound: Cramér–Rao bound of the depth in one frame, float32 `[H, W]` [m]; NaN for no estimate.
-        density, edges: Of the water's backscatter over depth on the axis [1/m], `[PROFILE_BINS]`, and its bins' edges
-            [m].
-        signal, backscatter: Expected detections per pulse, median over the target's pixels and over all.
-        depth, intensity: Of the frames as they are stored: codes, uint16 and uint8 `[K, H, W]`.
-        label: Packed bits, uint8 `[K, H, ceil(W/8)]`.
-        intensity_step: Recorded photons per unit of intensity.
-        counts: Of a traced scene, int32 `[K, H, W, T]`.
-        expected: Of a traced scene, expected counts of a frame before pile-up, float16 `[H, W, T]`.
-        polarisation: Degree of polarisation of each bin, float16 `[H, W, T]`; None: the camera does not record it.
-    """
-
-    draw: SceneDraw
-    scene: Scene
-    truth: Truth
-    bound: NDArray[np.float32]
-    density: NDArray[np.float32]
-    edges: NDArray[np.float32]
-    signal: float
-    backscatter: float
-    depth: NDArray[np.uint16]
-    label: NDArray[np.uint8]
-    intensity: NDArray[np.uint8]
-    intensity_step: float
-    counts: NDArray[np.int32] | None = None
-    expected: NDArray[np.float16] | None = None
-    polarisation: NDArray[np.float16] | None = None
+    draw: SceneDraw  # what was drawn for it
+    scene: Scene  # the scene with its final number of pulses
+    truth: Truth  # what the camera would see through clear water
+    bound: NDArray[np.float32]  # Cramér–Rao bound of the depth in one frame, float32 `[H, W]` [m]; NaN for no estimate
+    density: NDArray[np.float32]  # of the water's backscatter over depth on the axis [1/m], `[PROFILE_BINS]`
+    edges: NDArray[np.float32]  # of its bins [m]
+    signal: float  # expected detections of the return per pulse, median over the target's pixels
+    backscatter: float  # expected detections of backscatter per pulse, median over all pixels
+    depth: NDArray[np.uint16]  # of the frames as they are stored: codes `[K, H, W]`
+    label: NDArray[np.uint8]  # packed bits, uint8 `[K, H, ceil(W/8)]`
+    intensity: NDArray[np.uint8]  # codes `[K, H, W]`
+    intensity_step: float  # recorded photons per unit of intensity
+    counts: NDArray[np.int32] | None = None  # of a traced scene, int32 `[K, H, W, T]`
+    expected: NDArray[np.float16] | None = None  # likewise, counts of a frame before pile-up, `[H, W, T]`
+    polarisation: NDArray[np.float16] | None = None  # its degree in each bin `[H, W, T]`; None: it is not recorded
 
 
 def intensity_step(brightest: float) -> float:

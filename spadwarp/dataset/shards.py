@@ -7,10 +7,12 @@ to `event_start[n + 1]`.
 
 from __future__ import annotations
 
+import importlib.resources
 import math
 import os
+import tomllib
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -40,22 +42,14 @@ _COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
 
 @dataclass(frozen=True)
 class Column:
-    """A dataset of a file, or a field of a frame.
+    """A dataset of a file, or a field of a frame."""
 
-    Attributes:
-        kind: Its type; `object`: text; a tuple: one of them.
-        unit, meaning: In words.
-        source: The attribute of a `RenderedScene` with its value; "": it is computed, or is none of a scene's.
-        shape: Of a row.
-        axis: Name of the first dimension of an image that has three.
-    """
-
-    kind: Any
+    kind: Any  # its type; `object`: text; a tuple: one of them
     unit: str
     meaning: str
-    source: str = ""
-    shape: tuple[int, ...] = ()
-    axis: str = ""
+    source: str = ""  # the attribute of a `RenderedScene` with its value; "": it is computed, or is none of a scene's
+    shape: tuple[int, ...] = ()  # of a row
+    axis: str = ""  # name of the first dimension of an image that has three
 
     @property
     def is_text(self) -> bool:
@@ -73,112 +67,30 @@ class Column:
         return {"unit": self.unit, "description": self.meaning}
 
 
-_TARGET = Column(np.int32, "1", "index into the targets of manifest.json", "draw.target")
-_DISTANCE = ("m", "of the target's centre along the optical axis", "draw.distance")
-_LENGTHS = ("1", "extinction times distance, one way", "draw.attenuation_lengths")
-_FRACTION = "requested part of the pixels that report backscatter; NaN: the photon rates decide"
-_LABEL = "the pixel reports backscatter or other background: np.packbits along rows, first pixel highest"
+def columns_of(table: str, **sides: int) -> dict[str, Column]:
+    """The columns of a table of columns.toml, whose shapes name sides."""
 
-FRAME_COLUMNS: dict[str, Column] = {
-    "depth": Column(np.uint16, "m", "noisy planar depth = offset + step * code; code 0: no return", "depth"),
-    "label": Column(np.uint8, "1", _LABEL, "label"),
-    "intensity": Column(np.uint8, "1", "recorded photons = intensity_step * code, cut at 255", "intensity"),
-    "scene": Column(np.int32, "1", "index into scenes.h5", "draw.index"),
-    "sample": Column(np.int64, "1", "id of the frame in the whole dataset", "draw.samples"),
-    "seed": Column(np.uint64, "1", "with the sample id, key of the frame's random numbers", "draw.frame_seed"),
-    "target": _TARGET,
-    "backscatter_fraction": Column(np.float32, "1", _FRACTION, "draw.fractions"),
-    "attenuation_lengths": Column(np.float32, *_LENGTHS),
-    "distance": Column(np.float32, *_DISTANCE),
-    "pulses": Column(np.int64, "1", "laser pulses of the frame", "scene.pulses_per_depth_frame"),
-    "intensity_step": Column(np.float32, "1", "recorded photons per unit of intensity", "intensity_step"),
-}
-"""Datasets of a frames file, all with one first dimension."""
+    def column(kind: str | list[str], shape: Sequence[str | int] = (), **others: str) -> Column:
+        types: Any = tuple(np.dtype(one).type for one in kind) if isinstance(kind, list) else kind
+        if isinstance(kind, str) and kind[0] != "S":
+            types = object if kind == "text" else np.dtype(kind).type
+        return Column(types, shape=tuple(side if isinstance(side, int) else sides[side] for side in shape), **others)
 
-_EXPECTED = "expected counts of a frame before pile-up: target, scattered light, dark counts, ambient light"
-_POLARISATION = "degree of polarisation of each bin's light, by both channels; NaN where none arrives"
-
-HISTOGRAM_COLUMNS: dict[str, Column] = {
-    "scene": FRAME_COLUMNS["scene"],
-    "expected": Column(np.float16, "1", _EXPECTED),
-    "polarisation": Column(np.float16, "1", _POLARISATION),
-    "gate_start": Column(np.float64, "s", "start of bin 0 after the pulse left the laser", "scene.gate.start"),
-    "bin_width": Column(np.float64, "s", "width of a bin", "scene.gate.bin_width"),
-    "sample": FRAME_COLUMNS["sample"],
-    "counts": Column(_COUNTS, "1", "counts of the frame"),
-    "event_start": Column(np.int64, "1", "first event of each frame; one entry more than frames"),
-    "event_index": Column(np.uint32, "1", "y * W * T + x * T + bin"),
-    "event_count": Column(_COUNTS, "1", "counts in that bin"),
-}
-"""Datasets of a histograms file."""
-
-# Unit, meaning and source.
-_SCENE_NUMBERS: dict[str, tuple[str, str, str]] = {
-    "distance": _DISTANCE,
-    "attenuation_lengths": _LENGTHS,
-    "absorption": ("1/m", "a", "scene.medium.absorption"),
-    "scattering": ("1/m", "b", "scene.medium.scattering"),
-    "extinction": ("1/m", "c = a + b", "scene.medium.extinction"),
-    "anisotropy": ("1", "g, mean cosine of the scattering angle", ""),
-    "group_index": ("1", "light travels at 299792458 m/s over this", "scene.medium.group_index"),
-    "gate_near": ("m", "range at which the gate opens", ""),
-    "gate_far": ("m", "range at which the gate closes", ""),
-    "target_reflectance": ("1", "of the target; NaN where each pixel has its own", ""),
-    "pulses": ("1", "laser pulses of a frame", "scene.pulses_per_depth_frame"),
-    "photons": ("1", "photons that were traced; 0: analytic", ""),
-    "signal": ("1", "expected detections of the return per pulse, median over the target's pixels", "signal"),
-    "backscatter": ("1", "expected backscatter detections per pulse within the gate, median", "backscatter"),
-    "pulse_energy": ("J", "of the laser", "scene.laser.pulse_energy"),
-    "pulse_fwhm": ("s", "of the laser", ""),
-    "jitter_fwhm": ("s", "of the detector", ""),
-    "pde": ("1", "photon detection efficiency", "scene.detections_per_photon"),
-    "dark_count_rate": ("1/s", "of a pixel", "scene.detector.dark_count_rate"),
-}
+    return {name: column(**entry) for name, entry in _TABLES[table].items()}
 
 
-def scene_columns(shape: tuple[int, int]) -> dict[str, Column]:
-    """Datasets of `scenes.h5`, all with one first dimension; `shape`: height and width of the images."""
-    bins, real, half = PROFILE_BINS, np.float32, np.float16
-    density = "density of the water's backscatter over depth, on axis"
-    return {
-        "depth": Column(real, "m", "true planar depth; NaN where nothing is hit", "truth.depth", shape),
-        "bound": Column(real, "m", "Cramér–Rao bound of the depth in one frame; NaN for no estimate", "bound", shape),
-        "normal": Column(half, "1", "unit normals towards the camera", "truth.normal", (*shape, 3)),
-        "reflectance": Column(half, "1", "Lambertian reflectance", "truth.reflectance", shape),
-        "backscatter_profile": Column(real, "1/m", density, "density", (bins,)),
-        "profile_edges": Column(real, "m", "edges of the profile's bins", "edges", (bins + 1,)),
-        "target": _TARGET,
-        "target_name": Column("S64", "1", "its name", "draw.source.name"),
-        "translation": Column(real, "m", "of the target", "", (3,)),
-        "rotation_deg": Column(real, "deg", "of the target about its own x, y, z", "", (3,)),
-        "scale": Column(real, "1", "of the target", "", (3,)),
-        "laser_position": Column(real, "m", "in the camera frame", "scene.beam.position", (3,)),
-        **{name: Column(np.float64, *numbers) for name, numbers in _SCENE_NUMBERS.items()},
-        "config": Column("S8192", "1", "the scene as TOML"),
-    }
-
+_TABLES = tomllib.loads((importlib.resources.files("spadwarp.dataset") / "columns.toml").read_text(encoding="utf-8"))
+FRAME_COLUMNS, HISTOGRAM_COLUMNS, FIELDS = map(columns_of, ("frames", "histograms", "items"))
+"""Datasets of a frames file and of a histograms file; images of an item, float32 `[1, H, W]` without another shape."""
 
 HISTOGRAM_FIELDS = ("counts", "expected", "polarisation")
 """Cubes of a frame."""
 
-_TRACED = "[bin, height, width]; of traced scenes"
-_DEGREE = f"degree of polarisation by both channels, without the noise of counts, {_TRACED} with an analyser"
-# Unit, meaning, and the name of the first of three dimensions.
-_FIELDS = {
-    "noisy": ("m", "depth frame; NaN: no return", ""),
-    "clean": ("m", "true planar depth; NaN: nothing is hit", ""),
-    "label": ("1", "1: the pixel reports backscatter or other background, else 0", ""),
-    "intensity": ("1", "recorded photons", ""),
-    "bound": ("m", "Cramér–Rao bound of the depth; NaN: no estimate", ""),
-    "normal": ("1", "unit normals towards the camera, [3, height, width]", "axis"),
-    "reflectance": ("1", "Lambertian reflectance", ""),
-    "prior": ("1/m", "density with which the water alone reports the depth in noisy; NaN where noisy is", ""),
-    "counts": ("1", f"histogram of the frame, {_TRACED}", "bin"),
-    "expected": ("1", f"expected histogram before pile-up, {_TRACED}", "bin"),
-    "polarisation": ("1", f"{_DEGREE}; NaN: no light", "bin"),
-}
-FIELDS = {name: Column(np.float32, unit, meaning, axis=axis) for name, (unit, meaning, axis) in _FIELDS.items()}
-"""Images that an item can hold, float32 `[1, H, W]` where no other shape is given."""
+
+def scene_columns(shape: tuple[int, int]) -> dict[str, Column]:
+    """Datasets of `scenes.h5`; `shape`: height and width of the images."""
+    return columns_of("scenes", height=shape[0], width=shape[1], bins=PROFILE_BINS, edges=PROFILE_BINS + 1)
+
 
 _SCENE_FIELDS = {"clean": "depth", "bound": "bound", "normal": "normal", "reflectance": "reflectance"}
 

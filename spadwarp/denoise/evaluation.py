@@ -173,30 +173,20 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation:
-    """Scores of methods on a dataset.
+    """Scores of methods on a dataset."""
 
-    Attributes:
-        data: The dataset's name and folder.
-        summary: Photons, water, backscatter and seed of the frames, as text.
-        methods, targets, levels: In the order of the tables; `"input"` is the first method. A level is a backscatter
-            fraction, the part of the pixels that report backscatter, or a range of photon counts.
-        scores: Mean over frames, by (method, target, level).
-        frames: Number of frames, by (target, level).
-        windows: Side of the median that has the highest PSNR, by level [pixels].
-        steps: Steps of the staircase's frames, by (method, level); empty without a staircase.
-        samples: A frame by (target, level).
-    """
-
-    data: str
-    summary: str
-    methods: tuple[str, ...]
-    targets: tuple[str, ...]
+    data: str  # the dataset's name and folder
+    summary: str  # photons, water, backscatter and seed of the frames, as text
+    methods: tuple[str, ...]  # in the order of the tables; "input" is the first
+    targets: tuple[str, ...]  # in the order of the tables
     levels: tuple[str, ...]
-    scores: dict[tuple[str, str, str], Scores]
-    frames: dict[tuple[str, str], int]
-    windows: dict[str, int]
+    """Backscatter fractions, the part of the pixels that report backscatter, or ranges of photon counts."""
+    scores: dict[tuple[str, str, str], Scores]  # mean over frames, by (method, target, level)
+    frames: dict[tuple[str, str], int]  # number of frames, by (target, level)
+    windows: dict[str, int]  # side of the median that has the highest PSNR, by level [pixels]
     steps: dict[tuple[str, str], Steps]
-    samples: dict[tuple[str, str], Sample]
+    """Steps of the staircase's frames, by (method, level); empty without a staircase."""
+    samples: dict[tuple[str, str], Sample]  # a frame by (target, level)
 
     def mean(self, method: str, *, level: str | None = None, target: str | None = None) -> Scores:
         """Mean over targets and levels, or over those of one level or target; each counts once."""

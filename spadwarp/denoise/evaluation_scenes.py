@@ -231,20 +231,14 @@ class FrameScores:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneScores:
-    """Scores of methods on frames of `spadwarp.denoise.evaluation_scenes`, or of scenes of one's own.
+    """Scores of methods on frames of `spadwarp.denoise.evaluation_scenes`, or of scenes of one's own."""
 
-    Attributes:
-        methods: In the order of the tables; "input" is the first.
-        rows: Scores by (method, setting, water, level, shape).
-        windows: Side of the best median by (setting, water, level) [pixels].
-        reliability: By method and "target" or "confidence": pixels and those of which it was true, by tenths of the
-            probability, `[10, 2]`; of methods that estimate probabilities.
-    """
-
-    methods: tuple[str, ...]
-    rows: dict[tuple[str, str, str, float, str], FrameScores]
-    windows: dict[tuple[str, str, float], int]
+    methods: tuple[str, ...]  # in the order of the tables; "input" is the first
+    rows: dict[tuple[str, str, str, float, str], FrameScores]  # scores by (method, setting, water, level, shape)
+    windows: dict[tuple[str, str, float], int]  # side of the best median by (setting, water, level) [pixels]
     reliability: dict[tuple[str, str], NDArray[np.int64]]
+    """By method and "target" or "confidence": pixels and those of which it was true, by tenths of the probability,
+    `[10, 2]`; of methods that estimate probabilities."""
 
     def mean(self, field: str, method: str, **where: Any) -> float:
         """Mean of a field of `FrameScores` over the frames of a method.

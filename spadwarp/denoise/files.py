@@ -20,7 +20,7 @@ from spadwarp.dataset.shards import SceneFile
 from spadwarp.denoise.baselines import CLASSICAL
 from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
 from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins
-from spadwarp.denoise.inference import Estimate, estimate_frames, estimate_histograms, target_threshold
+from spadwarp.denoise.inference import Estimate, detected, estimate_frames, estimate_histograms, target_threshold
 from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
@@ -76,7 +76,8 @@ def read_depth(
 
     `.h5`: a result or frames of counts; of an analytic file, a shard or a dataset's folder the depth as it is. `.exr`:
     depth in `channel`. `.npy`, `.mat`, `.h5` of others: one frame `[H, W]` of depth, or histograms, see
-    `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`.
+    `spadwarp.frames.read_histograms`. `.ptu`: histograms. Histograms become depth by `spadwarp.frames.depth.depth_of`,
+    in every pixel.
 
     Args:
         path: The file.
@@ -133,7 +134,7 @@ def read_depth(
         # At the median bin of all pixels and frames together: that of sparse counts would be 0.
         total = histograms.values.reshape(-1, bins).sum(axis=0, dtype=np.float64)
         level = np.median(total) * bins / histograms.values.size
-        histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32))
+        histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32), level_known=False)
     if counted and gate is not None:
         histograms = _within(histograms, gate, float(group_index or 1.0))
     return dataclasses.replace(_estimate_depth(histograms, counted, method, group_index, device), truth=truth)
@@ -179,7 +180,7 @@ def _estimate_depth(
     method = method or ("likelihood" if counted else "matched")
     if method in ("matched", "likelihood") and histograms.response is None:
         method = "centroid"
-    reduced = depth_of(histograms, method=method, group_index=group_index, device=device)
+    reduced = depth_of(histograms, method=method, group_index=group_index, min_significance=0.0, device=device)
     scene = histograms.scene
     index = scene.medium.group_index if scene is not None else float(group_index or 1.0)
     gate_stop = histograms.gate_start + histograms.values.shape[-1] * float(histograms.bin_width or 0.0)
@@ -266,6 +267,7 @@ def denoise_file(
     device: str | None = None,
     precision: Precision | None = None,
     mask: float | None = None,
+    min_significance: float | None = None,
     **reading: Any,
 ) -> Denoised:
     """Denoises the depth in a file.
@@ -273,13 +275,16 @@ def denoise_file(
     Writes to `out`: `NAME.npy`, `NAME_target.npy`, `NAME_confidence.npy` (depth and the two probabilities of all
     frames), `NAME.exr` (all three of the first), and `NAME.png`, in which open water is left out. From counts also
     `NAME_second.npy`, the depth of a second return in the same pixel, NaN where there is none. In bright scenes this
-    may be light that the water scattered into the pixel from another part of the target.
+    may be light that the water scattered into the pixel from another part of the target. `NAME_significance.npy`: that
+    of the counts.
 
     Args:
         path: A result or frames of spadwarp, depth as EXR, NumPy or MATLAB, or measured histograms.
         out: The folder.
         model, weights, device, precision: See `spadwarp.denoise.estimate`.
         mask: Pixels that see a target with less than this probability become NaN; default: every pixel has a depth.
+        min_significance: Of counts, pixels below it become NaN, see `Estimate`; default: that of the scene's detector,
+            4 of measured histograms.
         gate: (start, stop) in depth [m]; of counts only the bins within it are used. Default: the file's, else all.
         profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
         reading: The other arguments of `read_depth`.
@@ -319,6 +324,12 @@ def denoise_file(
             second = None
             frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile)
             found = estimate_frames(frames, model=model, weights=weights, device=device, precision=precision)
+        if (held := read.histograms) is not None and held.response is not None and held.background is not None:
+            if min_significance is None:
+                min_significance = 4.0 if held.scene is None else held.scene.detector.min_significance
+            test: dict[str, Any] = {"min_significance": min_significance, "level_known": held.level_known}
+            response = held.response.per_bin(float(held.bin_width or 0.0))
+            found = detected(found, held.values, held.background, response, model=model, **test)
         depth = found.depth if mask is None else found.masked(mask)
     notes += [str(warning.message) for warning in caught]
     if empty := np.count_nonzero(np.isnan(depth).all(axis=(1, 2))):
@@ -342,6 +353,8 @@ def _write(
 ) -> list[Path]:
     """Writes the arrays and the EXR of `denoise_file`; their paths."""
     arrays = {"": found.depth, "_target": found.target_probability, "_confidence": found.confidence}
+    if found.significance is not None:
+        arrays["_significance"] = found.significance
     if second is not None:
         arrays["_second"] = second
     for ending, values in arrays.items():

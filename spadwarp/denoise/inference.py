@@ -22,6 +22,7 @@ from spadwarp.denoise.frames import (
 )
 from spadwarp.denoise.histograms import checked_histograms, features_of_histograms, target_bins
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
+from spadwarp.frames.depth import arrival_time
 from spadwarp.values import ArgumentError, check_choice, check_real
 
 __all__ = ["METHODS", "Estimate", "apply", "estimate"]
@@ -46,19 +47,19 @@ _PIXELS_AT_ONCE = {"cpu": 1 << 16, "cuda": 1 << 23}  # a batch that fits into a 
 
 
 class Estimate(NamedTuple):
-    """The answer of denoising, float32, each of the frames' shape.
-
-    Attributes:
-        depth: [m]; an answer for every pixel of PyramidNet, except in frames without any report (NaN).
-        target_probability: Probability that the pixel sees a target and not only water. For methods that do not
-            estimate it: 1 where the pixel reported, else 0.
-        confidence: Probability that the depth is right to 1 % of the gate that holds the target; NaN for methods that
-            do not estimate it.
-    """
+    """The answer of denoising, float32, each of the frames' shape."""
 
     depth: NDArray[np.float32]
+    """[m]; an answer for every pixel of PyramidNet, except in frames without any report (NaN)."""
     target_probability: NDArray[np.float32]
+    """Probability that the pixel sees a target and not only water. For methods that do not estimate it: 1 where the
+    pixel reported, else 0."""
     confidence: NDArray[np.float32]
+    """Probability that the depth is right to 1 % of the gate that holds the target; NaN for methods that do not
+    estimate it."""
+    significance: NDArray[np.float32] | None = None
+    """Of the counts of the pixel for "likelihood", of 7 × 7 pixels for the others, which use those around it; see
+    `spadwarp.arrival_time`. None without counts."""
 
     def masked(self, probability: float) -> NDArray[np.float32]:
         """Depth, NaN where a target is less probable than `probability`."""
@@ -98,6 +99,7 @@ def estimate(
     counts: ArrayLike | None = None,
     background: ArrayLike | None = None,
     response: ArrayLike | None = None,
+    min_significance: float = 4.0,
     weights: str | Path | None = None,
     device: str | None = None,
     precision: Precision | None = None,
@@ -118,6 +120,7 @@ def estimate(
         background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`, as
             `spadwarp.frames.InstrumentResponse.per_bin` gives it.
+        min_significance: Of counts, pixels below this significance have no depth; 0: every pixel has one.
         weights: File of `spadwarp train`; default: the weights of the package.
         device: torch device of the network; default: the first GPU, else the CPU.
         precision: Of the layers of PyramidNet for depth alone, "float16", "bfloat16" or "float32". Default: float16 on
@@ -164,7 +167,42 @@ def estimate(
             depth, cubes, levels, taps, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
             profile=profile, weights=weights, device=device,
         )  # fmt: skip
-    return Estimate(*(values.reshape(np.shape(depth)) for values in found))
+        found = detected(found, cubes, levels, taps, model=model, min_significance=min_significance)
+    shaped: Any = (None if values is None else values.reshape(np.shape(depth)) for values in found)
+    return Estimate(*shaped)
+
+
+def detected(
+    found: Estimate,
+    counts: NDArray[Any],
+    background: NDArray[Any],
+    response: NDArray[Any],
+    *,
+    model: str,
+    min_significance: float,
+    level_known: bool = True,
+) -> Estimate:
+    """`found` with the significance of the counts, and neither depth nor target below the least; of rates as it is."""
+    from scipy.ndimage import convolve1d
+
+    least = check_real("min_significance", min_significance, "[0, 1000]")
+    if counts.dtype.kind not in "biu" and not np.array_equal(counts, np.rint(counts)):
+        return found
+    window = np.ones(1 if model == "likelihood" else 7, np.int64)
+
+    def summed(cube: NDArray[Any]) -> NDArray[Any]:  # over the pixels of a window that are in the frame
+        return convolve1d(convolve1d(cube, window, axis=0, mode="constant"), window, axis=1, mode="constant")
+
+    frames = counts.reshape(-1, *counts.shape[-3:])
+    known = summed(np.broadcast_to(background, frames.shape[1:]))
+    significance = np.empty(frames.shape[:-1], np.float32)
+    options: dict[str, Any] = {"background": known, "level_known": level_known, "irf": response, "device": "cpu"}
+    for cube, out in zip(frames, significance, strict=True):
+        arrival_time(summed(cube.astype(np.int64)), gate_start=0.0, bin_width=1e-12, significance=out, **options)
+    significance = significance.reshape(found.depth.shape)
+    depth = np.where(significance >= least, found.depth, np.float32(np.nan))
+    probability = np.where(significance >= least, found.target_probability, np.float32(0.0))
+    return found._replace(depth=depth, target_probability=probability, significance=significance)
 
 
 def estimate_histograms(

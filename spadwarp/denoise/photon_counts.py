@@ -165,22 +165,15 @@ def _estimates(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhotonSweep:
-    """RMSE of methods over photon counts and signal-to-background ratios.
+    """RMSE of methods over photon counts and signal-to-background ratios."""
 
-    Attributes:
-        summary: Scene, water and seed, as text.
-        photons: Signal counts of the median pixel, `[P]`.
-        sbr: Signal-to-background ratio, `[S]`.
-        rmse: By method, `[S, P]` [m]; "input" is the likelihood estimate itself.
-        bound: Root mean square over pixels of the Cramér–Rao bound, or of a uniform guess over the gate where that is
-            smaller, `[S, P]` [m].
-    """
-
-    summary: str
-    photons: tuple[float, ...]
-    sbr: tuple[float, ...]
-    rmse: dict[str, NDArray[np.float64]]
+    summary: str  # scene, water and seed, as text
+    photons: tuple[float, ...]  # signal counts of the median pixel, `[P]`
+    sbr: tuple[float, ...]  # signal-to-background ratio, `[S]`
+    rmse: dict[str, NDArray[np.float64]]  # by method, `[S, P]` [m]; "input" is the likelihood estimate itself
     bound: NDArray[np.float64]
+    """Root mean square over pixels of the Cramér–Rao bound, or of a uniform guess over the gate where that is smaller,
+    `[S, P]` [m]."""
 
     def saving(self, method: str) -> NDArray[np.float64]:
         """Factor in photons at which the input reaches the method's RMSE, `[S, P]`; NaN beyond the sweep's counts."""

@@ -41,29 +41,19 @@ _LARGEST_DTIME = 32768  # bins of a T3 record of PicoQuant
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SequenceFrame:
-    """One frame of any source; without counts where there is depth alone.
+    """One frame of any source; without counts where there is depth alone."""
 
-    Attributes:
-        images: Name → `[H, W]`; `Z` is the depth [m] where the source has it.
-        counts, expected: `[H, W, T]`; expected counts are those before pile-up, of all light and noise.
-        background: The part of `expected` that is not target, counts of a pixel over all bins, mean over pixels.
-        pulses, gate_start, bin_width, period: As of `Frames`.
-        scene: What the camera looked at.
-        depth: True depth [m] `[H, W]`.
-        content: What the images are, in words.
-    """
-
-    images: dict[str, NDArray[Any]]
-    counts: NDArray[Any] | None = None
-    expected: NDArray[np.float32] | None = None
-    background: float | None = None
-    pulses: int = 0
+    images: dict[str, NDArray[Any]]  # name → `[H, W]`; `Z` is the depth [m] where the source has it
+    counts: NDArray[Any] | None = None  # `[H, W, T]`
+    expected: NDArray[np.float32] | None = None  # `[H, W, T]`, before pile-up, of all light and noise
+    background: float | None = None  # its part that is not target, counts of a pixel over all bins, mean over pixels
+    pulses: int = 0  # as of `Frames`, like the next three
     gate_start: float = 0.0
     bin_width: float = 0.0
     period: float | None = None
-    scene: Scene | None = None
-    depth: NDArray[np.float32] | None = None
-    content: str = ""
+    scene: Scene | None = None  # what the camera looked at
+    depth: NDArray[np.float32] | None = None  # true depth [m] `[H, W]`
+    content: str = ""  # what the images are, in words
 
     def bins_of(self, scene: Scene, depth: NDArray[np.float32]) -> NDArray[np.float64]:
         """Time of flight in bins from the start of the gate, with its fraction, of depth [m] that a scene's camera sees
@@ -76,19 +66,12 @@ class SequenceFrame:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameSequence:
-    """Frames of one source, read one at a time.
+    """Frames of one source, read one at a time."""
 
-    Attributes:
-        name: What to call the source in an error.
-        count: Of the frames.
-        frame: Number of a frame, from 0 → the frame.
-        same_scene: Number of a frame → numbers of all frames of its scene; None where frames have counts.
-    """
-
-    name: str
-    count: int
-    frame: Callable[[int], SequenceFrame]
-    same_scene: Callable[[int], range] | None = None
+    name: str  # what to call the source in an error
+    count: int  # of the frames
+    frame: Callable[[int], SequenceFrame]  # number of a frame, from 0 → the frame
+    same_scene: Callable[[int], range] | None = None  # → numbers of all frames of its scene; None: frames have counts
 
     def at(self, number: int) -> SequenceFrame:
         """A frame; `ArgumentError` for a number that is not there."""
@@ -112,9 +95,7 @@ def open_source(source: Any, *, result: Result | None = None, split: str = "all"
         result: From which `Frames` were drawn.
         split: Of a dataset.
 
-    Raises:
-        ArgumentError: A source of another type.
-        FileError: Not a file of ours, or damaged.
+    Raises `ArgumentError`: a source of another type; `FileError`: not a file of ours, or damaged.
     """
     check_choice("split", split, (*SPLITS, "all"))
     if isinstance(source, Frames):
@@ -276,12 +257,8 @@ def export(
         result: The result that the `Frames` were drawn from; `.mat` needs its truth.
         channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
 
-    Returns:
-        The files that were written.
-
-    Raises:
-        ArgumentError: No such frame, or what the format holds is not in the source.
-        FileError: A file cannot be read or written, or the package for its format is not installed.
+    Returns the files that were written. Raises `ArgumentError`: no such frame, or what the format holds is not in the
+    source; `FileError`: a file cannot be read or written, or the package for its format is not installed.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -332,9 +309,8 @@ def export_sensor_fusion(
         factor: Pixels of the camera image in a pixel, each way, in [1, 64].
         frames, split, result: As for `export`.
 
-    Raises:
-        ArgumentError: No such frame, or no counts, or no scene of meshes.
-        FileError: A file cannot be read or written.
+    Raises `ArgumentError`: no such frame, or no counts, or no scene of meshes; `FileError`: a file cannot be read or
+    written.
     """
     opened, folder = open_source(source, result=result, split=split), Path(folder)
     if isinstance(opened, Result):

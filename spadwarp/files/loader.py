@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic import AnalyticFile
+from spadwarp.analytic import AnalyticFile, AnalyticResult, Proposal
+from spadwarp.arrays import on_host
+from spadwarp.checks import summary as scene_summary
 from spadwarp.dataset import FrameReader
-from spadwarp.frames import FramesFile, Reduction, SequenceFile
+from spadwarp.frames import Frames, FramesFile, Reduction, SequenceFile
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import file_within
-from spadwarp.result import Result, load_result
+from spadwarp.result import Result, Truth, load_result
+from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight, port_advance
 from spadwarp.transport import PhotonRecords, load_records
 from spadwarp.values import FileError, range_from_time
@@ -47,8 +50,7 @@ def load(path: str | os.PathLike[str]) -> Held:
     - `sequence.h5` of `simulate --trajectory`: a `SequenceFile`, which reads frames of a scene that moves when asked.
     - A directory with one of these files, such as that of a run: the same. A checkpoint counts if there is no result.
 
-    Raises:
-        FileError: Not a file of ours, damaged, or a directory that holds none or several of them.
+    Raises `FileError`: not a file of ours, damaged, or a directory that holds none or several of them.
     """
     place = locate(path)
     kind, is_shard = (None, True) if place.is_dir() else _format(place)
@@ -144,10 +146,17 @@ def gate_of(held: Held) -> tuple[float, float] | None:
 # Summaries
 
 
-def summary(held: Held) -> dict[str, Any]:
-    """Facts about what a loaded file holds, in numbers and text that JSON can hold; `kind` names what it is."""
+def summary(held: Held | Scene | Frames | AnalyticResult | Proposal) -> dict[str, Any]:
+    """Facts about what a loaded file holds, or is in memory, in numbers and text that JSON can hold; `kind` names it.
+
+    Raises `MeshError` where a target of a scene cannot be read.
+    """
     if isinstance(held, Result):
         return {"kind": "result", **held.summary()}
+    if isinstance(held, Proposal):
+        return {"kind": "proposal", **held.to_dict()}
+    if isinstance(held, Scene):
+        return {"kind": "scene", **scene_summary(held)}
     if isinstance(held, PhotonRecords):
         ended = {name: int(np.count_nonzero(held.reason == number)) for number, name in enumerate(held.reasons)}
         ended = {name: count for name, count in ended.items() if count}
@@ -157,7 +166,13 @@ def summary(held: Held) -> dict[str, Any]:
         facts = {"kind": "dataset", "name": held.manifest["name"], "folder": str(held.path)}
         facts |= {"shards": shards if len(shards) == 1 else len(shards), "frames": len(held)}
         return {**facts, "image": {"width": held.shape[1], "height": held.shape[0]}, "targets": targets}
+    if isinstance(held, Frames):
+        intensity = on_host(held.intensity)
+        facts = {"kind": "frames", "frames": held.frames, "added_up": held.summed, "bins": held.expected.shape[-1]}
+        return {**facts, **_of_frames(held, float(intensity.mean())), "notes": list(held.notes)}
     scene = held.base if isinstance(held, SequenceFile) else held.scene
+    if isinstance(held, AnalyticResult):
+        return {"kind": "analytic", "seed": held.seed, **_of_analytic(scene, vars(held), held.truth)}
     common = {
         "scene": str(scene.source) if scene.source else None,
         "frames": held.frames,
@@ -166,31 +181,39 @@ def summary(held: Held) -> dict[str, Any]:
         "bins": scene.gate.bins if isinstance(held, AnalyticFile) else held.bins,
     }
     if isinstance(held, AnalyticFile):
-        return {"kind": "analytic", **common, **_of_analytic(held)}
+        return {"kind": "analytic", **common, **_of_analytic(scene, held.maps, held.truth)}
     if isinstance(held, SequenceFile):
         times = held.trajectory.times
         facts = {"times_s": [float(times[0]), float(times[-1])], "moving": list(held.trajectory.fields)}
         return {"kind": "sequence", **common, "pulses": held.pulses, **facts, "depth_by": list(held.methods)}
     mean = [float(held.intensity(number).mean()) for number in range(held.frames)]
+    more = {} if held.channel == "I" else {"channel": held.channel}
+    counts = _of_frames(held, float(np.mean(mean)) if mean else None)
+    return {"kind": "frames", **common, **counts, "depth_by": list(held.methods), **more}
+
+
+def _of_frames(held: Frames | FramesFile, counts_per_pixel: float | None) -> dict[str, Any]:
     return {
-        "kind": "frames",
-        **common,
         "pulses": held.pulses,
+        "seed": held.seed,
         "gate_start_ns": 1e9 * held.gate_start,
         "bin_width_ps": 1e12 * held.bin_width,
         "period_ns": None if held.period is None else 1e9 * held.period,
-        "counts_per_pixel": float(np.mean(mean)) if mean else None,
-        "depth_by": list(held.methods),
+        "counts_per_pixel": counts_per_pixel,
         "response_fwhm_ps": 1e12 * held.irf.fwhm,
-        **({} if held.channel == "I" else {"channel": held.channel}),
     }
 
 
-def _of_analytic(file: AnalyticFile) -> dict[str, Any]:
-    estimated, chosen = file.maps["fisher"] > 0, file.scene.analytic
-    facts: dict[str, Any] = {name: getattr(chosen, name) for name in ("form", "backscatter", "count_law")}
-    facts["pixels_with_estimate"] = int(np.count_nonzero(estimated))
-    medians = {"signal_per_pulse": "signal", "sigma_depth_m": "sigma_depth"}
-    for name, field in (medians | {"outlier_probability": "outlier_probability"}).items():
-        facts[name] = float(np.median(file.maps[field][estimated])) if estimated.any() else None
+_MEDIANS = ("signal", "backscatter", "alpha", "signal_to_backscatter", "sigma_time", "sigma_depth")
+_MEANS = ("outlier_probability", "background_probability")
+
+
+def _of_analytic(scene: Scene, maps: Mapping[str, NDArray[Any]], truth: Truth) -> dict[str, Any]:
+    """Settings, numbers of pixels, and medians or means of those with an estimate."""
+    known = maps["fisher"] > 0
+    facts: dict[str, Any] = {name: getattr(scene.analytic, name) for name in ("form", "backscatter", "count_law")}
+    facts["pixels_with_target"] = int(np.isfinite(truth.depth).sum())
+    facts["pixels_with_estimate"] = int(known.sum())
+    for names, average in ((_MEDIANS, np.median), (_MEANS, np.mean)):
+        facts |= {name: float(average(maps[name][known])) if known.any() else None for name in names}
     return facts

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spadwarp.frames import Reduction, detector_response
 from spadwarp.io.arrays import point_cloud, write_array, write_exr, write_ply
-from spadwarp.io.paths import file_within, remove_temporaries
+from spadwarp.io.paths import atomic_path, file_within, remove_temporaries
 from spadwarp.io.text import write_text
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
@@ -50,37 +50,21 @@ _POINT_FRAMES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
 class _Pictures:
-    """The pictures beside the files of a result or a fit."""
-
-    of: Any
-    folder: Path
-
-    def plot(self, **options: Any) -> list[Path]:
-        """Draws those of a result; returns their paths."""
+    @staticmethod
+    def plot(result: Result, folder: Path, **options: Any) -> list[Path]:
+        """Draws the pictures of a run; returns their paths."""
         import spadwarp
 
-        return spadwarp.viz.draw_result(self.of, self.folder, **options)
-
-    def save(self) -> Path:
-        """Draws that of a fit; returns its path."""
-        import spadwarp
-
-        return spadwarp.viz.draw_fit(self.of, self.folder / "fit.png")
+        return spadwarp.viz.draw_result(result, folder, **options)
 
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """The files of a run.
+    """The files of a run."""
 
-    Attributes:
-        written: Their paths.
-        depth: Depth frame [m], float64 `[H, W]`, by `output.depth_method`; NaN where nothing returned.
-    """
-
-    written: list[Path]
-    depth: NDArray[np.float64]
+    written: list[Path]  # their paths
+    depth: NDArray[np.float64]  # depth frame [m] `[H, W]`, by `output.depth_method`; NaN where nothing returned
 
 
 def write_run(result: Result, out: str | Path, *, device: str | None = None, keep: Sequence[str] = ()) -> RunFiles:
@@ -95,9 +79,8 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
         device: Warp device for the depth frame.
         keep: Names of earlier files that are not removed.
 
-    Raises:
-        FileError: A file cannot be written; a result that does not fit goes to the folder for temporary files instead,
-            which the text names.
+    Raises `FileError`: a file cannot be written; a result that does not fit goes to the folder for temporary files
+    instead, which the text names.
     """
     folder, scene, output = Path(out), result.scene, result.scene.output
     written: list[Path] = []
@@ -137,7 +120,7 @@ def _depth(result: Result, device: str | None) -> NDArray[np.float64]:
 def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[Callable[[], list[Path]]]:
     output = result.scene.output
     formats = [ending for ending in _ENDINGS if getattr(output, ending)]
-    draw = functools.partial(_Pictures(result, folder).plot, depth=depth, method=output.depth_method, formats=formats)
+    draw = functools.partial(_Pictures.plot, result, folder, depth=depth, method=output.depth_method, formats=formats)
     return [functools.partial(draw, kinds=(kind,)) for kind in _KINDS] if formats else []
 
 
@@ -206,15 +189,14 @@ def write_depth(
     ply_frame: Literal["camera", "world"] = "camera",
     comment: str = "",
 ) -> list[Path]:
-    """Writes `depth.npy` (all frames, float32), `depth.exr` and `depth.png` (the first); returns the paths.
+    """Writes `depth.npy` (all frames, float32), `depth.exr` and `depth.png` (the first); returns the paths. Of counts
+    also `significance.npy`.
 
     Without a field of view the names begin with `range`. `ply`: the points of the first frame, with normals and
     intensity, in the frame `ply_frame`, which a comment of the file names.
 
-    Raises:
-        ArgumentError: A point cloud was asked for and the field of view is not known, or in the world where the
-            camera's pose is not known.
-        FileError: A file cannot be written.
+    Raises `ArgumentError`: a point cloud was asked for and the field of view is not known, or in the world where the
+    camera's pose is not known; `FileError`: a file cannot be written.
     """
     check_choice("ply_frame", ply_frame, tuple(_POINT_FRAMES))
     if ply is not None and reduction.lines is None:
@@ -233,6 +215,8 @@ def write_depth(
         write_exr(folder / f"{name}.exr", channels, metadata),
         reduction.plot(folder / f"{name}.png", label=label, title=f"{name.capitalize()} ({reduction.method})"),
     ]
+    if (found := reduction.significance) is not None:
+        written.append(write_array(folder / "significance.npy", found if reduction.frames > 1 else found[0]))
     return written if ply is None else [*written, _write_points(reduction, ply, ply_frame, comment)]
 
 
@@ -269,7 +253,9 @@ def write_fit(fit: Fit, directory: str | Path) -> list[Path]:
     Raises `FileError`.
     """
     folder = Path(directory)
-    written = [_Pictures(fit, folder).save(), write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
+    with atomic_path(folder / "fit.png") as temporary:
+        fit.plot().savefig(temporary, format="png")
+    written = [folder / "fit.png", write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
     for estimate in fit.maps.values():
         name = _file_name(estimate.name)
         written += [write_array(folder / f"{name}.npy", estimate.value)]

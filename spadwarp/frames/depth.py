@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +19,7 @@ from spadwarp.values import (
     TIME,
     ArgumentError,
     check_choice,
+    check_integer,
     check_real,
     path_from_time,
     shown,
@@ -35,27 +37,20 @@ METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Histograms:
-    """Histograms with what their file knows about them; None for what it does not.
+    """Histograms with what their file knows about them; None for what it does not."""
 
-    Attributes:
-        values: `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not.
-        bin_width: [s].
-        gate_start: Time of flight at the lower edge of bin 0 [s].
-        background: Expected background in the unit of `values`, of a shape that `arrival_time` takes.
-        irf: The response that the histograms contain.
-        response: The response to filter with; differs from `irf` for expected histograms of infinitely short pulses.
-        scene: Of a simulation.
-        notes: What was inferred from the file, in words.
-    """
-
-    values: NDArray[Any]
-    bin_width: float | None = None
-    gate_start: float = 0.0
+    values: NDArray[Any]  # `[H, W, T]` or `[frames, H, W, T]`, not negative; counts are integers, rates are not
+    bin_width: float | None = None  # [s]
+    gate_start: float = 0.0  # time of flight at the lower edge of bin 0 [s]
     background: NDArray[np.float32] | None = None
-    irf: InstrumentResponse | None = None
+    """Expected background in the unit of `values`, of a shape that `arrival_time` takes."""
+    level_known: bool = True  # whether it is known apart from these values
+    pulses: int = 0  # of each histogram, where each counts one photon at most; else 0
+    irf: InstrumentResponse | None = None  # the response that the histograms contain
     response: InstrumentResponse | None = None
-    scene: Scene | None = None
-    notes: tuple[str, ...] = ()
+    """The response to filter with; differs from `irf` for expected histograms of infinitely short pulses."""
+    scene: Scene | None = None  # of a simulation
+    notes: tuple[str, ...] = ()  # what was inferred from the file, in words
 
     @property
     def background_per_bin(self) -> NDArray[np.float32] | None:
@@ -74,10 +69,14 @@ def arrival_time(
     irf: Any = None,
     device: Any = None,
     background: Any = None,
+    level_known: bool = True,
+    pulses: int = 0,
     gate: tuple[float, float] | None = None,
+    min_significance: float | None = None,
+    significance: Any = None,
 ) -> NDArray[np.float64]:
     """Arrival time of the return in every pixel [s], in the histogram's own time: float64 `histogram.shape[:-1]`; NaN
-    where nothing returned in the gate, or nothing above the background. From a torch tensor comes one, on its device.
+    where nothing was detected in the gate. From a torch tensor comes one, on its device.
 
     Args:
         histogram: `[..., bin]`, usually `[H, W, T]` or `[frames, H, W, T]`; NumPy, torch or Warp; counts (integer) or
@@ -94,10 +93,19 @@ def arrival_time(
         background: Expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
             number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
             does not use it.
+        level_known: False: detections do not rely on `background`. As where there is none, the level of a pixel is then
+            that of its counts, and the shape over time that of all pixels, less peaks narrower than about 16 FWHM.
+        pulses: Of each histogram, where each counts one photon at most; 0: any number. For detections.
         gate: (start, stop) [s]: only bins whose centres lie in it are used.
+        min_significance: Pixels below this significance have no arrival time, see `spadwarp_kernels.DetectionTest`; the
+            others that of what was detected. 0: every pixel reports. Default: 4, one false alarm in 10⁴ pixels, for
+            counts (integers); 0 for rates, which have no significance.
+        significance: Array or tensor to write that of counts into, float32 `histogram.shape[:-1]`.
 
     Raises `ArgumentError`, which names the argument, its value and what is allowed.
     """
+    import warp as wp
+
     from spadwarp_kernels import detection as kernels
 
     check_choice("method", method, METHODS)
@@ -113,7 +121,7 @@ def arrival_time(
         rows, shape = histogram_rows(histogram, name="histogram", device=device, dimensions=range(2, 16))
         frame, bins = shape[:-1], shape[-1]
         first, stop = (0, bins) if gate is None else _bins_of_gate(gate, gate_start, bin_width, bins)
-        response, lowest_tap, half_width, offset = None, 0, 3, 0.0
+        response, lowest_tap, half_width, offset, fwhm = None, 0, 3, 0.0, 2.0
         if irf is not None:
             mean, mode, fwhm = _moments(irf, bin_width)
             half_width = max(1, int(np.ceil(1.5 * fwhm)))
@@ -122,8 +130,20 @@ def arrival_time(
             response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
         known = None if background is None else _background_rows(background, rows, frame)
         options: dict[str, Any] = {"first": first, "stop": stop, "half_width": half_width, "lowest_tap": lowest_tap}
+        if min_significance is not None:
+            options["min_significance"] = check_real("min_significance", min_significance, "[0, 1000]")
+        if rows.dtype in (wp.int32, wp.int64):
+            options["significance"] = tested = wp.empty(rows.shape[0], dtype=float, device=rows.device)
+            options |= {"width": fwhm, "pulses": check_integer("pulses", pulses, "[0, 4611686018427387904]")}
+            options["pixels"] = math.prod(frame[-2:])
+            if known is None or not level_known:
+                options["profile"] = _background_profile(rows, first, stop, fwhm)
+        elif min_significance:
+            raise ArgumentError(f"min_significance = {min_significance} needs counts, integers; these are rates")
         found = kernels.arrival_bins(rows, method=method, background=known, response=response, **options)
         position: Any = tensor_of(found).double() if is_torch(histogram) else found.numpy().astype(np.float64)
+        if significance is not None and "significance" in options:
+            significance[...] = (tensor_of(tested) if is_torch(significance) else tested.numpy()).reshape(frame)
     return gate_start + (position.reshape(frame) - offset) * bin_width
 
 
@@ -152,6 +172,25 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
         raise ArgumentError(f"background has shape {shape}; a number, ({bins},) or {(*frame[-2:], bins)} is needed")
     flat = background.float() if is_torch(background) else background
     return histogram_rows(flat.reshape((-1, shape[-1] if shape else 1)), name="background", device=rows.device)[0]
+
+
+def _background_profile(rows: Any, first: int, stop: int, fwhm: float) -> Any:
+    """Shape of the background over time, float32 `[1, T]` on the device of the counts.
+
+    Of all pixels, over so many bins that their counts are 20 or more on average; the median over much longer times
+    takes peaks away, and leaves what only rises or falls. One count more keeps it from 0.
+    """
+    import warp as wp
+    from scipy.ndimage import median_filter, uniform_filter1d
+
+    bins, profile = stop - first, np.ones(rows.shape[1])
+    total = rows.numpy()[:, first:stop].sum(axis=0, dtype=np.float64)
+    half = math.ceil(fwhm)
+    side = 2 * max(half, math.ceil(10.0 * bins / max(float(total.sum()), 1.0))) + 1
+    if side < bins:
+        counts = side * uniform_filter1d(total, side, mode="nearest")
+        profile[first:stop] += median_filter(counts, min(8 * (side + 2 * half) + 1, 2 * bins + 1), mode="nearest")
+    return wp.array(profile[None], dtype=wp.float32, device=rows.device)
 
 
 def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:
@@ -223,24 +262,17 @@ def depth_frame(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reduction:
-    """Depth of histograms.
-
-    Attributes:
-        quantity: `"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known.
-        values, range: float64 `[frames, H, W]` [m], and the same along the line of sight; NaN where nothing returned.
-        intensity: Sum over the bins, `[frames, H, W]`.
-        lines: Lines of sight `[H, W]`, or None.
-        method: Estimator of the arrival time, or "stored" for depth that was read.
-        camera: That of a simulation, with its pose in the world; else None.
-    """
+    """Depth of histograms."""
 
     quantity: Literal["depth", "range"]
-    values: NDArray[np.float64]
-    range: NDArray[np.float64]
-    intensity: NDArray[Any]
-    lines: LinesOfSight | None
-    method: str
-    camera: Camera | None = None
+    """`"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known."""
+    values: NDArray[np.float64]  # float64 `[frames, H, W]` [m]; NaN where nothing returned
+    range: NDArray[np.float64]  # the same along the line of sight
+    intensity: NDArray[Any]  # sum over the bins, `[frames, H, W]`
+    lines: LinesOfSight | None  # lines of sight `[H, W]`, or None
+    method: str  # estimator of the arrival time, or "stored" for depth that was read
+    camera: Camera | None = None  # that of a simulation, with its pose in the world; else None
+    significance: NDArray[np.float32] | None = None  # of counts, float32 `[frames, H, W]`, see `spadwarp.arrival_time`
 
     @property
     def frames(self) -> int:
@@ -266,6 +298,7 @@ def depth_of(
     group_index: float | None = None,
     horizontal_fov_deg: float | None = None,
     background: float | Literal["median"] | None = None,
+    min_significance: float | None = None,
     device: Any = None,
 ) -> Reduction:
     """Depth of histograms from a file; measured ones count as of a laser in the lens, whose pulse leaves at time 0.
@@ -277,6 +310,7 @@ def depth_of(
         horizontal_fov_deg: Full horizontal field of view of a measuring camera with square pixels, in (0, 180).
         background: Expected background per bin in the unit of the values, ≥ 0; `"median"`: the median bin of each
             pixel. Default: that of the file; else none, with `"likelihood"` the median.
+        min_significance: See `spadwarp.arrival_time`; default: of counts of a scene its `detector.min_significance`.
         device: Warp device.
 
     Raises `ArgumentError`: something that is needed is missing, given twice or out of range.
@@ -291,12 +325,17 @@ def depth_of(
     if filtered and response is None:
         raise ArgumentError(f"method = {method!r} needs an instrument response (irf)")
     known: Any = histograms.background if background is None else background
+    level_known = known is not None and (histograms.level_known if background is None else background != "median")
     if background == "median" or (known is None and method == "likelihood"):
         # Of all frames together: that of sparse counts would be 0.
         frames = values.reshape(-1, height, width, values.shape[-1])
         known = (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)
-    axis: dict[str, Any] = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width}
-    time = arrival_time(values, **axis, method=method, irf=response, background=known, device=device)
+    significance = np.empty(values.shape[:-1], np.float32) if values.dtype.kind in "iu" else None
+    if min_significance is None and histograms.scene is not None and significance is not None:
+        min_significance = histograms.scene.detector.min_significance
+    options: dict[str, Any] = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width, "method": method}
+    options |= {"level_known": level_known, "pulses": histograms.pulses, "min_significance": min_significance}
+    time = arrival_time(values, irf=response, background=known, significance=significance, device=device, **options)
     path = path_from_time(time.reshape(-1, height, width), index)
     distance = 0.5 * path if lines is None else lines.range_from_path(path)
     return Reduction(
@@ -307,6 +346,7 @@ def depth_of(
         lines=lines,
         method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
+        significance=None if significance is None else significance.reshape(-1, height, width),
     )
 
 

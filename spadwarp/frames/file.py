@@ -67,14 +67,14 @@ class _StoredFrames:
     """Frames in a file; what `_own` does not read is read when it is asked for."""
 
     FORMAT: ClassVar[str]
-    path: Path
-    shape: tuple[int, int, int, int]
+    path: Path  # the file
+    shape: tuple[int, int, int, int]  # (frames, H, W, T)
     pulses: int
     seed: int
     gate_start: float
     bin_width: float
     period: float | None
-    methods: tuple[Method, ...]
+    methods: tuple[Method, ...]  # estimators whose depth frames the file holds
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -140,6 +140,10 @@ class _StoredFrames:
         """Depth by one of `methods` [m], `[H, W]` or `[frames, H, W]`."""
         return self._read(f"depth/{method}", np.float32, frame)
 
+    def significance(self, frame: int | None = None) -> NDArray[np.float32]:
+        """Detection significance, see `spadwarp.arrival_time`, `[H, W]` or `[frames, H, W]`."""
+        return self._read("significance", np.float32, frame)
+
     def _check(self, frame: int | None) -> None:
         if frame is not None and not 0 <= frame < self.frames:
             raise ArgumentError(f"frame = {frame} is outside [0, {self.frames}), the frames of {self.path}")
@@ -153,26 +157,17 @@ class _StoredFrames:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class FramesFile(_StoredFrames):
-    """Frames in a file. Counts and depth frames are read when they are asked for, the rest is in memory.
-
-    Attributes:
-        path: The file.
-        shape: (frames, H, W, T).
-        methods: Estimators whose depth frames the file holds.
-        scene, truth_depth: Of the result that the counts were drawn from; float32 `[H, W]` [m].
-        channel: Light that was counted: "I", all of it, or "co" or "cross" behind an analyser.
-        expected, background: As of `Frames`, as all others are; None in a file that does not hold them.
-    """
+    """Frames in a file. Counts and depth frames are read when they are asked for, the rest is in memory."""
 
     FORMAT = "spadwarp frames"
     edges: NDArray[np.float64]
     irf: InstrumentResponse
-    expected: NDArray[np.float32] | None
-    background: NDArray[np.float32] | None
-    scene: Scene
-    truth_depth: NDArray[np.float32]
+    expected: NDArray[np.float32] | None  # as of `Frames`, as all others are; None in a file that does not hold them
+    background: NDArray[np.float32] | None  # likewise
+    scene: Scene  # of the result that the counts were drawn from
+    truth_depth: NDArray[np.float32]  # of that result, float32 `[H, W]` [m]
     monte_carlo_noise: float | None = None
-    channel: str = "I"
+    channel: str = "I"  # light that was counted: "I", all of it, or "co" or "cross" behind an analyser
     notes: tuple[str, ...] = ()
 
     @classmethod
@@ -221,6 +216,7 @@ class FramesFile(_StoredFrames):
             first_frame=number,
             expected=self.expected,
             background=self.background,
+            detector=self.scene.detector,
             **{name: getattr(self, name) for name in _OF_A_FRAME},
         )
 
@@ -232,16 +228,11 @@ class FramesFile(_StoredFrames):
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class SequenceFile(_StoredFrames):
-    """Frames of a scene that moves. Arrays of a frame are read when they are asked for.
-
-    Attributes:
-        base: The scene before the trajectory.
-        trajectory: The row of each frame. All others: as of `FramesFile`.
-    """
+    """Frames of a scene that moves. Arrays of a frame are read when they are asked for."""
 
     FORMAT = "spadwarp sequence"
-    base: Scene
-    trajectory: Trajectory
+    base: Scene  # the scene before the trajectory
+    trajectory: Trajectory  # the row of each frame. All others: as of `FramesFile`.
 
     @classmethod
     def _own(cls, file: Hdf5File, scene: Scene, shape: tuple[int, ...]) -> dict[str, Any]:
@@ -292,11 +283,12 @@ class _Writer:
     def __init__(self, file: Any, frames: int) -> None:
         self._file, self._frames, self._written = file, frames, 0
 
-    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], layout: _Layout) -> None:
+    def add(self, part: Frames, scene: Scene, depth: Mapping[Method, Map], significance: Any, layout: _Layout) -> None:
         """Writes the next frames, their tags, and their depth by each estimator `[frames, H, W]` [m]."""
         every: dict[str, Variable] = {
             "counts": ((*_IMAGES, "time"), part.counts, "1", "detections in the bin"),
             "intensity": (_IMAGES, part.intensity, "1", "counts over all bins"),
+            "significance": (_IMAGES, significance, "1", "-log10 of the probability of a false alarm"),
             **layout.arrays,
         }
         for method, values in depth.items():
@@ -388,23 +380,15 @@ class FrameErrors:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """Summary of what `record_frames` wrote.
+    """Summary of what `record_frames` wrote."""
 
-    Attributes:
-        file: The file, opened.
-        errors: Of depth, by estimator; of at most the first 256 MiB of counts.
-        bound: Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say.
-        bound_photons: Photons that would make the noise in the bound a tenth.
-        detections: Counts of all frames.
-        monte_carlo: Noise of the simulation against the shot noise of one frame, see `monte_carlo_noise`.
-    """
-
-    file: FramesFile
-    errors: dict[Method, FrameErrors]
-    bound: ResultBound
-    bound_photons: float
-    detections: int
+    file: FramesFile  # the file, opened
+    errors: dict[Method, FrameErrors]  # of depth, by estimator; of at most the first 256 MiB of counts
+    bound: ResultBound  # Cramér–Rao bound of one frame; `sigma` is NaN where `crlb` refuses, which the notes then say
+    bound_photons: float  # photons that would make the noise in the bound a tenth
+    detections: int  # counts of all frames
     monte_carlo: MonteCarloNoise | None
+    """Noise of the simulation against the shot noise of one frame, see `monte_carlo_noise`."""
 
 
 def record_frames(
@@ -451,10 +435,11 @@ def record_frames(
             part = detect(result, frames=min(size, frames - start), first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
             depth: dict[Method, Map] = {}
+            found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}
             for method in methods:
-                time = part.arrival_time(method, undo_pile_up=undo_pile_up, device=device)
+                time = part.arrival_time(method, undo_pile_up=undo_pile_up, **found)
                 depth[method] = depth_from_time(time, scene=scene)
-            writer.add(part, scene, depth, _still(result, part, frames, bound.sigma))
+            writer.add(part, scene, depth, found["significance"], _still(result, part, frames, bound.sigma))
             detections += int(part.intensity.sum())
             errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
             if progress is not None:
@@ -570,9 +555,10 @@ def simulate_sequence(
                     warnings.simplefilter("ignore", SpadwarpWarning)
                 result = simulate(at, photons=photons, seed=frame_seed, device=device, mesh_cache=kept)
                 part = detect(result, first_frame=number, pulses=pulses, seed=seed, tags=tags, device=first)
-            times = {method: part.arrival_time(method, device=first) for method in methods}
+            found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": first}
+            times = {method: part.arrival_time(method, **found) for method in methods}
             depth = {method: depth_from_time(time, scene=at) for method, time in times.items()}
-            writer.add(part, base, depth, _moving(result, part, moves, number, photons))
+            writer.add(part, base, depth, found["significance"], _moving(result, part, moves, number, photons))
             if progress is not None:
                 progress("frames", number + 1, len(scenes))
     return SequenceFile.load(path)

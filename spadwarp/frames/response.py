@@ -36,17 +36,12 @@ class InstrumentResponse:
 
     A Gaussian convolved with an exponential tail, or a measured curve, linear between its points. Everything is in
     closed form: integrals over bins are exact however narrow the response is. With `sigma` and `tail` 0 it is a delta.
-
-    Attributes:
-        sigma: Standard deviation of the Gaussian [s]; time 0 is its centre.
-        tail: Time constant of the exponential [s], 0: none.
-        times, values: A measured curve instead: ascending times [s] and values ≥ 0 of any scale.
     """
 
-    sigma: float = 0.0
-    tail: float = 0.0
-    times: ArrayLike | None = None
-    values: ArrayLike | None = None
+    sigma: float = 0.0  # standard deviation of the Gaussian [s]; time 0 is its centre
+    tail: float = 0.0  # time constant of the exponential [s], 0: none
+    times: ArrayLike | None = None  # of a measured curve instead: ascending [s]
+    values: ArrayLike | None = None  # the curve at these times, ≥ 0, of any scale
     _knots: Floats = field(init=False, repr=False)
     _heights: Floats = field(init=False, repr=False)
 

@@ -150,22 +150,15 @@ DRAWN_EFFECTS = ("afterpulsing_probability", "max_count")  # on single detection
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Receiver:
-    """The camera before it counts: expected detections of a detector, from expected light.
+    """The camera before it counts: expected detections of a detector, from expected light."""
 
-    Attributes:
-        detector, window: The section of a scene, and its bins in time.
-        image: (height, width).
-        noise: Dark counts and ambient light of each pixel [1/s], Warp float32 `[pixel]`; where it lies, the others lie.
-        matrix: Fraction of the light of each source bin that is detected in each detector bin.
-        equal_bins: Whether all bins of the window are equally wide.
-    """
-
-    detector: Detector
-    window: Window
-    image: tuple[int, int]
+    detector: Detector  # the section of a scene
+    window: Window  # its bins in time
+    image: tuple[int, int]  # (height, width)
     noise: Any
-    matrix: SparseResponse
-    equal_bins: bool = True
+    """Dark counts and ambient light of each pixel [1/s], Warp float32 `[pixel]`; where it lies, the others lie."""
+    matrix: SparseResponse  # fraction of the light of each source bin that is detected in each detector bin
+    equal_bins: bool = True  # whether all bins of the window are equally wide
 
     @classmethod
     def of(
@@ -325,44 +318,33 @@ class TimeTags(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Frames:
-    """Counts that the camera records; `counts`, `expected` and `background` are torch tensors if the source was one.
+    """Counts that the camera records; `counts`, `expected` and `background` are torch tensors if the source was one."""
 
-    Attributes:
-        counts: int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames.
-        pulses: Laser pulses per frame; frames: how many; first_frame: number of the first.
-        gate_start: Start of the detector's window [s]. Where time wraps, a count at time t stands for light at t plus
-            any number of periods.
-        bin_width: Nominal [s].
-        edges: `[T + 1]`, actual bin edges from `gate_start` [s] (differential non-linearity).
-        period: Of the pulses [s], where time wraps; else None.
-        irf: The response that was applied.
-        expected: float32 `[H, W, T]`, expected detections per pulse and bin before pile-up, from which the counts were
-            drawn: light through the response, dark counts, ambient light, crosstalk.
-        background: float32 `[H, W, 1 or T]`, expected background detections per pulse and bin before pile-up: dark
-            counts, ambient light and, where the source has it apart, backscatter.
-        seed: Of the random numbers.
-        tags: Every detection, where it was asked for.
-        monte_carlo_noise: Standard error of the simulation over the shot noise of a frame, at the 95th percentile of
-            the pixels; None where nobody knows it. Above 0.5 `expected` is not smooth where few photons were traced,
-            and no more are the counts that are drawn from it.
-        notes: What the source could not give, in words.
-    """
-
-    counts: NDArray[np.int32]
-    pulses: int
+    counts: NDArray[np.int32]  # int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames
+    pulses: int  # laser pulses per frame; frames: how many; first_frame: number of the first
     frames: int
     first_frame: int
     gate_start: float
-    bin_width: float
-    edges: NDArray[np.float64]
-    period: float | None
-    irf: InstrumentResponse
+    """Start of the detector's window [s]. Where time wraps, a count at time t stands for light at t plus any number of
+    periods."""
+    bin_width: float  # nominal [s]
+    edges: NDArray[np.float64]  # `[T + 1]`, actual bin edges from `gate_start` [s] (differential non-linearity)
+    period: float | None  # of the pulses [s], where time wraps; else None
+    irf: InstrumentResponse  # the response that was applied
+    detector: Detector  # the section of a scene
     expected: NDArray[np.float32]
+    """float32 `[H, W, T]`, expected detections per pulse and bin before pile-up, from which the counts were drawn:
+    light through the response, dark counts, ambient light, crosstalk."""
     background: NDArray[np.float32]
-    seed: int
-    tags: TimeTags | None = None
+    """float32 `[H, W, 1 or T]`, expected background detections per pulse and bin before pile-up: dark counts, ambient
+    light and, where the source has it apart, backscatter."""
+    seed: int  # of the random numbers
+    tags: TimeTags | None = None  # every detection, where it was asked for
     monte_carlo_noise: float | None = None
-    notes: tuple[str, ...] = ()
+    """Standard error of the simulation over the shot noise of a frame, at the 95th percentile of the pixels; None where
+    nobody knows it. Above 0.5 `expected` is not smooth where few photons were traced, and no more are the counts that
+    are drawn from it."""
+    notes: tuple[str, ...] = ()  # what the source could not give, in words
 
     def __repr__(self) -> str:
         height, width, bins = self.counts.shape[-3:]
@@ -410,21 +392,32 @@ class Frames:
         irf: Any = None,
         undo_pile_up: bool = False,
         gate: tuple[float, float] | None = None,
+        min_significance: float | None = None,
+        significance: Any = None,
         device: Any = None,
     ) -> NDArray[np.float64]:
-        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing returned.
+        """Arrival time of the return [s]: `[frames, H, W]` or `[H, W]`, NaN where nothing was detected.
 
         All bins count as equally wide, as in a camera without calibration. The estimator knows the background.
-        `method`, `gate` (start, stop) [s], `device`: as of `spadwarp.arrival_time`; `irf`: that the estimator assumes;
-        default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the counts.
+        `method`, `gate` (start, stop) [s], `significance`, `device`: as of `spadwarp.arrival_time`; `irf`: that the
+        estimator assumes; default: the one that was applied; `undo_pile_up`: estimate from Coates' correction of the
+        counts; `min_significance`: default: that of the detector.
         """
-        histogram: Any = self.counts
+        least = self.detector.min_significance if min_significance is None else min_significance
+        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
+        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
+        options = {**axis, "method": method, "irf": irf, "background": known, "device": device}
+        test: dict[str, Any] = {"min_significance": least, "significance": significance}
+        test["pulses"] = self.exposure if self.detector.mode == "first_photon" else 0
+        time = arrival_time(self.counts, **options, **test)
         if undo_pile_up:
             corrected: Any = self.coates()
             histogram = (corrected.nan_to_num() if is_torch(corrected) else np.nan_to_num(corrected)) * self.exposure
-        axis: dict[str, Any] = {"gate_start": self.gate_start, "bin_width": self.bin_width, "gate": gate}
-        known, irf = self.background * float(self.exposure), self.irf if irf is None else irf
-        return arrival_time(histogram, **axis, method=method, irf=irf, background=known, device=device)
+            every: Any = arrival_time(histogram, **options)
+            if least > 0:
+                every[time != time] = math.nan
+            time = every
+        return time
 
 
 def to_xarray(frames: Frames) -> xarray.Dataset:
@@ -464,19 +457,13 @@ def to_xarray(frames: Frames) -> xarray.Dataset:
 
 @dataclass(frozen=True, kw_only=True)
 class MonteCarloNoise:
-    """The standard error of a result against the shot noise of one frame of `pulses`, both of the counts of a pixel.
-
-    Attributes:
-        ratio: Standard error over shot noise, at the 95th percentile of the pixels.
-        pixels: Part of the pixels in which it is above 0.5.
-        photons, photons_needed: That were traced, and that would bring `ratio` to 0.5: it falls with their root.
-    """
+    """The standard error of a result against the shot noise of one frame of `pulses`, both of the counts of a pixel."""
 
     pulses: int
-    ratio: float
-    pixels: float
-    photons: int
-    photons_needed: float
+    ratio: float  # standard error over shot noise, at the 95th percentile of the pixels
+    pixels: float  # part of the pixels in which it is above 0.5
+    photons: int  # that were traced
+    photons_needed: float  # that would bring `ratio` to 0.5: it falls with their root
 
     def __str__(self) -> str:
         return (
@@ -656,6 +643,7 @@ def detect(
         period=seen.period if detector.wrap else None,
         irf=irf,
         tags=found,
+        detector=detector,
         notes=notes if scene is None or noise is not None else (*notes, UNKNOWN),
         monte_carlo_noise=None if noise is None else noise.ratio,
         **numbers,

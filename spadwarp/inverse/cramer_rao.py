@@ -24,23 +24,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Bound:
-    """Bound of one unknown; of an unknown of each pixel, the median of the pixels that see a target.
+    """Bound of one unknown; of an unknown of each pixel, the median of the pixels that see a target."""
 
-    Attributes:
-        name, value, unit: The unknown and its value in the scene; depth counts from where the targets are.
-        standard_error: Least standard deviation of an unbiased estimate when all unknowns are unknown.
-        alone: The same when all others are known.
-        relative: `standard_error` over the value; NaN for depth.
-        per_pixel: Whether each pixel has a value of its own. The median of the background is that of all pixels.
-    """
-
-    name: str
-    value: float
-    standard_error: float
-    alone: float
-    relative: float
-    per_pixel: bool
-    unit: str
+    name: str  # of the unknown
+    value: float  # in the scene; depth counts from where the targets are
+    standard_error: float  # least standard deviation of an unbiased estimate when all unknowns are unknown
+    alone: float  # the same when all others are known
+    relative: float  # `standard_error` over the value; NaN for depth
+    per_pixel: bool  # whether each pixel has a value of its own. The median of the background is that of all pixels.
+    unit: str  # of the value
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,23 +40,19 @@ class Bounds(Joint):
     """Cramér–Rao bounds of unknowns together.
 
     Attributes:
-        bounds: By name.
         names, covariance: Of the unknowns of the whole exposure, `[S, S]`: the inverse of their Fisher information when
             those of the pixels are unknown too; on the scale of the logarithm for positive values.
-        maps: By name the bound of each pixel `[H, W]`, NaN where the counts say nothing of it.
-        alone_maps: The same when all other unknowns are known.
-        counts: Expected in the exposure.
         pulses, photons: Of the exposure; traced.
-        simulation: Variance that the noise of the simulation would add to a fit with these photons, over that of the
-            counts; the bounds are right within about its half.
         warnings: What may mislead, in words.
     """
 
-    bounds: Mapping[str, Bound]
-    maps: Mapping[str, Floats]
-    alone_maps: Mapping[str, Floats]
-    counts: float
+    bounds: Mapping[str, Bound]  # by name
+    maps: Mapping[str, Floats]  # by name the bound of each pixel `[H, W]`, NaN where the counts say nothing of it
+    alone_maps: Mapping[str, Floats]  # the same when all other unknowns are known
+    counts: float  # expected in the exposure
     simulation: float
+    """Variance that the noise of the simulation would add to a fit with these photons, over that of the counts; the
+    bounds are right within about its half."""
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers without maps, for JSON."""

@@ -32,24 +32,17 @@ _SHARE = 0.2  # of the scattering that the slope contains: most of it goes on fo
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Exposure:
-    """Counts of a number of pulses.
-
-    Attributes:
-        counts: `[pixel, bin]`, added up over frames; None where there is only a plan of an exposure.
-        pulses: In all.
-        window: Start [s] and bins of the detector's window.
-        tdc_widths: Relative widths of its bins; None: equal.
-        irf: The response that the counts contain; None: that of the scene.
-        monte_carlo_noise: Of simulated counts: standard error of their simulation over their shot noise, at the 95th
-            percentile of the pixels; None: not known, or measured.
-    """
+    """Counts of a number of pulses."""
 
     counts: NDArray[np.int64] | None
-    pulses: int
-    window: tuple[float, int]
-    tdc_widths: NDArray[np.float64] | None = None
-    irf: InstrumentResponse | None = None
+    """`[pixel, bin]`, added up over frames; None where there is only a plan of an exposure."""
+    pulses: int  # in all
+    window: tuple[float, int]  # start [s] and bins of the detector's window
+    tdc_widths: NDArray[np.float64] | None = None  # relative widths of its bins; None: equal
+    irf: InstrumentResponse | None = None  # the response that the counts contain; None: that of the scene
     monte_carlo_noise: float | None = None
+    """Of simulated counts: standard error of their simulation over their shot noise, at the 95th percentile of the
+    pixels; None: not known, or measured."""
 
     def left(self) -> NDArray[np.float32]:
         """Pulses without a count before each bin, `[pixel, bin]`: those that first-photon counting has left there."""

@@ -77,25 +77,15 @@ _CORRELATED, _UNSURE = 0.99, 0.5  # correlation, and standard error of a logarit
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """One value for the whole exposure.
+    """One value for the whole exposure."""
 
-    Attributes:
-        name: Of the unknown; depth is that of the target in the pixel nearest to the middle of the image.
-        value: The estimate, in SI units; NaN, as its errors, where nothing was seen that depends on it.
-        standard_error: Of counts and simulation together.
-        interval: 95 %; of positive values from the standard error of the logarithm.
-        simulation: The part of the variance that is noise of the simulation.
-        initial_guess: Where the search began.
-        unit: "" for a plain number.
-    """
-
-    name: str
-    value: float
-    standard_error: float
-    interval: tuple[float, float]
-    simulation: float
-    initial_guess: float
-    unit: str = ""
+    name: str  # of the unknown; depth is that of the target in the pixel nearest to the middle of the image
+    value: float  # the estimate, in SI units; NaN, as its errors, where nothing was seen that depends on it
+    standard_error: float  # of counts and simulation together
+    interval: tuple[float, float]  # 95 %; of positive values from the standard error of the logarithm
+    simulation: float  # the part of the variance that is noise of the simulation
+    initial_guess: float  # where the search began
+    unit: str = ""  # "" for a plain number
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -122,11 +112,11 @@ class Iteration:
 class Joint:
     """What a fit and bounds have in common: unknowns of the whole exposure with their covariance."""
 
-    names: Sequence[str]
-    covariance: Floats
-    warnings: Sequence[str]
-    pulses: int
-    photons: int
+    names: Sequence[str]  # of the estimates
+    covariance: Floats  # of them on the scale that is searched, the logarithm for positive values
+    warnings: Sequence[str]  # what may mislead, in words
+    pulses: int  # in all
+    photons: int  # traced by the whole fit
 
     @property
     def correlation(self) -> Floats:
@@ -164,36 +154,21 @@ class Joint:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Joint):
-    """A maximum-likelihood fit of counts.
+    """A maximum-likelihood fit of counts."""
 
-    Attributes:
-        scene: With the estimates in place of the unknowns.
-        estimates: By name, what is one value for the whole exposure.
-        maps: By name, what is a value for each pixel.
-        names, covariance: Of the estimates on the scale that is searched, the logarithm for positive values.
-        iterations: In order.
-        converged: Whether the last step promised less than the noise of the likelihood.
-        warnings: What may mislead, in words.
-        goodness: Whether the fit describes the counts.
-        depth: Depth of the targets by the fit, float64 `[H, W]` [m], NaN without a target; None unless it was unknown.
-        counts, expected: `[H, W, T]`: what was fitted, and its mean by a rendering at the estimates, float32.
-        edges: Of the bins in time of flight [s].
-        pulses: In all.
-        photons: Traced by the whole fit.
-        seconds: It took.
-    """
-
-    scene: Scene
-    estimates: Mapping[str, Estimate]
-    maps: Mapping[str, EstimateMap]
-    iterations: Sequence[Iteration]
-    converged: bool
-    goodness: Goodness
+    scene: Scene  # with the estimates in place of the unknowns
+    estimates: Mapping[str, Estimate]  # by name, what is one value for the whole exposure
+    maps: Mapping[str, EstimateMap]  # by name, what is a value for each pixel
+    iterations: Sequence[Iteration]  # in order
+    converged: bool  # whether the last step promised less than the noise of the likelihood
+    goodness: Goodness  # whether the fit describes the counts
     depth: Floats | None
+    """Depth of the targets by the fit, float64 `[H, W]` [m], NaN without a target; None unless it was unknown."""
     counts: NDArray[np.integer] = field(repr=False)
-    expected: NDArray[np.float32] = field(repr=False)
-    edges: Floats = field(repr=False)
-    seconds: float
+    """What was fitted, `[H, W, T]`."""
+    expected: NDArray[np.float32] = field(repr=False)  # its mean by a rendering at the estimates, float32
+    edges: Floats = field(repr=False)  # of the bins in time of flight [s]
+    seconds: float  # it took
 
     def __repr__(self) -> str:
         values = [f"{item.name} {item.value:.4g} ± {item.standard_error:.2g}" for item in self.estimates.values()]

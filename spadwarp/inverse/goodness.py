@@ -32,20 +32,13 @@ COMPONENTS = ("target", "water", "noise")
 
 @dataclass(frozen=True, kw_only=True)
 class Deviance:
-    """The deviance of counts from a fit.
+    """The deviance of counts from a fit."""
 
-    Attributes:
-        deviance: The sum over bins, pixels, or both.
-        expected, standard_deviation: Of it, if the model is right.
-        p: Probability of one as large or larger, if the model is right; NaN where nothing is expected.
-        counts: In them.
-    """
-
-    deviance: float
-    expected: float
-    standard_deviation: float
-    p: float
-    counts: int
+    deviance: float  # the sum over bins, pixels, or both
+    expected: float  # of it, if the model is right
+    standard_deviation: float  # of it, likewise
+    p: float  # probability of one as large or larger, if the model is right; NaN where nothing is expected
+    counts: int  # in them
 
     def __str__(self) -> str:
         return f"{self.deviance:.4g}, expected {self.expected:.4g} ± {self.standard_deviation:.2g}"
@@ -53,22 +46,15 @@ class Deviance:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Goodness:
-    """Whether a fit describes its counts.
+    """Whether a fit describes its counts."""
 
-    Attributes:
-        p: Probability of deviances as large or larger than those of `parts`, if the model is right; NaN: not known.
-        parts: Deviances: "pixels and bins", "time" (pixels added up), "image" (bins added up).
-        components: Those of pixels and bins in which light of the "target", light of the "water", or "noise" (dark
-            counts and ambient light) is the largest part of the mean.
-        misfit: Root mean square difference of counts and fit over time, beyond their noise, over the counts.
-        pixels: Deviance of each pixel less the expected one, in standard deviations, `[H, W]`.
-    """
-
-    p: float
-    parts: Mapping[str, Deviance]
+    p: float  # probability of deviances as large or larger than those of `parts`, if the model is right; NaN: not known
+    parts: Mapping[str, Deviance]  # deviances: "pixels and bins", "time" (pixels added up), "image" (bins added up)
     components: Mapping[str, Deviance]
-    misfit: float
-    pixels: Floats = field(repr=False)
+    """Those of pixels and bins in which light of the "target", light of the "water", or "noise" (dark counts and
+    ambient light) is the largest part of the mean."""
+    misfit: float  # root mean square difference of counts and fit over time, beyond their noise, over the counts
+    pixels: Floats = field(repr=False)  # deviance of each pixel less the expected one, in standard deviations, `[H, W]`
 
     @property
     def is_bad(self) -> bool:

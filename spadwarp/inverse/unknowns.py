@@ -26,16 +26,12 @@ _UNITS = {"absorption": "1/m", "scattering": "1/m", DEPTH: "m", "ambient_rate": 
 
 @dataclass(frozen=True)
 class Unknown:
-    """One unknown.
-
-    Attributes:
-        name: "medium.absorption", "medium.scattering", "medium.anisotropy", "targets[k].reflectance",
-            "detector.ambient_rate", or "depth": where the targets are along the optical axis.
-        per_pixel: Whether each pixel has a value of its own.
-    """
+    """One unknown."""
 
     name: str
-    per_pixel: bool = False
+    """"medium.absorption", "medium.scattering", "medium.anisotropy", "targets[k].reflectance", "detector.ambient_rate",
+    or "depth": where the targets are along the optical axis."""
+    per_pixel: bool = False  # whether each pixel has a value of its own
 
     @property
     def is_positive(self) -> bool:

@@ -34,9 +34,8 @@ def write_exr(
         channels: Name → `[H, W]`, all of one shape; float16, float32 and uint32 as they are, float64 as float32.
         metadata: Name → value. Stored as text, because EXR's own numbers have 32 bits.
 
-    Raises:
-        ArgumentError: No channels, another type or shape, or a metadata name that EXR uses itself.
-        FileError: The file cannot be written.
+    Raises `ArgumentError`: no channels, another type or shape, or a metadata name that EXR uses itself; `FileError`:
+    the file cannot be written.
     """
     import OpenEXR
 

@@ -1,4 +1,5 @@
-"""Text files: TOML, JSON and columns of numbers, read with limits to what a small file can cost, and written."""
+"""Text files: TOML, JSON and columns of numbers, read with limits to what a small file can cost, and written. Facts and
+progress as text for people."""
 
 from __future__ import annotations
 
@@ -9,8 +10,9 @@ import json
 import math
 import os
 import re
+import time
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io.paths import atomic_path, similar, used
-from spadwarp.values import UNITS, ConfigError, FileError, Interval, parse_number, shown
+from spadwarp.values import UNITS, ConfigError, FileError, Interval, count, parse_number, shown
 
-__all__ = ["json_text", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml", "write_csv", "write_json"]
-__all__ += ["write_text"]
+__all__ = ["fact", "json_text", "parse_json", "parse_toml", "progress_report", "read_columns", "read_text", "read_toml"]
+__all__ += ["write_csv", "write_json", "write_text"]
 
 _LARGEST_TEXT = 4 << 20  # bytes; a table of 100 000 rows has 2 MiB
 _DEEPEST = 32  # tables and lists in each other; a recipe has 6
@@ -191,3 +193,73 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+# For people
+
+
+_ENDINGS = {"_m": "m", "_mm": "mm", "_s": "s", "_ns": "ns", "_ps": "ps", "_nm": "nm", "_deg": "°", "_bytes": "bytes"}
+_ENDINGS |= dict.fromkeys(("range", "length", "distance", "extent", "centre", "limit", "depth_error"), "m")
+_ENDINGS |= dict.fromkeys(("absorption", "scattering", "extinction"), "1/m")
+_ENDINGS |= {"energy": "J", "power": "W", "rate": "Hz", "irradiance": "W/m²", "area": "m²", "seconds": "s"}
+_ENDINGS |= {"sigma_depth": "m", "sigma_time": "s"}
+
+
+def fact(name: str, value: Any) -> tuple[str, str]:
+    """A name without its unit, and its value with it, of a summary; fields of a scene keep their names."""
+    numbers = value if isinstance(value, list | tuple) else [value]
+    if "." in name or not all(isinstance(one, int | float) for one in numbers):
+        return name if "." in name else name.replace("_", " "), _shown(value)
+    ending = next((one for one in _ENDINGS if name.endswith(one)), "")
+    label = name.removesuffix(ending) if ending.startswith("_") else name
+    return label.replace("_", " "), f"{_shown(value)} {_ENDINGS.get(ending, '')}".rstrip()
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(" ".join(fact(name, item)) for name, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_shown, value))
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:.4g}"
+    return count(value) if isinstance(value, int) else str(value)
+
+
+def progress_report(
+    show: Callable[[float | None, str], None], unit: str, *, seldom: bool = False
+) -> Callable[[str, int, int], None]:
+    """An argument `progress`: `show` is called with the part that is done and its text, with None for a stage.
+
+    Ten times a second at most; or `seldom`, at every tenth, but not more often than every second, in a long run soon,
+    then ever more seldom.
+    """
+    began: tuple[float, int] | None = None  # the first report: kernels are loaded and truth maps made before it
+    shown_at, shown_done, patience = time.monotonic() if seldom else 0.0, 0, 2.0
+
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal began, shown_at, shown_done, patience
+        now = time.monotonic()
+        if not total:
+            compiling = "loading kernels; the first run of a kind compiles them, which takes a while"
+            return show(None, compiling if stage == "compile" else stage)
+        began = began or (now, done)
+        seconds, waited = now - began[0], now - shown_at
+        often = done - shown_done >= 0.1 * total and waited >= 1.0 if seldom else waited >= 0.1
+        if done > shown_done and (often or waited >= patience or done == total):
+            text = f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}"
+            if seconds > 0.05 and (rate := (done - began[1]) / seconds):
+                text += f", {rate:.3g} {unit}/s"
+                text += f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(seconds)}"
+            show(done / total, text)
+            shown_at, shown_done, patience = now, done, min(2.0 * patience, 60.0)
+
+    return report
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 100 else f"{minutes} min {seconds:.0f} s"

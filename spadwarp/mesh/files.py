@@ -63,20 +63,14 @@ _KNOWN = "PLY, OBJ, GLB and OFF files can hold colours"
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Reflectance that varies within the faces of a mesh: at their corners, times an image.
+    """Reflectance that varies within the faces of a mesh: at their corners, times an image."""
 
-    Attributes:
-        corners: float32 `[F, 3]`, reflectance at the corners of each face.
-        texture: int32 `[F]`, index into `images`, -1 for none.
-        coordinates: float32 `[F, 3, 2]`, (u, v) at the corners: (0, 0) is an image's lower left corner, (1, 1) its
-            upper right one; images repeat.
-        images: float32 `[rows, columns]` each, factors in [0, 1].
-    """
-
-    corners: NDArray[np.float32]
-    texture: NDArray[np.int32]
+    corners: NDArray[np.float32]  # float32 `[F, 3]`, reflectance at the corners of each face
+    texture: NDArray[np.int32]  # int32 `[F]`, index into `images`, -1 for none
     coordinates: NDArray[np.float32]
-    images: Images
+    """float32 `[F, 3, 2]`, (u, v) at the corners: (0, 0) is an image's lower left corner, (1, 1) its upper right one;
+    images repeat."""
+    images: Images  # float32 `[rows, columns]` each, factors in [0, 1]
 
 
 def colour_channel(wavelength_nm: float) -> int:
@@ -99,8 +93,7 @@ def read_coloured_mesh(
     and the texels of images are decoded from sRGB unless `encoding` is "linear"; colours of materials, and of vertices
     in GLB, are linear already.
 
-    Raises:
-        MeshError: The file cannot be read, or has no colours.
+    Raises `MeshError`: the file cannot be read, or has no colours.
     """
     import trimesh
 

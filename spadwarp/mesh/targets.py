@@ -102,25 +102,17 @@ FARTHEST = 1e9  # [m], as for all coordinates of a scene
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """All targets of a scene as one mesh in the camera frame: +x right, +y down, +z away from the camera.
+    """All targets of a scene as one mesh in the camera frame: +x right, +y down, +z away from the camera."""
 
-    Attributes:
-        vertices: float32 `[V, 3]` [m].
-        faces: int32 `[F, 3]`, indices into `vertices`.
-        reflectance: float32 `[F]`, Lambertian reflectance of both sides, in [0, 1].
-        target: int32 `[F]`, index into `scene.targets`.
-        pattern: Where the reflectance varies within faces; `reflectance` then has their means over the corners, times
-            the mean of the face's image.
-        specular, roughness: float32 `[F]`, of the specular lobe; None if no target has one.
-    """
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    reflectance: NDArray[np.float32]
-    target: NDArray[np.int32]
+    vertices: NDArray[np.float32]  # float32 `[V, 3]` [m]
+    faces: NDArray[np.int32]  # int32 `[F, 3]`, indices into `vertices`
+    reflectance: NDArray[np.float32]  # float32 `[F]`, Lambertian reflectance of both sides, in [0, 1]
+    target: NDArray[np.int32]  # int32 `[F]`, index into `scene.targets`
     pattern: Pattern | None = None
-    specular: NDArray[np.float32] | None = None
-    roughness: NDArray[np.float32] | None = None
+    """Where the reflectance varies within faces; `reflectance` then has their means over the corners, times the mean of
+    the face's image."""
+    specular: NDArray[np.float32] | None = None  # float32 `[F]`, of the specular lobe; None if no target has one
+    roughness: NDArray[np.float32] | None = None  # the same
 
     @property
     def face_count(self) -> int:
@@ -226,9 +218,8 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     about its own axes, first x, then the new y, then the new z (intrinsic; R = Rx·Ry·Rz). A mesh file's axes are taken
     as they are. Faces that have no area in float32 are dropped, those of a mesh file with a warning that counts them.
 
-    Raises:
-        ConfigError: An unknown built-in, or a size for one that has its own.
-        MeshError: Missing or unreadable file, or a mesh that is empty, not finite or has no area.
+    Raises `ConfigError`: an unknown built-in, or a size for one that has its own; `MeshError`: missing or unreadable
+    file, or a mesh that is empty, not finite or has no area.
     """
     return _load(target, field)[0]
 
@@ -333,31 +324,18 @@ _SIDES = (0.03, 30.0)
 
 @dataclass(frozen=True, kw_only=True)
 class MeshSummary:
-    """A mesh file.
+    """A mesh file."""
 
-    Attributes:
-        path: The file.
-        faces: Triangles with an area.
-        extent: Size along x, y, z, in the file's unit.
-        centre: Centre of the bounding box, in the file's unit.
-        unit: The unit in which it has the size of a thing under water: m, mm, cm or µm; None if there is none.
-        scale: For `targets.scale`: this unit in metres; 1 without one.
-        longest: Longest side with this scale [m].
-        is_watertight: Whether every edge belongs to two faces, so that there is an inside.
-        is_inside_out: Whether the faces of a closed mesh are wound inwards. It makes no difference here.
-        bodies: Parts that do not touch.
-    """
-
-    path: Path
-    faces: int
-    extent: tuple[float, ...]
-    centre: tuple[float, ...]
-    unit: str | None
-    scale: float
-    longest: float
-    is_watertight: bool
-    is_inside_out: bool
-    bodies: int
+    path: Path  # the file
+    faces: int  # triangles with an area
+    extent: tuple[float, ...]  # size along x, y, z, in the file's unit
+    centre: tuple[float, ...]  # centre of the bounding box, in the file's unit
+    unit: str | None  # the unit in which it has the size of a thing under water: m, mm, cm or µm; None if there is none
+    scale: float  # for `targets.scale`: this unit in metres; 1 without one
+    longest: float  # longest side with this scale [m]
+    is_watertight: bool  # whether every edge belongs to two faces, so that there is an inside
+    is_inside_out: bool  # whether the faces of a closed mesh are wound inwards: no difference here
+    bodies: int  # parts that do not touch
 
     @property
     def hints(self) -> tuple[str, ...]:

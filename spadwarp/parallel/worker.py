@@ -17,16 +17,13 @@ __all__ = ["Ray", "Worker", "interruptible"]
 
 @dataclass(frozen=True)
 class Ray:
-    """Workers of Ray, each a process with one GPU or, on machines without GPUs, with a share of the cores.
-
-    Attributes:
-        address: Of a running cluster, "auto" or "host:port"; None takes the cluster that RAY_ADDRESS names or that this
-            process is connected to, else starts Ray on this machine alone.
-        workers: How many; by default one for each GPU of the cluster, else one for each of its machines.
-    """
+    """Workers of Ray, each a process with one GPU or, on machines without GPUs, with a share of the cores."""
 
     address: str | None = None
+    """Of a running cluster, "auto" or "host:port"; None takes the cluster that RAY_ADDRESS names or that this process
+    is connected to, else starts Ray on this machine alone."""
     workers: int | None = None
+    """How many; by default one for each GPU of the cluster, else one for each of its machines."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.address, str | None):
@@ -37,19 +34,13 @@ class Ray:
 
 @dataclass(eq=False)
 class Worker:
-    """The process and device that run a job.
+    """The process and device that run a job."""
 
-    Attributes:
-        device: "cpu" or "cuda:0", ...; what `device=` takes.
-        threads: CPU threads that it may use; None: as many as there are cores.
-        stopped: Set when the run was interrupted. A job that has begun is waited for; a long one may end early.
-        state: Kept from one job to the next on this worker.
-    """
-
-    device: str
-    threads: int | None = None
+    device: str  # "cpu" or "cuda:0", ...; what `device=` takes
+    threads: int | None = None  # CPU threads that it may use; None: as many as there are cores
     stopped: threading.Event = field(default_factory=threading.Event)
-    state: dict[str, Any] = field(default_factory=dict)
+    """Set when the run was interrupted. A job that has begun is waited for; a long one may end early."""
+    state: dict[str, Any] = field(default_factory=dict)  # kept from one job to the next on this worker
 
 
 class Event(NamedTuple):

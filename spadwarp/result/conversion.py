@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, overload
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 
@@ -18,37 +19,21 @@ if TYPE_CHECKING:
 
     from spadwarp.scene import Scene
 
-__all__ = ["TorchResult", "TorchTruth", "to_torch", "to_xarray"]
+__all__ = ["TorchResult", "to_torch", "to_xarray"]
 
 Frames = TypeVar("Frames")
 
 
-class TorchTruth(NamedTuple):
-    """`spadwarp.result.Truth` as tensors: `depth`, `range`, `reflectance` `[H, W]`, `normal` `[H, W, 3]`, float32."""
-
-    depth: torch.Tensor
-    range: torch.Tensor
-    normal: torch.Tensor
-    reflectance: torch.Tensor
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorchResult:
-    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`. Methods as of `Result`, of float64.
+    """A `Result` for torch; `spadwarp.detect` takes it as it takes a `Result`. Methods as of `Result`, of float64."""
 
-    Attributes:
-        scene, unit, photons: As in `Result`.
-        tallies: int64 `[3, H, W, T]`, value = tally · `tally_value`.
-        tally_value: Fraction of the photons per tally unit, float64 `[H, W]`; see `Result.tally_value`.
-        truth: float32 maps on the device of the tallies.
-    """
-
-    scene: Scene
-    tallies: torch.Tensor
+    scene: Scene  # as in `Result`, as unit and photons
+    tallies: torch.Tensor  # int64 `[3, H, W, T]`, value = tally · `tally_value`
     unit: float
     photons: int
-    tally_value: torch.Tensor
-    truth: TorchTruth
+    tally_value: torch.Tensor  # fraction of the photons per tally unit, float64 `[H, W]`; see `Result.tally_value`
+    truth: SimpleNamespace  # the maps of `Truth` as float32 tensors on the device of the tallies
 
     @cached_property
     def histogram(self) -> torch.Tensor:
@@ -84,11 +69,8 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         tallies: The caller's tensor that `spadwarp.simulate(…, tallies=…)` has filled, on any device; the result's
             tallies are then not read.
 
-    Returns:
-        `TorchResult`, or `Frames` whose arrays are tensors.
-
-    Raises:
-        ArgumentError: The tensor is not int64 or has not as many elements as the result.
+    Returns `TorchResult`, or `Frames` whose arrays are tensors. Raises `ArgumentError`: the tensor is not int64 or has
+    not as many elements as the result.
     """
     import torch
 
@@ -106,7 +88,7 @@ def to_torch(source: Any, *, tallies: torch.Tensor | None = None) -> Any:
         unit=source.unit,
         photons=source.photons,
         tally_value=_shared(source.tally_value).to(tallies.device),
-        truth=TorchTruth(**maps),
+        truth=SimpleNamespace(**maps),
     )
 
 
@@ -126,8 +108,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
     `derivative`, of results that have some, has the dimension parameter before these, and `polarisation` the dimension
     channel. Attributes: photons, seed, partial and the scene as TOML.
 
-    Raises:
-        FileError: xarray is not installed.
+    Raises `FileError`: xarray is not installed.
     """
     cube = ("component", "y", "x", "time")
     values = np.stack([result.component(name) for name in COMPONENTS])

@@ -76,8 +76,7 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
         path: The file; an existing one is replaced when the new one is whole.
         compression: Level of gzip, 1 (fast) to 9.
 
-    Raises:
-        FileError: The file cannot be written.
+    Raises `FileError`: the file cannot be written.
     """
     compression = check_integer("compression", compression, "[1, 9]")
     _, height, width, bins = result.tallies.shape
@@ -117,9 +116,8 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
 def load_result(path: str | Path) -> Result:
     """Reads what `save_result` wrote.
 
-    Raises:
-        FileError: No such file, not a spadwarp result, of a newer format version, damaged, or with arrays that are not
-            those of its scene; says which.
+    Raises `FileError`: no such file, not a spadwarp result, of a newer format version, damaged, or with arrays that are
+    not those of its scene; says which.
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         head = _head(file)
@@ -268,9 +266,8 @@ def merge(results: Iterable[ResultLike]) -> Result:
     The ids may leave gaps, which `simulate(resume=)` fills. Each part's provenance is in `provenance["parts"]`,
     with its ids.
 
-    Raises:
-        ArgumentError: No list of results.
-        ConfigError: Different scenes (photons and output aside), seeds, units or batches, or ids that overlap.
+    Raises `ArgumentError`: no list of results; `ConfigError`: different scenes (photons and output aside), seeds, units
+    or batches, or ids that overlap.
     """
     if isinstance(results, str | os.PathLike | Result) or not isinstance(results, Iterable):
         raise ArgumentError(f"results = {shown(results)} is not a list of results or of their paths")

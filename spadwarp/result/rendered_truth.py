@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,50 +16,11 @@ from spadwarp.result.result import Truth
 from spadwarp.scene.sight import pixel_directions
 from spadwarp.values import ArgumentError, FileError, check_choice, check_real
 
-__all__ = ["EXR_PRESETS", "ExrPreset", "load_truth_exr"]
-
-
-class ExrPreset(NamedTuple):
-    """How a program writes depth, normals and albedo.
-
-    Attributes:
-        depth_channels, normal_channels, albedo_channels: Where depth, the components of the world normal and albedo are
-            looked for, in this order; green first, in the middle of which lies 532 nm.
-        depth_scale: Metres per unit of depth.
-        sky: Stored depths from here on mean that nothing was hit.
-        axes: The camera's right, down and forward in the program's world, for a camera that is not rotated.
-    """
-
-    depth_channels: Sequence[str]
-    depth_scale: float
-    sky: float
-    normal_channels: Sequence[tuple[str, str, str]]
-    albedo_channels: Sequence[str]
-    axes: tuple[tuple[float, float, float], ...]
+__all__ = ["load_truth_exr"]
 
 
 _HALF_MAX = 65504.0  # the largest float16, which stands for infinity in files of float16
-
-EXR_PRESETS: dict[str, ExrPreset] = {
-    # Unreal: x forward, y right, z up, left-handed; scene depth is planar, in centimetres.
-    "unreal": ExrPreset(
-        depth_channels=("A",),
-        depth_scale=0.01,
-        sky=_HALF_MAX,
-        normal_channels=(("R", "G", "B"),),
-        albedo_channels=("G", "Y"),
-        axes=((0.0, 1.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0)),
-    ),
-    # Blender: x right, y forward, z up, right-handed; the depth pass is planar, in metres, 1e10 for the sky.
-    "blender": ExrPreset(
-        depth_channels=("Depth.Z", "Depth.V", "Z", "V"),
-        depth_scale=1.0,
-        sky=1e9,
-        normal_channels=(("Normal.X", "Normal.Y", "Normal.Z"), ("X", "Y", "Z"), ("R", "G", "B")),
-        albedo_channels=("DiffCol.G", "Color.G", "G", "Y"),
-        axes=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-    ),
-}
+_PRESETS = tomllib.loads((files("spadwarp.result") / "exr_presets.toml").read_text(encoding="utf-8"))
 
 
 def load_truth_exr(
@@ -88,22 +51,18 @@ def load_truth_exr(
         axes: `[3, 3]`, the camera's right, down and forward as unit vectors of the program's world; the preset's are
             those of a camera without rotation.
 
-    Returns:
-        Truth; NaN where the file has NaN, infinity, 0 or the sky's value.
-
-    Raises:
-        FileError: A file that cannot be read, without the channel (the message names those it has), of another size
-            than the camera's image, with negative depth or albedo outside [0, 1], or with nothing in view.
-        ArgumentError: An argument out of range.
+    Returns Truth; NaN where the file has NaN, infinity, 0 or the sky's value. Raises `FileError`: a file that cannot be
+    read, without the channel (the message names those it has), of another size than the camera's image, with negative
+    depth or albedo outside [0, 1], or with nothing in view; `ArgumentError`: an argument out of range.
     """
-    check_choice("preset", preset, [*EXR_PRESETS])
+    check_choice("preset", preset, [*_PRESETS])
     if camera.port is not None:
         raise ArgumentError("camera.port: rendered truth is of cameras that see along straight lines")
-    how, shape, view = EXR_PRESETS[preset], (camera.height, camera.width), pixel_directions(camera)
-    scale = check_real("depth_scale", how.depth_scale if depth_scale is None else depth_scale, "[1e-9, 1e9]")
+    how, shape, view = _PRESETS[preset], (camera.height, camera.width), pixel_directions(camera)
+    scale = check_real("depth_scale", how["depth_scale"] if depth_scale is None else depth_scale, "[1e-9, 1e9]")
 
-    stored = _channel(depth, (depth_channel,) if depth_channel else how.depth_channels, shape)
-    sky = min(how.sky, _HALF_MAX) if stored.dtype == np.float16 else how.sky
+    stored = _channel(depth, (depth_channel,) if depth_channel else how["depth_channels"], shape)
+    sky = min(how["sky"], _HALF_MAX) if stored.dtype == np.float16 else how["sky"]
     raw = stored.astype(np.float64)
     raw[~np.isfinite(raw) | (raw >= sky) | (raw == 0)] = np.nan
     hit = ~np.isnan(raw)
@@ -114,7 +73,7 @@ def load_truth_exr(
     distance = raw * scale if radial else raw * scale / view[..., 2]
 
     if isinstance(albedo, (str, Path)):
-        wanted = (albedo_channel,) if albedo_channel else how.albedo_channels
+        wanted = (albedo_channel,) if albedo_channel else how["albedo_channels"]
         reflectance = _channel(albedo, wanted, shape).astype(np.float64)
         wrong = hit & ~((reflectance >= 0) & (reflectance <= 1))
         if wrong.any():
@@ -132,13 +91,13 @@ def load_truth_exr(
 
 
 def _normals(
-    path: str | Path, how: ExrPreset, axes: ArrayLike | None, view: NDArray[np.float64], hit: NDArray[np.bool_]
+    path: str | Path, how: dict[str, Any], axes: ArrayLike | None, view: NDArray[np.float64], hit: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Unit normals in the camera frame, on the camera's side."""
-    rows = np.asarray(how.axes if axes is None else axes, np.float64)
+    rows = np.asarray(how["axes"] if axes is None else axes, np.float64)
     if rows.shape != (3, 3) or not np.allclose(rows @ rows.T, np.eye(3), atol=1e-4):
         raise ArgumentError(f"axes = {rows.tolist()} are not three orthogonal unit vectors")
-    components = [_channel(path, names, hit.shape) for names in zip(*how.normal_channels, strict=True)]
+    components = [_channel(path, names, hit.shape) for names in zip(*how["normal_channels"], strict=True)]
     normals = np.stack(components, axis=-1).astype(np.float64) @ rows.T
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     if (missing := hit & ~(length[..., 0] > 0.1)).any():

@@ -17,7 +17,7 @@ from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.values import ArgumentError, ConfigError, check_choice, percent
+from spadwarp.values import ArgumentError, ConfigError, Shown, check_choice, percent
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -92,19 +92,12 @@ def _check_array(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Truth:
-    """What the camera would see through clear water, at pixel centres; NaN where the line of sight hits nothing.
+    """What the camera would see through clear water, at pixel centres; NaN where the line of sight hits nothing."""
 
-    Attributes:
-        depth: float32 `[H, W]`, planar depth z [m].
-        range: float32 `[H, W]`, distance along the line of sight [m].
-        normal: float32 `[H, W, 3]`, unit normal on the camera's side, in the camera frame.
-        reflectance: float32 `[H, W]`, Lambertian reflectance in [0, 1].
-    """
-
-    depth: NDArray[np.float32]
-    range: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    reflectance: NDArray[np.float32]
+    depth: NDArray[np.float32]  # float32 `[H, W]`, planar depth z [m]
+    range: NDArray[np.float32]  # float32 `[H, W]`, distance along the line of sight [m]
+    normal: NDArray[np.float32]  # float32 `[H, W, 3]`, unit normal on the camera's side, in the camera frame
+    reflectance: NDArray[np.float32]  # float32 `[H, W]`, Lambertian reflectance in [0, 1]
 
     def __post_init__(self) -> None:
         if self.depth.ndim != 2:
@@ -123,45 +116,28 @@ class Truth:
 class ResultHead:
     """Which photons of which run a result holds: its fields without arrays, as in `Result`."""
 
-    scene: Scene
-    unit: float
-    photons: int
-    seed: int
-    energy_balance_unit: float
-    partial: bool = False
+    scene: Scene  # the scene that was simulated
+    unit: float  # fraction of one emitted photon per tally unit, a power of two
+    photons: int  # emitted photons, > 0
+    seed: int  # 64-bit seed of the run
+    energy_balance_unit: float  # photons per unit of `energy_balance`, a power of two
+    partial: bool = False  # whether the run was interrupted; `photons` then counts those that were done
     photon_ranges: Sequence[tuple[int, int]] = ()
-    batch_size: int = 0
-    requested: tuple[int, int] = (0, 0)
-    focus_distance: float | None = None
-    file_hashes: tuple[str, ...] = ()
+    """The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`."""
+    batch_size: int = 0  # photons of a batch where errors were asked for, else 0; every range is whole batches then
+    requested: tuple[int, int] = (0, 0)  # ids [start, stop) that were asked for; an interrupted run has a part of them
+    focus_distance: float | None = None  # depth that the lens images sharply [m]; None: all of them, for a pinhole
+    file_hashes: tuple[str, ...] = ()  # SHA-256 of each of `scene.files` when the photons were traced
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Result(ResultHead, Tallies):
-    """Expected photon histograms of one scene in fixed point, and all that is needed to interpret them.
+class Result(Shown, ResultHead, Tallies):
+    """Expected photon histograms of one scene in fixed point, value = tally · unit / photons, see `tally_value`, and
+    all that is needed to interpret them; with the attributes of `Tallies`."""
 
-    The attributes of `Tallies`, of which value = tally · unit / photons, see `tally_value`, and:
-
-    Attributes:
-        scene: The scene that was simulated.
-        unit: Fraction of one emitted photon per tally unit, a power of two.
-        photons: Emitted photons, > 0.
-        seed: 64-bit seed of the run.
-        focus_distance: Depth that the lens images sharply [m], None if it is all of them, for a pinhole.
-        energy_balance_unit: Photons per unit of `energy_balance`, a power of two.
-        truth: Depth, range, normal and reflectance at pixel centres.
-        timing: Seconds of each stage.
-        provenance: Versions, device and date.
-        partial: Whether the run was interrupted; `photons` then counts those that were done.
-        photon_ranges: The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`.
-        requested: The ids [start, stop) that were asked for; an interrupted run has only a part of them.
-        file_hashes: SHA-256 of each of `scene.files` when the photons were traced.
-        batch_size: Photons of a batch where errors were asked for, else 0; every range is whole batches then.
-    """
-
-    truth: Truth
-    timing: Mapping[str, float] = field(default_factory=dict)
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    truth: Truth  # depth, range, normal and reflectance at pixel centres
+    timing: Mapping[str, float] = field(default_factory=dict)  # seconds of each stage
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # versions, device and date
 
     def __post_init__(self) -> None:
         if not self.photon_ranges:
@@ -256,8 +232,7 @@ class Result(ResultHead, Tallies):
     def standard_error(self) -> Floats:
         """Standard error of `histogram` from the spread between batches, float64 `[H, W, T]`.
 
-        Raises:
-            ConfigError: The run has no batches, or only one.
+        Raises `ConfigError`: the run has no batches, or only one.
         """
         moments, batches = _batches_of(self)
         return standard_error(self.tallies, moments, batches) * self.tally_value[..., None]
@@ -382,9 +357,8 @@ class Result(ResultHead, Tallies):
     def energy_report(self) -> dict[str, Any]:
         """The energy balance as fractions of the emitted weight, and whether it is exact.
 
-        Returns:
-            `emitted` (photons, each of weight 1), `fractions` (name → signed fraction), `difference` (emitted − sum of
-            the entries, in their units, from integers) and `exact` (whether it is 0).
+        Returns `emitted` (photons, each of weight 1), `fractions` (name → signed fraction), `difference` (emitted − sum
+        of the entries, in their units, from integers) and `exact` (whether it is 0).
         """
         emitted = round(self.photons / self.energy_balance_unit)
         difference = emitted - sum(self.energy_balance.values())
@@ -437,17 +411,6 @@ class Result(ResultHead, Tallies):
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }
-
-    def plot(self, kind: Any = None, **options: Any) -> Any:
-        """A figure: "depth", "intensity", "histogram" or "truth"; see `spadwarp.viz.plot`."""
-        import spadwarp
-
-        return spadwarp.viz.plot(self, kind, **options)
-
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
 
     def to_xarray(self) -> Any:
         """Histograms, depth and truth with coordinates and units: see `spadwarp.result.to_xarray`."""
@@ -616,10 +579,9 @@ def _short_names(names: Iterable[str]) -> list[str]:
 def component_errors(result: Result) -> dict[str, tuple[float, float]]:
     """How well the total of each component is known; empty without batches, and for components without light.
 
-    Returns:
-        By component the relative standard error of its light, all pixels and bins together, and the squared deviation
-        of the batch furthest from the mean, over the largest that it could have at the same variance, in [0, 1]: about
-        5/batches where many photons matter equally, near 1 where one decides.
+    Returns by component the relative standard error of its light, all pixels and bins together, and the squared
+    deviation of the batch furthest from the mean, over the largest that it could have at the same variance, in [0, 1]:
+    about 5/batches where many photons matter equally, near 1 where one decides.
     """
     return {
         name: (math.sqrt(spread / (n - 1)) / total, furthest * furthest / ((n - 1) * spread))
@@ -691,9 +653,7 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
 
     The energy balance and the counters stay those of all light; from Stokes cubes the channel has no standard errors.
 
-    Raises:
-        ArgumentError: No such channel.
-        ConfigError: The result was simulated without channels.
+    Raises `ArgumentError`: no such channel; `ConfigError`: the result was simulated without channels.
     """
     if check_choice("channel", channel, CHANNELS) == "I":
         return result

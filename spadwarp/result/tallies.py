@@ -27,48 +27,36 @@ Number = TypeVar("Number", int, float)
 
 @dataclass(frozen=True, eq=False)
 class SignedTallies:
-    """Tallies of the derivatives of a histogram, or of channels.
+    """Tallies of the derivatives of a histogram, or of channels."""
 
-    Attributes:
-        names: Of the P parameters, such as "medium.absorption", or channels, such as "cross".
-        tallies: int64 `[P, 3, H, W, T]`, by component; derivative or channel = tally · unit / photons.
-        units: Fraction of one emitted photon, per unit of the parameter, that a tally unit stands for; powers of two.
-        second_moment: uint64 `[2, P, H, W, T]`, as `Tallies.second_moment`; None without batches.
-    """
-
-    names: tuple[str, ...]
-    tallies: NDArray[np.int64]
+    names: tuple[str, ...]  # of the P parameters, such as "medium.absorption", or channels, such as "cross"
+    tallies: NDArray[np.int64]  # int64 `[P, 3, H, W, T]`, by component; derivative or channel = tally · unit / photons
     units: tuple[float, ...]
+    """Fraction of one emitted photon, per unit of the parameter, that a tally unit stands for; powers of two."""
     second_moment: NDArray[np.uint64] | None = None
+    """uint64 `[2, P, H, W, T]`, as `Tallies.second_moment`; None without batches."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Tallies:
-    """What photons left: their histograms in fixed point, their energy balance and counts of events.
+    """What photons left: their histograms in fixed point, their energy balance and counts of events."""
 
-    Attributes:
-        tallies: int64 `[3, H, W, T]` in the order of `COMPONENTS`.
-        energy_balance: Where the emitted weight went, in units of `energy_balance_unit` photons. Entries are
-            differences of fixed-point weights (before − after; a gain is negative), so that their sum is exactly the
-            emitted weight.
-        counters: Numbers of events, of contributions that were clipped or not a number, and by component of those of
-            less than one tally unit, see `Result.rounding_error`; light before and after the gate in tally units
-            (`guided` aims inside the gate and counts there what its surfaces score alone).
-        second_moment: uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally of
-            all components; None without batches.
-        batch_moments: By component, over batches of its tally summed over voxels: `…_squares` (their sum),
-            `…_smallest` and `…_largest`; empty without batches.
-        derivative_tallies: Of the derivatives that were asked for; None if there are none.
-        channel_tallies: Of the camera's channels but "I", which is the histogram; None if there are none.
-    """
-
-    tallies: NDArray[np.int64]
+    tallies: NDArray[np.int64]  # int64 `[3, H, W, T]` in the order of `COMPONENTS`
     energy_balance: Mapping[str, int]
+    """Where the emitted weight went, in units of `energy_balance_unit` photons. Entries are differences of fixed-point
+    weights (before − after; a gain is negative), so that their sum is exactly the emitted weight."""
     counters: Mapping[str, int]
+    """Numbers of events, of contributions that were clipped or not a number, and by component of those of less than one
+    tally unit, see `Result.rounding_error`; light before and after the gate in tally units (`guided` aims inside the
+    gate and counts there what its surfaces score alone)."""
     second_moment: NDArray[np.uint64] | None = None
+    """uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally of all components;
+    None without batches."""
     batch_moments: Mapping[str, int] = field(default_factory=dict)
-    derivative_tallies: SignedTallies | None = None
-    channel_tallies: SignedTallies | None = None
+    """By component, over batches of its tally summed over voxels: `…_squares` (their sum), `…_smallest` and
+    `…_largest`; empty without batches."""
+    derivative_tallies: SignedTallies | None = None  # of the derivatives that were asked for; None if there are none
+    channel_tallies: SignedTallies | None = None  # of the camera's channels but "I", the histogram; None: no others
 
 
 def total_of(*parts: Tallies) -> Tallies:
@@ -179,8 +167,7 @@ Ranges = tuple[Range, ...]
 def joined(ranges: Iterable[Range]) -> Ranges:
     """The ranges in order, adjoining ones made one.
 
-    Raises:
-        ConfigError: Ids are in more than one of them.
+    Raises `ConfigError`: ids are in more than one of them.
     """
     whole: list[Range] = []
     for start, stop in sorted(ranges):
@@ -214,8 +201,7 @@ def count(ranges: Iterable[Range]) -> int:
 def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
     """Part `shard[0]`, from 1, of `shard[1]` equal parts of a span of whole units.
 
-    Raises:
-        ConfigError: There are more parts than units.
+    Raises `ConfigError`: there are more parts than units.
     """
     (number, parts), (start, stop) = shard, span
     units = (stop - start) // unit

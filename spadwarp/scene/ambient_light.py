@@ -20,13 +20,7 @@ from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import Scene, camera_port
 from spadwarp.scene.sight import pixel_directions
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, Interval
-from spadwarp.water.daylight import (
-    SKY_REFLECTANCE,
-    clear_sky_irradiance,
-    daylight_attenuation,
-    refracted_cosine,
-    surface_reflectance,
-)
+from spadwarp.water import daylight as skylight
 from spadwarp.water.seawater import RANGES
 
 __all__ = ["daylight_radiance", "daylight_rate", "downwelling_irradiance", "noise_rate"]
@@ -49,7 +43,7 @@ class _Field:
         # κ = a + b_b along a line of sight [1/m].
         self.attenuation = medium.absorption + phase.backscatter_fraction * medium.scattering
         # Irradiance across the sun's light [W/m²]; radiance within Snell's window, even: E = π L sin² [W/m²/sr].
-        self.sun = direct / refracted_cosine(daylight.sun_elevation_deg, index)
+        self.sun = direct / skylight.refracted_cosine(daylight.sun_elevation_deg, index)
         self.sky = diffuse / (math.pi / index**2)
         self.window = math.sqrt(1.0 - 1.0 / index**2)  # cosine of its half angle
         self.towards, self.down = daylight.sun_direction(index) @ turn, daylight.down @ turn  # of the sun's light
@@ -255,14 +249,14 @@ def _irradiance(scene: Scene, wavelength_nm: float, depth: float) -> tuple[float
     daylight, medium = _daylight(scene), scene.medium
     medium = medium.at_wavelength(wavelength_nm) if medium.follows_wavelength else medium
     phase, elevation = phase_function(medium), daylight.sun_elevation_deg
-    above = clear_sky_irradiance(
+    above = skylight.clear_sky_irradiance(
         wavelength_nm, sun_elevation_deg=elevation, aerosol_optical_depth=daylight.aerosol_optical_depth
     )
     backward = phase.backscatter_fraction * medium.scattering
-    decay = daylight_attenuation(medium.absorption, backward, sun_elevation_deg=elevation)
+    decay = skylight.daylight_attenuation(medium.absorption, backward, sun_elevation_deg=elevation)
     factor = daylight.cloud_factor * math.exp(-decay * depth)
-    direct = factor * (above.direct * (1.0 - surface_reflectance(elevation, medium.phase_index)))
-    return direct, factor * above.diffuse * (1.0 - SKY_REFLECTANCE), decay, medium, phase
+    direct = factor * (above.direct * (1.0 - skylight.surface_reflectance(elevation, medium.phase_index)))
+    return direct, factor * above.diffuse * (1.0 - skylight.SKY_REFLECTANCE), decay, medium, phase
 
 
 def _window_average(scattered: Floats, window: float) -> Floats:

@@ -200,16 +200,11 @@ def read_grid(path: str | Path) -> GridFile:
         with read_hdf5(place) as file:
             found = {name: entry for name, entry in file.arrays().items() if name in names}
             return _checked({n: file.array(n, kind, (None,) * len(shape)) for n, (shape, kind) in found.items()})
-    except _Unfit as error:
+    except ConfigError as error:
         raise FileError(f"{path}: {error}") from None
     except (SpadwarpError, ValueError, TypeError, RuntimeError, OSError, MemoryError) as error:
-        raise (
-            error if isinstance(error, FileError) else FileError(f"{path}: damaged or not readable: {error}")
-        ) from error
-
-
-class _Unfit(Exception):
-    """Why the content of a file is no grid."""
+        text = str(error) if isinstance(error, FileError) else f"{path}: damaged or not readable: {error}"
+        raise FileError(text) from error
 
 
 def _read_nvdb(path: Path) -> dict[str, NDArray[Any]]:
@@ -226,24 +221,24 @@ def _read_nvdb(path: Path) -> dict[str, NDArray[Any]]:
     named = {info.name: (info, one) for info, one in volumes if info.name in GRID_ARRAYS}
     if not named and len(volumes) > 1:
         names = [info.name for info, _ in volumes]
-        raise _Unfit(f"grids {names}, none of which is one of {', '.join(GRID_ARRAYS)}")
+        raise ConfigError(f"grids {names}, none of which is one of {', '.join(GRID_ARRAYS)}")
     named = named or {"density": volumes[0]}
     voxels = {name: one.get_voxels().numpy() for name, (_, one) in named.items()}
     if not all(map(len, voxels.values())):
-        raise _Unfit("a grid without voxels")
+        raise ConfigError("a grid without voxels")
     low = np.min([one.min(axis=0) for one in voxels.values()], axis=0)
     shape = tuple(int(n) for n in np.max([one.max(axis=0) for one in voxels.values()], axis=0) + 1 - low)
     if np.prod(shape, dtype=np.float64) > LARGEST_CELL_COUNT:
-        raise _Unfit(f"voxels within {shape} cells; at most {LARGEST_CELL_COUNT} are allowed")
+        raise ConfigError(f"voxels within {shape} cells; at most {LARGEST_CELL_COUNT} are allowed")
     info = next(iter(named.values()))[0]
     transform = np.array(info.transform_matrix, np.float64).reshape(3, 3)
     cell = np.diag(transform)
     if not np.allclose(transform, np.diag(cell)) or (cell <= 0.0).any():
-        raise _Unfit("a rotated or mirrored grid; rotate it by medium.grid.rotation_deg")
+        raise ConfigError("a rotated or mirrored grid; rotate it by medium.grid.rotation_deg")
     arrays: dict[str, NDArray[Any]] = {}
     for name, (info, one) in named.items():
         if one.dtype is not wp.float32:
-            raise _Unfit(f"grid {info.name!r} holds {one.dtype}; float is needed")
+            raise ConfigError(f"grid {info.name!r} holds {one.dtype}; float is needed")
         values = wp.empty(len(voxels[name]), dtype=float, device="cpu")
         indices: wp.array = wp.array(voxels[name], dtype=wp.vec3i, device="cpu")
         wp.launch(sk.voxel_values_kernel, len(voxels[name]), [one.id, indices, values], device="cpu")
@@ -260,29 +255,29 @@ def _checked(found: Mapping[str, NDArray[Any]]) -> GridFile:
         if (values := found.get(name)) is None:
             continue
         if values.ndim not in (3, 4) or values.dtype.kind not in "fiu" or not 0 < values.size <= LARGEST_CELL_COUNT:
-            raise _Unfit(
+            raise ConfigError(
                 f"{name} is {values.dtype} {values.shape}; numbers [x, y, z] or [frame, x, y, z] of at most "
                 f"{LARGEST_CELL_COUNT} cells are needed"
             )
         values = values.astype(np.float32).reshape(-1, *values.shape[-3:])
         if not (inside := interval.holds(values)).all():
             place = tuple(int(i) for i in np.argwhere(~inside)[0])
-            raise _Unfit(f"{name}{list(place[1:])} = {values[place]:g} is outside {interval}")
+            raise ConfigError(f"{name}{list(place[1:])} = {values[place]:g} is outside {interval}")
         arrays[name] = values
     coefficients = set(COEFFICIENTS) & set(arrays)
     if ("density" in arrays) == bool(coefficients) or len(coefficients) not in (0, 2):
         needed = "density, or two of extinction, absorption, scattering and albedo are needed"
-        raise _Unfit(f"holds {', '.join(arrays) or 'none of them'}; {needed}")
+        raise ConfigError(f"holds {', '.join(arrays) or 'none of them'}; {needed}")
     shapes = {values.shape for values in arrays.values()}
     if len(shapes) > 1:
-        raise _Unfit(f"arrays of different shapes, {sorted(shapes)}")
+        raise ConfigError(f"arrays of different shapes, {sorted(shapes)}")
     places: dict[str, NDArray[np.float64]] = {}
     for name, within in _PLACES.items():
         if name in found:
             values = np.asarray(found[name], np.float64).ravel()
             places[name] = np.repeat(values, 3) if values.size == 1 else values
             if places[name].size != 3 or not Interval.read(within).holds(values).all():
-                raise _Unfit(f"{name} = {places[name].tolist()[:4]} is not three numbers in {within}")
+                raise ConfigError(f"{name} = {places[name].tolist()[:4]} is not three numbers in {within}")
     if "cell_size" in places:
         places.setdefault("size", places["cell_size"] * shapes.pop()[1:])
     return GridFile(arrays, *(vector_of(places[name]) if name in places else None for name in ("size", "origin")))

@@ -19,17 +19,8 @@ from pydantic import Field, model_validator
 from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file
 from spadwarp.scene.port import Port
-from spadwarp.scene.sections import (
-    AnyFile,
-    CsvFile,
-    Direction,
-    Section,
-    Vector,
-    field,
-    field_range,
-    read_table,
-    unit_vector,
-)
+from spadwarp.scene.pose import unit_vector
+from spadwarp.scene.sections import AnyFile, CsvFile, Direction, Section, Vector, field, field_range, read_table
 from spadwarp.scene.settings import Detector
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval, SpadwarpError
 from spadwarp.water.seawater import RANGES

@@ -31,14 +31,8 @@ from spadwarp.scene.sections import (
     read_table,
 )
 from spadwarp.values import ConfigError, bounds, pulse_speed
-from spadwarp.water import (
-    molecular_density,
-    rayleigh_matrix,
-    read_matrix_table,
-    scaled_rayleigh_matrix,
-    voss_fry_matrix,
-)
-from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, water_optics
+from spadwarp.water import rayleigh_matrix, read_matrix_table, scaled_rayleigh_matrix, voss_fry_matrix
+from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, molecular_density, water_optics
 
 __all__ = ["Layer", "Matrix", "Medium", "PhaseFunction", "phase_function", "scattering_matrix"]
 
@@ -98,14 +92,8 @@ PHASE_FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "tabulated": (("phase_table",), ()),
 }
 
-# Tabulated phase functions: name -> (file in spadwarp/water/tables, source).
-PHASE_TABLES: dict[str, tuple[str, str]] = {
-    "petzold-average-particle": (
-        "petzold_average_particle.csv",
-        "Petzold 1972 (SIO Ref. 72-78), mean of three stations in San Diego harbour without the water's own "
-        "scattering, as tabulated by Mobley et al., Appl. Opt. 32, 7484 (1993)",
-    )
-}
+# Tabulated phase functions: name → file in spadwarp/water/tables, whose head has the source.
+PHASE_TABLES = {"petzold-average-particle": "petzold_average_particle.csv"}
 
 
 class Water(Section):
@@ -385,21 +373,13 @@ def grid_cells(medium: Medium) -> GridCells:
 
 @dataclass(frozen=True, eq=False)
 class PhaseFunction:
-    """Probability density of the direction of scattered light, of unit integral over the sphere.
+    """Probability density of the direction of scattered light, of unit integral over the sphere."""
 
-    Attributes:
-        name: `medium.phase_function`.
-        parameters: The medium's fields that it takes.
-        molecular_share: Part of the scattering that is the water's own and not of that name.
-        over_t: The density [1/sr] over t = 1 - cosθ in (0, 2].
-        first_angle: Of a table [rad]; below it the table is continued.
-    """
-
-    name: str
-    parameters: dict[str, float | str]
-    molecular_share: float
-    over_t: Callable[[Floats], Floats]
-    first_angle: float = 0.0
+    name: str  # `medium.phase_function`
+    parameters: dict[str, float | str]  # the medium's fields that it takes
+    molecular_share: float  # part of the scattering that is the water's own and not of that name
+    over_t: Callable[[Floats], Floats]  # the density [1/sr] over t = 1 - cosθ in (0, 2]
+    first_angle: float = 0.0  # of a table [rad]; below it the table is continued
 
     def density(self, angle: ArrayLike) -> Floats:
         """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""
@@ -454,7 +434,7 @@ def phase_function(medium: Medium) -> PhaseFunction:
     if name == "tabulated":
         path = Path(str(medium.phase_table))
         if str(path) in PHASE_TABLES:
-            path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)][0]
+            path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)]
         angles, values = read_table("medium.phase_table", path, {"angle_deg": "[0, 180]", "value": "[0, 1e30]"})
         try:
             density = sk.interpolated_density(np.radians(angles), values)

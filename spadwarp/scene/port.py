@@ -7,16 +7,18 @@ their own, in float32.
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from importlib.resources import files
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from spadwarp.scene.pose import vector_of
-from spadwarp.scene.sections import Direction, Section, Vector, field, unit_vector
+from spadwarp.scene.pose import unit_vector, vector_of
+from spadwarp.scene.sections import Direction, Section, Vector, field
 
 __all__: list[str] = []
 
@@ -26,33 +28,8 @@ Floats = NDArray[np.float64]
 _STEPS = 30
 
 
-class Material(NamedTuple):
-    """Sellmeier's n² = 1 + Σ B λ²/(λ² − C), λ in µm, within a range [µm], and its source."""
-
-    b: tuple[float, ...]
-    c: tuple[float, ...]
-    low: float
-    high: float
-    source: str
-
-
-_SULTANOVA = (0.4368, 1.052, "Sultanova et al., Acta Phys. Pol. A 116, 585 (2009), 20 °C")
-_SAPPHIRE = "ordinary ray; Malitson (1962), as in Weber, Handbook of optical materials (2003)"
-_BK7_C, _SAPPHIRE_B = (0.00600069867, 0.0200179144, 103.560653), (1.4313493, 0.65054713, 5.3414021)
-_SILICA_C, _SAPPHIRE_C = ((0.0684043**2, 0.1162414**2, 9.896161**2), (0.0726631**2, 0.1193242**2, 18.028251**2))
-_PMMA = Material((1.1819,), (0.011313,), *_SULTANOVA)
-
-MATERIALS = {
-    "BK7": Material((1.03961212, 0.231792344, 1.01046945), _BK7_C, 0.3, 2.5, "SCHOTT, data sheet of N-BK7"),
-    "fused silica": Material(
-        (0.6961663, 0.4079426, 0.8974794), _SILICA_C, 0.21, 6.7, "Malitson, J. Opt. Soc. Am. 55, 1205 (1965)"
-    ),
-    "sapphire": Material(_SAPPHIRE_B, _SAPPHIRE_C, 0.2, 5.0, _SAPPHIRE),
-    "acrylic": _PMMA,
-    "PMMA": _PMMA,
-    "polycarbonate": Material((1.4182,), (0.021304,), *_SULTANOVA),
-}
-"""Materials of windows; the coefficients as refractiveindex.info lists them."""
+MATERIALS = tomllib.loads((files("spadwarp.scene") / "materials.toml").read_text(encoding="utf-8"))
+"""Materials of windows."""
 
 
 def window_indices(material: str, wavelength_nm: float) -> tuple[float, float]:
@@ -61,10 +38,11 @@ def window_indices(material: str, wavelength_nm: float) -> tuple[float, float]:
     Raises `ValueError` outside the range of its source.
     """
     glass, micrometres = MATERIALS[material], wavelength_nm * 1e-3
-    if not glass.low <= micrometres <= glass.high:
-        low, high = 1e3 * glass.low, 1e3 * glass.high
-        raise ValueError(f"material = {material!r} is known for [{low:g}, {high:g}] nm, not for {wavelength_nm:g} nm")
-    square, terms = micrometres**2, list(zip(glass.b, glass.c, strict=True))
+    low, high = glass["range"]
+    if not low <= micrometres <= high:
+        known = f"[{1e3 * low:g}, {1e3 * high:g}] nm"
+        raise ValueError(f"material = {material!r} is known for {known}, not for {wavelength_nm:g} nm")
+    square, terms = micrometres**2, list(zip(glass["b"], glass["c"], strict=True))
     index = math.sqrt(1.0 + sum(b * square / (square - c) for b, c in terms))
     slope = -sum(b * c * micrometres / (square - c) ** 2 for b, c in terms) / index
     return index, index - micrometres * slope

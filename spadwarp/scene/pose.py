@@ -6,6 +6,7 @@ are the columns of R sees the world's point X at Rᵀ(X − position); R = Rx·R
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import numpy as np
@@ -85,3 +86,9 @@ def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.
 def vector_of(values: NDArray[np.float64]) -> Vector:
     """An array of three numbers as a tuple."""
     return float(values[0]), float(values[1]), float(values[2])
+
+
+def unit_vector(vector: Vector) -> Vector:
+    """A vector over its length."""
+    x, y, z = (part / math.hypot(*vector) for part in vector)
+    return x, y, z

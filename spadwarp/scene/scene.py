@@ -25,16 +25,7 @@ from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import interpolated_angles, rotation_matrix, vector_of
 from spadwarp.scene.sections import Document, Overrides, listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
-from spadwarp.values import (
-    ArgumentError,
-    ConfigError,
-    FileError,
-    check_integer,
-    check_real,
-    path_from_time,
-    read_real,
-    shown,
-)
+from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_integer, check_real, read_real, shown
 
 __all__ = ["Scene", "SceneLike", "Trajectory", "WaterLine", "as_scene", "load_scene", "load_trajectory", "template"]
 __all__ += ["water_lines"]
@@ -42,7 +33,7 @@ __all__ += ["water_lines"]
 _DOWNWARDS = 0.999  # Cosine with the vertical, of the normal of a surface.
 
 
-class Scene(Document):
+class Scene(Shown, Document):
     """Everything a run depends on, checked and frozen."""
 
     medium: Medium
@@ -126,14 +117,6 @@ class Scene(Document):
         through, position = camera_port(self), list(self.beam.position)
         if through is not None and (why := through.outside((0.0, 0.0, 0.0))):
             yield f"camera.port: the lens is outside: {why}; change offset or radius"
-        lens = self.camera
-        wide = 0.5 * lens.pixel_tangent * math.hypot(lens.width, lens.height)
-        radius = 0.0 if lens.pinhole else lens.aperture_radius
-        if through is not None and laser is None and through.houses(position, wide, radius):
-            yield (
-                f"laser.position = {position} is inside camera.port: laser.port = 'camera' lets it shine through that "
-                "window, a table [laser.port] through one of its own; in the water it stands in front or beside"
-            )
         if (through := laser_port(self)) is not None and (why := through.outside(position)):
             is_shared = laser == "camera"
             hint = "move the laser, or give it a port of its own: [laser.port]" if is_shared else "change it"
@@ -197,19 +180,8 @@ class Scene(Document):
     @property
     def path_limit(self) -> float:
         """Longest geometric path that counts [m]: `transport.max_path` or the gate's end, whichever is shorter."""
-        gate_end = path_from_time(self.gate.stop, self.medium.group_index)
+        gate_end = self.gate.stop * self.medium.pulse_speed
         return min(self.transport.max_path or gate_end, gate_end)
-
-    def plot(self, **options: Any) -> Any:
-        """A figure of what the camera sees through clear water; see `spadwarp.viz.plot`."""
-        import spadwarp
-
-        return spadwarp.viz.plot(self, **options)
-
-    def _repr_html_(self) -> str:
-        import spadwarp
-
-        return spadwarp.viz.html(self)
 
     def __repr__(self) -> str:
         name = self.source.stem if self.source else "Python"
@@ -264,18 +236,12 @@ def template() -> str:
 
 
 class WaterLine(NamedTuple):
-    """A line of the light that passes the filter, in the water.
+    """A line of the light that passes the filter, in the water."""
 
-    Attributes:
-        share: Photons, over those of a pulse of one line at `laser.wavelength_nm`.
-        extinction, scattering: [1/m].
-        speed: Of a pulse [m/s].
-    """
-
-    share: float
-    extinction: float
-    scattering: float
-    speed: float
+    share: float  # photons, over those of a pulse of one line at `laser.wavelength_nm`
+    extinction: float  # [1/m]
+    scattering: float  # [1/m]
+    speed: float  # of a pulse [m/s]
 
 
 def water_lines(scene: Scene) -> list[WaterLine]:
@@ -324,19 +290,12 @@ _MOST_ROWS = 1_000_000
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Trajectory:
-    """Values of fields of a scene at ascending times.
+    """Values of fields of a scene at ascending times."""
 
-    Attributes:
-        times: [s], `[N]`.
-        fields: As overrides name them, such as `camera.position[0]` or `targets[1].translation[2]`.
-        values: `[N, fields]`, in the units of the fields.
-        source: The file that they came from.
-    """
-
-    times: NDArray[np.float64]
-    fields: tuple[str, ...]
-    values: NDArray[np.float64]
-    source: str | None = None
+    times: NDArray[np.float64]  # [s], `[N]`
+    fields: tuple[str, ...]  # as overrides name them, such as `camera.position[0]` or `targets[1].translation[2]`
+    values: NDArray[np.float64]  # `[N, fields]`, in the units of the fields
+    source: str | None = None  # the file that they came from
 
     def __len__(self) -> int:
         return len(self.times)

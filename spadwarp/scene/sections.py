@@ -22,19 +22,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, ValidationInfo
 from pydantic.fields import FieldInfo
+from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
 
 from spadwarp.io.paths import sha256
 from spadwarp.io.text import parse_toml, read_columns
@@ -96,12 +86,6 @@ def _with_length(vector: tuple[float, ...]) -> tuple[float, ...]:
     if math.hypot(*vector) < 1e-9:
         raise ValueError("has no length")
     return vector
-
-
-def unit_vector(vector: tuple[float, float, float]) -> tuple[float, float, float]:
-    """A vector over its length."""
-    x, y, z = (part / math.hypot(*vector) for part in vector)
-    return x, y, z
 
 
 Whole = Annotated[int, BeforeValidator(_whole)]

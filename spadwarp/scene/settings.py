@@ -10,20 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from spadwarp.scene.sections import (
-    AnyFile,
-    Corner,
-    CsvFile,
-    Direction,
-    FilePath,
-    Scale,
-    Section,
-    Size,
-    Vector,
-    Whole,
-    field,
-    unit_vector,
-)
+from spadwarp.scene.pose import unit_vector
+from spadwarp.scene.sections import Corner, CsvFile, Direction, FilePath, Scale, Section, Size, Vector, Whole, field
 from spadwarp.values import SEED, bounds
 from spadwarp.water.daylight import refracted_cosine
 from spadwarp.water.seawater import RANGES
@@ -37,7 +25,7 @@ class Target(Section):
     displaces: ClassVar = {"builtin": ("mesh",), "mesh": ("builtin", "size")}
     builtin: str | None = Field(None, min_length=1)
     """a built-in mesh, such as "staircase"; see `spadwarp list targets`"""
-    mesh: AnyFile = field(None, "path of a mesh file, relative to the scene file")
+    mesh: Annotated[str | None, FilePath()] = field(None, "path of a mesh file, relative to the scene file")
     size: Size | None = field(None, "extent of plane, box, sphere; one number, two for x and y, or three [m]")
     subdivisions: Whole = field(0, "times that every face is split into four", "[0, 12]")
     scale: Scale = field((1.0, 1.0, 1.0), "factor, one or three; mesh units to metres")
@@ -189,6 +177,7 @@ class Detector(Section):
     wrap: bool = field(True, "time of flight modulo the pulse period (range aliasing), as a detector sees it")
     pulses_per_frame: Whole = field(20_000, "laser pulses in one frame of counts", "[1, 9223372036854775807]")
     max_count: Whole = field(0, "largest count a histogram bin holds; 0 is unlimited", "[0, 2147483647]")
+    min_significance: float = field(4.0, "of pixels with a depth, −log10 of false alarms a pixel; 0: all", "[0, 1000]")
 
     def _problems(self) -> Iterator[str]:
         for name in ("filter_centre_nm", "filter_fwhm_nm", "filter_peak"):

@@ -226,30 +226,41 @@ def beam_planes(laser: Laser) -> Floats:
 
 
 def points_inside(triangles: Floats, planes: Floats) -> Floats:
-    """Points of the triangles that are inside all planes, `[N, 3]`: none if and only if no triangle reaches in."""
+    """Points of the triangles that are inside all planes, or within 1 µm of it, `[N, 3]`: none if and only if no
+    triangle reaches in."""
+    from trimesh.intersections import slice_faces_plane
+
     whole, outside = np.ones(len(triangles), dtype=bool), np.zeros(len(triangles), dtype=bool)
     for plane in planes:
         distance = triangles @ plane[:3] + plane[3]
         whole &= (distance >= 0.0).all(axis=1)
         outside |= (distance < 0.0).all(axis=1)
-    found = [_spread(triangles[whole])]
-    for triangle in triangles[~whole & ~outside]:
-        polygon = _clip(triangle, planes)
-        if len(polygon):
-            fan = np.stack([np.broadcast_to(polygon[0], polygon[2:].shape), polygon[1:-1], polygon[2:]], axis=1)
-            found.append(_spread(fan))
-            if len(found) > 256:  # enough for every number that a check reports
-                break
-    return np.concatenate(found)
+    cut = triangles[~whole & ~outside]
+    for plane in planes if len(cut) else ():
+        faces, normal = np.arange(3 * len(cut)).reshape(-1, 3), plane[:3] / np.linalg.norm(plane[:3])
+        origin = -(plane[3] / np.linalg.norm(plane[:3]) + 1e-6) * normal
+        vertices, faces, _ = slice_faces_plane(cut.reshape(-1, 3), faces, normal, origin)
+        cut = np.asarray(vertices)[faces]
+    return np.concatenate([_spread(triangles[whole]), _spread(cut)])
 
 
 def within_port(scene: Scene, triangles: Floats) -> str:
-    """Which part of triangles reaches into the housing or the window of the camera's port; empty where none does."""
-    if (port := camera_port(scene)) is None or not len(triangles):
+    """What is in the housing or the window of the camera's port and is not meant for it: a laser that shines through no
+    port, or parts of triangles; empty where nothing is."""
+    port, camera, laser = camera_port(scene), scene.camera, scene.beam
+    if port is None or len(set(port.index)) == 1:
         return ""
-    nearest = port.nearest * (1.0 - 1e-6)
-    if port.shape == "flat":
-        planes = np.vstack([view_planes(scene.camera), [*(-np.array(port.normal)), nearest]])
+    radius = 0.0 if camera.pinhole else camera.aperture_radius
+    wide = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)
+    if laser.port is None and port.houses(laser.position, wide, radius):
+        return (
+            f"laser.position = {list(laser.position)} is inside camera.port: laser.port = 'camera' lets it shine "
+            "through that window, a table [laser.port] through one of its own; in the water it is in front or beside"
+        )
+    if not len(triangles):
+        return ""
+    if port.shape == "flat":  # but for what touches it, which `points_inside` finds too
+        planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), port.nearest - 2e-6]])
         inside = points_inside(triangles, planes)
     else:
         from trimesh.triangles import closest_point
@@ -257,7 +268,8 @@ def within_port(scene: Scene, triangles: Floats) -> str:
         found = closest_point(triangles, np.broadcast_to(port.centre, (len(triangles), 3)))
         outer = (port.radius + port.thickness) * (1.0 - 1e-6)
         inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
-    return f"a target is at {inside[0].round(6).tolist()} m in the camera's frame" if len(inside) else ""
+    where = "camera.port: a target is within the housing or the window, at {} m in the camera's frame"
+    return where.format(inside[0].round(6).tolist()) if len(inside) else ""
 
 
 def _spread(triangles: Floats) -> Floats:
@@ -265,20 +277,3 @@ def _spread(triangles: Floats) -> Floats:
     steps = 6 if len(triangles) < 2000 else 1
     weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
     return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)
-
-
-def _clip(polygon: Floats, planes: Floats) -> Floats:
-    """The part of a convex polygon inside all planes (Sutherland & Hodgman 1974), `[K, 3]`, empty if there is none."""
-    for plane in planes:
-        distance = polygon @ plane[:3] + plane[3]
-        kept: list[Floats] = []
-        for i, (d, x) in enumerate(zip(distance, polygon, strict=True)):
-            before, y = distance[i - 1], polygon[i - 1]
-            if (d >= 0.0) != (before >= 0.0):
-                kept.append(y + (x - y) * (before / (before - d)))
-            if d >= 0.0:
-                kept.append(x)
-        if len(kept) < 3:
-            return np.zeros((0, 3))
-        polygon = np.array(kept)
-    return polygon

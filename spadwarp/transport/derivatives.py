@@ -100,10 +100,9 @@ def resolve_derivatives(scene: Scene, names: Iterable[str], blocks: Sequence[int
     "medium.grid.absorption", ".scattering" and ".extinction" stand for those of all blocks, of which `blocks` gives the
     number along the edges of the box, by default one: "medium.grid.absorption[0,0,0]", ..., behind all others.
 
-    Raises:
-        ArgumentError: No list of names, no numbers of blocks, or more than the kernel takes.
-        ConfigError: A name that the scene does not have, that stands for several, is given twice, or whose parameter
-            has no derivative, or blocks that the grid cannot be divided into.
+    Raises `ArgumentError`: no list of names, no numbers of blocks, or more than the kernel takes; `ConfigError`: a name
+    that the scene does not have, that stands for several, is given twice, or whose parameter has no derivative, or
+    blocks that the grid cannot be divided into.
     """
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ArgumentError(f"derivatives = {shown(names)} is not a list of names")

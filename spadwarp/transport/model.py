@@ -61,13 +61,11 @@ def build_model(
     will hold so many `copies` of the histogram on the device, for the check of its memory. `mesh_cache` has meshes of
     earlier scenes; one of the same faces is refitted and not built anew. `derivatives` are full names.
 
-    Raises:
-        ConfigError: The histogram has more bins than an index can count, laser or camera stand outside the domain, or
-            the phase function's table is not a density.
-        FileError: That table or the beam's profile cannot be read.
-        DeviceError: The device has too little memory.
+    Raises `ConfigError`: the histogram has more bins than an index can count, laser or camera stand outside the domain,
+    or the phase function's table is not a density; `FileError`: that table or the beam's profile cannot be read;
+    `DeviceError`: the device has too little memory.
     """
-    check_places(scene, mesh, camera)
+    _check_places(scene, mesh, camera)
     if camera:
         _check_gate(scene)
     if scale is None:
@@ -426,11 +424,12 @@ def _channel_rows(camera: Camera) -> list[list[float]]:
 # What is refused
 
 
-def check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) -> None:
-    """Refuses a target within the camera's port; a camera or a laser, or the way out of its port, outside the domain;
-    and a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
-    if camera and mesh is not None and (found := within_port(scene, mesh.vertices[mesh.faces].astype(np.float64))):
-        raise ConfigError(f"camera.port: {found}, within the housing or the window", source=scene.source)
+def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) -> None:
+    """Refuses a laser or a target within the camera's port; a camera or a laser, or the way out of its port, outside
+    the domain; and a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
+    triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
+    if camera and (found := within_port(scene, triangles)):
+        raise ConfigError(found, source=scene.source)
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
     ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)]

@@ -48,29 +48,24 @@ _LARGEST_BATCH = 1 << 30
 class RunOptions:
     """How the photons of a run are divided, and what of the run is on disk; no choice changes the bits of a photon.
 
-    Attributes:
-        threads: CPU threads; by default one a core. A GPU takes none.
-        launch_size: Photons in one launch, up to 2^26, on the CPU 2^20; by default what suits the device.
-        first_photon: Id of the first photon; runs with disjoint ids can be added by `merge`.
-        shard: (3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole.
-        resume: A result of the same scene, or its path, to which photons are added until it has `photons`; the outcome
-            is that of one long run. Gaps in its ids are filled.
-        checkpoint: A file for the photons done so far, as a partial result that `resume` takes. It is not removed when
-            the run is done.
-        checkpoint_every: Seconds between checkpoints, at least; more where writing takes long, so that it costs 2 % of
-            the time at most.
-
-    Raises:
-        ArgumentError: A number out of range.
+    Raises `ArgumentError`: a number out of range.
     """
 
-    threads: int | None = None
+    threads: int | None = None  # CPU threads; by default one a core; a GPU takes none
     launch_size: int | None = None
-    first_photon: int = 0
+    """Photons in one launch, up to 2^26, on the CPU 2^20; by default what suits the device."""
+    first_photon: int = 0  # id of the first photon; runs with disjoint ids can be added by `merge`
     shard: tuple[int, int] | None = None
+    """(3, 64) for the third of 64 equal parts of the photons, which `merge` makes whole."""
     resume: ResultLike | None = None
+    """A result of the same scene, or its path, to which photons are added until it has `photons`; the outcome is that
+    of one long run. Gaps in its ids are filled."""
     checkpoint: str | Path | None = None
+    """A file for the photons done so far, as a partial result that `resume` takes. It is not removed when the run is
+    done."""
     checkpoint_every: float = 60.0
+    """Seconds between checkpoints, at least; more where writing takes long, so that it costs 2 % of the time at
+    most."""
 
     def __post_init__(self) -> None:
         checked: dict[str, Any] = {

@@ -56,36 +56,24 @@ _READ_ME = (
 
 @dataclass(frozen=True, eq=False)
 class PhotonRecords:
-    """How each photon ended.
+    """How each photon ended."""
 
-    Attributes:
-        id: uint64 `[N]`.
-        position: float32 `[N, 3]`, where it ended [m].
-        direction: float32 `[N, 3]`, unit vector of its last flight.
-        weight: float32 `[N]`, remaining weight.
-        path: float32 `[N]`, geometric path [m].
-        collisions: int32 `[N]`, events, surfaces included.
-        reason: int32 `[N]`, index into `reasons`.
-        reasons: Names of the entries of the energy balance: weight_cutoff, max_collisions, max_path, lateral_limit,
-            exit_x_low, ...
-        energy_balance: As in `Result`, with its unit.
-        derivatives: Names of the P parameters that were asked for.
-        log_derivatives: float32 `[N, P]`, ∂ ln f/∂parameter of the photon's flights and events f so far: the
-            derivative of the expectation of anything that the records tell is the mean of this times this.
-    """
-
-    id: NDArray[np.uint64]
-    position: NDArray[np.float32]
-    direction: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    path: NDArray[np.float32]
-    collisions: NDArray[np.int32]
-    reason: NDArray[np.int32]
+    id: NDArray[np.uint64]  # uint64 `[N]`
+    position: NDArray[np.float32]  # float32 `[N, 3]`, where it ended [m]
+    direction: NDArray[np.float32]  # float32 `[N, 3]`, unit vector of its last flight
+    weight: NDArray[np.float32]  # float32 `[N]`, remaining weight
+    path: NDArray[np.float32]  # float32 `[N]`, geometric path [m]
+    collisions: NDArray[np.int32]  # int32 `[N]`, events, surfaces included
+    reason: NDArray[np.int32]  # int32 `[N]`, index into `reasons`
     reasons: tuple[str, ...]
-    energy_balance: dict[str, int]
+    """Names of the entries of the energy balance: weight_cutoff, max_collisions, max_path, lateral_limit, exit_x_low,
+    ..."""
+    energy_balance: dict[str, int]  # as in `Result`, with its unit
     energy_balance_unit: float
-    derivatives: tuple[str, ...] = ()
+    derivatives: tuple[str, ...] = ()  # names of the P parameters that were asked for
     log_derivatives: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """float32 `[N, P]`, ∂ ln f/∂parameter of the photon's flights and events f so far: the derivative of the
+    expectation of anything that the records tell is the mean of this times this."""
 
     def ended(self, *names: str) -> NDArray[np.bool_]:
         """Mask of the photons that ended for one of the named reasons."""
@@ -154,8 +142,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
         path: The file; an existing one is replaced when the new one is whole.
         scene: The scene they were traced in, to be stored with them.
 
-    Raises:
-        FileError: The file cannot be written.
+    Raises `FileError`: the file cannot be written.
     """
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, "read_me": _READ_ME, "reasons": list(records.reasons)}
     if records.derivatives:
@@ -179,8 +166,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
 def load_records(path: str | Path) -> PhotonRecords:
     """Reads what `save_records` wrote.
 
-    Raises:
-        FileError: No such file, not photon records, or damaged; says which.
+    Raises `FileError`: no such file, not photon records, or damaged; says which.
     """
     with read_hdf5(path, FORMAT, version=FORMAT_VERSION) as file:
         names: list[Any] = np.ravel(file.attribute("derivatives", [])).tolist()

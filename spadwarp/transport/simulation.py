@@ -109,8 +109,8 @@ def simulate(
             only vertices moved its tree is refitted and not built anew. Without `engine`.
         run: Threads and launches, photon ids of a part of a run, resuming and checkpoints; see `RunOptions`.
 
-    Returns:
-        The result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked `partial`.
+    Returns the result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked
+    `partial`.
 
     Raises:
         ArgumentError: An argument of the wrong kind or out of range.

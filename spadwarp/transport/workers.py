@@ -334,9 +334,8 @@ class LocalWorkers:
     A worker's first block, of `first_block` photons, shows how fast it is; `must_rest`: `tallies` changes while any
     traces. `threads` are those of the CPU in all, by default one a core; a GPU takes one.
 
-    Raises:
-        ConfigError: CPU and GPU together, caller's tallies with several devices, or a number out of range.
-        DeviceError: A device failed, or has too little memory.
+    Raises `ConfigError`: CPU and GPU together, caller's tallies with several devices, or a number out of range;
+    `DeviceError`: a device failed, or has too little memory.
     """
 
     must_rest = True

@@ -666,8 +666,7 @@ def run(
         tabulated: Whether every Henyey–Greenstein phase function is first written to a table and read from it.
         progress: Called with each case before it is run.
 
-    Raises:
-        ArgumentError: An unknown case, or photons or seed out of range.
+    Raises `ArgumentError`: an unknown case, or photons or seed out of range.
     """
     names = list(CASES) if cases is None else list(cases)
     for name in names:

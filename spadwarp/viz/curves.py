@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,19 +16,9 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.sweeps import OUTLIERS, TOLERANCE, BudgetRow, Sweep
 from spadwarp.scene import Scene
-from spadwarp.viz.style import (
-    BLUE,
-    PAGE,
-    RED,
-    SERIES,
-    log_axis,
-    new_figure,
-    panel_grid,
-    paper,
-    plain_axis,
-    save,
-    wrapped,
-)
+from spadwarp.scene.sections import field_unit, locate, parse_key
+from spadwarp.viz import style
+from spadwarp.viz.style import BLUE, PAGE, SERIES, log_axis, panel_grid, paper, save, wrapped
 
 __all__ = ["draw_budget", "draw_learning_curves", "draw_sweep", "draw_validation"]
 
@@ -125,11 +114,9 @@ def _broken(label: str) -> str:
 
 def _unit(field: str) -> str:
     """` [1/m]` for `medium.extinction`: the unit in the field's description, or nothing."""
-    section, _, name = field.partition(".")
-    info = Scene.model_fields.get(section)
-    described = getattr(info.annotation, "model_fields", {}).get(name) if info else None
-    found = re.search(r" \[[^\]]+\]", getattr(described, "description", None) or "")
-    return found.group(0) if found else ""
+    info = locate(Scene, parse_key(field))[1]
+    unit = None if info is None else field_unit(info)
+    return "" if unit in (None, "1") else f" [{unit}]"
 
 
 def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool = False) -> None:
@@ -160,17 +147,17 @@ def draw_learning_curves(
     signal photons per pixel (1 and more), to the PSNR there. `width`: of the picture [inch].
     """
     steps, losses = [line["step"] for line in log], [line["loss"] for line in log]
-    style: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
+    drawn: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
     levels = list(log[-1]["psnr"])
     counted = all(float(level) >= 1 for level in levels)
     figure, (loss, psnr) = panel_grid(2, width, least=3.0, height=2.1)
-    loss.plot(steps, losses, color=BLUE, **style)
+    loss.plot(steps, losses, color=BLUE, **drawn)
     loss.set(xlabel="step", ylabel="loss")
     if min(losses) > 0:  # "psnr" is a logarithm
         log_axis(loss, "y")
     for level, shade in zip(levels, np.linspace(0.85, 0.0, len(levels)), strict=True):
-        style |= {"color": matplotlib.colormaps["viridis"](shade), "label": f"{float(level):g}" if counted else level}
-        psnr.plot(steps, [line["psnr"][level] for line in log], **style)
+        drawn |= {"color": matplotlib.colormaps["viridis"](shade), "label": f"{float(level):g}" if counted else level}
+        psnr.plot(steps, [line["psnr"][level] for line in log], **drawn)
     psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
     for axis in (loss, psnr):
         axis.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
@@ -187,16 +174,16 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     picture [inch]. Raises `FileError`.
     """
     names = [wrapped(row["quantity"], 0.36 * width, size=7) for row in rows]
-    figure = new_figure(width, 0.65 + 0.15 * sum(name.count("\n") + 2 for name in names))
+    figure = style.new_figure(width, 0.65 + 0.15 * sum(name.count("\n") + 2 for name in names))
     figure.caption(title)
     ratio, deviation = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for y, row in enumerate(rows):
-        style: dict[str, Any] = {"color": BLUE if row["passed"] else RED, "marker": "o" if row["passed"] else "X"}
+        marks: dict[str, Any] = {"color": BLUE if row["passed"] else style.RED, "marker": "o" if row["passed"] else "X"}
         if reference := row["reference"]:
             error = abs(row["standard_error"] / reference)
-            ratio.errorbar(row["value"] / reference - 1.0, y, xerr=error, linestyle="none", **style)
+            ratio.errorbar(row["value"] / reference - 1.0, y, xerr=error, linestyle="none", **marks)
         if math.isfinite(row["z"]):
-            deviation.plot(row["z"], y, **style)
+            deviation.plot(row["z"], y, **marks)
     ratio.axvline(0.0, color="0.6", linewidth=0.8)
     ratio.set(xlabel="value / reference − 1", ylim=(len(rows) - 0.5, -0.5))
     ratio.set_yticks(range(len(rows)), names)
@@ -205,5 +192,5 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     for axis in (ratio, deviation):
         axis.locator_params(axis="x", nbins=4)
         axis.xaxis.minorticks_on()
-        plain_axis(axis)
+        style.plain_axis(axis)
     return save(figure, path)

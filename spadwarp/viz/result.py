@@ -22,11 +22,11 @@ from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import ArgumentError, rounded
+from spadwarp.values import ArgumentError, count, percent, rounded
 from spadwarp.viz import style
-from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits, spaced
+from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits
 
-__all__ = ["draw_analytic", "draw_denoised", "draw_depth", "draw_fit", "draw_recording", "draw_result", "plot"]
+__all__ = ["draw", "draw_denoised", "draw_depth", "draw_result", "plot"]
 
 KINDS = ("depth", "intensity", "histogram", "truth")
 """Figures of a result."""
@@ -78,19 +78,9 @@ def plot(
     return panels.figure
 
 
-def draw_analytic(result: AnalyticResult, path: str | Path, *, width: float = PAGE) -> Path:
-    """Maps of the model and a frame, its first one or one that is drawn now; `width` [inch]; returns the path."""
-    return save(plot(result, width=width), path)
-
-
-def draw_fit(fit: Fit, path: str | Path, *, width: float = PAGE) -> Path:
-    """Counts, fit, residuals and deviance of a fit: over the image and over time; `width` [inch]; returns the path."""
-    return save(plot(fit, width=width), path)
-
-
-def draw_recording(file: FramesFile, path: str | Path, *, width: float = PAGE) -> Path:
-    """The first of the frames that were recorded, with its depth; `width` [inch]; returns the path."""
-    return save(plot(file, width=width), path)
+def draw(shown: FramesFile | AnalyticResult | Fit | Scene, path: str | Path, **options: Any) -> Path:
+    """Writes the figure of `plot`, with its options; returns the path. Raises `FileError`."""
+    return save(plot(shown, **options), path)
 
 
 @paper()
@@ -255,7 +245,7 @@ def _range_axis(result: Result, axis: Axes, row: int, column: int) -> None:
 
 
 def _caption(result: Result) -> str:
-    photons = style.power_text(result.photons) if result.photons >= 1e6 else spaced(result.photons)
+    photons = style.power_text(result.photons) if result.photons >= 1e6 else count(result.photons)
     partial = ", interrupted" if result.partial else ""
     light = channel_text(result.provenance.get("channel"))
     return f"{photons} photons{partial}{light}; {_water_text(result.scene.medium)}; seed {result.seed}"
@@ -385,7 +375,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
     noise = noise_caption(shown.monte_carlo_noise)
-    panels.figure.caption(f"{which}: {spaced(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
+    panels.figure.caption(f"{which}: {count(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
     return panels.figure
 
 
@@ -492,9 +482,9 @@ def draw_denoised(
     else:
         target, found = np.isfinite(truth), np.isfinite(denoised)
         missed, invented = target & ~found, found & ~target
-        parts = (100 * some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
-        of_target, of_water = map(style.percent, parts)
-        label = f"depth z [m]\nblack: missed, {of_target}\nred: invented, {of_water}"
+        parts = (some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
+        of_target, of_water = map(percent, parts)
+        label = f"depth z [m]\nblack: missed, {of_target} %\nred: invented, {of_water} %"
         style.mark_pixels(panels.show_depth(denoised, "Denoised", limits, label), missed, invented)
         panels.show_depth(truth, "Truth", limits)
         panels.show_error(denoised - truth, "Denoised − truth")
@@ -540,5 +530,5 @@ def _fit_figure(fit: Fit, width: float) -> Figure:
         for item in fit.estimates.values()
     ]
     good = f"{'BAD FIT: ' * fit.goodness.is_bad}{fit.goodness.summary()}"
-    panels.figure.caption("; ".join([good, *values, f"{spaced(fit.pulses)} pulses"]))
+    panels.figure.caption("; ".join([good, *values, f"{count(fit.pulses)} pulses"]))
     return panels.figure

@@ -20,7 +20,7 @@ from spadwarp.scene.camera import to_camera, to_world
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.transport import truth_maps
-from spadwarp.values import ArgumentError, check_integer
+from spadwarp.values import ArgumentError, check_integer, count
 from spadwarp.viz import style
 from spadwarp.viz.style import BOUND_MAP, DEPTH_MAP, INTENSITY_MAP, PAGE, PaperFigure, coloured_depth, paper, save
 
@@ -247,7 +247,7 @@ def draw_dataset(
         name, fraction = reader.manifest["targets"][item["target"]], float(item["backscatter_fraction"])
         by_fraction |= not math.isnan(fraction)
         level = "" if math.isnan(fraction) else f", BS = {fraction:.3g}"
-        level += f", brightest {style.spaced(round(top))} photons"
+        level += f", brightest {count(round(top))} photons"
         title = f"{name.replace('_', ' ')} ({splits[name]})\nc r = {item['attenuation_lengths']:.2g}{level}"
         axis.set_title(title, fontsize=6.5, pad=2)
     _sheet_bar(figure, Normalize(0.0, 1.0), INTENSITY_MAP, "recorded photons, relative to the brightest")

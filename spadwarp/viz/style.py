@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from spadwarp.io.paths import atomic_path
 from spadwarp.result import Channel
-from spadwarp.values import FileError, check_real
+from spadwarp.values import FileError, check_real, percent
 
 STYLE = "spadwarp.viz.paper"
 """Name of the style file for `matplotlib.style.use`."""
@@ -184,16 +184,6 @@ def wrapped_items(text: str, width: float) -> str:
     return wrapped(" ".join(item.replace(" ", "\N{NO-BREAK SPACE}") for item in items), width)
 
 
-def spaced(number: int) -> str:
-    """A whole number with a thin space between thousands."""
-    return f"{number:,}".replace(",", "\u2009")
-
-
-def percent(value: float) -> str:
-    """A part in percent, with two digits."""
-    return f"{value:.2g} %" if value < 99.5 else "100 %"
-
-
 def power_text(value: float) -> str:
     """A number by its power of ten, such as 3·10⁻⁴."""
     digits, power = f"{value:.2e}".split("e")
@@ -333,10 +323,10 @@ class Panels:
         reach = error_limit(error)
         factor, unit = (1e3, "mm") if reach < 0.1 else (1e2, "cm") if reach < 1.0 else (1.0, "m")
         known = max(1, int(np.isfinite(error).sum()))
-        below, above = (100 * np.count_nonzero(side) / known for side in (error < -reach, error > reach))
+        below, above = (np.count_nonzero(side) / known for side in (error < -reach, error > reach))
         label = f"depth error [{unit}]"
         if below or above:
-            label += "\n" + wrapped_items(f"{percent(below)} below, {percent(above)} above", self._line)
+            label += "\n" + wrapped_items(f"{percent(below)} % below, {percent(above)} % above", self._line)
         self.show(factor * error, title, label, ERROR_MAP, (-factor * reach, factor * reach))
 
     def show_intensity(self, image: NDArray[Any], title: str, label: str) -> None:

@@ -26,7 +26,7 @@ from spadwarp.io.paths import atomic_path, check_apart
 from spadwarp.result import Channel, Result, analyser_channel
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real
+from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real, count
 from spadwarp.viz import style
 from spadwarp.viz.result import channel_text
 from spadwarp.viz.style import PaperFigure, colour_map, median_pixel, paper
@@ -86,9 +86,8 @@ def view(
         channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
         device: Warp device for the depth frame.
 
-    Raises:
-        FileError: plotly is not installed, or a file cannot be read or written.
-        ArgumentError: No such frame, method or channel.
+    Raises `FileError`: plotly is not installed, or a file cannot be read or written; `ArgumentError`: no such frame,
+    method or channel.
     """
     try:
         from plotly.offline import get_plotlyjs
@@ -127,7 +126,7 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
     chosen: Any = method or "centroid"
     partial = ", interrupted" if result.partial else ""
     return _Page(
-        caption=f"{style.spaced(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}{partial}"
+        caption=f"{count(result.photons)} photons, seed {result.seed}, {scene.transport.estimator}{partial}"
         f"{channel_text(result.provenance.get('channel'))}; expected histograms, before the instrument response",
         scene=scene,
         depth=result.depth(method=chosen, device=device),
@@ -155,7 +154,7 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
     background = np.broadcast_to(file.background, counts.shape)
     mode = file.scene.detector.mode.replace("_", "-")
     return _Page(
-        caption=f"frame {frame} of {file.frames}: {style.spaced(file.pulses)} pulses, {mode}, seed {file.seed}; "
+        caption=f"frame {frame} of {file.frames}: {count(file.pulses)} pulses, {mode}, seed {file.seed}; "
         f"expectations before pile-up{noise_caption(file.monte_carlo_noise)}",
         scene=file.scene,
         depth=file.depth(chosen, frame),
@@ -350,9 +349,8 @@ def video(
         scale: "log" over four decades, or "linear".
         frame: Number of the frame, from 0, where the source holds frames.
 
-    Raises:
-        ArgumentError: An argument out of range, or another ending.
-        FileError: A file cannot be read or written, or ffmpeg is missing.
+    Raises `ArgumentError`: an argument out of range, or another ending; `FileError`: a file cannot be read or written,
+    or ffmpeg is missing.
     """
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):

@@ -58,8 +58,7 @@ def clear_sky_irradiance(
         aerosol_optical_depth: Of the aerosol at 500 nm, vertically; 0.084 is that of ASTM G173, 0.05 very clear air,
             0.3 haze.
 
-    Raises:
-        ArgumentError: A value outside its range.
+    Raises `ArgumentError`: a value outside its range.
     """
     elevation = check_real("sun_elevation_deg", sun_elevation_deg, RANGES["sun_elevation_deg"])
     turbidity = check_real("aerosol_optical_depth", aerosol_optical_depth, RANGES["aerosol_optical_depth"])

@@ -50,18 +50,13 @@ _LARGEST = 2e4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ParticleOptics(Coefficients):
-    """Optical properties at one wavelength of particles, or of water with particles in it.
+    """Optical properties at one wavelength of particles, or of water with particles in it."""
 
-    Attributes:
-        angles_deg: Scattering angles `[n]` [°], ascending to 180.
-        density: Phase function at them [1/sr], of unit integral over the sphere.
-        matrix: Elements m12, m22, m33, m34 and m44 of the scattering matrix at them, each over the phase function
-            `[n, 5]`; None where only the phase function is known (Kopelevich's components).
-    """
-
-    angles_deg: Floats
-    density: Floats
+    angles_deg: Floats  # scattering angles `[n]` [°], ascending to 180
+    density: Floats  # phase function at them [1/sr], of unit integral over the sphere
     matrix: Floats | None = None
+    """Elements m12, m22, m33, m34 and m44 of the scattering matrix at them, each over the phase function `[n, 5]`; None
+    where only the phase function is known (Kopelevich's components)."""
 
     @cached_property
     def mean_cosine(self) -> float:
@@ -151,9 +146,7 @@ def mie_particles(
         concentration: Volume of the particles [ppm], cm³ in a m³ of water.
         temperature, salinity: Of the water [°C], [g/kg].
 
-    Raises:
-        ArgumentError: A value out of its range.
-        FileError: miepython is not installed.
+    Raises `ArgumentError`: a value out of its range; `FileError`: miepython is not installed.
     """
     try:
         import miepython
@@ -243,8 +236,7 @@ def kopelevich_particles(wavelength_nm: float, *, small: float, large: float) ->
         small: v_s, mineral particles below 1 µm [ppm]; the sea has 0.01 to 0.2.
         large: v_l, organic particles above 1 µm [ppm]; the sea has 0.01 to 0.4.
 
-    Raises:
-        ArgumentError: A value out of its range, or no particles.
+    Raises `ArgumentError`: a value out of its range, or no particles.
     """
     check_ranges(wavelength_nm=wavelength_nm)
     small, large = check_real("small", small, "[0, 1e4] ppm"), check_real("large", large, "[0, 1e4] ppm")

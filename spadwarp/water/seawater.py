@@ -87,8 +87,7 @@ def water_optics(
         temperature: 0 to 30 [°C]; absorption does not follow it (less than 1 % a degree, in the red).
         salinity: 0 to 40 [g/kg]; 35 is the ocean.
 
-    Raises:
-        ArgumentError: A value outside its range.
+    Raises `ArgumentError`: a value outside its range.
     """
     check_ranges(wavelength_nm=wavelength_nm, chlorophyll=chlorophyll, temperature=temperature, salinity=salinity)
     water = {"temperature": temperature, "salinity": salinity}

@@ -15,70 +15,64 @@ PORTS = {
     "flat": {"camera.port": FLAT, "laser.port": "camera"},
     "dome": {"camera.port": DOME, "laser.port": FLAT},
 }
+BEAM = {"laser.profile": "collimated", "laser.beam_radius": 0.2, "analytic.backscatter": "constant"}
 
 
-@pytest.fixture
-def one():
-    changes = {"analytic.backscatter": "single_scatter", "transport.max_collisions": 1, "medium.albedo": 0.5}
-    changes |= {"camera.width": 16, "camera.height": 16}
-    return spadwarp.load_scene("plane_5m").with_overrides(changes)
+def scene(**changes):
+    single = {"analytic.backscatter": "single_scatter", "transport.max_collisions": 1, "medium.albedo": 0.5}
+    size = {"camera.width": 16, "camera.height": 16}
+    return spadwarp.load_scene("plane_5m").with_overrides({**single, **size, **changes})
 
 
-def test_cells_without_matter_change_nothing(one):
-    empty = {**CLOUD, "extinction": 0.0, "size": [9.0, 9.0, 20.0], "anisotropy": None}
-    empty = one.with_overrides({"medium.grid": {k: v for k, v in empty.items() if v is not None}})
-    plain, through = (spadwarp.simulate_analytic(each, frames=0, device="cpu") for each in (one, empty))
-    np.testing.assert_allclose(through.signal, plain.signal, rtol=1e-5)
-    np.testing.assert_allclose(through.backscatter, plain.backscatter, rtol=0.01)  # the rim of the cone
-    np.testing.assert_allclose(through.sigma_time, plain.sigma_time, rtol=0.02)
+def maps(one, device="cpu"):
+    return spadwarp.simulate_analytic(one, frames=0, device=device)
+
+
+def test_cells_without_matter_change_nothing():
+    empty = {name: value for name, value in CLOUD.items() if name != "anisotropy"}
+    empty |= {"extinction": 0.0, "size": [9.0, 9.0, 20.0]}
+    plain, through = maps(scene()), maps(scene(**{"medium.grid": empty}))
+    for name, close in (("signal", 1e-5), ("backscatter", 0.01), ("sigma_time", 0.02)):  # the rim of the cone
+        np.testing.assert_allclose(getattr(through, name), getattr(plain, name), rtol=close)
 
 
 @pytest.mark.parametrize("ports", PORTS)
-@pytest.mark.parametrize("laser", [{}, {"laser.profile": "collimated", "laser.beam_radius": 0.2}])
-def test_cells_of_one_water_are_that_water_behind_ports_too(one, ports, laser, tmp_path):
+@pytest.mark.parametrize("laser", [{}, BEAM])
+def test_cells_of_one_water_are_that_water_behind_ports_too(ports, laser, tmp_path):
     """In a box that holds camera, laser and target."""
-    if laser:
-        one = one.with_overrides({**laser, "analytic.backscatter": "constant"})
-    one = one.with_overrides(PORTS[ports])
-    path = tmp_path / "water.npz"
-    cells = np.ones((5, 6, 7), np.float32)
+    cells, path = np.ones((5, 6, 7), np.float32), tmp_path / "water.npz"
     np.savez(path, extinction=0.6 * cells, albedo=0.7 * cells, anisotropy=0.8 * cells, size=[30.0, 30.0, 30.0])
-    cellular = one.with_overrides({"medium.grid": {"file": str(path)}})
-    plain = one.with_overrides({"medium.extinction": 0.6, "medium.albedo": 0.7, "medium.anisotropy": 0.8})
-    expected, found = (spadwarp.simulate_analytic(each, frames=0, device="cpu") for each in (plain, cellular))
+    one = scene(**PORTS[ports], **laser)
+    water = {"medium.extinction": 0.6, "medium.albedo": 0.7, "medium.anisotropy": 0.8}
+    plain, cellular = (one.with_overrides(change) for change in (water, {"medium.grid": {"file": str(path)}}))
+    expected, found = maps(plain), maps(cellular)
     assert expected.signal.any()
-    np.testing.assert_allclose(found.signal, expected.signal, rtol=1e-5)
-    np.testing.assert_allclose(found.arrival, expected.arrival, rtol=1e-6)
-    np.testing.assert_allclose(found.backscatter, expected.backscatter, rtol=0.02)  # the rim of the cone
+    for name, close in (("signal", 1e-5), ("arrival", 1e-6), ("backscatter", 0.02)):  # the rim of the cone
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=close)
     assert found.backscatter.sum() == pytest.approx(expected.backscatter.sum(), rel=0.003)
-    rows = [spadwarp.budget(each, ranges=[5.0], device="cpu")[0] for each in (plain, cellular)]
-    assert rows[1].optical_depth == pytest.approx(rows[0].optical_depth)
+    depths = [spadwarp.budget(each, ranges=[5.0], device="cpu")[0].optical_depth for each in (plain, cellular)]
+    assert depths[1] == pytest.approx(depths[0])
 
 
 @pytest.mark.physics
 @pytest.mark.parametrize("ports", ["none", "flat"])
-def test_signal_and_backscatter_are_those_of_single_scattering(one, ports, device):
+def test_signal_and_backscatter_are_those_of_single_scattering(ports, device):
     """Over the middle of the image, to 2 % (4 standard errors are 1.5 %)."""
-    one = one.with_overrides(PORTS[ports])
+    one = scene(**PORTS[ports])
     cloudy = one.with_overrides({"medium.grid": CLOUD})
-    analytic = spadwarp.simulate_analytic(cloudy, frames=0, device=device)
-    traced = spadwarp.simulate(cloudy, photons=400_000, seed=1, device=device)
+    analytic, traced = maps(cloudy, device), spadwarp.simulate(cloudy, photons=400_000, seed=1, device=device)
     scale = cloudy.laser.photons_per_pulse * cloudy.detections_per_photon
     middle = np.s_[4:12, 4:12]
     for values, component in ((analytic.signal, "ballistic"), (analytic.backscatter, "backscatter")):
         assert values[middle].sum() == pytest.approx(traced.component(component)[middle].sum() * scale, rel=0.02)
-    assert analytic.signal[middle].sum() < 0.3 * spadwarp.simulate_analytic(one, frames=0).signal[middle].sum()
+    assert analytic.signal[middle].sum() < 0.3 * maps(one).signal[middle].sum()
 
 
-def test_budgets_name_the_optical_depth_of_the_cells(one):
-    cloudy = one.with_overrides({"medium.grid": CLOUD})
+def test_budgets_name_the_optical_depth_of_the_cells_and_the_form_of_the_paper_is_refused():
+    cloudy = scene(**{"medium.grid": CLOUD})
     rows = spadwarp.budget(cloudy, ranges=[1.0, 5.0], device="cpu")
     assert rows[1].optical_depth == pytest.approx(cloudy.optical_depth((0, 0, 0), (0, 0, 5.0)))
     assert rows[1].optical_depth > 2.0 > 0.4 > rows[0].optical_depth
     assert summary(cloudy)["optical_depth"] == pytest.approx(rows[1].optical_depth, rel=0.02)
-
-
-def test_the_form_of_the_paper_is_refused_by_name(one):
-    paper = one.with_overrides({"medium.grid": CLOUD, "analytic.form": "lu2024"})
     with pytest.raises(spadwarp.ConfigError, match=r"analytic.form = 'lu2024' takes one water"):
-        spadwarp.simulate_analytic(paper, device="cpu")
+        maps(cloudy.with_overrides({"analytic.form": "lu2024"}))

@@ -33,13 +33,21 @@ def ported(port=None, laser_port=None, **sections):
         "gate": {"start_ns": 0.0, "bin_width_ps": 400.0, "bins": 120},
         "targets": [PLATE],
     }
-    ports = {
-        "camera": {} if port is None else {"port": port},
-        "laser": {} if laser_port is None else {"port": laser_port},
-    }
     for name, fields in sections.items():
         tables[name] = fields if isinstance(fields, list) else {**tables.get(name, {}), **fields}
-    return Scene.from_dict({**tables, **{name: {**tables[name], **ports[name]} for name in ports}})
+    for name, one in {"camera": port, "laser": laser_port}.items():
+        tables[name] = tables[name] if one is None else {**tables[name], "port": one}
+    return Scene.from_dict(tables)
+
+
+def maps_of(one, frames=0, **options):
+    return spadwarp.simulate_analytic(one, frames=frames, device="cpu", **options)
+
+
+def detected(one, component, *, photons, seed):
+    """Photons that a pulse of a traced scene brings, by pixel and bin."""
+    traced = spadwarp.simulate(one, photons=photons, seed=seed, device="cpu")
+    return traced.component(component) * one.laser.photons_per_pulse * one.detections_per_photon
 
 
 def narrow(port, laser_port, angle, half_angle, **sections):
@@ -72,13 +80,9 @@ few_units = pytest.mark.filterwarnings("ignore:.*rounding to the histogram:Runti
 def test_return_and_its_time_are_those_of_unscattered_photons(name, angle):
     """Photons are refracted one by one: 250 000 of them, of which 60 000 or more are seen, say it to 0.4 %."""
     one = narrow(*CASES[name], angle, 1.2, medium=WATER | {"albedo": 1e-6})
-    result = spadwarp.simulate(one, photons=250_000, seed=1, device="cpu")
-    light = result.component("ballistic")
-    photons = light.sum() * one.laser.photons_per_pulse * one.detections_per_photon
-    found = spadwarp.simulate_analytic(one, frames=0, device="cpu")
-    assert found.signal.sum() == pytest.approx(photons, rel=0.016)
-    edges = (np.arange(2400) + 0.5) * 2e-11
-    time = light.sum(axis=(0, 1)) @ edges / light.sum()
+    light, found = detected(one, "ballistic", photons=250_000, seed=1), maps_of(one)
+    assert found.signal.sum() == pytest.approx(light.sum(), rel=0.016)
+    time = light.sum(axis=(0, 1)) @ ((np.arange(2400) + 0.5) * 2e-11) / light.sum()
     mean = (found.signal * found.arrival).sum() / found.signal.sum()
     assert mean == pytest.approx(time, abs=8e-12)  # 1 mm; the pixels' own spread is 60 ps
 
@@ -86,10 +90,10 @@ def test_return_and_its_time_are_those_of_unscattered_photons(name, angle):
 @pytest.mark.physics
 @pytest.mark.parametrize("name", CASES)
 def test_backscatter_is_that_of_photons_that_scatter_once(name):
-    one = narrow(*CASES[name], 25.0, 8.0, targets=[], transport={"max_collisions": 1})
+    behind = {**PLATE, "translation": [0.0, 0.0, 60.0]}  # the gate: the kernel is that of the scenes with a target
+    one = narrow(*CASES[name], 25.0, 8.0, targets=[behind], transport={"max_collisions": 1})
     one = one.with_overrides({"gate.start_ns": 4.0})
-    result = spadwarp.simulate(one, photons=2_000_000, seed=2, device="cpu")
-    photons = result.component("backscatter") * one.laser.photons_per_pulse * one.detections_per_photon
+    photons = detected(one, "backscatter", photons=2_000_000, seed=2)
     nothing = {"distance": np.full(4, np.nan), "normal": np.zeros((4, 3)), "reflectance": np.zeros(4)}
     maps, table = pixel_maps(one, view=pixel_directions(one.camera).reshape(-1, 3), device="cpu", **nothing)
     assert maps["backscatter"].sum() == pytest.approx(photons.sum(), rel=0.02)
@@ -107,9 +111,7 @@ def test_equal_indices_are_a_camera_in_the_water(form, laser):
     """To what the water takes that the port leaves out: 1 µm, and 2 mm."""
     optics = {"camera": {"aperture_diameter": 1e-4, "pinhole": True}, "laser": {"position": [1e-4, 0.0, 0.0]}}
     optics["gate"] = {"start_ns": 5.0}
-    bare = ported(**optics)
-    inside = ported(form | SAME, laser, **optics)
-    maps, expected = (spadwarp.simulate_analytic(one, frames=0, device="cpu") for one in (inside, bare))
+    maps, expected = maps_of(ported(form | SAME, laser, **optics)), maps_of(ported(**optics))
     close = 3e-5 if "distance" in form else 4e-3
     for name in ("signal", "arrival", "backscatter", "sigma_depth", "fisher"):
         np.testing.assert_allclose(getattr(maps, name), getattr(expected, name), rtol=close, err_msg=name)
@@ -134,7 +136,7 @@ def test_frames_report_background_evenly_over_the_gate_behind_a_port():
     """Depths of pixels that report dark counts, turned back into times along the bent rays."""
     dark = {"detector": {"dark_count_rate": 1e9}, "analytic": {"backscatter_fraction": 0.9, "backscatter": "constant"}}
     one = ported(WINDOW, WINDOW | {"distance": 0.02}, gate={"start_ns": 5.0}, **dark)
-    found = spadwarp.simulate_analytic(one, frames=60, seed=5, device="cpu")
+    found = maps_of(one, frames=60, seed=5)
     lines = lines_of_sight(one)
     path = lines.path_from_range(lines.range_from_depth(found.depth.astype(np.float64)))
     time = path[found.labels] / one.medium.pulse_speed
@@ -143,26 +145,15 @@ def test_frames_report_background_evenly_over_the_gate_behind_a_port():
     assert stats.kstest(time, stats.uniform(*gate).cdf).pvalue > 1e-3
 
 
-def test_depth_error_follows_the_bent_rays():
-    """σ of depth over σ of time is dz/dt, by differences of depths of times."""
-    one = ported(WINDOW, "camera")
-    found = spadwarp.simulate_analytic(one, frames=0, device="cpu")
-    lines = lines_of_sight(one)
-    depth = [
-        lines.depth_from_range(lines.range_from_path((found.arrival + shift) * one.medium.pulse_speed))
-        for shift in (-1e-12, 1e-12)
-    ]
-    np.testing.assert_allclose(found.sigma_depth / found.sigma_time, (depth[1] - depth[0]) / 2e-12, rtol=1e-3)
-
-
 @pytest.mark.physics
 def test_the_gate_of_a_plan_holds_the_return_of_a_simulation():
     laser = {"half_angle_deg": 12.0, "repetition_rate": 1e5, "pulse_energy": 1e-9}
     one = ported(WINDOW, "camera", laser=laser, camera={"aperture_diameter": 0.02, "horizontal_fov_deg": 20.0})
     found = spadwarp.plan(one, photons=60_000, device="cpu", largest_range=False)
-    result = spadwarp.simulate(found.scene, photons=200_000, seed=9, device="cpu")
-    whole = spadwarp.simulate(one, photons=200_000, seed=9, device="cpu")
-    inside, everything = (run.component("ballistic").sum() for run in (result, whole))
+    inside, everything = (
+        spadwarp.simulate(each, photons=200_000, seed=9, device="cpu").component("ballistic").sum()
+        for each in (found.scene, one)
+    )
     assert inside == pytest.approx(everything, rel=1e-3)
     truth = spadwarp.truth_maps(one, device="cpu").range
     assert found.target_range == (float(truth.min()), float(truth.max()))
@@ -219,10 +210,10 @@ def test_daylight_through_a_port_is_that_in_the_water_times_its_own_factor():
 
 def test_what_has_no_model_behind_a_port_is_refused_by_name():
     with pytest.raises(ConfigError, match=r"analytic.form = 'lu2024' knows no camera.port or laser.port"):
-        spadwarp.simulate_analytic(ported(WINDOW, analytic={"form": "lu2024"}))
+        maps_of(ported(WINDOW, analytic={"form": "lu2024"}))
     beam = {"profile": "collimated", "beam_radius": 0.005}
     with pytest.raises(ConfigError, match="'collimated' does not stay parallel behind a dome"):
-        spadwarp.simulate_analytic(ported(DOME, "camera", laser=beam, analytic={"backscatter": "constant"}))
+        maps_of(ported(DOME, "camera", laser=beam, analytic={"backscatter": "constant"}))
     with pytest.raises(ArgumentError, match=r"ranges: 1 m is not beyond the camera's port, which ends at 2 m"):
         spadwarp.budget(ported({"distance": 2.0}), [1.0, 3.0])
     assert spadwarp.budget(ported({"distance": 2.0}), device="cpu")[0].range == 3.0
@@ -233,23 +224,26 @@ def test_what_has_no_model_behind_a_port_is_refused_by_name():
 def test_a_collimated_beam_behind_a_window_stays_one():
     """Its spot on the plate, and the light in it, as photons have it; the window is tilted against the beam."""
     beam = {"profile": "collimated", "beam_radius": 0.05, "position": [0.0, 0.0, 0.0]}
-    one = ported(WINDOW | {"normal": [0.3, 0.0, 1.0]}, "camera", laser=beam, analytic={"backscatter": "constant"})
-    one = one.with_overrides(
-        {"camera.horizontal_fov_deg": 4.0, "medium.albedo": 1e-6, "camera.aperture_diameter": 1e-3}
-    )
-    found = spadwarp.simulate_analytic(one, frames=0, device="cpu")
-    result = spadwarp.simulate(one, photons=200_000, seed=4, device="cpu")
-    photons = result.component("ballistic").sum(axis=2) * one.laser.photons_per_pulse * one.detections_per_photon
+    few = {"medium": {"albedo": 1e-6}, "camera": {"horizontal_fov_deg": 4.0, "aperture_diameter": 1e-3}}
+    window = WINDOW | {"normal": [0.3, 0.0, 1.0]}
+    one = ported(window, "camera", laser=beam, analytic={"backscatter": "constant"}, **few)
+    found = maps_of(one)
+    photons = detected(one, "ballistic", photons=200_000, seed=4).sum(axis=2)
     assert found.signal.sum() == pytest.approx(photons.sum(), rel=0.02)
     lit = photons > 0.5 * photons.max()
     np.testing.assert_allclose(found.signal[lit], photons[lit], rtol=0.12)
 
 
-def test_frames_on_disk_become_points_on_the_bent_rays(tmp_path):
+def test_depths_and_their_errors_follow_the_bent_rays_also_from_disk(tmp_path):
+    """σ of depth over σ of time is dz/dt, by differences of depths of times."""
     one = ported(WINDOW, "camera")
-    path = spadwarp.simulate_analytic(one, frames=2, seed=1, device="cpu").save(tmp_path / "analytic.h5")
-    file = spadwarp.load(path)
-    stored, lines = stored_depth(file), lines_of_sight(one)
+    found, lines = maps_of(one, frames=2, seed=1), lines_of_sight(one)
+    early, late = (
+        lines.depth_from_range(lines.range_from_path((found.arrival + shift) * one.medium.pulse_speed))
+        for shift in (-1e-12, 1e-12)
+    )
+    np.testing.assert_allclose(found.sigma_depth / found.sigma_time, (late - early) / 2e-12, rtol=1e-3)
+    file = spadwarp.load(found.save(tmp_path / "analytic.h5"))
+    stored = stored_depth(file)
     np.testing.assert_array_equal(stored.range, lines.range_from_depth(stored.values))
-    near, far = gate_of(file)
-    assert (near, far) == pytest.approx(summary(one)["gate_range"], abs=0.02)
+    assert gate_of(file) == pytest.approx(summary(one)["gate_range"], abs=0.02)

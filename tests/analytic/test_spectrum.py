@@ -18,9 +18,8 @@ pytestmark = pytest.mark.physics
 
 def on_axis(scene, distance, **options):
     axis = np.array([[0.0, 0.0, 1.0]])
-    return pixel_maps(scene, view=axis, distance=[distance], normal=-axis, reflectance=[0.4], device="cpu", **options)[
-        0
-    ]
+    wall = {"distance": [distance], "normal": -axis, "reflectance": [0.4]}
+    return pixel_maps(scene, view=axis, **wall, device="cpu", **options)[0]
 
 
 def test_signal_is_the_integral_of_equation_7():

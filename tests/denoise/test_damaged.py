@@ -4,31 +4,31 @@ import json
 import struct
 
 import pytest
+from safetensors.torch import load_file, save_file
 
-torch = pytest.importorskip("torch")
-from safetensors.torch import load_file, save_file  # noqa: E402
-
-from spadwarp.denoise.network_files import WEIGHTS, load_network, own_weights, weights_metadata  # noqa: E402
-from spadwarp.values import FileError, SpadwarpError  # noqa: E402
+from spadwarp.denoise.network_files import WEIGHTS, load_network, own_weights, weights_metadata
+from spadwarp.values import FileError, SpadwarpError
 
 SOURCE = WEIGHTS / "usdn.safetensors"
 
 
+def saved(folder, values, **metadata):
+    save_file(values, folder / "usdn.safetensors", metadata={"model": "usdn", **metadata})
+    return folder / "usdn.safetensors"
+
+
 @pytest.mark.parametrize("text", ["{", "[" * 10_000, '{"a": ' * 5_000])
 def test_a_header_that_is_not_json_is_refused(text, tmp_path):
-    path = tmp_path / "usdn.safetensors"
-    save_file(load_file(SOURCE), path, metadata={"model": "usdn", "recipe": text})
     with pytest.raises(FileError, match=r"usdn\.safetensors: its header is damaged"):
-        weights_metadata("usdn", path)
+        weights_metadata("usdn", saved(tmp_path, load_file(SOURCE), recipe=text))
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path):
     values = load_file(SOURCE)
     name = next(iter(values))
     values[name].view(-1)[0] = float("nan")
-    save_file(values, tmp_path / "usdn.safetensors", metadata={"model": "usdn"})
     with pytest.raises(FileError, match=f"{name} is not finite"):
-        load_network("usdn", tmp_path / "usdn.safetensors")
+        load_network("usdn", saved(tmp_path, values))
 
 
 def test_sizes_that_a_header_declares_and_the_file_does_not_have(tmp_path):
@@ -43,6 +43,7 @@ def test_sizes_that_a_header_declares_and_the_file_does_not_have(tmp_path):
         struct.pack("<Q", 2**63) + content[8:],
         content[: len(content) // 2],
         content[:8],
+        b"\x00" * 100,
         b"",
     ):
         path.write_bytes(changed)

@@ -2,13 +2,10 @@
 
 import dataclasses
 import json
-import os
 import re
 import subprocess
 import sys
 import time
-import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +13,9 @@ import torch
 from skimage.metrics import structural_similarity
 
 import spadwarp
-from helpers.cli import run
-from helpers.datasets import recipe
+from helpers.cli import ENVIRONMENT, run
+from helpers.datasets import make, recipe
+from helpers.scenes import scene as make_scene
 from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.dataset import Plan
@@ -30,21 +28,13 @@ from spadwarp.denoise.synthetic_noise import Batch
 from spadwarp.denoise.training import fit
 from spadwarp.frames import record_frames
 
-
-def names(folder):
-    return {path.name for path in folder.iterdir()}
-
-
 # Baselines
 
 
-def test_the_median_is_that_of_its_window():
+def test_the_median_is_that_of_its_window_and_missing_pixels_take_their_nearest():
     depth = np.arange(81, dtype=np.float32).reshape(9, 9) / 81 + 14
     found = baselines.median_filter(depth_frames(depth, gate=GATE), window=3)
     assert found[0, 4, 4] == np.median(depth[3:6, 3:6])
-
-
-def test_missing_pixels_take_their_nearest():
     image = np.full((5, 5), np.nan, np.float32)
     image[0, 0], image[4, 4] = 1.0, 2.0
     filled = fill_missing(image, 0.0)
@@ -61,12 +51,11 @@ def test_gating_drops_what_the_water_explains():
     assert np.abs(found[0] - clean)[near].mean() < 0.05
 
 
+@pytest.mark.filterwarnings("ignore")  # of the packages that bmnd compiles with
 def test_bm3d_smooths_a_small_crop():
     clean = np.full((24, 24), 15.0, np.float32)
     noisy = clean + np.random.default_rng(3).normal(0, 0.1, clean.shape).astype(np.float32)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the packages that bmnd compiles with
-        found = baselines.bm3d_filter(depth_frames(noisy, gate=GATE))
+    found = baselines.bm3d_filter(depth_frames(noisy, gate=GATE))
     assert np.std(found[0] - clean) < 0.5 * np.std(noisy - clean)
 
 
@@ -85,25 +74,18 @@ def test_scores_are_those_of_their_definitions():
     step = 255 * 0.02 / 2.5  # 2 of 255
     assert found.psnr == pytest.approx(10 * np.log10(255**2 / (0.5 * round(step) ** 2)), abs=1e-6)
 
-    def eight(image):
-        return np.round((image - 13.5) / 2.5 * 255).astype(np.uint8)
-
+    images = (np.round((image - 13.5) / 2.5 * 255).astype(np.uint8) for image in (clean, estimate))
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "win_size": 11}
-    _, full = structural_similarity(eight(clean), eight(estimate), full=True, **options)
+    _, full = structural_similarity(*images, full=True, **options)
     assert found.ssim == pytest.approx(full.mean(), abs=1e-9)
 
 
-def test_pixels_without_a_target_do_not_count():
+def test_pixels_without_a_target_do_not_count_and_steps_do():
     clean = scene()
-    estimate = np.nan_to_num(clean, nan=13.5)
-    found = evaluation.score(clean, estimate, gate=GATE)
+    found = evaluation.score(clean, np.nan_to_num(clean, nan=13.5), gate=GATE)
     assert found.rmse_mm == 0.0 and found.psnr == 100.0 and found.ssim == pytest.approx(1.0)
     with pytest.raises(ValueError, match="no pixel sees a target"):
         evaluation.score(np.full((16, 16), np.nan, np.float32), np.ones((16, 16), np.float32), gate=GATE)
-
-
-def test_steps_of_a_staircase():
-    clean = scene()
     assert evaluation.staircase_steps(clean, clean) == evaluation.Steps(total=3, resolved=3)
     flat = np.where(clean < 14.99, 14.8, clean).astype(np.float32)  # the steps are gone, the wall is there
     assert evaluation.staircase_steps(clean, flat).resolved < 3
@@ -115,10 +97,9 @@ def test_steps_of_a_staircase():
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "set"
-    fractions, camera = [0.042, 0.48], {"preset": "lu2024", "width": 64, "height": 48}
-    changes = {"frames.per_scene": 6, "frames.backscatter_fraction": fractions, "scene.camera": camera}
-    spadwarp.dataset.make_dataset(recipe(scenes_per_target=1, **{"pose.yaw_deg": 0.0}, **changes), folder, device="cpu")
-    return folder
+    changes = {"frames.per_scene": 6, "frames.backscatter_fraction": [0.042, 0.48], "pose.yaw_deg": 0.0}
+    changes |= {"scene.camera": {"preset": "lu2024", "width": 64, "height": 48}, "scenes_per_target": 1}
+    return make(recipe(**changes), folder).folder
 
 
 @pytest.mark.slow
@@ -143,20 +124,17 @@ def test_evaluation_and_report(dataset, tmp_path):
     assert {row["method"] for row in scores["scores"]} == {"input", "median"}
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"models": ("unet",)}, "'unet' is not one of"),
-        ({"models": ("histograms",)}, "needs histograms with their background, which datasets do not keep"),
-        ({"models": ("median",), "crop": (65, 48)}, r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"),
-        ({"models": ("dncnn",), "weights": network_files.WEIGHTS / "usdn.safetensors"}, "not among models: dncnn"),
-    ],
-)
-def test_evaluation_refuses_what_it_cannot_do(dataset, options, message, tmp_path):
-    with pytest.raises(ArgumentError, match=message):
-        spadwarp.denoise.evaluate(dataset, **options)
-    with pytest.raises(FileError, match="no dataset there"):
-        spadwarp.denoise.evaluate(tmp_path)
+def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
+    foreign = {"models": ("dncnn",), "weights": network_files.WEIGHTS / "usdn.safetensors"}
+    for folder, options, message in (
+        (dataset, {"models": ("unet",)}, "'unet' is not one of"),
+        (dataset, {"models": ("histograms",)}, "needs histograms with their background, which datasets do not keep"),
+        (dataset, {"models": ("median",), "crop": (65, 48)}, r"crop = \(65, 48\) is outside \(8, 8\) to \(64, 48\)"),
+        (dataset, foreign, "not among models: dncnn"),
+        (tmp_path, {}, "no dataset there"),
+    ):
+        with pytest.raises((ArgumentError, FileError), match=message):
+            spadwarp.denoise.evaluate(folder, **options)
 
 
 @pytest.mark.slow
@@ -164,7 +142,7 @@ def test_training_from_a_dataset(dataset, tmp_path):
     file, out, own = tmp_path / "recipe.toml", tmp_path / "run", tmp_path / "run" / "usdn.safetensors"
     file.write_text(f'model = "usdn"\ndata = "{dataset}"\n[optimiser]\nsteps = 2\nbatch = 2\ncrop = 32\n')
     run("train", file, "--out", out, "--device", "cpu")
-    assert names(out) >= {"usdn.safetensors", "log.jsonl", "curves.png"}
+    assert {path.name for path in out.iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert network_files.weights_metadata("usdn", own)["seed"] == "0"
     trained, shipped = (
         spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, weights=weights, device="cpu")
@@ -183,13 +161,10 @@ def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, m
     """
     place, out = tmp_path / "recipe.toml", tmp_path / "two"
     optimiser = "steps = 16\nbatch = 4\ncrop = 32\nreport_every = 4\nwarm_up = 2\naveraging = 0.5"
-    place.write_text(
-        f'model = "usdn"\ndata = "{dataset}"\nseed = 3\n[optimiser]\n{optimiser}\n[noise]\ncounting = 0.0\n'
-    )
+    place.write_text(f'model = "usdn"\ndata = "{dataset}"\nseed = 3\nnoise.counting = 0.0\n[optimiser]\n{optimiser}\n')
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command += ["-m", "spadwarp", "train", str(place), "--out", str(out), "--device", "cpu"]
-    paths = os.pathsep.join([str(Path(spadwarp.__file__).parents[1]), *filter(None, sys.path)])
-    options = {"env": {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}, "text": True}
+    options = {"env": {**ENVIRONMENT, "OMP_NUM_THREADS": "1"}, "text": True}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options) as first:
         while first.poll() is None and not (out / "checkpoint.pt").is_file():
             time.sleep(0.02)
@@ -202,7 +177,7 @@ def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, m
     again = subprocess.run(command, capture_output=True, timeout=240, **options)
     assert again.returncode == 0, again.stderr
     assert again.stdout.count("weights") == 1 and "strides" not in again.stderr
-    visible = {name for name in names(out) if name[0] != "."}  # hidden: what was half written
+    visible = {path.name for path in out.glob("[!.]*")}  # hidden: what was half written
     assert visible == {"checkpoint.pt", "curves.png", "log.jsonl", "usdn.safetensors"}
     steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
     assert steps == [4, 8, 12, 16]
@@ -235,16 +210,15 @@ def test_two_processes_train_as_one_and_resume_after_a_kill(dataset, tmp_path, m
 @pytest.fixture(scope="module")
 def wall():
     """A Monte Carlo result of a plane at 3 m, 16 x 12 pixels."""
-    scene = spadwarp.Scene.from_dict(
-        {
-            "medium": {"extinction": 0.3, "albedo": 0.7, "group_index": 1.36},
-            "laser": {"half_angle_deg": 12.0, "pulse_fwhm_ps": 300.0},
-            "camera": {"width": 16, "height": 12, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
-            "gate": {"start_ns": 18.0, "bin_width_ps": 200.0, "bins": 64},
-            "targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0], "reflectance": 0.5}],
-        }
+    plane = {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0], "reflectance": 0.5}
+    one = make_scene(
+        medium={"extinction": 0.3, "albedo": 0.7, "anisotropy": 0.9, "group_index": 1.36},
+        laser={"half_angle_deg": 12.0, "pulse_fwhm_ps": 300.0, "position": [0.0, 0.0, 0.0]},
+        camera={"width": 16, "height": 12, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
+        gate={"start_ns": 18.0, "bin_width_ps": 200.0, "bins": 64},
+        targets=[plane],
     )
-    return spadwarp.simulate(scene, photons=200_000, seed=2, device="cpu")
+    return spadwarp.simulate(one, photons=200_000, seed=2, device="cpu")
 
 
 def test_counts_are_denoised_with_their_histograms(wall, tmp_path):
@@ -285,10 +259,12 @@ def test_a_sweep_over_photons(wall, tmp_path):
 
 @pytest.mark.parametrize("test_recipe", ["lu2024", "small"])
 def test_training_and_test_share_no_target_and_no_seed(test_recipe):
-    trained = Plan(spadwarp.dataset.load_recipe("configs/datasets/training.toml"))
-    tested = Plan(spadwarp.dataset.load_recipe(f"configs/datasets/{test_recipe}.toml"))
-    seen = {target.name for target in trained.targets if target.split in ("train", "validation")}
-    unseen = {target.name for target in tested.targets if target.split == "test"}
+    parts = ("train", "validation", "test")
+    plans = [Plan(spadwarp.dataset.load_recipe(f"configs/datasets/{name}.toml")) for name in ("training", test_recipe)]
+    trained, tested = ([(target.name, target.split) for target in plan.targets] for plan in plans)
+    seen, unseen = (
+        {name for name, split in trained if split != "test"},
+        {name for name, split in tested if split == "test"},
+    )
     assert "staircase" in unseen and seen.isdisjoint(unseen)
-    seeds = [plan.split_seeds[split] for plan in (trained, tested) for split in ("train", "validation", "test")]
-    assert len(set(seeds)) == 6
+    assert len({plan.split_seeds[split] for plan in plans for split in parts}) == 6

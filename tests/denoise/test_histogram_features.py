@@ -7,8 +7,7 @@ from scipy.linalg import toeplitz
 from scipy.stats import exponnorm, norm
 
 from helpers.stepped_frames import denoised
-from spadwarp import ArgumentError, DeviceError
-from spadwarp.denoise import apply, estimate, synthetic_noise
+from spadwarp.denoise import apply, synthetic_noise
 from spadwarp.denoise import histograms as histogram_inputs
 from spadwarp.denoise.classical import GUIDES
 from spadwarp.denoise.histogram_features import EDGES, FEATURES, SEEN, WINDOWS, extract_features, log_likelihood
@@ -89,10 +88,9 @@ def test_each_pixel_may_have_its_background():
     counts += generator.poisson(np.maximum(beam - 1.0, 0.0) * level, (32, 32, BINS))
     each = np.broadcast_to(np.maximum(beam, 1.0) * level, (32, 32, BINS))
     sides = np.abs(np.linspace(-1, 1, 32)) > 0.6
-    wrong = [
-        np.mean(np.abs(BINS * features_of(counts, one)[5] - 70.3)[:, sides] > 4) for one in (each.mean((0, 1)), each)
-    ]
-    assert wrong[1] < 0.1 < wrong[0]
+    places = (BINS * features_of(counts, one)[5] for one in (each, each.mean((0, 1))))
+    own, common = (np.mean(np.abs(place - 70.3)[:, sides] > 4) for place in places)
+    assert own < 0.1 < common
 
 
 @pytest.mark.parametrize("width", [128, 300])
@@ -147,25 +145,12 @@ def test_depths_far_from_the_counts_are_answered():
     assert np.isfinite(denoised(depth, **given)).all()
 
 
-def test_a_classical_method_checks_what_it_is_given():
-    depth, given = np.full((16, 16), 15.0), {"background": np.ones(8), "response": np.ones(3), "gate": (14.0, 16.0)}
-    for change, error, problem in (
-        ({"gate": (16.0, 14.0)}, ArgumentError, r"gate = \(16.0, 14.0\)"),
-        ({"counts": np.full((16, 16, 8), np.nan)}, ArgumentError, "counts = nan"),
-        ({"device": True}, DeviceError, "device = True is not 'cpu' or 'cuda:N'"),
-        ({"weights": "own.safetensors"}, ArgumentError, "weights are for a network, not for 'likelihood'"),
-    ):
-        with pytest.raises(error, match=problem):
-            estimate(depth, model="likelihood", **{"counts": np.zeros((16, 16, 8)), **given, **change})
-
-
 def test_masked_pixels_and_tensors_are_depth_too():
-    values = np.full((16, 16), 15.0)
-    masked = np.ma.masked_array(values, np.eye(16) > 0)
-    holes = apply(np.where(np.eye(16) > 0, np.nan, values), gate=(14.0, 16.0), model="gating")
-    assert np.array_equal(apply(masked, gate=(14.0, 16.0), model="gating"), holes, equal_nan=True)
+    values, options = np.full((16, 16), 15.0), {"gate": (14.0, 16.0), "model": "median"}
+    masked, holes = np.ma.masked_array(values, np.eye(16) > 0), np.where(np.eye(16) > 0, np.nan, values)
+    np.testing.assert_array_equal(apply(masked, **options), apply(holes, **options))
     learned = torch.tensor(values, requires_grad=True)
-    assert np.array_equal(apply(learned, gate=(14.0, 16.0), model="median"), np.full((16, 16), 15.0, np.float32))
+    np.testing.assert_array_equal(apply(learned, **options), values.astype(np.float32))
 
 
 def test_shapes_of_features():

@@ -34,22 +34,21 @@ PLAIN |= dict.fromkeys(("slanted_gate", "counting", "scattered", "dead", "unknow
 PLAIN |= dict.fromkeys(("hot", "sparse", "tail", "two_returns", "wide_gate"), 0.0)
 
 
-def draw(plain, *, size=64, crop=64, seed=3, **options):
+def draw(plain, *, size=64, crop=64, seed=3):
     generator = torch.Generator().manual_seed(seed)
-    return draw_batch(scenes(), plain, size=size, crop=crop, generator=generator, always_replaced=True, **options)
+    return draw_batch(scenes(), plain, size=size, crop=crop, generator=generator, always_replaced=True)
 
 
 def test_networks_have_the_weights_and_the_cost_that_they_state():
     """DehazeNet has 8 240 weights for three channels of input, of which USDN has one."""
     layers = [one for one in networks.USDN().modules() if isinstance(one, torch.nn.Conv2d)]
     assert sum(one.weight.numel() for one in layers) + 2 * 5 * 5 * 16 == 8240
-    multiply_adds = []
+    multiply_adds = {}
     for name in ("pyramid", "dncnn"):
         with torch.no_grad(), FlopCounterMode(display=False) as counter:
             networks.build_network(name).eval()(torch.zeros(1, 3, 64, 64))
-        multiply_adds.append(counter.get_total_flops() // 2)
-    ours, theirs = multiply_adds
-    assert theirs == 64 * 64 * (9 * 64 * 2 + 15 * 9 * 64 * 64) and ours < theirs / 6
+        multiply_adds[name] = counter.get_total_flops() // 2
+    assert multiply_adds["dncnn"] == 64 * 64 * (9 * 64 * 2 + 15 * 9 * 64 * 64) > 6 * multiply_adds["pyramid"]
 
 
 def test_order_statistics_are_those_of_a_sort():
@@ -91,23 +90,18 @@ def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
         assert torch.allclose(network(frame)[:, 0], torch.tensor(0.5), atol=1e-4)
 
 
-def test_the_selection_of_strips_is_that_of_whole_frames(monkeypatch):
+def test_the_selection_of_strips_is_that_of_whole_frames_and_never_the_mean_of_two_surfaces(monkeypatch):
     generator = torch.Generator().manual_seed(7)
-    shapes = ((2, 1, 23, 9), (2, 3, 23, 9), (2, FEATURES, 23, 9))
-    images = [torch.rand(shape, generator=generator) for shape in shapes]
+    images = [torch.rand((2, channels, 23, 9), generator=generator) for channels in (1, 3, FEATURES)]
     network = networks.Selection()
     torch.nn.init.normal_(network.last.weight)  # all candidates are chosen
     with torch.no_grad():
         whole = networks.selected(*network(*images))
         monkeypatch.setattr(networks, "_PIXELS_AT_ONCE", 5 * 9)
         assert torch.allclose(networks.selected_depth(network, *images), whole, atol=1e-6)
-
-
-def test_the_selection_is_never_the_mean_of_two_surfaces():
-    candidates = torch.tensor([0.2, 0.2, 0.7, 0.7])[None, :, None, None]
-    for scores, expected in (([0.0, 0.0, 0.1, 0.0], 0.7), ([0.1, 0.0, 0.0, 0.0], 0.2)):
-        found = networks.selected(candidates, torch.tensor(scores)[None, :, None, None])
-        assert torch.allclose(found, torch.tensor(expected))
+    candidates, scores = torch.tensor([[0.2, 0.2, 0.7, 0.7]] * 2), torch.tensor([[0, 0, 0.1, 0], [0.1, 0, 0, 0]])
+    found = networks.selected(candidates[:, :, None, None], scores[:, :, None, None])
+    assert torch.allclose(found.flatten(), torch.tensor([0.7, 0.2]))
 
 
 def test_drawn_scenes_are_varied_and_repeatable():
@@ -186,11 +180,10 @@ def test_crops_count_for_what_they_can_judge():
 
 def test_the_chosen_depth_decides_what_counts_as_the_targets():
     """With histograms: a chosen depth that is right does not count as wrong because the pixel's own depth is."""
-    hit = torch.ones(1, 1, 32, 32)
+    hit, candidates = torch.ones(1, 1, 32, 32), torch.zeros(1, 1 + POOLED, 32, 32)
     batch = Batch(torch.zeros(1, 3 + FEATURES, 32, 32), 0.5 * hit, hit, torch.ones(1, 1, 1, 1))
-    logits = 9 * hit.expand(-1, 3, -1, -1)
-    candidates = torch.zeros(1, 1 + POOLED, 32, 32)
-    right, wrong = (torch.cat([0.5 * hit, logits, chosen * hit, candidates], dim=1) for chosen in (0.5, 0.1))
+    depths = (torch.cat([0.5 * hit, 9 * hit.expand(-1, 3, -1, -1), some * hit, candidates], 1) for some in (0.5, 0.1))
+    right, wrong = depths
     assert loss_of(right, batch, kind="mse") + 0.2 < loss_of(wrong, batch, kind="mse")
 
 
@@ -218,39 +211,32 @@ COUNTS = {"model": "histograms", "noise": {"counting": 1.0}, "optimiser": {"pool
 RECIPE = {"model": "usdn", "data": "none", "seed": 4, "optimiser": OPTIMISER}
 
 
-def train(folder, *, progress=None, **changes):
-    recipe = TrainingRecipe.from_dict({**RECIPE, **changes})
-    return fit(recipe, scenes(), scenes(), folder, device="cpu", progress=progress)
+def train(folder, given=None, *, progress=None, **changes):
+    recipe, given = TrainingRecipe.from_dict({**RECIPE, **changes}), given or scenes()
+    return fit(recipe, given, given, folder, device="cpu", progress=progress)
 
 
 @pytest.mark.parametrize("wide", [0.0, 0.5])
 def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path, wide):
     """After a checkpoint of the first step (Ctrl-C), one between two reports (SIGTERM), and one that died after it."""
 
-    class Death(Exception):
-        pass
-
-    def at(step, action):
-        return lambda stage, done, total: action() if done == step else None
-
-    def die():
-        raise Death
+    def at(step, action, *arguments):
+        return lambda stage, done, total: action(*arguments) if done == step else None
 
     optimiser = {**OPTIMISER, "wide": wide}
     whole = train(tmp_path / "whole", optimiser=optimiser)
     for step, number in ((1, signal.SIGINT), (4, signal.SIGTERM)):
         with pytest.raises(KeyboardInterrupt, match=rf"interrupted at step {step} of 6; .*checkpoint\.pt"):
-            train(tmp_path / "parts", progress=at(step, lambda n=number: signal.raise_signal(n)), optimiser=optimiser)
+            train(tmp_path / "parts", progress=at(step, signal.raise_signal, number), optimiser=optimiser)
         assert torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)["step"] == step
-    with pytest.raises(Death):
-        train(tmp_path / "parts", progress=at(5, die), optimiser=optimiser)
+    with pytest.raises(ZeroDivisionError):
+        train(tmp_path / "parts", progress=at(5, divmod, 1, 0), optimiser=optimiser)
     parts = train(tmp_path / "parts", optimiser=optimiser)
     for name, values in load_file(whole.weights).items():
         assert torch.equal(values, load_file(parts.weights)[name]), name
-    lines = [json.loads(line) for line in parts.log.read_text().splitlines()]
+    reference, lines = ([json.loads(line) for line in run.log.read_text().splitlines()] for run in (whole, parts))
     assert [line["step"] for line in lines] == [3, 6]
     assert lines[-1]["mean_psnr"] == pytest.approx(whole.psnr, abs=1e-3)
-    reference = [json.loads(line) for line in whole.log.read_text().splitlines()]
     assert [line["loss"] for line in lines] == pytest.approx([line["loss"] for line in reference], rel=1e-5)
 
 
@@ -264,18 +250,17 @@ def test_an_interrupted_run_ends_like_one_that_was_not(tmp_path, wide):
     ],
 )
 def test_crops_that_no_scene_holds_are_refused(tmp_path, size, wide, problem):
-    given = scenes(size=size)
-    recipe = TrainingRecipe.from_dict({"model": "usdn", "optimiser": {**OPTIMISER, "crop": 64, "wide": wide}})
     with pytest.raises(ConfigError, match=problem):
-        fit(recipe, given, given, tmp_path, device="cpu")
+        train(tmp_path, scenes(size=size), optimiser={**OPTIMISER, "crop": 64, "wide": wide})
 
 
 @pytest.mark.slow
 def test_a_training_starts_from_the_weights_of_the_package(tmp_path):
     noise = {"counting": 1.0, "scattered": 0.5, "roughness": [0.0, 1.0]}
     once = {**OPTIMISER, "steps": 2, "report_every": 2}
-    tables = {**RECIPE, "model": "histograms", "start": "histograms", "noise": noise, "optimiser": once}
-    done = fit(TrainingRecipe.from_dict(tables), scenes(), scenes(count=1, size=32), tmp_path, device="cpu")
+    done = train(
+        tmp_path, scenes(count=1, size=32), model="histograms", start="histograms", noise=noise, optimiser=once
+    )
     learnt = load_file(done.weights)
     for name, values in network_files.load_network("histograms").state_dict().items():
         assert torch.allclose(learnt[name].float(), values, atol=0.01), name  # two steps
@@ -293,31 +278,30 @@ def test_training_without_a_dataset_draws_scenes_and_says_how_long_it_takes(tmp_
 
 def test_a_folder_holds_one_recipe(tmp_path):
     train(tmp_path)
-    with pytest.raises(ConfigError, match=r"another recipe \(seed = 4, here 5\); choose another folder"):
-        train(tmp_path, seed=5)
-    with pytest.raises(ConfigError, match=r"optimiser.steps = 6, here 3; its learning rate decreases over all steps\)"):
-        train(tmp_path, optimiser={**OPTIMISER, "steps": 3})
-    with pytest.raises(ConfigError, match=r"\(noise.hot = 0.01, here 0.02\)"):
-        train(tmp_path, noise={"hot": 0.02})
+    for change, problem in (
+        ({"seed": 5}, r"another recipe \(seed = 4, here 5\); choose another folder"),
+        ({"optimiser": {**OPTIMISER, "steps": 3}}, r"steps = 6, here 3; its learning rate decreases over all steps\)"),
+        ({"noise": {"hot": 0.02}}, r"\(noise.hot = 0.01, here 0.02\)"),
+    ):
+        with pytest.raises(ConfigError, match=problem):
+            train(tmp_path, **change)
     (tmp_path / "checkpoint.pt").write_bytes(b"no")
     with pytest.raises(FileError, match="damaged"):
         train(tmp_path)
+    with pytest.raises(FileError, match="cannot be read"):
+        load_training_recipe(tmp_path / "none.toml")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"model": "unet"}, "model"),
-        ({"noise": {"backscatter": [0.5, 1.2]}}, r"noise.backscatter"),
         ({"noise": {"backscatter": [0.5, 0.2]}}, r"noise.backscatter = \[0.5, 0.2\] is not \(lowest"),
-        ({"noise": {"photons": [0.0, 3.0]}}, r"noise.photons"),
         ({"optimiser": {"crops": 3}}, r"optimiser.crops"),
         ({"model": "histograms"}, r"noise.counting"),
         ({"start": "pyramid"}, r"start"),
         ({"optimiser": {"pool": 48}}, r"optimiser.pool = 48 with model = 'usdn'"),
         ({"mixture": [{"share": 1.0}]}, r"optimiser.pool = 0 with a mixture"),
         ({**COUNTS, "mixture": [{"share": 0.4}, {"share": 0.5}]}, r"shares add up to 0.9, not to 1"),
-        ({**COUNTS, "mixture": [{"share": 1.0, "foton": [1.0, 2.0]}]}, r"mixture.*foton"),
         ({**COUNTS, "mixture": [{"share": 1.0, "photons": [0.0, 2.0]}]}, r"mixture.*photons"),
         ({**COUNTS, "mixture": [{"share": 1.0, "counting": 0.5}]}, r"noise.counting = 0.5"),
     ],
@@ -325,8 +309,3 @@ def test_a_folder_holds_one_recipe(tmp_path):
 def test_errors_in_a_recipe_name_the_field(change, message):
     with pytest.raises(ConfigError, match=message):
         TrainingRecipe.from_dict({**RECIPE, **change})
-
-
-def test_a_recipe_that_cannot_be_read(tmp_path):
-    with pytest.raises(FileError, match="cannot be read"):
-        load_training_recipe(tmp_path / "none.toml")

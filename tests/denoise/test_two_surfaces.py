@@ -76,8 +76,6 @@ def test_of_two_returns_the_stronger_one_is_found():
     taps = np.diff(norm.cdf(np.arange(-4.5, 5.0), scale=1.2))
     depth = 10.0 + 2.56 * (counts.argmax(axis=-1) + 0.5) / bins
     assert np.mean(np.abs(depth - 11.606) > 0.2) > 0.01
-    flat = np.full(bins, 6.0 / bins)
-    found = estimate(
-        depth, gate=(10.0, 12.56), model="histograms", counts=counts, background=flat, response=taps / taps.sum()
-    )
+    given = {"counts": counts, "background": np.full(bins, 6.0 / bins), "response": taps / taps.sum()}
+    found = estimate(depth, gate=(10.0, 12.56), model="histograms", **given)
     assert np.mean(np.abs(found.depth - 11.606) > 0.2) < 0.002

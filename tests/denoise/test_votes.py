@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from spadwarp.denoise.networks import neighbour_votes  # noqa: E402
+from spadwarp.denoise.networks import neighbour_votes
 
 RING = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
 
@@ -15,20 +14,15 @@ def agreement(one, other, most):
     return 0.0 if np.isnan(one) or np.isnan(other) else max(0.0, 1.0 - abs(one - other) / most)
 
 
-def frame(seed=1):
-    generator = np.random.default_rng(seed)
-    depth = generator.integers(0, 4, (7, 9)) * 0.2 + 0.002 * generator.standard_normal((7, 9))
-    depth[generator.random(depth.shape) < 0.3] = np.nan
-    return depth
-
-
 def votes(depth):
     image = torch.from_numpy(depth).float()[None, None]
     return neighbour_votes(torch.nan_to_num(image, nan=1.0), (~torch.isnan(image)).float())
 
 
 def test_votes_are_those_of_every_pair_of_pixels():
-    depth = frame()
+    generator = np.random.default_rng(1)
+    depth = generator.integers(0, 4, (7, 9)) * 0.2 + 0.002 * generator.standard_normal((7, 9))
+    depth[generator.random(depth.shape) < 0.3] = np.nan
     padded = np.pad(depth, 2, constant_values=np.nan)
     found = votes(depth)
     for row, column in np.ndindex(depth.shape):
@@ -37,9 +31,9 @@ def test_votes_are_those_of_every_pair_of_pixels():
         near = sum(agreement(around[2, 2], value, 0.012) for value in beside) / 8
         wide = sum(agreement(around[2, 2], value, 0.04) for value in around.ravel()) - (not np.isnan(around[2, 2]))
         counts = [sum(agreement(one, other, 0.012) for other in beside) for one in beside]  # each agrees with itself
-        assert float(found.near[0, 0, row, column]) == pytest.approx(near, abs=1e-4)
-        assert float(found.wide[0, 0, row, column]) == pytest.approx(wide / 24, abs=1e-4)
-        assert float(found.support[0, 0, row, column]) == pytest.approx(max(counts) / 8, abs=1e-4)
+        expected = {"near": near, "wide": wide / 24, "support": max(counts) / 8}
+        for name, share in expected.items():
+            assert float(getattr(found, name)[0, 0, row, column]) == pytest.approx(share, abs=1e-4), name
 
 
 def test_the_depth_with_most_votes_is_that_of_the_side_that_a_pixel_is_on():

@@ -7,7 +7,6 @@ import pytest
 from scipy import integrate, stats
 
 from spadwarp.frames.response import (
-    FWHM_PER_SIGMA,
     InstrumentResponse,
     instrument_response,
     read_response,
@@ -18,18 +17,15 @@ from spadwarp.values import ArgumentError
 PS = 1e-12
 
 
-def _measured():
-    times = np.array([-60.0, -10.0, 5.0, 40.0, 200.0, 390.0]) * PS
-    return InstrumentResponse(times=times, values=[0.0, 3.0, 10.0, 6.0, 1.0, 0.0])
-
-
+TIMES = np.array([-60.0, -10.0, 5.0, 40.0, 200.0, 390.0]) * PS
 RESPONSES = {
     "gaussian": InstrumentResponse(sigma=90 * PS),
     "tail": InstrumentResponse(sigma=60 * PS, tail=150 * PS),
     "short tail": InstrumentResponse(sigma=100 * PS, tail=3 * PS),
+    "vanishing tail": InstrumentResponse(sigma=100 * PS, tail=0.01 * PS),
     "long tail": InstrumentResponse(sigma=20 * PS, tail=900 * PS),
     "exponential": InstrumentResponse(tail=120 * PS),
-    "measured": _measured(),
+    "measured": InstrumentResponse(times=TIMES, values=[0.0, 3.0, 10.0, 6.0, 1.0, 0.0]),
     "delta": InstrumentResponse(),
 }
 
@@ -37,9 +33,7 @@ RESPONSES = {
 def test_widths_of_pulse_and_jitter_add_in_quadrature():
     irf = instrument_response(pulse_fwhm=85e-12, jitter_fwhm=200e-12)
     assert irf.fwhm == pytest.approx(np.hypot(85e-12, 200e-12))
-    assert irf.sigma * FWHM_PER_SIGMA == pytest.approx(irf.fwhm)
-    half = irf.density(0.5 * irf.fwhm) / irf.density(0.0)
-    assert half == pytest.approx(0.5)
+    assert irf.density(0.5 * irf.fwhm) / irf.density(0.0) == pytest.approx(0.5)
 
 
 def test_the_tail_is_the_convolution_of_both():
@@ -49,12 +43,6 @@ def test_the_tail_is_the_convolution_of_both():
     np.testing.assert_allclose(irf.density(t), law.pdf(t), rtol=1e-8, atol=1e-4)
     np.testing.assert_allclose(irf.cumulative(t), law.cdf(t), atol=1e-12)
     assert irf.mean == pytest.approx(law.mean())
-
-
-def test_a_vanishing_tail_is_a_gaussian():
-    t = np.linspace(-400, 400, 81) * PS
-    gaussian, tailed = InstrumentResponse(sigma=100 * PS), InstrumentResponse(sigma=100 * PS, tail=0.01 * PS)
-    np.testing.assert_allclose(tailed.cumulative(t + 0.01 * PS), gaussian.cumulative(t), atol=1e-7)
 
 
 @pytest.mark.parametrize("name", [name for name in RESPONSES if name != "delta"])
@@ -118,86 +106,88 @@ def test_a_window_without_light_is_empty():
     assert matrix.row_start.tolist() == [0, 0, 0] and matrix.weight.size == 0
 
 
-def test_csv(tmp_path):
-    path = tmp_path / "irf.csv"
-    path.write_text("# a measured response\ntime_ps,value\n-50,0\n0,4\n\n150,0\n")
-    irf = instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape=str(path))
-    assert irf.mean == pytest.approx((-50 + 0 + 150) / 3 * PS)  # of a triangle
-    assert irf.mode == 0 and irf.fwhm == pytest.approx(100 * PS, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("time_ps,value\n0,1\n1,x\n", "line 3"),
-        ("0,1\n1,-1\n", r"line 2: value = -1 is outside \[0, 1e30\]"),
-        ("0,1\n0,2\n", "ascending"),
-        ("0,1\n", "two or more"),
-        ("0,0\n1,0\n", "not all 0"),
-        ("0,1\n1e300,1\n", "line 2: time_ps = 1e[+]300 is outside"),
-    ],
-)
-def test_a_bad_csv_is_named(tmp_path, text, message):
-    path = tmp_path / "irf.csv"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=message) as error:
-        instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape=str(path))
-    assert "irf.csv" in str(error.value)
+def test_a_response_has_times_or_a_value_for_each_bin(tmp_path):
+    (tmp_path / "bins.csv").write_text("# of a pulse\n1\n4\n1\n")
+    np.save(tmp_path / "bins.npy", np.array([1.0, 4.0, 1.0]))
+    (tmp_path / "times.csv").write_text("time_ps,value\n-100,0\n-50,1\n0,4\n\n50,1\n100,0\n")
+    same = [read_response(tmp_path / name, bin_width=50e-12) for name in ("bins.csv", "bins.npy", "times.csv")]
+    for one in (*same, instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape=str(tmp_path / "times.csv"))):
+        assert one.mean == pytest.approx(0.0, abs=1e-15) and one.fwhm == pytest.approx(same[0].fwhm)
+        np.testing.assert_allclose(one.per_bin(50e-12), same[0].per_bin(50e-12), atol=1e-12)
+    np.save(tmp_path / "bad.npy", np.zeros(4))
+    for name, words, options in (("bins", "bin width is missing", {}), ("bad", "is not a resp", {"bin_width": 5e-11})):
+        with pytest.raises(ArgumentError, match=words):
+            read_response(tmp_path / f"{name}.npy", **options)
+    (tmp_path / "triangle.csv").write_text("time_ps,value\n-50,0\n0,4\n150,0\n")
+    triangle = read_response(tmp_path / "triangle.csv", bin_width=50e-12)
+    assert triangle.mean == pytest.approx((-50 + 0 + 150) / 3 * PS)
+    assert triangle.mode == 0 and triangle.fwhm == pytest.approx(100 * PS, rel=1e-3)
 
 
 @pytest.mark.parametrize("scale", [5e-324, 1e-310, 1e-160, 1e300, 1.7e308 / 4])
 def test_the_unit_of_a_measured_response_does_not_matter(scale, tmp_path):
     """Neither sums that overflow nor values below the smallest normal number change its shape."""
-    shape = np.array([1.0, 4.0, 2.0])
-    np.save(tmp_path / "unit.npy", shape)
-    np.save(tmp_path / "scaled.npy", shape * scale)
+    shape, times = np.array([1.0, 4.0, 2.0]), [0.0, 1e-10, 2e-10]
+    for name, values in {"unit": shape, "scaled": shape * scale}.items():
+        np.save(tmp_path / f"{name}.npy", values)
     unit, scaled = (read_response(tmp_path / f"{name}.npy", bin_width=1e-10) for name in ("unit", "scaled"))
     assert scaled.mean == pytest.approx(unit.mean, abs=1e-22) and scaled.fwhm == pytest.approx(unit.fwhm)
-    times = [0.0, 1e-10, 2e-10]
-    assert (
-        InstrumentResponse(times=times, values=shape * scale).fwhm == InstrumentResponse(times=times, values=shape).fwhm
-    )
+    scaled, unit = (InstrumentResponse(times=times, values=values) for values in (shape * scale, shape))
+    assert scaled.fwhm == unit.fwhm
 
 
-@pytest.mark.parametrize("times", [[0.0, 5e-324, 1e-323], [-1.7e308, 0.0, 1.7e308]])
-def test_times_of_no_usable_length_are_refused(times):
-    with pytest.raises(ArgumentError, match="times of a measured response"):
-        InstrumentResponse(times=times, values=[0.0, 1.0, 0.0])
+def measured(times):
+    return lambda: InstrumentResponse(times=times, values=[0.0, 1.0, 0.0])
 
 
-def test_wrong_input_is_named():
-    with pytest.raises(ValueError, match="pulse_fwhm = -1"):
-        instrument_response(pulse_fwhm=-1, jitter_fwhm=0)
-    with pytest.raises(ValueError, match="tail = nan"):
-        instrument_response(pulse_fwhm=0, jitter_fwhm=0, tail=np.nan)
-    with pytest.raises(ValueError, match="neither a known shape nor a file"):
-        instrument_response(pulse_fwhm=0, jitter_fwhm=0, shape="lorentzian")
-    with pytest.raises(ValueError, match="sigma = inf"):
-        InstrumentResponse(sigma=np.inf)
-    with pytest.raises(ValueError, match="no density"):
-        InstrumentResponse().density(0.0)
+def response(**changes):
+    return lambda: instrument_response(**{"pulse_fwhm": 0, "jitter_fwhm": 0, **changes})
+
+
+def matrix(**changes):
+    given = {"irf": RESPONSES["gaussian"], **AXIS, "edges": np.linspace(0.0, 1e-9, 11), **changes}
+    return lambda: response_matrix(given.pop("irf"), **given)
+
+
+REFUSED = [
+    ("times of a measured response", measured([0.0, 5e-324, 1e-323])),  # of no usable length
+    ("times of a measured response", measured([-1.7e308, 0.0, 1.7e308])),
+    ("pulse_fwhm = -1", response(pulse_fwhm=-1)),
+    ("tail = nan", response(tail=np.nan)),
+    ("neither a known shape nor a file", response(shape="lorentzian")),
+    ("sigma = inf", lambda: InstrumentResponse(sigma=np.inf)),
+    ("no density", lambda: InstrumentResponse().density(0.0)),
+    ("irf = 1e-10 is not an InstrumentResponse", matrix(irf=1e-10)),
+    ("source_width = -1e-10 is outside", matrix(source_width=-1e-10)),
+    ("source_start = nan is outside", matrix(source_start=math.nan)),
+    ("source_bins = 0 is outside", matrix(source_bins=0)),
+    ("period = 0.0 is outside", matrix(period=0.0)),
+    ("finite, ascending times", matrix(edges=[2.0, 1.0])),
+    ("finite, ascending times", matrix(edges=[])),
+    # In the wrong unit; fills no memory.
+    (r"of .* s on a side is longer than 1e\+07 bins of 1e-10 s", lambda: InstrumentResponse(sigma=1.0).per_bin(1e-10)),
+    ("bin_width = -1e-10 is outside", lambda: InstrumentResponse(sigma=1e-10).per_bin(-1e-10)),
+]
+
+
+@pytest.mark.parametrize(("message", "call"), REFUSED)
+def test_wrong_input_is_named(message, call):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 @pytest.mark.parametrize(
-    "changes, message",
+    ("text", "message"),
     [
-        ({"irf": 1e-10}, "irf = 1e-10 is not an InstrumentResponse"),
-        ({"source_width": -1e-10}, "source_width = -1e-10 is outside"),
-        ({"source_start": math.nan}, "source_start = nan is outside"),
-        ({"source_bins": 0}, "source_bins = 0 is outside"),
-        ({"period": 0.0}, "period = 0.0 is outside"),
-        ({"edges": [2.0, 1.0]}, "finite, ascending times"),
-        ({"edges": []}, "finite, ascending times"),
+        ("time_ps,value\n0,1\n1,x\n", r"irf\.csv.*line 3"),
+        ("0,1\n1,-1\n", r"irf\.csv.*line 2: value = -1 is outside \[0, 1e30\]"),
+        ("0,1\n0,2\n", r"irf\.csv.*ascending"),
+        ("0,1\n", r"irf\.csv.*two or more"),
+        ("0,0\n1,0\n", r"irf\.csv.*not all 0"),
+        ("0,1\n1e300,1\n", r"irf\.csv.*line 2: time_ps = 1e[+]300 is outside"),
     ],
 )
-def test_axes_that_cannot_be_are_named(changes, message):
-    given = {"irf": RESPONSES["gaussian"], **AXIS, "edges": np.linspace(0.0, 1e-9, 11), **changes}
+def test_a_bad_file_is_named(tmp_path, text, message):
+    (tmp_path / "irf.csv").write_text(text)
     with pytest.raises(ArgumentError, match=message):
-        response_matrix(given.pop("irf"), **given)
-
-
-def test_a_response_in_the_wrong_unit_is_refused_and_fills_no_memory():
-    with pytest.raises(ArgumentError, match=r"a response of .* s on a side is longer than 1e\+07 bins of 1e-10 s"):
-        InstrumentResponse(sigma=1.0).per_bin(100e-12)
-    with pytest.raises(ArgumentError, match="bin_width = -1e-10 is outside"):
-        InstrumentResponse(sigma=1e-10).per_bin(-100e-12)
+        response(shape=str(tmp_path / "irf.csv"))()

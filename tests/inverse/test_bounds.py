@@ -57,11 +57,10 @@ def test_noise_of_the_simulation_is_no_information():
     scene = plate()
     few, many = (
         bounds(scene, unknown=UNKNOWN, pulses=1000, photons=photons, seed=seed, device="cpu")
-        for photons, seed in ((50_000, 3), (3_000_000, 4))
+        for photons, seed in ((50_000, 3), (1_500_000, 4))
     )
     for name, one in many.bounds.items():
-        assert few.bounds[name].alone > 0.97 * one.alone, name
-        assert few.bounds[name].alone < 1.2 * one.alone, name
+        assert 0.97 * one.alone < few.bounds[name].alone < 1.2 * one.alone, name
     assert few.simulation > many.simulation
 
 
@@ -95,14 +94,9 @@ def test_the_median_of_the_pixels_is_that_of_those_that_see_a_target():
 def test_the_depth_is_looked_for_in_the_view_of_the_scene():
     # Of a focal length in metres: with a focus in metres, the sensor would stand further from the lens than in focus on
     # the target, and the view would be 5 % narrower.
-    scene = plate(
-        {
-            "camera.focal_length": 0.08,
-            "camera.pixel_pitch_um": 4000.0,
-            "targets[0].rotation_deg": [0.0, 40.0, 0.0],
-            "targets[0].size": [1.0, 1.0],
-        }
-    )
+    lens = {"camera.focal_length": 0.08, "camera.pixel_pitch_um": 4000.0}
+    tilted = {"targets[0].rotation_deg": [0.0, 40.0, 0.0], "targets[0].size": [1.0, 1.0]}
+    scene = plate({**lens, **tilted})
     exposure = Exposure(counts=None, pulses=1, window=(scene.gate.start, scene.gate.bins))
     render = Renderer(scene, read_unknowns(scene, "depth"), exposure, device="cpu")
     render({"depth": 0.0}, photons=1000)

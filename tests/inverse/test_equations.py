@@ -18,12 +18,10 @@ def rates():
 @pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
 def test_slopes_of_the_mean_are_its_derivatives(law, rates):
     slopes = np.random.default_rng(2).normal(size=(3, 1, 20)).astype(np.float32)
-    trials = np.full((3, law.recorded), 1e4, np.float32)
-    step = 1e-3
-    sides = [law.mean(rates + sign * step * slopes[:, 0], trials).astype(np.float64) for sign in (1, -1)]
-    np.testing.assert_allclose(
-        law.slopes(rates, slopes, trials)[:, 0], (sides[0] - sides[1]) / (2 * step), rtol=2e-2, atol=3.0
-    )
+    trials, step = np.full((3, law.recorded), 1e4, np.float32), 1e-3
+    more, less = (law.mean(rates + sign * step * slopes[:, 0], trials).astype(np.float64) for sign in (1, -1))
+    found = law.slopes(rates, slopes, trials)[:, 0]
+    np.testing.assert_allclose(found, (more - less) / (2 * step), rtol=2e-2, atol=3.0)
 
 
 def test_mean_of_first_photons_is_their_law(rates):

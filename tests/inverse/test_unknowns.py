@@ -12,9 +12,8 @@ from spadwarp.inverse.unknowns import moved, with_values
 def test_short_names_stand_for_fields():
     found = read_unknowns(plate(), "absorption, reflectance,depth:pixel,background")
     names = ["medium.absorption", "targets[0].reflectance", "depth", "detector.ambient_rate"]
-    assert [one.name for one in found] == names
-    assert [one.per_pixel for one in found] == [False, False, True, False]
-    assert [one.unit for one in found] == ["1/m", "", "m", "1/s"]
+    expected = zip(names, (False, False, True, False), ("1/m", "", "m", "1/s"), strict=True)
+    assert [(one.name, one.per_pixel, one.unit) for one in found] == list(expected)
 
 
 @pytest.mark.parametrize(
@@ -26,21 +25,22 @@ def test_short_names_stand_for_fields():
         ("depth,depth:pixel", "named twice"),
         ("absorption:pixel", "of the whole water"),
         ("depth:row", "':pixel'"),
-        ("targets[3].reflectance", "has 1 targets"),
+        ("targets[3].reflectance", "has 1 target"),
         ([5], "is not a name"),
     ],
 )
 def test_other_names_are_refused(names, words):
-    with pytest.raises(spadwarp.SpadwarpError, match="unknown: ") as error:
+    with pytest.raises(spadwarp.SpadwarpError, match=f"unknown: .*{words}"):
         read_unknowns(plate(), names)
-    assert words in str(error.value)
 
 
 def test_what_has_no_derivative_is_refused():
-    with pytest.raises(spadwarp.ConfigError, match="henyey_greenstein"):
-        read_unknowns(plate({"medium.phase_function": "fournier_forand"}), "anisotropy")
-    with pytest.raises(spadwarp.ConfigError, match="no targets"):
-        read_unknowns(plate().model_copy(update={"targets": ()}), "depth")
+    for changes, name, words in (
+        ({"medium.phase_function": "fournier_forand"}, "anisotropy", "henyey_greenstein"),
+        ({"targets": []}, "depth", "no targets"),
+    ):
+        with pytest.raises(spadwarp.ConfigError, match=words):
+            read_unknowns(plate(changes), name)
 
 
 def test_values_go_into_the_scene():

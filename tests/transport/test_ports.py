@@ -75,7 +75,7 @@ def test_equal_indices_are_a_camera_in_the_water(device, monkeypatch):
     """Photon by photon in water that is empty where the window is, for guided in a domain that begins there: flights
     then end there with and without it. Those of a dome, whose view has a margin, do not; of a tilted window the empty
     wedge differs."""
-    monkeypatch.setattr("spadwarp.transport.model._check_domain", lambda *_: None)  # lets a lens stay outside the water
+    monkeypatch.setattr("spadwarp.transport.model._check_places", lambda *_: None)  # lets a lens stay outside the water
     window = {"distance": 0.15, "thickness": 0.05, **NO_GLASS}
     dome = {"shape": "dome", "radius": 0.15, "thickness": 0.05, **NO_GLASS}
     medium = {"extinction": 1e-12, "layers": [{"start": 0.2, "extinction": 0.5, "albedo": 0.8}]}

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import tomllib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -35,44 +36,27 @@ def shown(request):
     return SCENE if request.param == "scene" else request.getfixturevalue(request.param)
 
 
-def test_names_are_short_and_say_what_it_is(shown):
-    text = repr(shown)
+def test_names_are_short_and_pages_have_numbers_and_a_picture(shown):
+    text, page, figure = repr(shown), shown._repr_html_(), shown.plot()
     assert len(text) < 160 and text.startswith(f"{type(shown).__name__}(") and "4 x 4 pixels" in text
     assert str(shown) == text
-
-
-def test_a_picture_with_numbers(shown):
-    page = shown._repr_html_()
     assert page.count("<tr>") >= 5 and "data:image/png;base64," in page and len(page) < 200_000
-
-
-def test_plot_gives_a_figure_that_a_notebook_shows(shown):
-    figure = shown.plot()
     assert isinstance(figure, Figure) and figure._repr_png_().startswith(b"\x89PNG")
 
 
-def test_each_kind_of_picture_of_a_result(result):
+def test_each_kind_of_picture_of_a_result(result, frames):
     titles = {kind: result.plot(kind).axes[0].get_title() for kind in ("depth", "intensity", "histogram", "truth")}
     assert len(set(titles.values())) == 4
     assert "peak" in result.plot("depth", method="peak").axes[0].get_title()
     with pytest.raises(spadwarp.ArgumentError, match="kind = 'film' is not one of 'depth'"):
         result.plot("film")
-
-
-def test_a_frame_that_is_not_there(frames):
     with pytest.raises(spadwarp.ArgumentError, match=r"frame = 3 is outside \[0, 3\)"):
         frames.plot(3)
 
 
-def test_a_scene_whose_mesh_is_missing_still_has_numbers(tmp_path):
-    scene = make_scene(targets=[{"mesh": str(tmp_path / "nothing.stl")}])
-    page = scene._repr_html_()
+def test_a_scene_whose_mesh_is_missing_still_has_numbers_and_its_text_is_escaped():
+    page = make_scene(targets=[{"mesh": "<b>.stl"}])._repr_html_()
     assert "no such file" in page and "extinction" in page and "<img" not in page
-
-
-def test_text_is_escaped():
-    scene = make_scene(targets=[{"mesh": "<b>.stl"}])
-    page = scene._repr_html_()
     assert "<b>.stl" not in page and "&lt;b&gt;.stl" in page
 
 
@@ -86,7 +70,7 @@ def test_a_proposal_is_a_table():
 def test_a_bar_on_a_terminal_counts_to_the_end(capsys):
     spadwarp.simulate(SCENE, photons=20_000, device="cpu", progress=spadwarp.viz.progress_bar())
     text = capsys.readouterr().err
-    assert "loading kernels" in text and "100 %, 20000 of 20000 photons" in text and text.endswith("\n")
+    assert "loading kernels" in text and "100 %  20 000 of 20 000 photons" in text and text.endswith("\n")
 
 
 def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
@@ -94,33 +78,25 @@ def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
     from spadwarp.viz import notebook
 
     shown = []
-
-    class Handle:
-        def update(self, html):
-            shown.append(html.data)
-
-    def first(html, display_id):
-        assert display_id
-        shown.append(html.data)
-        return Handle()
-
-    monkeypatch.setattr(display, "display", first)
+    handle = SimpleNamespace(update=lambda html: shown.append(html.data))
+    monkeypatch.setattr(display, "display", lambda html, display_id: shown.append(html.data) or handle)
     monkeypatch.setattr(notebook, "_in_notebook", lambda: True)
     bar = spadwarp.viz.progress_bar("frames")
     for stage, done, total in (("compile", 0, 0), ("<note>", 0, 0), ("frames", 1, 4), ("frames", 4, 4)):
         bar(stage, done, total)
     assert [text.split("</progress> ")[1] for text in shown][1:] == [
         "&lt;note&gt;",
-        "25 %, 1 of 4 frames",
-        "100 %, 4 of 4 frames",
+        " 25 %  1 of 4 frames",
+        "100 %  4 of 4 frames",
     ]
 
 
 # xarray
 
 
-def test_a_result_as_labelled_arrays(result):
+def test_a_result_as_labelled_arrays(result, tmp_path):
     data = result.to_xarray()
+    data.to_netcdf(tmp_path / "result.nc", engine="scipy")
     assert dict(data.sizes) == {"component": 3, "y": 4, "x": 4, "time": 64, "axis": 3}
     assert np.array_equal(data.histogram.sel(component="backscatter"), result.component("backscatter"))
     assert np.allclose(data.histogram.sum("component"), result.histogram, rtol=1e-12)
@@ -139,10 +115,6 @@ def test_frames_and_maps_as_labelled_arrays(frames, analytic):
     maps = analytic.to_xarray()
     assert np.array_equal(maps.sigma_depth, analytic.sigma_depth, equal_nan=True)
     assert maps.sigma_depth.attrs["units"] == "m" and maps.depth.dims == ("frame", "y", "x")
-
-
-def test_labelled_arrays_go_into_a_file(result, tmp_path):
-    result.to_xarray().to_netcdf(tmp_path / "result.nc", engine="scipy")
 
 
 # Data frames

@@ -24,6 +24,8 @@ def test_light_stays_in_its_time_and_a_peak_in_its_bin():
     light[40], light[60] = 1000.0, 1.0
     edges = merged_edges(light, light)
     assert {40, 41, 61} <= set(edges) and not set(range(1, 40)) & set(edges)
+    edges = merged_edges(0.0 * light, 0.0 * light)  # nothing is one group of nothing
+    assert merged_means(0.0 * light, edges).sum() == 0 and edges[-1] == 100
 
 
 @pytest.mark.parametrize("weight", [1e-3, 5.0])
@@ -31,11 +33,6 @@ def test_the_weight_of_a_photon_is_found_on_a_slope(weight):
     counts = np.random.default_rng(2).poisson(np.geomspace(2000.0, 20.0, 300))
     # The median of the square of a normal variable is 0.45 of its mean.
     assert np.median(typical_weight(weight * counts)) == pytest.approx(0.45 * weight, rel=0.25)
-
-
-def test_nothing_is_one_group_of_nothing():
-    edges = merged_edges(np.zeros(8), np.zeros(8))
-    assert merged_means(np.zeros(8), edges).sum() == 0 and edges[-1] == 8
 
 
 def test_no_group_of_the_sum_goes_across_the_first_light_of_a_component():

@@ -228,30 +228,19 @@ def sample_frames(
 
 @wp.struct
 class FrameCoding:
-    """What is drawn, and how it is written.
+    """What is drawn, and how it is written."""
 
-    Attributes:
-        laser: Position of the laser [m].
-        nearest, farthest: Paths at which the gate opens and closes [m].
-        width, pixels: Of a row, of a frame.
-        seed: Of the random numbers.
-        first_sample: Id of the first frame; the others follow.
-        depth_offset, depth_step: depth = offset + step · code [m]; code 0 is no return.
-        pulses: Pulses of a frame.
-        intensity_step: Recorded photons per unit of the intensity code.
-    """
-
-    laser: wp.vec3
-    nearest: float
-    farthest: float
-    width: int
-    pixels: int
-    seed: wp.uint64
-    first_sample: wp.int64
-    depth_offset: float
-    depth_step: float
-    pulses: float
-    intensity_step: float
+    laser: wp.vec3  # position of the laser [m]
+    nearest: float  # path at which the gate opens [m]
+    farthest: float  # path at which it closes [m]
+    width: int  # pixels of a row
+    pixels: int  # of a frame
+    seed: wp.uint64  # of the random numbers
+    first_sample: wp.int64  # id of the first frame; the others follow
+    depth_offset: float  # [m]: depth = offset + step · code; code 0 is no return
+    depth_step: float  # [m]
+    pulses: float  # pulses of a frame
+    intensity_step: float  # recorded photons per unit of the intensity code
 
 
 @memoised

@@ -40,67 +40,40 @@ BACKSCATTER_SOURCES = ("constant", "single_scatter", "monte_carlo")
 
 @wp.struct
 class Ports:
-    """The ports that an `Optics` of them reads; those of a camera and a laser in the water are as they are made.
+    """The ports that an `Optics` of them reads; those of a camera and a laser in the water are as they are made."""
 
-    Attributes:
-        camera: What the camera looks through.
-        laser: What the laser shines through.
-    """
-
-    camera: Port
-    laser: Port
+    camera: Port  # what the camera looks through
+    laser: Port  # what the laser shines through
 
 
 @wp.struct
 class Lidar:
-    """Laser, water, camera and gate as the analytic model needs them.
-
-    Attributes:
-        lu2024: 1 if the photon budget of Lu et al. 2024 (K = 8, small angles, no cosines) replaces radiometry, else 0.
-        photons: Photons per pulse, E0 λ/hc.
-        pde: Photon detection efficiency, PDP times fill factor.
-        extinction, scattering: Of the water [1/m].
-        speed: Group velocity c0/n_g [m/s].
-        laser, axis: Position [m] and unit direction of the laser.
-        profile: Index into LASER_PROFILES.
-        spread: 1 - cos(half angle) (uniform cone); unused otherwise.
-        tan2: tan^2 of the half angle.
-        radius: Beam radius [m] (collimated).
-        pixel_tangent: Pixel pitch over focal length.
-        aperture_area: [m^2].
-        start, stop: The gate [s].
-        sigma: Standard deviation of the instrument response [s].
-        dark: Rate of dark counts and ambient light [1/s].
-        source: Index into BACKSCATTER_SOURCES.
-        constant: Backscatter rate [1/s] (source 0).
-        nearest: Range below which single scattering is left out [m] (source 1).
-        bin_width: Of the Monte Carlo profile [s] (source 2).
-        ports: What camera and laser are behind, for the optics that say so.
-    """
+    """Laser, water, camera and gate as the analytic model needs them."""
 
     lu2024: int
-    photons: wp.float64
-    pde: wp.float64
-    extinction: wp.float64
-    scattering: wp.float64
-    speed: wp.float64
-    laser: wp.vec3d
-    axis: wp.vec3d
-    profile: int
-    spread: wp.float64
-    tan2: wp.float64
-    radius: wp.float64
-    pixel_tangent: wp.float64
-    aperture_area: wp.float64
-    start: wp.float64
-    stop: wp.float64
-    sigma: wp.float64
-    dark: wp.float64
-    source: int
-    constant: wp.float64
-    nearest: wp.float64
-    bin_width: wp.float64
-    ports: Ports
+    """1 if the photon budget of Lu et al. 2024 (K = 8, small angles, no cosines) replaces radiometry, else 0."""
+    photons: wp.float64  # photons per pulse, E0 λ/hc
+    pde: wp.float64  # photon detection efficiency, PDP times fill factor
+    extinction: wp.float64  # of the water [1/m]
+    scattering: wp.float64  # of the water [1/m]
+    speed: wp.float64  # group velocity c0/n_g [m/s]
+    laser: wp.vec3d  # position of the laser [m]
+    axis: wp.vec3d  # its unit direction
+    profile: int  # index into LASER_PROFILES
+    spread: wp.float64  # 1 - cos(half angle) (uniform cone); unused otherwise
+    tan2: wp.float64  # tan^2 of the half angle
+    radius: wp.float64  # beam radius [m] (collimated)
+    pixel_tangent: wp.float64  # pixel pitch over focal length
+    aperture_area: wp.float64  # [m^2]
+    start: wp.float64  # of the gate [s]
+    stop: wp.float64  # of the gate [s]
+    sigma: wp.float64  # standard deviation of the instrument response [s]
+    dark: wp.float64  # rate of dark counts and ambient light [1/s]
+    source: int  # index into BACKSCATTER_SOURCES
+    constant: wp.float64  # backscatter rate [1/s] (source 0)
+    nearest: wp.float64  # range below which single scattering is left out [m] (source 1)
+    bin_width: wp.float64  # of the Monte Carlo profile [s] (source 2)
+    ports: Ports  # what camera and laser are behind, for the optics that say so
 
 
 @wp.struct

@@ -35,7 +35,7 @@ def _limits(interval: str) -> tuple[float, float, bool, bool]:
 
 
 def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
-    """A finite number within an interval, written as in an error: `"[0, 1)"`; a closed end is compared as float32."""
+    """A finite number in an interval, as in an error: `"[0, 1)"`; closed ends hold what float32 makes of them."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -43,7 +43,7 @@ def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
     low, high, low_open, high_open = _limits(interval)
     inside = (low < number if low_open else low <= number) and (number < high if high_open else number <= high)
     ends = [end for end, is_open in ((low, low_open), (high, high_open)) if not is_open]
-    if not (math.isfinite(number) and (inside or any(np.float32(end) == np.float32(number) for end in ends))):
+    if not (math.isfinite(number) and (inside or any(math.isclose(number, end, rel_tol=6e-8) for end in ends))):
         raise ArgumentError(f"{name} = {value} is outside {interval}")
     return number
 

@@ -9,10 +9,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_choice, check_integer, check_numbers
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_array,
+    check_choice,
+    check_integer,
+    check_number,
+    check_numbers,
+)
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 
 from .counts import RATES
+from .significance import COUNTS, MIN_SIGNIFICANCE, DetectionTest
 
 __all__ = ["PHASES", "arrival_bins"]
 
@@ -50,6 +58,23 @@ class _Search:
     lowest_tap: int
     floor: float  # of the background, a part of the counts
     coarse_step: int  # of the first search [phases]
+    # Of the detection:
+    min_significance: float
+    significance: wp.array[float]
+    window: wp.array[int]
+    half_width_of_window: int
+    peak_tap: int  # of the response, from the bin of the return
+
+
+@wp.func
+def _bins_to_search(search: _Search, pixel: int) -> wp.vec2i:
+    """First bin and stop: with a threshold the window that was detected, with half of it on either side, or none."""
+    if search.min_significance <= 0.0:
+        return wp.vec2i(search.first, search.stop)
+    if search.significance[pixel] < search.min_significance:
+        return wp.vec2i(0, 0)
+    first = search.window[pixel] - search.half_width_of_window - search.peak_tap
+    return wp.vec2i(wp.max(first, search.first), wp.min(first + 4 * search.half_width_of_window, search.stop))
 
 
 @wp.func
@@ -63,9 +88,10 @@ def _peak_kernel(dtype: Any, centroid: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def peak(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
+        bins = _bins_to_search(search, pixel)
         peak_bin = int(-1)
         highest = float(0.0)
-        for k in range(search.first, search.stop):
+        for k in range(bins[0], bins[1]):
             excess = float(histogram[pixel, k]) - _level(search, pixel, k)
             if excess > highest:
                 highest = excess
@@ -163,13 +189,14 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     def find(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
         coarse_step = search.coarse_step
+        bins = _bins_to_search(search, pixel)
         total = float(0.0)
         for k in range(search.first, search.stop):
             total += float(histogram[pixel, k])
         least = search.floor * total
         best = wp.vec3(0.0, -1.0, -1.0)
         if total > 0.0:
-            for step in range(search.first * PHASES / coarse_step, search.stop * PHASES / coarse_step):
+            for step in range(bins[0] * PHASES / coarse_step, bins[1] * PHASES / coarse_step):
                 phases = step * coarse_step
                 score = score_of(histogram, search, pixel, phases, least, best[0])
                 if score > 0.0:
@@ -196,8 +223,8 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
 
 
 class ArrivalEstimator:
-    """`arrival_bins` for histograms of so many bins on a device, with everything prepared: a call allocates nothing and
-    reads no value on the host. Arguments and errors are those of `arrival_bins`."""
+    """`arrival_bins` for histograms of so many bins on a device, with everything prepared: a call reads no value on the
+    host, and from the second one of as many pixels on allocates nothing. Arguments and errors: see `arrival_bins`."""
 
     def __init__(
         self,
@@ -210,6 +237,9 @@ class ArrivalEstimator:
         first: int = 0,
         stop: int | None = None,
         half_width: int = 3,
+        min_significance: float = MIN_SIGNIFICANCE,
+        width: float | None = None,
+        **test: Any,
     ) -> None:
         check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
         self.device, self.method = wp.get_device(device), method
@@ -233,6 +263,7 @@ class ArrivalEstimator:
             if taps.ndim != 2 or taps.shape[0] != PHASES or taps.size == 0:
                 raise ArgumentError(f"response has shape {taps.shape}; ({PHASES}, taps) is needed")
             largest = taps.max()
+            width = np.count_nonzero(taps[0] >= 0.5 * taps[0].max()) if width is None else width
             if not (np.isfinite(taps).all() and taps.min() >= 0.0 and largest > 0.0):
                 limits = "finite values >= 0 are needed, and one above"
                 raise ArgumentError(f"response holds {taps.min()} to {largest}; {limits}")
@@ -242,16 +273,29 @@ class ArrivalEstimator:
             if method == "matched":
                 # ln(h / floor): counts outside the response add the same to every delay.
                 taps = np.log(np.maximum(taps, floor) / floor)
+            search.peak_tap = search.lowest_tap + int(np.argmax(taps[0]))
         search.response = wp.array(taps.astype(np.float32), device=self.device)
+        search.min_significance = check_number("min_significance", min_significance, "[0, 1e6]")
+        test = {"first": first, "stop": stop, "background": background if "profile" not in test else None, **test}
+        self._test = DetectionTest(bins, self.device, half_width / 1.5 if width is None else width, **test)
+        search.half_width_of_window = self._test.half_width
 
-    def __call__(self, histogram: wp.array, arrival: wp.array) -> None:
-        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`."""
+    def __call__(self, histogram: wp.array, arrival: wp.array, significance: wp.array | None = None) -> None:
+        """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`, and of counts, where there is an
+        array for it or a threshold, the significance."""
         check_array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
         check_array("arrival", arrival, wp.float32, (pixels,), self.device)
         make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
         kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
-        launch_pixels(kernel, pixels, [histogram, self._search, arrival], device=self.device)
+        search = self._search
+        if search.min_significance > 0.0 or significance is not None:
+            if search.window is None or search.window.shape != (pixels,):
+                search.window, search.significance = (wp.empty(pixels, kind, self.device) for kind in (int, float))
+            if significance is not None:
+                search.significance = significance
+            self._test(histogram, search.significance, search.window)
+        launch_pixels(kernel, pixels, [histogram, search, arrival], device=self.device)
 
 
 def arrival_bins(
@@ -264,6 +308,9 @@ def arrival_bins(
     first: int = 0,
     stop: int | None = None,
     half_width: int = 3,
+    min_significance: float | None = None,
+    significance: wp.array | None = None,
+    **test: Any,
 ) -> wp.array:
     """Arrival time of every pixel [bins from the start of bin 0], NaN where there is none.
 
@@ -280,16 +327,24 @@ def arrival_bins(
         lowest_tap: bin of the first tap, relative to the bin of the return.
         first, stop: the bins looked at, [first, stop).
         half_width: of the centroid's window [bins].
+        min_significance: pixels below this significance (`DetectionTest`) have no arrival time; in the others it is
+            looked for where they have detected something. 0: every pixel reports, from all bins. Default: 4, one false
+            alarm in 10^4 pixels; 0 for rates, which have no significance.
+        significance: array to write that of each pixel into, float32 `[pixel]`.
+        test: `width` (default: that of the response, or `half_width` / 1.5), `profile` (in place of the background, for
+            the test), `pulses` and `pixels` of `DetectionTest`.
 
     Returns:
-        float32 `[pixel]` on the histogram's device. NaN: nothing returned (no counts, or none above the background).
+        float32 `[pixel]` on the histogram's device. NaN: nothing detected, or no counts above the background.
 
     Raises:
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
     check_array("histogram", histogram, RATES, (None, None))
     bins, device = histogram.shape[1], histogram.device
-    search = (method, background, response, lowest_tap, first, stop, half_width)
+    if min_significance is None:
+        min_significance = MIN_SIGNIFICANCE if histogram.dtype in COUNTS else 0.0
+    search = (method, background, response, lowest_tap, first, stop, half_width, min_significance)
     arrival = wp.empty(histogram.shape[0], dtype=float, device=device)
-    ArrivalEstimator(bins, device, *search)(histogram, arrival)
+    ArrivalEstimator(bins, device, *search, **test)(histogram, arrival, significance)
     return arrival

@@ -33,26 +33,23 @@ class Estimator(NamedTuple):
     Every function may be any mixture of physics and chance as long as the expectation of the histogram is that of the
     analog walk. They take the state of the photon and the world by reference and return a small struct; the stages
     alone change the state.
-
-    Attributes:
-        cross: ``(s, world) -> Contribution``, what the photon itself brings on the flight that ends in
-            its event; needs no shadow ray.
-        plan_flight: ``(s, block, world) -> FlightPlan``, before a flight is traced;
-            `block`: random words, the third and fourth for the lens.
-        request_flight: ``(s) -> Request``, the score of a flight whose planned interval is not empty.
-        request_event: ``(s, world) -> Request``, the score of the event that the photon has come to.
-        score: ``(request, world) -> Scored``; needed with either request. It delivers what rides along,
-            see `Rider`.
-        direct: ``(s, reflected, lobe, world, id) -> Direction``, instead of the phase function and the surface's law;
-            `reflected` is the draw of a rough specular surface.
     """
 
     cross: wp.Function | None = None
+    """``(s, world) -> Contribution``, what the photon itself brings on the flight that ends in its event; needs no
+    shadow ray."""
     plan_flight: wp.Function | None = None
+    """``(s, block, world) -> FlightPlan``, before a flight is traced; `block`: random words, the third and fourth for
+    the lens."""
     request_flight: wp.Function | None = None
+    """``(s) -> Request``, the score of a flight whose planned interval is not empty."""
     request_event: wp.Function | None = None
+    """``(s, world) -> Request``, the score of the event that the photon has come to."""
     score: wp.Function | None = None
+    """``(request, world) -> Scored``; needed with either request. It delivers what rides along, see `Rider`."""
     direct: wp.Function | None = None
+    """``(s, reflected, lobe, world, id) -> Direction``, instead of the phase function and the surface's law;
+    `reflected` is the draw of a rough specular surface."""
 
     @property
     def scores(self) -> bool:

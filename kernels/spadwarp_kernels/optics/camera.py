@@ -18,36 +18,25 @@ __all__ = ["C0", "CALIBRATED", "PLAIN", "Camera", "Gate", "Lens"]
 
 @wp.struct
 class Camera:
-    """A camera with a thin lens: a disc in the plane z = 0 that images one depth sharply.
+    """A camera with a thin lens: a disc in the plane z = 0 that images one depth sharply."""
 
-    Attributes:
-        width, height: Image size [pixels].
-        pixel_tangent: Pixel pitch over image distance.
-        aperture_radius: Radius of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply.
-        aperture_area: The area that collects light [m^2], also where the lens is a point.
-        inverse_focus: 1 over the depth that is imaged sharply [1/m]; 0 is infinity.
-        focal: Focal length in pixels along rows and columns. This and what follows is for `CALIBRATED` alone;
-            for `PLAIN`, `launch_transport` computes what it needs of it.
-        principal: Image coordinates of the optical axis.
-        radial: k1, k2, k3 of Brown's model.
-        tangential: p1, p2 of Brown's model.
-        view: Least and largest tangents (left, top, right, bottom) of what the image shows: a box that holds it.
-        port: What is between the lens and the water, see `make_flat_port`; read by specs with a port alone. View and
-            focus are those in the air behind it.
-    """
-
-    width: int
-    height: int
-    pixel_tangent: float
+    width: int  # of the image [pixels]
+    height: int  # of the image [pixels]
+    pixel_tangent: float  # pixel pitch over image distance
     aperture_radius: float
-    aperture_area: float
-    inverse_focus: float
+    """Radius of the entrance pupil [m]; 0 makes the lens a point, which images all depths sharply."""
+    aperture_area: float  # the area that collects light [m^2], also where the lens is a point
+    inverse_focus: float  # 1 over the depth that is imaged sharply [1/m]; 0 is infinity
     focal: wp.vec2
-    principal: wp.vec2
-    radial: wp.vec3
-    tangential: wp.vec2
-    view: wp.vec4
+    """Focal length in pixels along rows and columns. This and what follows is for `CALIBRATED` alone; for `PLAIN`,
+    `launch_transport` computes what it needs of it."""
+    principal: wp.vec2  # image coordinates of the optical axis
+    radial: wp.vec3  # k1, k2, k3 of Brown's model
+    tangential: wp.vec2  # p1, p2 of Brown's model
+    view: wp.vec4  # least and largest tangents (left, top, right, bottom) of what the image shows: a box that holds it
     port: Port
+    """What is between the lens and the water, see `make_flat_port`; read by specs with a port alone. View and focus are
+    those in the air behind it."""
 
 
 @wp.func
@@ -227,19 +216,12 @@ C0 = 299_792_458.0
 
 @wp.struct
 class Gate:
-    """Equal bins of geometric path.
+    """Equal bins of geometric path."""
 
-    Attributes:
-        start: Path of the gate's begin [m]; bin k covers [start + k w, start + (k + 1) w).
-        stop: Path at which it ends [m], before the last bin does if histories may not be as long.
-        bins_per_metre: 1/w [1/m].
-        bins: Number of bins.
-    """
-
-    start: float
-    stop: float
-    bins_per_metre: float
-    bins: int
+    start: float  # path of the gate's begin [m]; bin k covers [start + k w, start + (k + 1) w)
+    stop: float  # path at which it ends [m], before the last bin does if histories may not be as long
+    bins_per_metre: float  # 1/w [1/m]
+    bins: int  # number of bins
 
 
 BEFORE = wp.constant(-1)
@@ -284,22 +266,15 @@ def clip_to_gate(gate: Gate, x: wp.vec3, u: wp.vec3, path: float, lens: wp.vec3,
 
 
 class Lens(NamedTuple):
-    """A way of imaging, as Warp functions for the camera that the transport kernel gets, see `Camera.focal`.
+    """A way of imaging, as Warp functions for the camera that the transport kernel gets, see `Camera.focal`."""
 
-    Attributes:
-        name: "plain" or "calibrated"; identifies it in the kernel cache.
-        project: (camera, view, target, x, o) -> the pixel that images x by way of o, or -1.
-        view: (camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image, or the pixel of
-            a scan, shows.
-        shows: As `in_view`, for such a view without a port.
-        toward_middle: As the function of that name, for such a view.
-    """
-
-    name: str
-    project: wp.Function
+    name: str  # "plain" or "calibrated"; identifies it in the kernel cache
+    project: wp.Function  # (camera, view, target, x, o) -> the pixel that images x by way of o, or -1
     view: wp.Function
-    shows: wp.Function = in_view
-    toward_middle: wp.Function = toward_middle
+    """(camera, view) -> tangents (left, top, right, bottom) of a box that holds what the image, or the pixel of a scan,
+    shows."""
+    shows: wp.Function = in_view  # as `in_view`, for such a view without a port
+    toward_middle: wp.Function = toward_middle  # as the function of that name, for such a view
 
 
 @wp.func

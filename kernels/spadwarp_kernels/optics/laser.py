@@ -20,32 +20,22 @@ LASER_PROFILES = ("uniform_cone", "gaussian", "collimated")
 
 @wp.struct
 class Laser:
-    """A laser in camera coordinates.
+    """A laser in camera coordinates."""
 
-    Attributes:
-        position: Centre of the exit pupil [m].
-        axis: Unit vector of the beam.
-        profile: Index into LASER_PROFILES.
-        spread: 1 - cos of the half angle, in [0, 2] (uniform cone).
-        tan2: tan^2 of the half angle at which the irradiance is 1/e^2 of that on the axis (gaussian).
-        radius: Beam radius at the exit [m] (collimated; 0 is a pencil beam).
-        rows, columns: Distribution functions of a measured profile, see `profile_tables`; this and what follows is
-            read by `emit_measured` alone.
-        extent: Tangents of the profile's half width and half height.
-        port: What is between the laser and the water, in the frame of the camera, see `make_flat_port`; read by specs
-            with a port of the laser alone.
-    """
-
-    position: wp.vec3
-    axis: wp.vec3
-    profile: int
-    spread: float
-    tan2: float
-    radius: float
+    position: wp.vec3  # centre of the exit pupil [m]
+    axis: wp.vec3  # unit vector of the beam
+    profile: int  # index into LASER_PROFILES
+    spread: float  # 1 - cos of the half angle, in [0, 2] (uniform cone)
+    tan2: float  # tan^2 of the half angle at which the irradiance is 1/e^2 of that on the axis (gaussian)
+    radius: float  # beam radius at the exit [m] (collimated; 0 is a pencil beam)
     rows: wp.array[float]
-    columns: wp.array2d[float]
-    extent: wp.vec2
+    """Distribution functions of a measured profile, see `profile_tables`; this and what follows is read by
+    `emit_measured` alone."""
+    columns: wp.array2d[float]  # likewise
+    extent: wp.vec2  # tangents of the profile's half width and half height
     port: Port
+    """What is between the laser and the water, in the frame of the camera, see `make_flat_port`; read by specs with a
+    port of the laser alone."""
 
 
 @wp.func
@@ -152,17 +142,12 @@ def emit_measured(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
 
 @wp.struct
 class Scan:
-    """A raster that laser and pixel walk together: photon id belongs to position id mod `count`.
+    """A raster that laser and pixel walk together: photon id belongs to position id mod `count`."""
 
-    Attributes:
-        count: Number of positions; position i is scored into pixel i.
-        axis: Unit vector of the beam at each.
-        view: Tangents (left, top, right, bottom) of what each position's pixel sees; a box that holds it.
-    """
-
-    count: int
-    axis: wp.array[wp.vec3]
+    count: int  # number of positions; position i is scored into pixel i
+    axis: wp.array[wp.vec3]  # unit vector of the beam at each
     view: wp.array[wp.vec4]
+    """Tangents (left, top, right, bottom) of what each position's pixel sees; a box that holds it."""
 
 
 class Beam(NamedTuple):

@@ -20,21 +20,16 @@ Channels = wp.types.matrix(shape=(3, 4), dtype=float)
 
 @wp.struct
 class Polarisation:
-    """Parameters of a polarised spec, made by `make_polarisation`.
+    """Parameters of a polarised spec, made by `make_polarisation`."""
 
-    Attributes:
-        laser: Stokes vector of the beam on its axis, I = 1, with respect to the right of `beam_frame`.
-        first, last: Tables of m12, m22, m33, m34 and of m44 at `matrix_cosines`, see `Elements`.
-        channels: A row for each channel of the receiver, whose product with the Stokes vector it takes; with respect to
-            the image's x, so that U is light at 45 degrees from x towards y less that at 135.
-        facet_index: Index of each face's specular facets over that of the water; empty without a specular lobe.
-    """
-
-    laser: wp.vec4
-    first: wp.array(dtype=wp.vec4)
-    last: wp.array(dtype=float)
+    laser: wp.vec4  # Stokes vector of the beam on its axis, I = 1, with respect to the right of `beam_frame`
+    first: wp.array(dtype=wp.vec4)  # table of m12, m22, m33, m34 at `matrix_cosines`, see `Elements`
+    last: wp.array(dtype=float)  # table of m44 there
     channels: Channels
+    """A row for each channel of the receiver, whose product with the Stokes vector it takes; with respect to the
+    image's x, so that U is light at 45 degrees from x towards y less that at 135."""
     facet_index: wp.array(dtype=float)
+    """Index of each face's specular facets over that of the water; empty without a specular lobe."""
 
 
 def matrix_cosines() -> NDArray[np.float64]:

@@ -20,36 +20,24 @@ class Port:
     A flat window is all space between the planes x·normal = distance and distance + thickness, a dome all between the
     spheres of radius and radius + thickness about its centre. With a thickness of 0 there is none, as at a calm
     surface.
-
-    Attributes:
-        normal: Unit vector into the water (flat).
-        distance: To the inner face from the origin along the normal [m] (flat).
-        centre: Of the spheres [m] (dome).
-        radius: Of the inner sphere [m] (dome).
-        thickness: Of the window [m].
-        index: Phase index of what is inside, of the window, of the water.
-        delay: Group index over that of the water, of what is inside and of the window.
-        glass_slope, water_slope: Bounds of the tangent that a ray makes with the normal in the window and in the water,
-            over that inside, among the rays of a view: (least, largest) (flat).
-        turn: Bound of the sine of the angle by which a ray of the view is bent (dome).
-        aside: Bound of a ray's distance from the centre, in the water [m] (dome).
-        early, late: The way through the port takes at most this much less, and more, than the straight line in water
-            [m of water].
     """
 
-    normal: wp.vec3
-    distance: float
-    centre: wp.vec3
-    radius: float
-    thickness: float
-    index: wp.vec3
-    delay: wp.vec2
+    normal: wp.vec3  # unit vector into the water (flat)
+    distance: float  # to the inner face from the origin along the normal [m] (flat)
+    centre: wp.vec3  # of the spheres [m] (dome)
+    radius: float  # of the inner sphere [m] (dome)
+    thickness: float  # of the window [m]
+    index: wp.vec3  # phase index of what is inside, of the window, of the water
+    delay: wp.vec2  # group index over that of the water, of what is inside and of the window
     glass_slope: wp.vec2
-    water_slope: wp.vec2
-    turn: float
-    aside: float
+    """Bounds of the tangent that a ray makes with the normal in the window over that inside, among the rays of a view:
+    (least, largest) (flat)."""
+    water_slope: wp.vec2  # the same in the water
+    turn: float  # bound of the sine of the angle by which a ray of the view is bent (dome)
+    aside: float  # bound of a ray's distance from the centre, in the water [m] (dome)
     early: float
-    late: float
+    """The way through the port takes at most this much less than the straight line in water [m of water]."""
+    late: float  # and at most this much more [m of water]
 
 
 @wp.struct
@@ -445,26 +433,18 @@ _FAR = 1.0e6
 
 
 class PortKind(NamedTuple):
-    """A kind of port; its name identifies it in the kernel cache.
+    """A kind of port; its name identifies it in the kernel cache."""
 
-    Attributes:
-        name: "flat" or "dome".
-        connect: Warp function (port, x, o) -> Connection from x in the water to o inside.
-        apparent: Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m].
-        apparent_centre: Warp function (port) -> about that point for the lens's centre, at once [m].
-        leave: Warp function (port, x, u) -> PortRay of a ray from the water to the plane z = 0 inside.
-        enter: Warp function (port, x, u) -> PortRay of a ray from inside into the water.
-        cosines: Warp function (port, x, u) -> vec4: index times cosine to the normal before and behind both interfaces,
-            in the order of `transmission`, of the ray through x in the water along u, on its way in or out.
-    """
-
-    name: str
-    connect: wp.Function
+    name: str  # "flat" or "dome"
+    connect: wp.Function  # Warp function (port, x, o) -> Connection from x in the water to o inside
     apparent: wp.Function
-    apparent_centre: wp.Function
-    leave: wp.Function
-    enter: wp.Function
+    """Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m]."""
+    apparent_centre: wp.Function  # Warp function (port) -> about that point for the lens's centre, at once [m]
+    leave: wp.Function  # Warp function (port, x, u) -> PortRay of a ray from the water to the plane z = 0 inside
+    enter: wp.Function  # Warp function (port, x, u) -> PortRay of a ray from inside into the water
     cosines: wp.Function
+    """Warp function (port, x, u) -> vec4: index times cosine to the normal before and behind both interfaces, in the
+    order of `transmission`, of the ray through x in the water along u, on its way in or out."""
 
 
 FLAT_PORT = PortKind("flat", connect_flat, apparent_flat, apparent_centre_flat, leave_flat, enter_flat, cosines_flat)

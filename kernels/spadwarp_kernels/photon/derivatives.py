@@ -55,44 +55,28 @@ _LARGEST_MEMORY = 1 << 28
 
 @wp.struct
 class Blocks:
-    """Blocks of the cells of a grid, made by `make_blocks`; the order of their scores is kind, then block.
+    """Blocks of the cells of a grid, made by `make_blocks`; the order of their scores is kind, then block."""
 
-    Attributes:
-        grid: The blocks as if they were the cells: its `turn`, `shift` and `size` alone are read.
-        count: Number of blocks.
-        kinds: Number of kinds of derivatives.
-        scale: Tally units of the derivative per emitted photon, by kind.
-        memory: Numbers by row and thread, of one launch. Of the history, and once more of what is scored: by kind and
-            block the score; the blocks that the light has met, in that order; how many they are.
-        threads, thread: How many there are, and which one this is.
-    """
-
-    grid: Grid
-    count: int
-    kinds: int
-    scale: wp.vec3
+    grid: Grid  # the blocks as if they were the cells: its `turn`, `shift` and `size` alone are read
+    count: int  # number of blocks
+    kinds: int  # number of kinds of derivatives
+    scale: wp.vec3  # tally units of the derivative per emitted photon, by kind
     memory: wp.array[float]
-    threads: int
-    thread: int
+    """Numbers by row and thread, of one launch. Of the history, and once more of what is scored: by kind and block the
+    score; the blocks that the light has met, in that order; how many they are."""
+    threads: int  # how many there are
+    thread: int  # which one this is
 
 
 @wp.struct
 class Derivatives:
-    """The parameters of a spec with derivatives, in its order, or of its channels; made by `make_derivatives`.
+    """The parameters of a spec with derivatives, in its order, or of its channels; made by `make_derivatives`."""
 
-    Attributes:
-        value: Of each parameter.
-        scale: Tally units of its derivative per emitted photon.
-        waters: By layer, bit p set: parameter p is of this layer; not read without layers.
-        faces: By face, bit p set: parameter p is this face's reflectance, or a factor on it.
-        blocks: Of a spec with blocks, from `make_blocks`.
-    """
-
-    value: LogDerivatives
-    scale: LogDerivatives
-    waters: wp.array[int]
-    faces: wp.array[int]
-    blocks: Blocks
+    value: LogDerivatives  # of each parameter
+    scale: LogDerivatives  # tally units of its derivative per emitted photon
+    waters: wp.array[int]  # by layer, bit p set: parameter p is of this layer; not read without layers
+    faces: wp.array[int]  # by face, bit p set: parameter p is this face's reflectance, or a factor on it
+    blocks: Blocks  # of a spec with blocks, from `make_blocks`
 
 
 def make_derivatives(

@@ -46,25 +46,15 @@ class World:
 
 @wp.struct
 class Records:
-    """Terminal states by photon; arrays of length 0 where they are not asked for.
+    """Terminal states by photon; arrays of length 0 where they are not asked for."""
 
-    Attributes:
-        position: Where the history ended [m].
-        direction: Unit vector of its last flight.
-        weight: Weight at the end.
-        path: Geometric path [m].
-        collisions: Events, surfaces included.
-        reason: Ledger entry that took the rest of the weight.
-        log_derivatives: Of what the history has met, [photons, derivatives]; empty without them.
-    """
-
-    position: wp.array[wp.vec3]
-    direction: wp.array[wp.vec3]
-    weight: wp.array[float]
-    path: wp.array[float]
-    collisions: wp.array[int]
-    reason: wp.array[int]
-    log_derivatives: wp.array2d[float]
+    position: wp.array[wp.vec3]  # where the history ended [m]
+    direction: wp.array[wp.vec3]  # unit vector of its last flight
+    weight: wp.array[float]  # weight at the end
+    path: wp.array[float]  # geometric path [m]
+    collisions: wp.array[int]  # events, surfaces included
+    reason: wp.array[int]  # ledger entry that took the rest of the weight
+    log_derivatives: wp.array2d[float]  # of what the history has met, [photons, derivatives]; empty without them
 
 
 def make_records(count: int, *, device: wp.DeviceLike = None, derivatives: int = 0) -> Records:

@@ -42,27 +42,22 @@ def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3,
 
 
 class Rider(NamedTuple):
-    """What becomes of what rides along, as Warp functions.
-
-    Attributes:
-        begin: ``(carried, world, target, emitted, x, u)``, for a photon that was emitted, see `make_emit`, and is in
-            the water at x on its way along u.
-        fork: ``(carried, world)``: what follows is of a contribution, no longer of the photon.
-        fly: ``(carried, world, x, u, length)``, a way in the water.
-        event: ``(carried, world, slot, x, u, v)``, an event at x that turns light from u to v, on the face of a slot of
-            the mesh's tree or (-1) in the water.
-        mirror: ``(carried, u, v, index)``, a smooth boundary that mirrors light from u to v, for the index behind it
-            over that of the water.
-        deliver: ``(contribution, carried, world, end, u, inside)``: light along u that leaves the water at `end` for
-            the lens, where it arrives along the unit vector `inside`.
-    """
+    """What becomes of what rides along, as Warp functions."""
 
     begin: wp.Function = _begin
-    fork: wp.Function = _fork
-    fly: wp.Function = _fly
+    """``(carried, world, target, emitted, x, u)``, for a photon that was emitted, see `make_emit`, and is in the water
+    at x on its way along u."""
+    fork: wp.Function = _fork  # ``(carried, world)``: what follows is of a contribution, no longer of the photon
+    fly: wp.Function = _fly  # ``(carried, world, x, u, length)``, a way in the water
     event: wp.Function = _event
+    """``(carried, world, slot, x, u, v)``, an event at x that turns light from u to v, on the face of a slot of the
+    mesh's tree or (-1) in the water."""
     mirror: wp.Function = _mirror
+    """``(carried, u, v, index)``, a smooth boundary that mirrors light from u to v, for the index behind it over that
+    of the water."""
     deliver: wp.Function = _deliver
+    """``(contribution, carried, world, end, u, inside)``: light along u that leaves the water at `end` for the lens,
+    where it arrives along the unit vector `inside`."""
 
     @property
     def rides(self) -> bool:

@@ -30,58 +30,38 @@ __all__ = ["Surfaces", "Textures", "make_surfaces", "make_textures", "surface_ch
 
 @wp.struct
 class Textures:
-    """Images on faces; arrays of length 0 where there are none.
+    """Images on faces; arrays of length 0 where there are none."""
 
-    Attributes:
-        face: Texture of each face, -1 for none.
-        coordinates: (u, v) of the corners of each face, [faces, 3]; u to the right, v up, images repeat with period 1.
-        region: (offset into `texels`, width, height) of each texture.
-        texels: Reflectance factors in [0, 1], row after row from the top.
-    """
-
-    face: wp.array[int]
+    face: wp.array[int]  # texture of each face, -1 for none
     coordinates: wp.array2d[wp.vec2]
-    region: wp.array[wp.vec3i]
-    texels: wp.array[float]
+    """(u, v) of the corners of each face, [faces, 3]; u to the right, v up, images repeat with period 1."""
+    region: wp.array[wp.vec3i]  # (offset into `texels`, width, height) of each texture
+    texels: wp.array[float]  # reflectance factors in [0, 1], row after row from the top
 
 
 @wp.struct
 class Surfaces:
-    """The target as the kernels take it, see `make_surfaces`.
+    """The target as the kernels take it, see `make_surfaces`."""
 
-    Attributes:
-        mesh: Id of a `wp.Mesh`.
-        lower, upper: Its bounding box [m], padded against rounding.
-        nodes, faces, order: The mesh's tree, see `bvh`, on the CPU `wide`.
-        reflectance: Of each face, in [0, 1].
-        near_depth: What the camera cannot miss, see `near_depth_map`; empty if nothing is known.
-        corner_reflectance: At the three corners of each face, instead of `reflectance`; empty unless it varies.
-        textures: Images that multiply the corners' reflectance.
-        specular: Reflectance of the facets of the specular lobe, of each face; empty if there is none.
-        roughness: Their width parameter, see `microfacet`.
-        depth, levels: Of the nodes of a moving mesh's tree on CUDA, and their number; else empty, and 1 for a moving
-            mesh on the CPU.
-        extent: Largest coordinate that the tree is made for [m].
-        patches, normals: Of a mesh of up to BRUTE_FORCE_FACES faces on CUDA, for rays that try them all.
-    """
-
-    mesh: wp.uint64
-    lower: wp.vec3
-    upper: wp.vec3
-    nodes: wp.array[wp.vec4]
-    faces: wp.array[wp.vec4]
-    order: wp.array[int]
-    reflectance: wp.array[float]
-    near_depth: wp.array2d[float]
+    mesh: wp.uint64  # id of a `wp.Mesh`
+    lower: wp.vec3  # of its bounding box [m], padded against rounding
+    upper: wp.vec3  # of the same
+    nodes: wp.array[wp.vec4]  # the mesh's tree, see `bvh`, on the CPU `wide`
+    faces: wp.array[wp.vec4]  # likewise
+    order: wp.array[int]  # likewise
+    reflectance: wp.array[float]  # of each face, in [0, 1]
+    near_depth: wp.array2d[float]  # what the camera cannot miss, see `near_depth_map`; empty if nothing is known
     corner_reflectance: wp.array[wp.vec3]
-    textures: Textures
-    specular: wp.array[float]
-    roughness: wp.array[float]
+    """At the three corners of each face, instead of `reflectance`; empty unless it varies."""
+    textures: Textures  # images that multiply the corners' reflectance
+    specular: wp.array[float]  # reflectance of the facets of the specular lobe, of each face; empty if there is none
+    roughness: wp.array[float]  # their width parameter, see `microfacet`
     depth: wp.array[int]
-    levels: int
-    extent: float
-    patches: wp.array[wp.vec4]
-    normals: wp.array[wp.vec4]
+    """Of the nodes of a moving mesh's tree on CUDA; else empty."""
+    levels: int  # their number; 1 for a moving mesh on the CPU
+    extent: float  # largest coordinate that the tree is made for [m]
+    patches: wp.array[wp.vec4]  # of a mesh of up to BRUTE_FORCE_FACES faces on CUDA, for rays that try them all
+    normals: wp.array[wp.vec4]  # likewise
 
 
 def make_surfaces(

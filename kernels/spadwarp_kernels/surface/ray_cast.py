@@ -27,19 +27,12 @@ __all__ = ["SurfaceHit", "intersect_mesh", "intersect_surfaces", "offset_from_su
 
 @wp.struct
 class SurfaceHit:
-    """Nearest surface along a ray.
+    """Nearest surface along a ray."""
 
-    Attributes:
-        distance: [m].
-        normal: Unit vector on the ray's side.
-        face: Its index; -1 for a miss.
-        slot: Its index in the order of the mesh's tree, where that was walked; -1 for a miss.
-    """
-
-    distance: float
-    normal: wp.vec3
-    face: int
-    slot: int
+    distance: float  # [m]
+    normal: wp.vec3  # unit vector on the ray's side
+    face: int  # its index; -1 for a miss
+    slot: int  # its index in the order of the mesh's tree, where that was walked; -1 for a miss
 
 
 @wp.func

@@ -74,38 +74,29 @@ _STRUCTS = {name: var.type for name, var in World.vars.items() if name not in ("
 class Model:
     """What is transported through: immutable, on one device.
 
-    Attributes:
-        device: Warp device that holds the arrays.
-        medium, laser, camera, gate, limits, guiding: Parameter structs.
-        mesh: Target, or None for water alone; kept here so that its BVH lives as long as the model.
-        surfaces: The struct that kernels take, made from the mesh by `make_surfaces`.
-        scale: Tally units per emitted photon.
-        layers: Of a layered spec, from `make_layers`; empty otherwise.
-        scan: Raster of a confocal spec; empty otherwise.
-        derivatives: The parameters of a spec with derivatives or channels, from `make_derivatives`.
-        polarisation: Those of a polarised spec, from `make_polarisation`.
-        split_accumulators: Whether large launches on CUDA may take half the tally's memory more where that makes them
-            faster, with the same sums.
-
     Raises:
         ArgumentError: Another kind of struct, a device that does not exist, or a scale that is not positive.
     """
 
-    device: wp.Device
-    medium: Medium
-    laser: Laser
-    camera: Camera
-    gate: Gate
-    limits: Limits
-    guiding: Guiding
-    mesh: wp.Mesh | None
-    surfaces: Surfaces
-    scale: float
-    layers: Layers = field(default_factory=Layers)
-    scan: Scan = field(default_factory=Scan)
+    device: wp.Device  # Warp device that holds the arrays
+    medium: Medium  # parameter structs
+    laser: Laser  # likewise
+    camera: Camera  # likewise
+    gate: Gate  # likewise
+    limits: Limits  # likewise
+    guiding: Guiding  # likewise
+    mesh: wp.Mesh | None  # target, or None for water alone; kept here so that its BVH lives as long as the model
+    surfaces: Surfaces  # the struct that kernels take, made from the mesh by `make_surfaces`
+    scale: float  # tally units per emitted photon
+    layers: Layers = field(default_factory=Layers)  # of a layered spec, from `make_layers`; empty otherwise
+    scan: Scan = field(default_factory=Scan)  # raster of a confocal spec; empty otherwise
     derivatives: Derivatives = field(default_factory=Derivatives)
+    """The parameters of a spec with derivatives or channels, from `make_derivatives`."""
     polarisation: Polarisation = field(default_factory=Polarisation)
+    """Those of a polarised spec, from `make_polarisation`."""
     split_accumulators: bool = False
+    """Whether large launches on CUDA may take half the tally's memory more where that makes them faster, with the same
+    sums."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "device", check_device("model.device", self.device))
@@ -122,30 +113,23 @@ class Model:
 
 @dataclass
 class Data:
-    """What transport writes: mutable, on one device; several launches may add to one.
+    """What transport writes: mutable, on one device; several launches may add to one."""
 
-    Attributes:
-        tally: int64 [component * height * width * bin], fixed point.
-        ledger: int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`.
-        records: Terminal states of the last launch's photons.
-        cursor: int32 [1]: how many photons of the running launch have been handed out; launches that share it go to one
-            stream.
-        offset: uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on.
-        reflecting: Whether faces of the domain reflect, so that `read_ledger` reports on them.
-        gradients: int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None
-            without them.
-        split_accumulators: uint32, as long as the tally, zero between launches; made by the first launch that is large
-            enough, see `tally.splitting_pays`, and used by those after it.
-    """
-
-    tally: wp.array
-    ledger: wp.array
-    records: Records
+    tally: wp.array  # int64 [component * height * width * bin], fixed point
+    ledger: wp.array  # int64 [LEDGER_WIDTH * LEDGER_SLOTS]; the sum over slots is the ledger, see `read_ledger`
+    records: Records  # terminal states of the last launch's photons
     cursor: wp.array
+    """int32 [1]: how many photons of the running launch have been handed out; launches that share it go to one
+    stream."""
     offset: wp.array | None = None
-    reflecting: bool = False
+    """uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on."""
+    reflecting: bool = False  # whether faces of the domain reflect, so that `read_ledger` reports on them
     gradients: wp.array | None = None
+    """int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None without
+    them."""
     split_accumulators: wp.array | None = None
+    """uint32, as long as the tally, zero between launches; made by the first launch that is large enough, see
+    `tally.splitting_pays`, and used by those after it."""
 
 
 def make_data(

@@ -22,19 +22,14 @@ __all__ = ["Boundary", "Limits", "make_boundary"]
 
 @wp.struct
 class Boundary:
-    """How the faces of the domain reflect, made by `make_boundary`.
+    """How the faces of the domain reflect, made by `make_boundary`."""
 
-    Attributes:
-        low, high: Phase index outside over that of the water, by axis; 0 where all light leaves.
-        images: Numbers of reflections across each axis, signed by the last face, of the ways that next events take
-            beside the straight one.
-        max_reflections: Reflections of the longest of them.
-    """
-
-    low: wp.vec3
-    high: wp.vec3
+    low: wp.vec3  # phase index outside over that of the water, by axis; 0 where all light leaves
+    high: wp.vec3  # likewise
     images: wp.array[wp.vec3i]
-    max_reflections: int
+    """Numbers of reflections across each axis, signed by the last face, of the ways that next events take beside the
+    straight one."""
+    max_reflections: int  # reflections of the longest of them
 
 
 @wp.func
@@ -167,29 +162,21 @@ def make_boundary(
 
 @wp.struct
 class Limits:
-    """Limits of a history; 1e30 stands for none.
+    """Limits of a history; 1e30 stands for none."""
 
-    Attributes:
-        lower, upper: The domain [m]; a flight that reaches a face leaves and is tallied by face, or is reflected.
-        rotation, origin: The domain's own axes: x lies at rotation x + origin in them. Read with `rotated_domain`
-            alone, else lower and upper stand in the frame of the flight.
-        lateral: A history ends where |x| or |y| reaches this [m].
-        max_path: Geometric path [m].
-        weight_cutoff: A history ends after an event that leaves its analog weight below this.
-        max_collisions: A history has at most this many events, surfaces included. Every estimator scores the light of
-            the last event, also of one below the cut-off.
-        boundary: Of a reflecting spec: what the faces reflect.
-    """
-
-    lower: wp.vec3
-    upper: wp.vec3
+    lower: wp.vec3  # the domain [m]; a flight that reaches a face leaves and is tallied by face, or is reflected
+    upper: wp.vec3  # likewise
     rotation: wp.mat33
-    origin: wp.vec3
-    lateral: float
-    max_path: float
-    weight_cutoff: float
+    """The domain's own axes: x lies at rotation x + origin in them. Read with `rotated_domain` alone, else lower and
+    upper stand in the frame of the flight."""
+    origin: wp.vec3  # likewise
+    lateral: float  # a history ends where |x| or |y| reaches this [m]
+    max_path: float  # geometric path [m]
+    weight_cutoff: float  # a history ends after an event that leaves its analog weight below this
     max_collisions: int
-    boundary: Boundary
+    """A history has at most this many events, surfaces included. Every estimator scores the light of the last event,
+    also of one below the cut-off."""
+    boundary: Boundary  # of a reflecting spec: what the faces reflect
 
 
 # Least normal float32: a weight below it is 0 to a GPU.

@@ -29,24 +29,16 @@ __all__ = ["Grid", "Layers", "Medium", "free_path", "make_layers"]
 
 @wp.struct
 class Medium:
-    """One water: all there is, or with `Layers` what they share.
+    """One water: all there is, or with `Layers` what they share."""
 
-    Attributes:
-        extinction: c = a + b [1/m], >= 0; 0 is vacuum.
-        albedo: Single-scattering albedo b/c in [0, 1]; with random_albedo, the upper end of the uniform draw.
-        anisotropy: Mean cosine g of the Henyey-Greenstein phase function, in (-1, 1).
-        axis_threshold: |u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1
-            switches it off, and functions of your own that the transport kernel calls then see 2.
-        per_bit: -ln(2)/c [m], 0 in vacuum; filled by `launch_transport`.
-        phase: Of the phase function TABULATED, from `make_phase_tables`; left alone otherwise.
-    """
-
-    extinction: float
-    albedo: float
-    anisotropy: float
+    extinction: float  # c = a + b [1/m], >= 0; 0 is vacuum
+    albedo: float  # single-scattering albedo b/c in [0, 1]; with random_albedo, the upper end of the uniform draw
+    anisotropy: float  # mean cosine g of the Henyey-Greenstein phase function, in (-1, 1)
     axis_threshold: float
-    per_bit: float
-    phase: DensityTables
+    """|u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1 switches it off, and
+    functions of your own that the transport kernel calls then see 2."""
+    per_bit: float  # -ln(2)/c [m], 0 in vacuum; filled by `launch_transport`
+    phase: DensityTables  # of the phase function TABULATED, from `make_phase_tables`; left alone otherwise
 
 
 def ready_medium(copy: Medium, medium: Medium) -> None:
@@ -84,32 +76,20 @@ _RANGES = {"start": "(-inf, inf)", "extinction": "(0, inf)", "albedo": "[0, 1]",
 
 @wp.struct
 class Grid:
-    """Cells of water in a box, made by `make_grid`.
+    """Cells of water in a box, made by `make_grid`."""
 
-    Attributes:
-        turn, shift: A point x [m] lies at turn x + shift in cells; the box has 0 ... size there.
-        size: Number of cells along the three edges.
-        extinction: c [1/m] by cell, the last edge fastest.
-        albedo: Single-scattering albedo in [0, 1].
-        anisotropy: g in (-1, 1), for phase functions that use the medium's; empty: the medium's everywhere.
-        block_edge: Cells along the edges of a block.
-        block_size: Number of blocks along the three edges of the box; the last may be incomplete.
-        block_majorant: Largest c in each block [1/m].
-        block_control: Mean c of each block, and the largest difference from it in the block [1/m].
-        residual: c less the block's, see `block_statistics` [1/m], by cell.
-    """
-
-    turn: wp.mat33
-    shift: wp.vec3
-    size: wp.vec3i
-    extinction: wp.array[float]
-    albedo: wp.array[float]
+    turn: wp.mat33  # a point x [m] lies at turn x + shift in cells; the box has 0 ... size there.
+    shift: wp.vec3  # likewise
+    size: wp.vec3i  # number of cells along the three edges
+    extinction: wp.array[float]  # c [1/m] by cell, the last edge fastest
+    albedo: wp.array[float]  # single-scattering albedo in [0, 1]
     anisotropy: wp.array[float]
-    block_edge: int
-    block_size: wp.vec3i
-    block_majorant: wp.array[float]
-    block_control: wp.array[wp.vec2]
-    residual: wp.array[float]
+    """g in (-1, 1), for phase functions that use the medium's; empty: the medium's everywhere."""
+    block_edge: int  # cells along the edges of a block
+    block_size: wp.vec3i  # number of blocks along the three edges of the box; the last may be incomplete
+    block_majorant: wp.array[float]  # largest c in each block [1/m]
+    block_control: wp.array[wp.vec2]  # mean c of each block, and the largest difference from it in the block [1/m]
+    residual: wp.array[float]  # c less the block's, see `block_statistics` [1/m], by cell
 
 
 @wp.struct
@@ -118,22 +98,15 @@ class Layers:
 
     In the frame of the photons: where a photon at x is at R x + o of the water's frame, with the axis a there, the axis
     here is R^T a, and each start is less by a·o. A layer reaches to the start of the next, the first back without end.
-
-    Attributes:
-        axis: Unit vector.
-        start: Position along the axis, x·axis, at which each layer begins [m], ascending; the first is not read.
-        extinction: c [1/m], > 0.
-        albedo: Single-scattering albedo in [0, 1].
-        anisotropy: g in (-1, 1), for phase functions that use the medium's.
-        grid: Of a spec with a grid, which has no layers: cells in a box; the medium is outside it.
     """
 
-    axis: wp.vec3
+    axis: wp.vec3  # unit vector
     start: wp.array[float]
-    extinction: wp.array[float]
-    albedo: wp.array[float]
-    anisotropy: wp.array[float]
-    grid: Grid
+    """Position along the axis, x·axis, at which each layer begins [m], ascending; the first is not read."""
+    extinction: wp.array[float]  # c [1/m], > 0
+    albedo: wp.array[float]  # single-scattering albedo in [0, 1]
+    anisotropy: wp.array[float]  # g in (-1, 1), for phase functions that use the medium's
+    grid: Grid  # of a spec with a grid, which has no layers: cells in a box; the medium is outside it
 
 
 @wp.func

@@ -151,22 +151,17 @@ def sphere_integral(function: Callable[[Floats], Floats]) -> float:
 class Guiding:
     """How strongly directions are drawn towards the lens; where weights have grown or a vessel is likely, `guided_part`
     lowers the probabilities.
-
-    Attributes:
-        probability: Chance p that a water collision draws its direction from the lobe about the lens, in [0, 1);
-            with delta tracking 1 - (1 - p)^2 for light that comes back, along u_z < 0.
-        surface_probability: The same at a surface.
-        anisotropy: g of that Henyey-Greenstein lobe; phase functions with a guide have one of their own.
-        return_probability: Chance that an event outside the view draws its direction from a lobe towards the optical
-            axis, so that light that strayed comes back into the view more often, in [0, 1).
-        return_anisotropy: g of that lobe.
     """
 
     probability: float
-    surface_probability: float
-    anisotropy: float
+    """Chance p that a water collision draws its direction from the lobe about the lens, in [0, 1); with delta tracking
+    1 - (1 - p)^2 for light that comes back, along u_z < 0."""
+    surface_probability: float  # the same at a surface
+    anisotropy: float  # g of that Henyey-Greenstein lobe; phase functions with a guide have one of their own
     return_probability: float
-    return_anisotropy: float
+    """Chance that an event outside the view draws its direction from a lobe towards the optical axis, so that light
+    that strayed comes back into the view more often, in [0, 1)."""
+    return_anisotropy: float  # g of that lobe
 
 
 class PhaseGuide(NamedTuple):
@@ -176,40 +171,29 @@ class PhaseGuide(NamedTuple):
     and of any scale: best is p(theta). Directions towards the lens have the density of a lobe [1/sr]: best is the
     integral of p from theta to pi, which the flight in such a direction brings, over the sine of theta, its distance
     from the lens. The lobe is about the very point of the lens at which that flight is scored.
-
-    Attributes:
-        complement: ``(theta: float, medium: Medium) -> float``, integral of q from theta to pi; falls with theta.
-        angle: ``(value: float, medium: Medium) -> float``, the inverse of it.
-        density: ``(theta: float, medium: Medium) -> float``, q itself.
-        lobe_pdf: ``(t: float, medium: Medium, guiding: Guiding) -> float``, t = 1 - cos of the angle to the lens.
-        lobe_sample: ``(xi: float, medium: Medium, guiding: Guiding) -> float``, returns t.
-        chord: The functions take, and q is over, the chord c = 2 sin(theta/2) in (0, 2) instead of theta, which needs
-            no trigonometry: Henyey-Greenstein is (a^2 + c^2)^(-3/2) without approximation, a^2 = (1 - g)^2/g.
     """
 
     complement: wp.Function
-    angle: wp.Function
-    density: wp.Function
+    """``(theta: float, medium: Medium) -> float``, integral of q from theta to pi; falls with theta."""
+    angle: wp.Function  # ``(value: float, medium: Medium) -> float``, the inverse of it
+    density: wp.Function  # ``(theta: float, medium: Medium) -> float``, q itself
     lobe_pdf: wp.Function
-    lobe_sample: wp.Function
+    """``(t: float, medium: Medium, guiding: Guiding) -> float``, t = 1 - cos of the angle to the lens."""
+    lobe_sample: wp.Function  # ``(xi: float, medium: Medium, guiding: Guiding) -> float``, returns t
     chord: bool = False
+    """The functions take, and q is over, the chord c = 2 sin(theta/2) in (0, 2) instead of theta, which needs no
+    trigonometry: Henyey-Greenstein is (a^2 + c^2)^(-3/2) without approximation, a^2 = (1 - g)^2/g."""
 
 
 class PhaseFunction(NamedTuple):
-    """A phase function as the transport kernels take it.
+    """A phase function as the transport kernels take it."""
 
-    Attributes:
-        name: Identifies it in the kernel cache and in files.
-        pdf: Warp function ``(t: float, medium: Medium) -> float``, density [1/sr].
-        sample: Warp function ``(xi: float, medium: Medium) -> float``, returns t = 1 - cos(theta).
-        guide: How the estimator `guided` follows it; None: as it follows Henyey-Greenstein with the medium's
-            anisotropy. No guide makes it wrong, a poor one makes it noisy.
-    """
-
-    name: str
-    pdf: wp.Function
-    sample: wp.Function
+    name: str  # identifies it in the kernel cache and in files
+    pdf: wp.Function  # Warp function ``(t: float, medium: Medium) -> float``, density [1/sr]
+    sample: wp.Function  # Warp function ``(xi: float, medium: Medium) -> float``, returns t = 1 - cos(theta)
     guide: PhaseGuide | None = None
+    """How the estimator `guided` follows it; None: as it follows Henyey-Greenstein with the medium's anisotropy. No
+    guide makes it wrong, a poor one makes it noisy."""
 
 
 # ---- The phase function of Henyey and Greenstein.

@@ -62,21 +62,13 @@ class ShapeTable:
 
 @dataclass(frozen=True)
 class Shapes:
-    """Shapes of all worlds, from `make_shapes`, `newton_shapes` or `mujoco_shapes`.
+    """Shapes of all worlds, from `make_shapes`, `newton_shapes` or `mujoco_shapes`."""
 
-    Attributes:
-        table: The struct that kernels take.
-        worlds: Number of worlds.
-        device: Warp device of the arrays.
-        meshes: Meshes that are kept alive with the shapes.
-        bodies: Number of poses that `move_shapes` needs.
-    """
-
-    table: ShapeTable
-    worlds: int
-    device: wp.Device
-    meshes: tuple[wp.Mesh, ...] = ()
-    bodies: int = 0
+    table: ShapeTable  # the struct that kernels take
+    worlds: int  # number of worlds
+    device: wp.Device  # Warp device of the arrays
+    meshes: tuple[wp.Mesh, ...] = ()  # meshes that are kept alive with the shapes
+    bodies: int = 0  # number of poses that `move_shapes` needs
 
     def __len__(self) -> int:
         return int(self.table.kind.size)

@@ -32,6 +32,7 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES, ArrivalEstimator
 from spadwarp_kernels.detection.counts import first_photon_counts
+from spadwarp_kernels.detection.significance import MIN_SIGNIFICANCE
 from spadwarp_kernels.optics.camera import C0
 from spadwarp_kernels.optics.laser import LASER_PROFILES
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_density
@@ -78,6 +79,7 @@ _RANGES = {
     "anisotropy": "(-1, 1)",
     "group_index": "[1, inf)",
     "nearest": "(0, inf)",
+    "min_significance": "[0, 1e6]",
 }
 
 
@@ -85,53 +87,38 @@ _RANGES = {
 class SpadConfig:
     """A pulsed laser beside a SPAD array in water: what `SpadCamera` and `SpadTracer` take.
 
-    Attributes:
-        width, height: Of the image [pixels].
-        horizontal_fov: Full angle [rad]; pixels are square. See `vertical_fov` for that of Newton and MuJoCo.
-        bins: Time bins of a histogram.
-        gate: What is recorded, as distance in this water along the optical axis [m].
-        pulses: Of a frame.
-        pulse_energy: [J].
-        wavelength: [m].
-        pde: Photon detection efficiency, PDP times fill factor.
-        dark_rate: Dark counts and ambient light of a pixel [1/s].
-        timing_sigma: Standard deviation of pulse and timing jitter together [s].
-        aperture_radius: [m].
-        laser_position: In the optical frame [m]: +x right, +y down, +z forward. The beam goes along +z.
-        laser_half_angle: Of its uniform cone [rad]; None covers the corners of the image.
-        absorption, scattering: Of the water [1/m]; both 0 in air.
-        anisotropy: g of its Henyey–Greenstein phase function.
-        group_index: c0 over the group velocity.
-        nearest: Distance below which the water's backscatter is left out [m].
-        method: Of the depth: "centroid", "peak", "matched" or "likelihood", see `arrival_bins`. The expected counts of
-            an image without targets are taken as known background.
-        seed: 64-bit.
-
     Raises:
         ArgumentError: A number out of range.
     """
 
-    width: int = 160
-    height: int = 120
+    width: int = 160  # of the image [pixels]
+    height: int = 120  # of the image [pixels]
     horizontal_fov: float = 1.2
-    bins: int = 256
-    gate: tuple[float, float] = (0.5, 10.0)
-    pulses: int = 20_000
-    pulse_energy: float = 2e-9
-    wavelength: float = 532e-9
-    pde: float = 0.25
-    dark_rate: float = 1000.0
-    timing_sigma: float = 200e-12
-    aperture_radius: float = 0.01
+    """Full angle [rad]; pixels are square. See `vertical_fov` for that of Newton and MuJoCo."""
+    bins: int = 256  # time bins of a histogram
+    gate: tuple[float, float] = (0.5, 10.0)  # what is recorded, as distance in this water along the optical axis [m]
+    pulses: int = 20_000  # of a frame
+    pulse_energy: float = 2e-9  # [J]
+    wavelength: float = 532e-9  # [m]
+    pde: float = 0.25  # photon detection efficiency, PDP times fill factor
+    dark_rate: float = 1000.0  # dark counts and ambient light of a pixel [1/s]
+    timing_sigma: float = 200e-12  # standard deviation of pulse and timing jitter together [s]
+    aperture_radius: float = 0.01  # [m]
     laser_position: tuple[float, float, float] = (0.05, 0.0, 0.0)
-    laser_half_angle: float | None = None
-    absorption: float = 0.1
-    scattering: float = 0.2
-    anisotropy: float = 0.924
-    group_index: float = 1.3638
-    nearest: float = 0.05
+    """In the optical frame [m]: +x right, +y down, +z forward. The beam goes along +z."""
+    laser_half_angle: float | None = None  # of its uniform cone [rad]; None covers the corners of the image
+    absorption: float = 0.1  # of the water [1/m]; 0 in air
+    scattering: float = 0.2  # of the water [1/m]; 0 in air
+    anisotropy: float = 0.924  # g of its Henyey–Greenstein phase function
+    group_index: float = 1.3638  # c0 over the group velocity
+    nearest: float = 0.05  # distance below which the water's backscatter is left out [m]
     method: str = "centroid"
-    seed: int = 1
+    """Of the depth: "centroid", "peak", "matched" or "likelihood", see `arrival_bins`. The expected counts of an image
+    without targets are taken as known background."""
+    min_significance: float = MIN_SIGNIFICANCE
+    """Of a pixel that has a depth, −log10 of the probability that background alone looks like it, see `DetectionTest`.
+    0: every pixel reports."""
+    seed: int = 1  # 64-bit
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "bins"):
@@ -399,7 +386,7 @@ class WorldCameras:
         self.counts = wp.zeros(image, dtype=int, device=device)
         self.depth, self.true_depth = (wp.full(image, wp.nan, dtype=float, device=device) for _ in range(2))
         self.normal = wp.zeros(image, dtype=wp.vec3, device=device)
-        self.reflectance = wp.zeros(image, dtype=float, device=device)
+        self.reflectance, self.significance = (wp.zeros(image, dtype=float, device=device) for _ in range(2))
         self.step = wp.zeros(1, dtype=wp.int64, device=device)
         self._view = wp.array(config.lines_of_sight(), dtype=wp.vec3, device=device)
         background = backscatter_rates(config, device)
@@ -410,7 +397,8 @@ class WorldCameras:
         known = wp.array(config.pulses * (background + self._dark), dtype=float, device=device)
         response, lowest_tap = config.response()
         taps = {"response": response, "lowest_tap": lowest_tap, "half_width": -lowest_tap - 1}
-        self._estimate = ArrivalEstimator(config.bins, device=device, method=config.method, background=known, **taps)
+        taps |= {"min_significance": config.min_significance, "width": 2.355 * config._sigma_bins}
+        self._estimate = ArrivalEstimator(config.bins, device, config.method, known, **taps, pulses=config.pulses)
 
     def _cast_rays(self, shapes: Shapes, camera_q: wp.array, body_q: wp.array | None) -> None:
         """Moves the shapes and casts a ray a pixel."""
@@ -434,7 +422,7 @@ class WorldCameras:
         config = self.config
         rates, counts = self.rates.reshape(self._rows), self.histogram.reshape(self._rows)
         first_photon_counts(rates, pulses=config.pulses, first_frame=self.step, seed=config.seed, counts=counts)
-        self._estimate(counts, self._arrival)
+        self._estimate(counts, self._arrival, self.significance.flatten())
         inputs = [self._arrival, self._view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
         outputs = [self.depth.flatten(), self.counts.flatten(), self.step]
         wp.launch(_depth_kernel, self._rows[0], [*inputs, counts], outputs, device=self.device)
@@ -591,8 +579,9 @@ class SpadCamera(WorldCameras):
         rates: Expected detections per pulse, float32 `[cameras, height, width, bins]`.
         histogram: Counts of the frame, int32 `[cameras, height, width, bins]`.
         counts: Sum of the histogram, int32 `[cameras, height, width]`.
-        depth: Planar depth (z of the optical frame) from the histogram [m], float32 `[cameras, height, width]`; NaN for
-            none.
+        depth: Planar depth (z of the optical frame) from the histogram [m], float32 `[cameras, height, width]`; NaN
+            where nothing was detected.
+        significance: Of the detection, float32 `[cameras, height, width]`, see `SpadConfig.min_significance`.
         true_depth, normal, reflectance: What is there, `[cameras, height, width]`: planar depth [m], unit normals to
             the camera in the optical frame, reflectance; NaN for none.
         step: Number of the next step, int64 `[1]`. A step's random numbers depend on `config.seed` and it alone.

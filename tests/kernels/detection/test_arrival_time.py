@@ -29,6 +29,7 @@ def drawn(signal, background, pixels=64, seed=5):
 
 
 def run(counts, method, **options):
+    options.setdefault("min_significance", 0.0)
     if "background" in options:
         background = np.atleast_2d(np.asarray(options["background"], np.float32))
         options["background"] = wp.array(background, dtype=float, device="cpu")
