@@ -21,7 +21,15 @@ from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwelling_irradiance
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
-from spadwarp.scene.medium import WATER_INDICES, Layer, Medium, grid_cells, phase_function, scattering_matrix
+from spadwarp.scene.medium import (
+    NOTABLE_UNSEEN,
+    WATER_INDICES,
+    Layer,
+    Medium,
+    grid_cells,
+    phase_function,
+    scattering_matrix,
+)
 from spadwarp.scene.port import Port
 from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import field_unit
@@ -630,6 +638,23 @@ def _check_polarisation(survey: Survey) -> None:
             survey.note(f"{section}.{field}", f"{field} = {value:g} is not used: it goes with {section}.{needed}")
 
 
+def _check_peak(survey: Survey) -> None:
+    """A forward peak that is too narrow for the photons to see it."""
+    scene, (estimator, photons) = survey.scene, (survey.scene.transport.estimator, survey.scene.transport.photons)
+    if scene.medium.range.scattering == 0.0:
+        return
+    middle = 0.5 * (scene.gate.start + scene.gate.stop)
+    distance = survey.target_range[0] if survey.target_range else survey.range_of(middle)
+    angle, unseen = scene.unseen_peak(photons, distance)
+    if unseen > NOTABLE_UNSEEN:
+        text = (
+            f"{estimator}: up to {100.0 * unseen:.2g} % of the scattered light is of a forward peak, below "
+            f"{math.degrees(angle):.2g}°, that {photons:.3g} photons hardly see: it is missing as a rule, and not in "
+            f"standard errors; what helps: more photons{', guided' if estimator == 'next_event' else ''}"
+        )
+        survey.warn("transport.estimator", text, unseen=unseen, angle_deg=math.degrees(angle))
+
+
 def _check_statistics(survey: Survey) -> None:
     """The size of the tallies, the expected signal, and the photons that a pixel gets."""
     scene, size, axis = survey.scene, survey.histogram_bytes, survey.on_axis
@@ -803,7 +828,7 @@ def _grid_summary(scene: Scene) -> dict[str, Any] | None:
 _CHECKS = (
     *(_check_plausible, _check_targets, _check_focus, _check_ports, _check_scan, _check_timing, _check_spectrum),
     *(_check_daylight, _check_medium, _check_phase_table, _check_collisions, _check_grid),
-    *(_check_polarisation, _check_statistics),
+    *(_check_peak, _check_polarisation, _check_statistics),
 )
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
+from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, ConfigError, Shown, check_choice, percent
 
@@ -247,26 +248,38 @@ class Result(Shown, ResultHead, Tallies):
         """Channel → standard error, as `derivative_errors`."""
         return _SignedValues(self, "channels", errors=True)
 
+    @cached_property
+    def unseen_share(self) -> float:
+        """Part of the light scattered in the water, in [0, 1], that the run may have missed: that of a forward peak
+        which its photons are too few to see (`Scene.unseen_peak`). No standard error holds it. 1 where the table of
+        the phase function is gone."""
+        ranges = self.truth.range[np.isfinite(self.truth.range)]
+        distance = float(ranges.min()) if ranges.size else 0.25 * float(self.path_edges[0] + self.path_edges[-1])
+        try:
+            return self.scene.unseen_peak(self.photons, distance)[1]
+        except ConfigError:
+            return 1.0
+
     @property
     def relative_error(self) -> float:
-        """Relative standard error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of
-        the pixels that hold a target, or of all without any, in which anything returned. Infinite if nothing did."""
+        """Relative error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of the
+        pixels that hold a target, or of all without any, in which anything returned. The standard error, plus what is
+        missing if `unseen_share` of the scattered light is. Infinite if nothing returned."""
         moments, batches = _batches_of(self)
         # Row by row: of a large histogram nothing is copied.
         peak = np.stack([row.sum(axis=0).argmax(axis=1) for row in self.tallies.swapaxes(0, 1)])[None, ..., None]
         tallies = np.take_along_axis(self.tallies, peak, axis=3)[..., 0]
-        value = tallies.sum(axis=0)
-        error = standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], batches)
+        value, unseen = tallies.sum(axis=0), self.unseen_share
+        missing = tallies[1:].sum(axis=0) * (unseen / max(1.0 - unseen, 1e-12))
+        error = missing + standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], batches)
         target = np.isfinite(self.truth.depth)
         returned = (value > 0) & (target | ~target.any())
         return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Reasons to mistrust the errors: components whose standard error rests on few heavy photons.
-
-        They show in results with batches (`uncertainty=True`, or `relative_error`).
-        """
+        """Reasons to mistrust the errors: a forward peak that the photons have not seen; in results with batches
+        (`uncertainty=True`, or `relative_error`), components whose standard error rests on few heavy photons."""
         transport, ways = self.scene.transport, ["more photons"]
         if transport.estimator != "guided":
             ways.append('estimator = "guided"')
@@ -275,7 +288,15 @@ class Result(Shown, ResultHead, Tallies):
         if transport.termination == "roulette":
             ways.append('termination = "cutoff"')
         batches = self.photons // max(self.batch_size, 1)
-        return tuple(
+        unseen: tuple[str, ...] = ()
+        scattered, total = (float(part.sum(dtype=np.float64)) for part in (self.tallies[1:], self.tallies))
+        if self.unseen_share * scattered > NOTABLE_UNSEEN * total:
+            unseen = (
+                f"{transport.estimator}: up to {100 * self.unseen_share:.2g} % of the scattered light, which has "
+                f"{100 * scattered / total:.2g} % of all, is of a forward peak that {self.photons:.3g} photons hardly "
+                f"see: it is not in standard errors; what helps: {', '.join(ways[:2])}",
+            )
+        return unseen + tuple(
             f"{name}: one of {batches} batches has {100 * share:.0f} % of the variance of its light (relative standard "
             f"error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "
             f"helps: {', '.join(ways)}"
@@ -383,6 +404,7 @@ class Result(Shown, ResultHead, Tallies):
             "energy_balance": self.energy_report(),
             "counters": dict(self.counters),
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
+            "unseen_share": self.unseen_share,
             "warnings": list(self.warnings),
             **({"derivatives": _short_names(self.derivatives)} if self.derivatives else {}),
             **_polarisation_summary(self),

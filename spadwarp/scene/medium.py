@@ -42,6 +42,8 @@ Floats = NDArray[np.float64]
 # Time of flight uses the group index.
 WATER_INDICES: dict[str, tuple[float, float]] = {"seawater": (1.3415, 1.3638), "fresh": (1.3350, 1.3566)}
 
+NOTABLE_UNSEEN = 0.01  # `PhaseFunction.unseen_share` of the light that is worth a warning
+
 # Overriding one coefficient of a complete medium keeps this other one.
 _KEEPS = {"absorption": "scattering", "scattering": "absorption", "extinction": "albedo", "albedo": "extinction"}
 
@@ -399,6 +401,18 @@ class PhaseFunction:
         """Part of the light that is scattered by less than an angle [rad] in (0, π]."""
         share = math.sin(0.5 * angle) ** 2
         return share * _sphere_integral(lambda t: self.over_t(share * t))
+
+    def unseen_share(self, photons: float) -> tuple[float, float]:
+        """What so many directions, evenly over the sphere, hardly see of a narrow forward peak.
+
+        Returns:
+            The angle [rad] below which ten of the directions are from that of the lens, and the part of the light in
+            [0, 1] that is scattered by less, without what the density at that angle would scatter there.
+        """
+        part = min(10.0 / max(photons, 10.0), 1.0)
+        angle = 2.0 * math.asin(math.sqrt(part))
+        even = 4.0 * math.pi * part * float(self.over_t(np.array(2.0 * part)))
+        return angle, min(max(self.fraction_below(angle) - even, 0.0), 1.0)
 
 
 def _sphere_integral(density: Callable[[Floats], Floats]) -> float:

@@ -20,7 +20,7 @@ from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
-from spadwarp.scene.medium import Medium
+from spadwarp.scene.medium import Medium, phase_function
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import interpolated_angles, rotation_matrix, vector_of
 from spadwarp.scene.sections import Document, Overrides, listed
@@ -126,6 +126,20 @@ class Scene(Shown, Document):
     def scan_positions(self) -> int:
         """Positions of the beam: photon i is emitted at position i modulo this number."""
         return 1 if self.scan.mode == "none" else self.camera.width * self.camera.height
+
+    def unseen_peak(self, photons: float, distance: float) -> tuple[float, float]:
+        """The forward peak that so many photons hardly see: `PhaseFunction.unseen_share` of the directions in which
+        the estimator looks for the lens. Those of `next_event` are anywhere; `guided` with a table aims at points of
+        the lens, each drawn apart from the light that flies into it, here from `distance` [m]. 0 for all others.
+
+        Raises what `phase_function` raises.
+        """
+        directions, estimator = photons / self.scan_positions, self.transport.estimator
+        if estimator == "analog" or (estimator == "guided" and not self.medium.has_phase_table):
+            return 0.0, 0.0
+        if estimator == "guided":
+            directions /= math.sin(0.5 * math.atan2(self.camera.aperture_radius, distance)) ** 2
+        return phase_function(self.medium).unseen_share(directions)
 
     @property
     def beam(self) -> Laser:

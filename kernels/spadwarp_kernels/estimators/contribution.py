@@ -23,12 +23,13 @@ from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, Phas
 @wp.struct
 class FlightSample:
     """A point of a flight: distance s along it, distance r to the lens point [m], its density over s [1/m]; 0 for
-    none. With a `Profile`: its optical depth up to there."""
+    none. With a `Profile` that draws: its optical depth up to there, and the extinction there [1/m]."""
 
     s: float
     r: float
     density: float
     depth: float
+    extinction: float
 
 
 @wp.func
@@ -130,6 +131,7 @@ def make_sample_flight(guide: PhaseGuide = HENYEY_GREENSTEIN_GUIDE, profile: Pro
             drawn = draw(medium, layers, begin_point, u, width, given, xi)
             s = s0 + drawn.s
             sample.depth = drawn.depth
+            sample.extinction = drawn.extinction
         s = wp.clamp(s, s0, s1)
         along = s - t_c
         r = wp.sqrt(d * d + along * along)
@@ -275,7 +277,8 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
             before = float(0.0)
             if s0 > 0.0:
                 before = depth_along(world.medium, world.layers, request.x, request.u, s0)
-            weight *= there.extinction * wp.exp(-before - flight.depth)
+            # The extinction of the draw: beside it in a dense cell, that of a thin one would leave a spike.
+            weight *= flight.extinction * wp.exp(-before - flight.depth)
         else:
             passed = water_extinction(world.medium, world.layers, request.x, request.u, flight.s, seed)
             weight *= there.extinction * wp.exp(-passed * flight.s)

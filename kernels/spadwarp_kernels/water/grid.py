@@ -295,12 +295,23 @@ def draw_by_cells(
         sample.s = xi * width
         if thick:
             sample.s = wp.min(distance_to(medium, layers, x, u, -wp.log(1.0 - xi * kept)), width)
-    sample.depth = depth_along(medium, layers, x, u, sample.s)
-    cell = grid_cell(layers.grid, x + sample.s * u)
-    extinction = float(medium.extinction)
-    if cell >= 0:
-        extinction = layers.grid.extinction[cell]
-    sample.density = wp.where(thick, extinction * wp.exp(-sample.depth) / kept, 1.0 / width)
+    # Its cell by the walk that drew it. A face belongs to the cell behind it, since what is drawn next to the face of a
+    # dense cell rounds to it.
+    line = grid_line(layers.grid, x, u, width)
+    sample.extinction = medium.extinction
+    sample.depth = medium.extinction * sample.s
+    if line.begin < line.end and line.begin <= sample.s:
+        stop = wp.min(sample.s, line.end)
+        sample.depth = medium.extinction * (sample.s - (stop - line.begin))
+        place = first_place(line, layers.grid.size)
+        while place.leave <= stop and place.leave < line.end:
+            sample.depth += layers.grid.extinction[place.cell] * (place.leave - place.t)
+            place = next_place(line, place)
+        inside = float(layers.grid.extinction[place.cell])
+        sample.depth += inside * (stop - place.t)
+        if sample.s < line.end or line.end == width:
+            sample.extinction = inside
+    sample.density = wp.where(thick, sample.extinction * wp.exp(-sample.depth) / kept, 1.0 / width)
     return sample
 
 

@@ -200,11 +200,13 @@ def _water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
 
 @wp.struct
 class ProfileSample:
-    """A point of a line: its distance s [m], the density over s of the draw [1/m], and the optical depth up to it."""
+    """A point of a line: its distance s [m], the density over s of the draw [1/m], the optical depth up to it, and the
+    extinction there [1/m], which a rounded point that lies by a face would not tell."""
 
     s: float
     density: float
     depth: float
+    extinction: float
 
 
 class Profile(NamedTuple):
