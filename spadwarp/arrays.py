@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from spadwarp.values import ArgumentError, FileError, guarded, shown
 
@@ -27,7 +27,7 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     """A contiguous Warp array of int32, int64, float32 or float64 from NumPy, torch or Warp; copies only if it must.
 
     Raises:
-        TypeError: The data is of another kind (complex, text).
+        ArgumentError: The data is of another kind (complex, text).
     """
     import warp as wp
 
@@ -52,11 +52,11 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
         elif values.dtype.kind == "f":
             values = values.astype(np.float64 if values.dtype.itemsize >= 8 else np.float32, copy=False)
         else:
-            raise TypeError(f"{name} has dtype {values.dtype}; integers or real numbers are needed")
+            raise ArgumentError(f"{name} has dtype {values.dtype}; integers or real numbers are needed")
         device = pick_device(device)
         result = wp.array(np.ascontiguousarray(values), device=device, copy=device.is_cuda)
     if result.dtype not in (wp.int32, wp.int64, wp.float32, wp.float64):
-        raise TypeError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")
+        raise ArgumentError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")
     return result if result.is_contiguous else result.contiguous()
 
 
@@ -94,7 +94,7 @@ def on_host(array: Any) -> Any:
     return array.detach().cpu().numpy() if is_torch(array) else array
 
 
-def real_array(name: str, values: Any, dtype: Any = np.float32) -> NDArray[Any]:
+def real_array(name: str, values: Any, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     """A copy of an argument as an array of real numbers, also of a tensor. Raises `ArgumentError`."""
     given = np.asarray(on_host(values))
     if given.dtype.kind not in "biuf":

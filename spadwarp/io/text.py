@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io.paths import atomic_path, similar, used
-from spadwarp.values import UNITS, ConfigError, FileError, Interval, parse_number, shown
+from spadwarp.values import UNITS, ArgumentError, ConfigError, FileError, Interval, parse_number, shown
 
 __all__ = ["json_text", "parse_json", "parse_toml", "read_columns", "read_text", "read_toml", "write_csv", "write_json"]
 __all__ += ["write_text"]
@@ -159,7 +159,10 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
 
 def json_text(value: Any, *, indent: int = 2) -> str:
     """A value as JSON with a line end; numbers that are not finite become null, paths text."""
-    return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
+    try:
+        return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
+    except TypeError as error:
+        raise ArgumentError(f"value: {error}") from None
 
 
 def write_text(text: str, path: str | Path) -> Path:
