@@ -236,6 +236,7 @@ def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
         rows, index = rows.rows, pandas.Index(rows.values, name=rows.field)
     elif isinstance(rows, Mapping):
         rows = rows.values()
+    rows = rows if isinstance(rows, Iterable) else [rows]
     table: list[Any] = [dataclasses.asdict(row) if dataclasses.is_dataclass(row) else row for row in rows]  # type: ignore[arg-type]
     if not all(isinstance(row, Mapping) for row in table):
         raise ArgumentError(f"rows hold a {type(table[0]).__name__}; data classes or dicts are needed")
