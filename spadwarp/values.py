@@ -298,6 +298,8 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is float or kind is int:
         needed = "__float__" if kind is float else "__index__"
         single = not isinstance(value, type) and getattr(value, "ndim", 0) == 0
+        if kind is int and getattr(getattr(value, "dtype", None), "kind", "i") not in ("i", "u", "b"):
+            return False
         return single and (hasattr(value, needed) or (kind is float and hasattr(value, "__index__")))
     plain = dict if is_typeddict(kind) else origin or kind
     if not isinstance(plain, type):
