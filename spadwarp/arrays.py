@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from spadwarp.values import ArgumentError, FileError, guarded, shown
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
     """A contiguous Warp array of int32, int64, float32 or float64 from NumPy, torch or Warp; copies only if it must.
 
-    Raises `TypeError`: the data is of another kind (complex, text).
+    Raises `ArgumentError`: the data is of another kind (complex, text).
     """
     import warp as wp
 
@@ -51,11 +51,11 @@ def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
         elif values.dtype.kind == "f":
             values = values.astype(np.float64 if values.dtype.itemsize >= 8 else np.float32, copy=False)
         else:
-            raise TypeError(f"{name} has dtype {values.dtype}; integers or real numbers are needed")
+            raise ArgumentError(f"{name} has dtype {values.dtype}; integers or real numbers are needed")
         device = pick_device(device)
         result = wp.array(np.ascontiguousarray(values), device=device, copy=device.is_cuda)
     if result.dtype not in (wp.int32, wp.int64, wp.float32, wp.float64):
-        raise TypeError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")
+        raise ArgumentError(f"{name} has dtype {result.dtype.__name__}; int32, int64, float32 or float64 is needed")
     return result if result.is_contiguous else result.contiguous()
 
 
@@ -92,7 +92,7 @@ def on_host(array: Any) -> Any:
     return array.detach().cpu().numpy() if is_torch(array) else array
 
 
-def real_array(name: str, values: Any, dtype: Any = np.float32) -> NDArray[Any]:
+def real_array(name: str, values: Any, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     """A copy of an argument as an array of real numbers, also of a tensor. Raises `ArgumentError`."""
     given = np.asarray(on_host(values))
     if given.dtype.kind not in "biuf":
@@ -230,6 +230,7 @@ def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
         rows, index = rows.rows, pandas.Index(rows.values, name=rows.field)
     elif isinstance(rows, Mapping):
         rows = rows.values()
+    rows = rows if isinstance(rows, Iterable) else [rows]
     table: list[Any] = [dataclasses.asdict(row) if dataclasses.is_dataclass(row) else row for row in rows]  # type: ignore[arg-type]
     if not all(isinstance(row, Mapping) for row in table):
         raise ArgumentError(f"rows hold a {type(table[0]).__name__}; data classes or dicts are needed")

@@ -20,10 +20,23 @@ import re
 import reprlib
 import sys
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, SupportsFloat, SupportsIndex, Union, cast, get_args, get_origin
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    SupportsFloat,
+    SupportsIndex,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    is_typeddict,
+)
 
 __all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
 __all__ += ["DeviceError", "FileError", "Interval", "MeshError", "Shown", "SpadwarpError", "SpadwarpWarning"]
@@ -46,6 +59,10 @@ class SpadwarpError(Exception):
 
 class ArgumentError(SpadwarpError, ValueError):
     """An argument of a public function that is out of range, of the wrong shape, missing or one too many."""
+
+
+class UnforeseenArgument(ArgumentError):
+    """An argument that no check of ours refused and a library could not use, see `guarded`: its cause says where."""
 
 
 class ConfigError(SpadwarpError):
@@ -136,7 +153,9 @@ def need_memory(gibibytes: float, name: str) -> None:
 
 def guarded(module: str, names: Iterable[str]) -> list[str]:
     """Makes `ArgumentError` of what libraries raise when a public function of a module gets an argument that is not of
-    its annotated type; returns the names. Nothing is checked before something was raised: calls cost no time for it.
+    its annotated type, that holds nothing or no finite number, or arrays that do not fit; returns the names.
+
+    Nothing is checked before something was raised: calls cost no time for it.
     """
     space, names = vars(sys.modules[module]), list(names)
     for name in names:
@@ -163,43 +182,103 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
     if hasattr(function, "__guarded__"):
         return function
 
-    @functools.wraps(function)
-    def call(*arguments: Any, **named: Any) -> Any:
+    @contextmanager
+    def in_own_words(arguments: Sequence[Any], named: Mapping[str, Any]) -> Iterator[None]:
         try:
-            return function(*arguments, **named)
+            yield
         except SpadwarpError:
             raise
         except Exception as error:
-            if problem := _wrong_argument(function, arguments, named):
-                raise ArgumentError(problem) from error
+            if isinstance(error, OSError) and error.filename is not None and error.errno != errno.ENOMEM:
+                raise FileError(in_words(error)) from error
+            if problem := _wrong_argument(error, function, arguments, named):
+                raise UnforeseenArgument(problem) from error
             raise
 
+    def value_of(*arguments: Any, **named: Any) -> Any:
+        with in_own_words(arguments, named):
+            return function(*arguments, **named)
+
+    def items_of(*arguments: Any, **named: Any) -> Any:
+        with in_own_words(arguments, named):
+            return (yield from function(*arguments, **named))
+
+    yields = function.__code__.co_flags & _GENERATOR
+    call: Any = functools.wraps(function)(items_of if yields else value_of)
     call.__module__ = module  # where pickle finds it
-    call.__guarded__ = True  # type: ignore[attr-defined]
+    call.__guarded__ = True
     return call
 
 
-def _wrong_argument(function: Callable[..., Any], arguments: Sequence[Any], named: Mapping[str, Any]) -> str:
-    """The first argument that is not of the type that it is annotated with; empty if there is none."""
+# What libraries raise for values that are of the right type and yet cannot be used.
+_OF_VALUES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+
+_GENERATOR = 0x20  # flag of the code of a function that yields
+_FUNCTIONS = (types.FunctionType, types.MethodType, functools.partial)
+
+
+def _wrong_argument(
+    error: Exception, function: Callable[..., Any], arguments: Sequence[Any], named: Mapping[str, Any]
+) -> str:
+    """The first argument that is not of the type that it is annotated with, or else the first that holds nothing, no
+    numbers, or none that are finite and below 2^31, or else the arrays, where these do not fit; empty if none is."""
     import inspect
 
     signature = inspect.signature(function)
+    modules = [module for key, module in sys.modules.items() if key.startswith("spadwarp.")]
+    names = {name: value for module in modules for name, value in vars(module).items()}
+    names |= getattr(function, "__globals__", {})  # which lack what is there for type checkers alone
     try:
         given = signature.bind(*arguments, **named).arguments
     except TypeError:  # one is missing or too many, as Python says
         return ""
+    arrays = []
     for name, value in given.items():
         parameter = signature.parameters[name]
         kind, text = parameter.annotation, str(parameter.annotation)
         if isinstance(kind, str):
             try:
-                kind = eval(kind, getattr(function, "__globals__", {}))
-            except Exception:  # a name for type checkers alone
-                continue
+                kind = eval(kind, names)
+            except Exception:  # of a package that is not loaded
+                kind = Any
         single = parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
         if name not in ("self", "cls") and single and not _fits(value, kind):
             return f"{name} = {shown(value)} is not of the type {text}"
-    return ""
+        if "Array" in text or hasattr(value, "shape"):
+            arrays.append(f"{name} [{', '.join(map(str, getattr(value, 'shape', [])))}]")
+    words = " ".join(str(error).split())[:200] or type(error).__name__
+    short = (in_words(error) or "").startswith("not enough memory")
+    if short or not isinstance(error, _OF_VALUES) or any(isinstance(value, _FUNCTIONS) for value in given.values()):
+        return ""  # or from a function of the caller's
+    for name, value in given.items():
+        needed = isinstance(error, AttributeError) and error.obj is value
+        needed |= value is None and signature.parameters[name].default is not None
+        if name not in ("self", "cls") and (needed or _is_odd(value)):
+            return f"{name} = {shown(value)} cannot be used: {words}"
+        tables = [item for item in (value if isinstance(value, list | tuple) else [value]) if isinstance(item, Mapping)]
+        if isinstance(error, KeyError) and any(error.args[0] not in table for table in tables):
+            return f"{name} = {shown(value)} has no {error}"
+    unfit = isinstance(error, IndexError | ValueError) or "array" in words
+    return f"{', '.join(arrays)}: arrays that do not fit: {words}" if arrays and unfit else ""
+
+
+def _is_odd(value: Any) -> bool:
+    """Whether a value holds nothing, no numbers, or none that are finite and below 2^31."""
+    import numpy as np
+
+    if isinstance(value, str | bytes | os.PathLike):
+        text = os.fsdecode(value)
+        return not text or "\0" in text or not text.isprintable()
+    if isinstance(value, dict | list | tuple) and not all(isinstance(item, int | float) for item in value):
+        return any(map(_is_odd, value.values() if isinstance(value, dict) else value))
+    if value is None or not (type(value).__module__ in ("builtins", "numpy") or hasattr(value, "numpy")):
+        return False
+    try:
+        array = np.asarray(value.numpy() if hasattr(value, "numpy") else value)
+        with np.errstate(all="ignore"):
+            return array.size == 0 or array.dtype.kind not in "biuf" or not bool((np.abs(array) < 2.0**31).all())
+    except Exception:
+        return True
 
 
 def _fits(value: Any, kind: Any) -> bool:
@@ -211,20 +290,29 @@ def _fits(value: Any, kind: Any) -> bool:
         return _fits(value, inner[0])
     if origin is Literal:
         return any(value is item or (isinstance(value, str | int) and value == item) for item in inner)
-    if kind is None:
-        return value is None
+    if kind is None or kind is Any:
+        return kind is Any or value is None
     if kind is float or kind is int:
         needed = "__float__" if kind is float else "__index__"
-        return hasattr(value, needed) or (kind is float and hasattr(value, "__index__"))
-    plain = origin or kind
-    if plain is Any or not isinstance(plain, type) or getattr(plain, "_is_protocol", False):
+        single = not isinstance(value, type) and getattr(value, "ndim", 0) == 0
+        if kind is int and getattr(getattr(value, "dtype", None), "kind", "i") not in ("i", "u", "b"):
+            return False
+        return single and (hasattr(value, needed) or (kind is float and hasattr(value, "__index__")))
+    plain = dict if is_typeddict(kind) else origin or kind
+    if not isinstance(plain, type):
         return True
-    if not isinstance(value, plain) or (inner and isinstance(value, str)):  # a text is no list of texts
+    if getattr(plain, "_is_protocol", False):
+        return all(hasattr(value, name) for name, member in vars(plain).items() if _is_of_protocol(name, member))
+    if not isinstance(value, plain) or (inner and isinstance(value, str | bytes)):  # a text is no list of texts
         return False
     if isinstance(value, tuple) and plain is tuple and inner and inner[-1] is not Ellipsis:
         return len(value) == len(inner) and all(_fits(*pair) for pair in zip(value, inner, strict=True))
     items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
     return not inner or all(_fits(item, inner[len(inner) > 1 and isinstance(value, dict)]) for item in items)
+
+
+def _is_of_protocol(name: str, member: Any) -> bool:
+    return isinstance(member, types.FunctionType | property) and name not in ("__init__", "__subclasshook__")
 
 
 # ---- Numbers and words, as text or from Python: of their kind and within their range, or refused by name.

@@ -22,7 +22,7 @@ import typer
 from typer.core import TyperGroup
 
 import spadwarp
-from spadwarp.values import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, in_words
+from spadwarp.values import ArgumentError, ConfigError, SpadwarpError, SpadwarpWarning, UnforeseenArgument, in_words
 
 FAILED, WRONG_USE, BUG, INTERRUPTED = 1, 2, 70, 130
 
@@ -94,6 +94,8 @@ class _Commands(TyperGroup):
 
 def _described(error: Exception) -> tuple[str, int]:
     """The error in words, and the exit code."""
+    if isinstance(error, UnforeseenArgument) and isinstance(error.__cause__, Exception):
+        error = error.__cause__  # what a command hands over it has checked
     text = str(error) if isinstance(error, SpadwarpError) else in_words(error)
     if text is not None:
         return text, WRONG_USE if isinstance(error, ConfigError | ArgumentError) else FAILED

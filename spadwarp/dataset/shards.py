@@ -30,7 +30,7 @@ from spadwarp.io.hdf5 import Hdf5File, open_hdf5, write_hdf5
 from spadwarp.io.paths import remove_temporaries, sha256
 from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.sight import port_advance
-from spadwarp.values import DeviceError, FileError, SpadwarpError, range_from_time
+from spadwarp.values import DeviceError, FileError, SpadwarpError, check_choice, range_from_time
 
 FORMAT_VERSION = 1
 
@@ -325,7 +325,7 @@ class SceneFile:
 
     def stored(self, name: str) -> Any:
         """A column of `scene_columns`, its first dimension the scenes."""
-        column = self._columns[name]
+        column = self._columns[check_choice("name", name, list(self._columns))]
         return self.file.stored(name, "S" if isinstance(column.kind, str) else column.kind, (self.count, *column.shape))
 
     def array(self, name: str) -> NDArray[Any]:

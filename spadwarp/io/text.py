@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io.paths import atomic_path, similar, used
-from spadwarp.values import UNITS, ConfigError, FileError, Interval, count, parse_number, shown
+from spadwarp.values import UNITS, ArgumentError, ConfigError, FileError, Interval, count, parse_number, shown
 
 __all__ = ["fact", "json_text", "parse_json", "parse_toml", "progress_report", "read_columns", "read_text", "read_toml"]
 __all__ += ["write_csv", "write_json", "write_text"]
@@ -161,7 +161,10 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
 
 def json_text(value: Any, *, indent: int = 2) -> str:
     """A value as JSON with a line end; numbers that are not finite become null, paths text."""
-    return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
+    try:
+        return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
+    except TypeError as error:
+        raise ArgumentError(f"value: {error}") from None
 
 
 def write_text(text: str, path: str | Path) -> Path:

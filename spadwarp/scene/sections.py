@@ -28,7 +28,18 @@ from pydantic.functional_validators import AfterValidator, BeforeValidator, fiel
 
 from spadwarp.io.paths import sha256
 from spadwarp.io.text import parse_toml, read_columns
-from spadwarp.values import UNITS, ConfigError, FileError, Interval, bounds, parse_number, quantity, shown, suggestion
+from spadwarp.values import (
+    UNITS,
+    ConfigError,
+    FileError,
+    Interval,
+    bounds,
+    check_choice,
+    parse_number,
+    quantity,
+    shown,
+    suggestion,
+)
 
 __all__ = ["Preset", "parse_override", "presets"]
 
@@ -132,10 +143,10 @@ PRESETS = _read_presets()
 def presets(section: str | None = None) -> dict[str, Preset]:
     """The presets of one section by name, or of all sections by `section.name`.
 
-    Raises `KeyError` for a section without presets.
+    Raises `ArgumentError` for a section without presets.
     """
     if section is not None:
-        return dict(PRESETS[section])
+        return dict(PRESETS[check_choice("section", section, list(PRESETS))])
     return {f"{section}.{name}": preset for section, rows in PRESETS.items() for name, preset in rows.items()}
 
 

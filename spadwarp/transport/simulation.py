@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.device import pick_devices, processor_name
+from spadwarp.device import pick_device, pick_devices, processor_name
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.parallel.worker import Event
 from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
@@ -395,4 +395,7 @@ def provenance(device: Any = None) -> dict[str, Any]:
         "python": platform.python_version(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
-    return made if device is None else {**made, "device": device.alias, "device_name": processor_name(device)}
+    if device is None:
+        return made
+    device = pick_device(device)
+    return {**made, "device": device.alias, "device_name": processor_name(device)}

@@ -1,5 +1,6 @@
 """What is run on damaged files: a case is a folder of files, one of them damaged, and a command on it."""
 
+import itertools
 import random
 import shutil
 from collections.abc import Callable, Sequence
@@ -116,7 +117,8 @@ def _damaged(commands: Sequence[str], *names: str, others: tuple[str, ...] = ())
 
 
 def _command_line(r: random.Random, corpus: Corpus) -> Case:
-    files = dict.fromkeys(("scene.toml", "result.h5", "frames.h5", "counts.npy", "depth.npy", "box.stl", "recipe.toml"))
+    names = ("result.h5", "frames.h5", "depth.npy", "box.stl", "recipe.toml", "training.toml", "cells.npz", "data")
+    files = dict.fromkeys((*names, *itertools.chain(*command_lines.ALIKE.values())))
     arguments, outputs = command_lines.draw(r)
     return Case(arguments, files, outputs)
 

@@ -16,12 +16,16 @@ ODD = (
     "targets[0].scale=2", "targets[9].scale=2", "=", "a=", "=1", "medium=1", "transport.seed=1e3",
     "camera.width=1e9", "gate.bins=0", "transport.photons=07:32:00", "[" * 500, "{" * 500, "json", "html", "mat",
     "npy", "exr", "peak", "likelihood", "test", "nosuch", "pyramid", "median", "uwoc-clear", "staircase_15m", "1 m",
-    "3km", "1e3ps", "20 ns", "1e300", "True", "null",
+    "zero.npy", "many.npy", "gate.npy", "port.toml", "polarised.toml", "depth=5,1e-300", "medium.absorption=nan,1",
+    "medium.absorption", "depth:pixel", "targets[0].reflectance,background", "training.toml", "data", "slab", "water",
+    "all", "histograms", "medium.absorption=1e300", "bin_width=200ps,gate_start=3ns", "optimiser.steps=2", "0 m",
+    "5 mm", "3km", "1e3ps", "20 ns", "1e300", "True", "null",
 )  # fmt: skip
 
 # What would run for minutes, reach for a network or a browser, or write where it should not.
-_LEFT_OUT = {("validate",), ("bench",), ("doctor",), ("train",), ("evaluate",), ("plan",), ("dataset",)}
-_SETTINGS = {"--install-completion", "--show-completion", "--ray"}
+_LEFT_OUT = {("doctor",)}
+_SETTINGS = {"--install-completion", "--show-completion", "--ray", "--repeats"}
+_LONG = {("bench",), ("validate",)}  # with the cases and photons of their bases alone
 
 BASES = {
     ("check",): ("scene.toml",),
@@ -38,6 +42,19 @@ BASES = {
     ("water",): ("532",),
     ("list",): ("presets", "medium"),
     ("init",): ("mine",),
+    ("plan",): ("scene.toml", "--photons", "2000", "--no-range", "--device", "cpu"),
+    ("fit",): ("counts.npy", "scene.toml", "--unknown", "medium.absorption,depth", "--pulses", "300", "--photons",
+               "1000", "--out", "out", "--device", "cpu"),
+    ("train",): ("training.toml", "--out", "out", "--device", "cpu"),
+    ("evaluate",): ("data", "--models", "median", "--frames", "1", "--device", "cpu"),
+    ("validate",): ("slab", "--photons", "2000", "--device", "cpu"),
+    ("bench",): ("water", "--photons", "2000", "--repeats", "1", "--device", "cpu"),
+    ("dataset",): ("recipe.toml", "--out", "out", "--device", "cpu"),
+}  # fmt: skip
+# In the place of a base's scene or counts: other features, and counts of nothing, of too much, of another gate.
+ALIKE = {
+    "scene.toml": ("scene.toml", "grid.toml", "port.toml", "walls.toml", "polarised.toml"),
+    "counts.npy": ("counts.npy", "frames.h5", "result.h5", "zero.npy", "many.npy", "gate.npy"),
 }
 OUTPUTS = ("out", "out.json", "out.html", "out.gif", "mine.toml", "view.html", "light.gif", "scene.toml.new")
 
@@ -69,9 +86,9 @@ def options() -> dict[tuple[str, ...], list[tuple[str, bool]]]:
 def draw(r: random.Random) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Arguments, and the names that they name for output."""
     path = r.choice(sorted(options()))
-    words = list(BASES.get(path, ()))
+    words = [r.choice(ALIKE.get(word, (word,))) for word in BASES.get(path, ())]
     for _ in range(r.choice((1, 1, 2, 3))):
-        action = r.random()
+        action = r.random() * (0.45 if path in _LONG else 1.0)
         if action < 0.45 and options()[path]:
             name, takes_value = r.choice(options()[path])
             words += [name, r.choice(ODD)] if takes_value else [name]
@@ -89,4 +106,4 @@ def draw(r: random.Random) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return (*path, *words), (*OUTPUTS, *named, *initial)
 
 
-_NAMING = {"--out", "--json", "--ply", "--write", "--report", "--traceback"}
+_NAMING = {"--out", "--json", "--ply", "--write", "--report", "--traceback", "--plots"}

@@ -53,6 +53,35 @@ png = false
 """
 GRID = SCENE + b'[medium.grid]\nfile = "cells.npz"\ntranslation = [0.0, 0.0, 1.0]\n'
 
+
+def _with(**sections: str) -> bytes:
+    """The scene with more lines in some of its sections."""
+    text = SCENE.decode()
+    for name, lines in sections.items():
+        text = text.replace(f"[{name}]\n", f"[{name}]\n{lines}\n")
+    return text.encode()
+
+
+# Scenes with a feature of its own each: cells of water, glass before the lens, walls that reflect, polarised light.
+WALLS = (
+    'shape = "box"\nlower = [-1.0, -1.0, -0.5]\nupper = [1.0, 1.0, 3.0]\noutside_index = {y_low = 1.0, x_high = 1.2}'
+)
+SPECIAL = {
+    "grid.toml": GRID,
+    "port.toml": _with(
+        medium='phase_index = "seawater"',
+        laser='port = "camera"',
+        camera='port = {distance = 0.05, thickness = 0.01, material = "BK7"}',
+    ),
+    "walls.toml": SCENE + f"[domain]\n{WALLS}\n".encode(),
+    "polarised.toml": _with(
+        medium='scattering_matrix = "scaled_rayleigh"',
+        laser='polarisation = "linear"',
+        camera='polarisation = "stokes"',
+        transport="axis_threshold = 1.0",
+    ).replace(b"anisotropy = 0.9\n", b""),
+}
+
 CALIBRATED = b"""medium = {extinction = 0.5, albedo = 0.8, phase_function = "tabulated", phase_table = "phase.csv"}
 laser = {profile = "measured", profile_image = "beam.npy", half_angle_deg = 10}
 camera = {calibration = "camera.yaml", aperture_diameter = 0.02}
@@ -86,13 +115,13 @@ CAMERA_XML = b"""<?xml version="1.0"?><opencv_storage><image_width>10</image_wid
 """
 
 TRAINING = b"""model = "usdn"
-data = "none"
 seed = 4
 noise = {backscatter = [0.0, 0.5], photons = [1.0, 300.0]}
 [optimiser]
 steps = 6
 batch = 2
 crop = 32
+scenes = 4
 learning_rate = 1e-3
 report_every = 3
 """
@@ -107,7 +136,7 @@ def make_corpus(folder: Path) -> None:
     matrix = [[17.0, 0.0, 3.0], [0.0, 17.0, 2.0], [0.0, 0.0, 1.0]]
     camera = {"image_width": 10, "image_height": 8, "camera_matrix": matrix, "distortion_coefficients": [-0.01] * 5}
     for name, content in {
-        "scene.toml": SCENE, "grid.toml": GRID, "calibrated.toml": CALIBRATED, "training.toml": TRAINING,
+        **SPECIAL, "scene.toml": SCENE, "calibrated.toml": CALIBRATED, "training.toml": TRAINING,
         "camera.yaml": CAMERA, "camera.xml": CAMERA_XML, "camera.json": json.dumps(camera).encode(),
         "phase.csv": PHASE, "irf.csv": IRF, "recipe.toml": recipe().to_toml().encode(),
     }.items():  # fmt: skip
@@ -135,6 +164,9 @@ def make_corpus(folder: Path) -> None:
     spadwarp.dataset.make_dataset(small, folder / "data", device="cpu")
     # Arrays and histograms of others.
     np.save(folder / "counts.npy", COUNTS)
+    np.save(folder / "zero.npy", 0 * COUNTS)
+    np.save(folder / "many.npy", np.full(COUNTS.shape, 2**62))
+    np.save(folder / "gate.npy", COUNTS[..., :17])
     cells = {"density": np.linspace(0.0, 2.0, 60).reshape(3, 4, 5), "cell_size": np.full(3, 0.1)}
     np.savez(folder / "cells.npz", **cells)
     with h5py.File(folder / "cells.h5", "w") as file:

@@ -20,10 +20,10 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # threads do not survive a fork
 sys.path[:0] = [str(Path(__file__).parents[1])]
 
-from fuzz import kernel_calls
+from fuzz import api_calls, kernel_calls
 from fuzz.cases import CATEGORIES, draw
 from fuzz.command_lines import program
-from fuzz.corpus import Corpus, make_corpus
+from fuzz.corpus import SPECIAL, Corpus, make_corpus
 from fuzz.executed import run_case
 from helpers.cli import run as run_command
 from helpers.coarse_pictures import coarse_pictures
@@ -45,6 +45,7 @@ def warm_up(corpus: Path) -> None:
             ("denoise", "depth.npy", "--model", "usdn", *cpu),
             ("export", "frames.h5", "--format", "mat"),
             ("view", "result.h5", *cpu),
+            *(("simulate", name, "--photons", "50", *cpu) for name in SPECIAL),
         )):  # fmt: skip
             run_command(command, corpus / name, *rest, "--out", f"{out}/{number}{'.html' * (command == 'view')}")
 
@@ -53,6 +54,8 @@ def verdict_of(category: str, number: int, corpus: Corpus) -> tuple[str, str, st
     """Verdict, text and what was run."""
     if category == "kernels":
         return *kernel_calls.run(number), "kernels"
+    if category == "api":
+        return api_calls.run(number, corpus.folder)
     case = draw(number, corpus, category)
     return *run_case(case, corpus.folder), " ".join(case.arguments)[:300]
 
@@ -61,7 +64,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", type=int)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument("--only", default=",".join([*CATEGORIES, "kernels"]), help="categories, separated by commas")
+    parser.add_argument(
+        "--only", default=",".join([*CATEGORIES, "kernels", "api"]), help="categories, separated by commas"
+    )
     parser.add_argument("--out", help="findings as JSON lines")
     options = parser.parse_args()
     names, findings, began = options.only.split(","), 0, time.monotonic()
@@ -73,6 +78,8 @@ def main() -> int:
         warm_up(corpus.folder)
         if "kernels" in names:
             kernel_calls.warm_up()
+        if "api" in names:
+            api_calls.warm_up(corpus.folder)
         program()
         gc.collect()
         gc.freeze()  # else the first collection of every child copies this process's memory

@@ -24,7 +24,8 @@ def _texel(tangent: float, low: float, high: float) -> float:
     return (tangent - low) / (high - low) * float(_TEXELS)
 
 
-@wp.kernel(enable_backward=False)
+# In a module of its own: a thread that makes functions of this file changes theirs while another loads this kernel.
+@wp.kernel(module="unique", enable_backward=False)
 def _near_depth_kernel(camera: Camera, view: wp.vec4, mesh: wp.uint64, threads: int, near_depth: wp.array2d[float]):
     """Lowers each texel of a view to the least depth of the faces that may cover it. Launch: (faces, their threads)."""
     face, thread = wp.tid()

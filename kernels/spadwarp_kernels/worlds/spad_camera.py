@@ -389,6 +389,10 @@ class WorldCameras:
         self.reflectance, self.significance = (wp.zeros(image, dtype=float, device=device) for _ in range(2))
         self.step = wp.zeros(1, dtype=wp.int64, device=device)
         self._view = wp.array(config.lines_of_sight(), dtype=wp.vec3, device=device)
+
+    def _tabulate(self) -> None:
+        """Light and responses that no shape changes: seconds of work, after all arguments are checked."""
+        config, device = self.config, self.device
         background = backscatter_rates(config, device)
         self._background = wp.array(background, dtype=float, device=device)
         self._rows = (self.cameras * config.height * config.width, config.bins)
@@ -600,6 +604,7 @@ class SpadCamera(WorldCameras):
         device: wp.DeviceLike = None,
     ) -> None:
         super().__init__(config, cameras, world=world, frame=frame, device=device)
+        self._tabulate()
         self._lidar = self.config.lidar()
         self._signal, self._path = (wp.zeros(self._rows[0], dtype=float, device=self.device) for _ in range(2))
 

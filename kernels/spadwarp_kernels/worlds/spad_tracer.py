@@ -286,7 +286,9 @@ class SpadTracer(WorldCameras):
         self._meshes = CameraMeshes(shapes, worlds, self.device)
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(np.pad(taps, (_RUN - 1) * self._parts), dtype=float, device=self.device)
-        self._lane_count = min(check_integer("lanes", lanes, 1, 64), self.cameras if self.device.is_cuda else 1)
+        lanes = check_integer("lanes", lanes, 1, 64)
+        self._tabulate()
+        self._lane_count = min(lanes, self.cameras if self.device.is_cuda else 1)
         self._estimator = estimator
         self._models: list[Model] = []
         # Memory that cameras share which are traced one after the other; lanes run side by side on a GPU, each on its
