@@ -30,7 +30,6 @@ def test_estimators_agree_in_every_component(axis_threshold, photons, device):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*forward peak")
 @pytest.mark.parametrize(("medium", "axis_threshold"), [(TABLE, 0.97), ({"phase_function": "fournier_forand"}, 1.0)])
 def test_estimators_agree_with_a_tabulated_phase_function(medium, axis_threshold, device):
     """Two terms, one of them backward, under a raised near-axis threshold; a peak without a width."""

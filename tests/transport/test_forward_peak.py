@@ -31,7 +31,6 @@ def scattered(water, estimator, photons, device):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*forward peak")
 @pytest.mark.parametrize("water", WATERS)
 def test_what_the_estimators_miss_of_fournier_forand_is_what_they_say(water, device):
     """Against analog, which misses nothing: by no more than the unseen share of all photons and 3 standard errors;

@@ -26,7 +26,6 @@ WIDE = {"shape": "box", "lower": -60.0, "upper": 60.0}  # that no light of the g
     seed=st.integers(0, 2**64 - 1),
 )
 @pytest.mark.filterwarnings("ignore:.*rounding to the histogram's unit:RuntimeWarning")  # nearly black targets
-@pytest.mark.filterwarnings("ignore:.*forward peak")
 @pytest.mark.parametrize(("estimator", "termination"), [("next_event", "cutoff"), ("guided", "roulette")])
 def test_the_ledger_closes_exactly(estimator, termination, **values):
     """Emitted weight = the sum of all entries, in integers, for random waters, limits and targets in a box of water."""
