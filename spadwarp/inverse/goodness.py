@@ -49,7 +49,9 @@ class Goodness:
     """Whether a fit describes its counts."""
 
     p: float  # probability of deviances as large or larger than those of `parts`, if the model is right; NaN: not known
-    parts: Mapping[str, Deviance]  # deviances: "pixels and bins", "time" (pixels added up), "image" (bins added up)
+    parts: Mapping[str, Deviance]
+    """Deviances: "pixels and bins"; "image", the bins added up; the pixels added up, "time of the target" in bins in
+    which light of targets is the largest part, and "time of the rest"."""
     components: Mapping[str, Deviance]
     """Those of pixels and bins in which light of the "target", light of the "water", or "noise" (dark counts and
     ambient light) is the largest part of the mean."""
@@ -117,11 +119,19 @@ def goodness_of(
     pieces, number = np.stack([mean, variance, *batches, *parts]).astype(np.float64), 2 + len(batches)
     first, pixel = _cells(pieces[0])
     first_time, _ = _cells(pieces[:1].sum(axis=1).reshape(1, -1))
+
+    def over_time(x: Any) -> Any:
+        return np.add.reduceat(x.sum(axis=-2), first_time, axis=-1)
+
     ways: dict[str, tuple[Callable[[Any], Any], Any]] = {
         "pixels and bins": (lambda x: np.add.reduceat(x.reshape(*x.shape[:-2], rows.size), first, axis=-1), pixel),
-        "time": (lambda x: np.add.reduceat(x.sum(axis=-2), first_time, axis=-1), None),
         "image": (lambda x: x.sum(axis=-1), np.arange(len(rows))),
     }
+    # A wrong response shows in the few bins of the return, and is little among all.
+    times = {"time of the target": np.argmax(over_time(pieces[number:]), axis=0) == 0}
+    times["time of the rest"] = ~times["time of the target"]
+    times = {name: chosen for name, chosen in times.items() if chosen.any()}
+    ways |= {name: (functools.partial(_some, over_time, chosen), None) for name, chosen in times.items()}
     sums = ways["pixels and bins"][0](pieces)
     found = {name: _Cells(add_up(rows), add_up(pieces[:number])) for name, (add_up, _) in ways.items()}
     deviances = {name: one.deviance(lost.of(one.mean, *ways[name])) for name, one in found.items()}
@@ -135,8 +145,8 @@ def goodness_of(
         whole.expected - per_pixel.expected,
         whole.standard_deviation**2 - per_pixel.standard_deviation**2,
     )
-    known = [p for p in (within, deviances["time"].p, per_pixel.p) if not np.isnan(p)]
-    beyond = deviances["time"].deviance - deviances["time"].expected
+    known = [p for p in (within, per_pixel.p, *(deviances[name].p for name in times)) if not np.isnan(p)]
+    beyond = sum(deviances[name].deviance - deviances[name].expected for name in times)
     return Goodness(
         p=float(-np.expm1(len(known) * np.log1p(-min(known)))) if known and min(known) < 1.0 else 1.0,
         parts=deviances,
@@ -144,6 +154,10 @@ def goodness_of(
         misfit=float(np.sqrt(max(beyond, 0.0) / max(rows.sum(), 1))),
         pixels=(excess / np.sqrt(np.maximum(variances, 1e-300))).reshape(image),
     )
+
+
+def _some(add_up: Callable[[Any], Any], chosen: NDArray[np.bool_], x: Any) -> Any:
+    return add_up(x)[..., chosen]
 
 
 def _cells(mean: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
