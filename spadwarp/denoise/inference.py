@@ -196,7 +196,8 @@ def detected(
     frames = counts.reshape(-1, *counts.shape[-3:])
     known = summed(np.broadcast_to(background, frames.shape[1:]))
     significance = np.empty(frames.shape[:-1], np.float32)
-    options: dict[str, Any] = {"background": known, "level_known": level_known, "irf": response, "device": "cpu"}
+    options: dict[str, Any] = {"background": known, "level_known": level_known, "device": "cpu"}
+    options["irf"] = np.maximum(response, 0.0)  # which a convolution has rounded below
     for cube, out in zip(frames, significance, strict=True):
         arrival_time(summed(cube.astype(np.int64)), gate_start=0.0, bin_width=1e-12, significance=out, **options)
     significance = significance.reshape(found.depth.shape)

@@ -89,6 +89,7 @@ class _StoredFrames:
                 if name not in METHODS:
                     file.refuse(f"depth/{name}", f"is not by one of {', '.join(METHODS)}")
                 file.stored(f"depth/{name}", np.float32, shape[:3])
+            file.stored("significance", np.float32, shape[:3])
             common: dict[str, Any] = {
                 "path": Path(path),
                 "shape": shape,

@@ -414,7 +414,9 @@ class Fitter:
         assert counts is not None
         on_targets = [unknown.name == DEPTH or unknown.name.startswith("targets") for unknown in self.unknowns]
         if any(on_targets):
-            whole = significance(counts.reshape(1, -1), expected.reshape(1, -1), target.reshape(1, -1))[0]
+            # Without pixels of an own depth that too few photons show to be fitted: their light has no limit.
+            usable = target.sum(axis=1) <= counts.sum()
+            whole = significance(*(rows[usable].reshape(1, -1) for rows in (counts, expected, target)))[0]
             each = significance(counts, expected, target)
         for unknown, on_target in zip(self.unknowns, on_targets, strict=True):
             if unknown.per_pixel:

@@ -171,6 +171,7 @@ def _cells(mean: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 def significance(counts: NDArray[np.integer], mean: Rows, light: Rows) -> Floats:
     """Significance of light in counts, in standard deviations `[row]`, from the likelihood with as much of it as is
     likeliest, over that without. `mean`, and the part of it that is `light`: `[row, bin]`."""
+    light = np.maximum(light, 0.0)  # a convolution rounds below
     rest, total = np.maximum(mean - light, 1e-9).astype(np.float64), light.sum(axis=1, dtype=np.float64)
     amount = np.ones((len(mean), 1))
     for _ in range(_TURNS):  # expectation maximisation
