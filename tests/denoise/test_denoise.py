@@ -222,7 +222,8 @@ def wall():
 
 
 def test_counts_are_denoised_with_their_histograms(wall, tmp_path):
-    """One detection in five pixels of a plane: an error below 2 cm, with the histograms or from depth alone."""
+    """One detection in five pixels of a plane: an error below 2 cm, with the histograms or from depth alone, but in some
+    corners, around which too few were counted to be sure."""
     result = dataclasses.replace(wall, scene=wall.scene.with_overrides({"laser.pulse_energy": 1e-13}))
     recorded = record_frames(result, tmp_path / "frames.h5", pulses=2000, frames=4, seed=1, device="cpu")
     assert 0.1 < recorded.detections / (4 * 16 * 12) < 0.4
@@ -230,8 +231,9 @@ def test_counts_are_denoised_with_their_histograms(wall, tmp_path):
     for weights in (None, network_files.WEIGHTS / "pyramid.safetensors"):
         found = files.denoise_file(tmp_path / "frames.h5", tmp_path / "out", weights=weights, device="cpu")
         assert ("denoised with its histograms" in found.notes) == (weights is None)
-        errors.append(np.nan_to_num(found.depth, nan=0.5 * sum(found.gate)) - result.truth.depth)
-    rmse = np.sqrt(np.mean(np.square(errors), axis=(1, 2, 3)))
+        errors.append(found.depth - result.truth.depth)
+        assert np.isfinite(found.depth).mean() > 0.9
+    rmse = np.sqrt(np.nanmean(np.square(errors), axis=(1, 2, 3)))
     assert max(rmse) < 0.02
 
 
