@@ -222,8 +222,8 @@ def wall():
 
 
 def test_counts_are_denoised_with_their_histograms(wall, tmp_path):
-    """One detection in five pixels of a plane: an error below 2 cm, with the histograms or from depth alone, but in some
-    corners, around which too few were counted to be sure."""
+    """One detection in five pixels of a plane: an error below 2 cm, with the histograms or from depth alone, but in
+    some corners, around which too few were counted to be sure."""
     result = dataclasses.replace(wall, scene=wall.scene.with_overrides({"laser.pulse_energy": 1e-13}))
     recorded = record_frames(result, tmp_path / "frames.h5", pulses=2000, frames=4, seed=1, device="cpu")
     assert 0.1 < recorded.detections / (4 * 16 * 12) < 0.4
