@@ -20,8 +20,7 @@ import re
 import reprlib
 import sys
 import types
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import (
@@ -182,26 +181,27 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
     if hasattr(function, "__guarded__"):
         return function
 
-    @contextmanager
-    def in_own_words(arguments: Sequence[Any], named: Mapping[str, Any]) -> Iterator[None]:
-        try:
-            yield
-        except SpadwarpError:
-            raise
-        except Exception as error:
-            if isinstance(error, OSError) and error.filename is not None and error.errno != errno.ENOMEM:
-                raise FileError(in_words(error)) from error
-            if problem := _wrong_argument(error, function, arguments, named):
-                raise UnforeseenArgument(problem) from error
-            raise
+    def explain(error: Exception, arguments: Sequence[Any], named: Mapping[str, Any]) -> None:
+        if isinstance(error, SpadwarpError):
+            return
+        if isinstance(error, OSError) and error.filename is not None and error.errno != errno.ENOMEM:
+            raise FileError(in_words(error)) from error
+        if problem := _wrong_argument(error, function, arguments, named):
+            raise UnforeseenArgument(problem) from error
 
     def value_of(*arguments: Any, **named: Any) -> Any:
-        with in_own_words(arguments, named):
+        try:
             return function(*arguments, **named)
+        except Exception as error:
+            explain(error, arguments, named)
+            raise
 
     def items_of(*arguments: Any, **named: Any) -> Any:
-        with in_own_words(arguments, named):
+        try:
             return (yield from function(*arguments, **named))
+        except Exception as error:
+            explain(error, arguments, named)
+            raise
 
     yields = function.__code__.co_flags & _GENERATOR
     call: Any = functools.wraps(function)(items_of if yields else value_of)
