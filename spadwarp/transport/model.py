@@ -427,10 +427,9 @@ def _channel_rows(camera: Camera) -> list[list[float]]:
 def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) -> None:
     """Refuses a laser or a target within the camera's port; a camera or a laser, or the way out of its port, outside
     the domain; and a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
-    if camera and scene.camera.port is not None:
-        triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
-        if found := within_port(scene, triangles):
-            raise ConfigError(found, source=scene.source)
+    corners = np.zeros((0, 3, 3)) if mesh is None or scene.camera.port is None else mesh.vertices[mesh.faces]
+    if camera and (found := within_port(scene, corners.astype(np.float64))):
+        raise ConfigError(found, source=scene.source)
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
     ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)]
