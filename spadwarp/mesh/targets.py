@@ -423,7 +423,7 @@ def _apparent_distance(scene: Scene, port: PortGeometry, mesh: TriangleMesh | No
         frame = np.stack([*np.linalg.svd(axis[None])[2][1:], axis])
         triangles = (mesh.vertices[mesh.faces].astype(np.float64) - start) @ frame.T
         depth = _first_depth(triangles, lambda: triangles.reshape(-1, 3), 0.0)
-    return port.apparent_distance(start + (depth or _FAR) * axis)
+    return float(port.apparent_distance(start + (depth or _FAR) * axis))
 
 
 def _first_depth(

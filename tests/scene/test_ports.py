@@ -130,6 +130,7 @@ def test_a_lens_focuses_on_what_it_sees_through_the_port():
     expected = 0.05 + 0.01 * n_air / n_glass + 4.94 * n_air / 1.3415
     assert focus_distance(one, build_mesh(one)) == pytest.approx(expected, rel=1e-6)
     assert focus_distance(ported(WINDOW, targets=[]), None) > 1e5
+    assert type(focus_distance(one, build_mesh(one))) is float  # as fields are, also where a fit fixes them
 
 
 def test_check_knows_the_port():
