@@ -19,7 +19,7 @@ _PACKAGES = {
     "checks": ("check",),
     "transport": ("RunOptions", "simulate", "truth_maps"),
     "parallel": ("Ray",),
-    "result": ("Result", "load_result", "merge"),
+    "result": ("Result", "merge"),
     "frames": ("Frames", "arrival_time", "crlb", "detect"),
     "analytic": ("budget", "plan", "simulate_analytic", "sweep"),
     "inverse": ("fit",),
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from spadwarp.arrays import to_pandas as to_pandas
     from spadwarp.inverse import fit as fit
     from spadwarp.parallel import Ray as Ray
-    from spadwarp.result import Result as Result, load_result as load_result, merge as merge
+    from spadwarp.result import Result as Result, merge as merge
     from spadwarp.scene import Scene as Scene, load_scene as load_scene
     from spadwarp.transport import RunOptions as RunOptions, simulate as simulate, truth_maps as truth_maps
 else:
@@ -69,4 +69,4 @@ else:
         raise AttributeError(f"module 'spadwarp' has no attribute {name!r}")
 
     def __dir__() -> list[str]:
-        return sorted(__all__)
+        return sorted({*__all__, *_PACKAGES})

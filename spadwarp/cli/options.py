@@ -308,7 +308,7 @@ def read_scene(
 def load_run(place: Path, channel: Channel = "I") -> Result:
     """The result in a file, or in the directory of a run; a checkpoint where there is no result."""
     path = spadwarp.files.locate(place)
-    result = spadwarp.load_result(place / "result.h5" if path.is_dir() else path)
+    result = spadwarp.result.load_result(place / "result.h5" if path.is_dir() else path)
     return spadwarp.result.analyser_channel(result, channel)
 
 

@@ -51,7 +51,7 @@ def simulate(
 ) -> None:
     """Trace photons through a scene into histograms, or through each frame of a scene that moves.
 
-    Writes result.h5 (for `spadwarp info` and `spadwarp.load_result`), the complete scene.toml, depth.exr, truth.exr and
+    Writes result.h5 (for `spadwarp info` and `spadwarp.load`), the complete scene.toml, depth.exr, truth.exr and
     pictures. Ctrl-C or SIGTERM ends the run and writes the photons traced so far; after a crash, --resume continues
     from the last checkpoint. With --trajectory: sequence.h5 (counts, depth, truth; with --tags detections) and
     sequence.gif.

@@ -419,7 +419,7 @@ class Result(Shown, ResultHead, Tallies):
         return spadwarp.result.to_xarray(self)
 
     def save(self, path: str | Path) -> Path:
-        """Writes everything to one HDF5 file that `spadwarp.load_result` reads back bit for bit; returns its path."""
+        """Writes everything to one HDF5 file that `spadwarp.load` reads back bit for bit; returns its path."""
         import spadwarp
 
         return spadwarp.result.save_result(self, path)

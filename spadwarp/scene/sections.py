@@ -188,6 +188,13 @@ class Section(_Model):
     displaces: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Fields that drop others, which they exclude, from what they are laid over."""
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name.startswith("_"):
+            return super().__setattr__(name, value)
+        raise AttributeError(
+            f"{name} cannot be assigned: a scene does not change; scene.with_overrides makes another one"
+        )
+
     @model_validator(mode="before")
     @classmethod
     def _over_preset(cls, fields: Any) -> Any:

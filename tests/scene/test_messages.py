@@ -252,3 +252,10 @@ def test_any_object_is_a_value_or_refused_in_a_line(field, value):
     tables = {section: {**MINIMAL.get(section, {}), name: value}} if name else {section: value}
     (first, *_) = problems(tables)
     assert first.startswith(section) and len(first) < 500
+
+
+def test_assigning_to_a_field_leads_to_with_overrides():
+    scene = make_scene()
+    for place, name in ((scene, "medium"), (scene.medium, "scattering"), (scene.targets[0], "nonsense")):
+        with pytest.raises(AttributeError, match=rf"^{name} cannot be assigned.*with_overrides"):
+            setattr(place, name, 1.0)
