@@ -255,7 +255,7 @@ def test_any_object_is_a_value_or_refused_in_a_line(field, value):
 
 
 def test_assigning_to_a_field_leads_to_with_overrides():
-    scene = make_scene()
+    scene = spadwarp.Scene.from_dict(BASE)
     for place, name in ((scene, "medium"), (scene.medium, "scattering"), (scene.targets[0], "nonsense")):
         with pytest.raises(AttributeError, match=rf"^{name} cannot be assigned.*with_overrides"):
             setattr(place, name, 1.0)
