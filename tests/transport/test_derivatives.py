@@ -81,7 +81,7 @@ def test_estimators_agree(device):
 
     def cells(one, estimator, photons):
         one = one.with_overrides({"transport.estimator": estimator})
-        runs = [simulated(one, device, ALL, photons, seed=seed) for seed in range(24)]
+        runs = [simulated(one, device, ALL, photons, seed=seed) for seed in range(16)]
         return np.array([np.stack([*run.derivatives.values()]).sum(axis=(2, 3)).ravel() for run in runs])
 
     for threshold in (1.0, 0.97):
