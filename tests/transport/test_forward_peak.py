@@ -31,8 +31,8 @@ def scattered(water, estimator, photons, device):
 def test_what_the_estimators_miss_of_fournier_forand_is_what_they_say(device):
     """Against analog, which misses nothing: by no more than the unseen share of all photons and 3 standard errors;
     guided misses less than half of what next_event does."""
-    photons = {"guided": 40_000, "next_event": 50_000}
-    truth, deviation = scattered(WATER, "analog", 200_000, device)
+    photons = {"guided": 20_000, "next_event": 50_000}
+    truth, deviation = scattered(WATER, "analog", 100_000, device)
     missing = {}
     for estimator, number in photons.items():
         mean, error = scattered(WATER, estimator, number, device)
