@@ -197,7 +197,7 @@ def test_behind_a_port_the_path_is_that_in_water_and_lambertian_bounces_are_coun
 
 
 def test_errors_between_batches_are_those_between_seeds(device):
-    runs = [simulated(layered(), device, ALL, 32_768, seed=seed, uncertainty=True) for seed in range(16)]
+    runs = [simulated(layered(), device, ALL, 32_768, seed=seed, uncertainty=True) for seed in range(24)]
     for name in ALL:
         spread = np.std([run.derivatives[name].sum(axis=0) for run in runs], axis=0, ddof=1)
         stated = np.sqrt(np.mean([run.derivative_errors[name] ** 2 for run in runs], axis=0))
