@@ -27,7 +27,7 @@ settings.load_profile("spadwarp")
 
 
 def pytest_addoption(parser):
-    parser.addoption("--fuzz", type=int, default=108, metavar="N", help="cases of the fuzzing harness, tests/fuzz")
+    parser.addoption("--fuzz", type=int, default=54, metavar="N", help="cases of the fuzzing harness, tests/fuzz")
 
 
 def pytest_collection_modifyitems(items):

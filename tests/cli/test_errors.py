@@ -209,7 +209,7 @@ def test_an_interrupt_while_commands_are_loaded():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", [0.2, 0.5, 1.0, 1.5])
+@pytest.mark.parametrize("moment", [0.3, 1.0])
 def test_an_interrupt_at_any_moment(moment, scene):
     with start("check", scene) as command:
         time.sleep(moment)
@@ -245,7 +245,7 @@ def test_less_memory_than_the_libraries_need(mebibytes, needed, arguments, tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("command", "mebibytes"), [("simulate", 1030), ("simulate", 1100), ("sweep", 1030)])
+@pytest.mark.parametrize(("command", "mebibytes"), [("simulate", 1100), ("sweep", 1030)])
 def test_short_memory_is_named(command, mebibytes, scene, tmp_path):
     done = limited(mebibytes, command, scene, "--device", "cpu", "--out", tmp_path / "out")
     said = ("not enough memory", "too little memory", "OpenBLAS error: Memory")

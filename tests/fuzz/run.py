@@ -20,6 +20,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # threads do not survive a fork
 sys.path[:0] = [str(Path(__file__).parents[1])]
 
+import warp as wp
+
 from fuzz import api_calls, kernel_calls
 from fuzz.cases import CATEGORIES, draw
 from fuzz.command_lines import program
@@ -29,6 +31,7 @@ from helpers.cli import run as run_command
 from helpers.coarse_pictures import coarse_pictures
 
 FINE = ("done", "refused")
+wp.config.cpu_compiler_flags = "-march=native"  # as in the other tests, which have compiled many of the kernels
 
 
 def warm_up(corpus: Path) -> None:

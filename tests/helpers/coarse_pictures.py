@@ -7,14 +7,14 @@ def coarse_pictures(replace=setattr):
     replace: Sets an attribute, as `setattr` or the method of `pytest.MonkeyPatch` do.
     """
     from matplotlib.figure import Figure as Picture
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     save = Picture.savefig
 
     def coarse(self, *where, **options):
         if options.get("format") != "rgba":  # frames of an animation have the size of its first
             options["dpi"] = 20
+        engine, self._layout_engine = self._layout_engine, None  # for which all would be drawn twice
         save(self, *where, **options)
+        self._layout_engine = engine
 
-    replace(ConstrainedLayoutEngine, "execute", lambda self, picture: None)
     replace(Picture, "savefig", coarse)

@@ -8,10 +8,11 @@ import spadwarp
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene.pose import rotation_matrix
 
+SEEDS = 20  # of each mean, which analog then knows to about 1 % and guided to better than that
 PHOTONS = {"analog": 40_000, "next_event": 20_000, "guided": 20_000}
 
 
-def cells(one, device, photons, seeds=32, pixels=False):
+def cells(one, device, photons, seeds=SEEDS, pixels=False):
     """Fractions of emitted photons `[seeds, cells]`: each component's bins over all pixels; with `pixels` also each
     pixel over all bins."""
     rows = []
@@ -47,7 +48,7 @@ def clear_at_the_lens(one):
     return one.with_overrides(medium=clear)
 
 
-def agreeing_cells(one, device, *, photons=PHOTONS, seeds=32, pixels=False, converged=0.2, clear=False):
+def agreeing_cells(one, device, *, photons=PHOTONS, seeds=SEEDS, pixels=False, converged=0.2, clear=False):
     """Cells of each estimator, after two pairs were found to have the same mean wherever both have converged: analog
     and guided, and next_event and guided in water that is clear next to the lens.
 

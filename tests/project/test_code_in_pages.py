@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import spadwarp
 from helpers.cli import ENVIRONMENT, run
@@ -57,6 +58,9 @@ LEFT_OUT = {
     r"bm3d": "takes minutes; tests/denoise has it on a small frame",
 }
 
+
+# In processes of their own too, kernels are those of the tests, see tests/conftest.py.
+QUICK = f"import warp; warp.config.cpu_compiler_flags = {wp.config.cpu_compiler_flags!r}"
 
 WITH_PYTHON = [page for page in (README, *PAGES) if page != TUTORIAL and blocks(page, "python")]
 WITH_COMMANDS = [page for page in (README, *PAGES) if page != TUTORIAL and commands(page)]
@@ -110,7 +114,8 @@ def test_python_in_the_text_runs(page, checkout, tmp_path):
 
 @pytest.mark.slow
 def test_python_of_the_kernels_runs_without_spadwarp_in_reach(tmp_path):
-    command = [sys.executable, program_of(ROOT / "kernels" / "README.md", tmp_path)]
+    program = program_of(ROOT / "kernels" / "README.md", tmp_path)
+    command = [sys.executable, "-c", f"{QUICK}; import runpy; runpy.run_path({program!r})"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "kernels")}
     process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert "reach the plate without a collision" in process.stdout, process.stderr
@@ -152,17 +157,20 @@ def test_everything_that_is_left_out_stands_in_a_page():
 # Notebooks
 
 
-def execute(path, folder, *, whole):
-    """The notebook with its outputs, executed in `folder`, at a small size or whole; an error in a cell is raised."""
+def execute(path, folder):
+    """The notebook with its outputs, executed in `folder` at a small size; an error in a cell is raised."""
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     notebook = nbformat.read(path, as_version=4)
-    for cell in () if whole else notebook.cells:
+    for cell in notebook.cells:
         photons = re.sub(r"\b\d_000_000\b|\b\d00_000\b", "20_000", cell.source)
         cell.source = photons.replace("optimiser.steps=50", "optimiser.steps=2")
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(QUICK))
     client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
     environment = {name: value for name, value in ENVIRONMENT.items() if name != "MPLBACKEND"}
-    return client.execute(env=environment)
+    client.execute(env=environment)
+    del notebook.cells[0]
+    return notebook
 
 
 @pytest.mark.slow
@@ -170,7 +178,7 @@ def execute(path, folder, *, whole):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)
 def test_notebook_runs(path, tmp_path):
     folder = os.environ.get("SPADWARP_EXECUTED_NOTEBOOKS")  # where docs/hooks.py looks for them
-    executed = execute(path, tmp_path, whole=bool(folder))
+    executed = execute(path, tmp_path)
     if folder:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
         Path(folder).mkdir(parents=True, exist_ok=True)

@@ -25,7 +25,7 @@ def components(extinction, path, device, estimator, tracking):
     return parts.mean(axis=0), parts.std(axis=0, ddof=1) / math.sqrt(SEEDS)
 
 
-@pytest.mark.parametrize("extinction", [1.0, 1e2, 1e4, 1e6])
+@pytest.mark.parametrize("extinction", [1e2, 1e6])
 def test_guided_by_regular_tracking_is_every_other_way(extinction, device, tmp_path):
     """Within 4 standard errors; backscatter, half of which is the dense cell's, to 5 %."""
     mean, error = components(extinction, tmp_path / "cell.npz", device, "guided", "regular")

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import spadwarp
 from helpers.scenes import ELSEWHERE, PLATE, scene, single_scatter_case
@@ -81,47 +80,12 @@ def test_estimators_agree(device):
 
     def cells(one, estimator, photons):
         one = one.with_overrides({"transport.estimator": estimator})
-        runs = [simulated(one, device, ALL, photons, seed=seed) for seed in range(24)]
+        runs = [simulated(one, device, ALL, photons, seed=seed) for seed in range(16)]
         return np.array([np.stack([*run.derivatives.values()]).sum(axis=(2, 3)).ravel() for run in runs])
 
     for threshold in (1.0, 0.97):
         one = layered(transport={"axis_threshold": threshold})
         assert equal_means_p(cells(one, "analog", 40_000), cells(one, "guided", 20_000)) > 1e-3
-
-
-def test_central_differences(device):
-    """Totals of the components, against independent runs of changed scenes; the step's own error is below theirs."""
-    water = {"absorption": 0.1, "scattering": 0.4, "anisotropy": 0.8}
-    steps = {"absorption": 0.01, "scattering": 0.01, "anisotropy": 0.02, "reflectance": 0.1}
-    p_values = []
-    runs = 10
-
-    def changed(reflectance=PLATE["reflectance"], **medium):
-        medium = {**water, **medium}
-        coefficients = {"extinction": medium["absorption"] + medium["scattering"]}
-        coefficients["albedo"] = medium["scattering"] / coefficients["extinction"]
-        targets = [{**PLATE, "reflectance": reflectance}]
-        optics = {**coefficients, "anisotropy": medium["anisotropy"]}
-        return layered(optics, targets=targets)
-
-    def totals(seed, **values):
-        result = spadwarp.simulate(changed(**values), photons=20_000, seed=seed, device=device)
-        return result.tallies.sum(axis=(1, 2, 3)) * (result.unit / result.photons)
-
-    results = [simulated(changed(), device, ALL, 20_000, seed=seed) for seed in range(runs)]
-    slopes = np.array([sums(result)[1:] for result in results])
-    for number, (name, step) in enumerate(steps.items()):
-        value = {**water, "reflectance": PLATE["reflectance"]}[name]
-        seeds = [1000 * (number + 1) + seed for seed in range(runs)]
-        differences = np.array(
-            [(totals(s, **{name: value + step}) - totals(s, **{name: value - step})) / (2 * step) for s in seeds]
-        )
-        for component in range(3):
-            if slopes[:, number, component].any():
-                pair = slopes[:, number, component], differences[:, component]
-                p_values.append(stats.ttest_ind(*pair, equal_var=False).pvalue)
-    assert len(p_values) == 10
-    assert min(p_values) * len(p_values) > 1e-3
 
 
 def test_layers_share_the_derivatives_of_one_water(device):

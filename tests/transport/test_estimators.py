@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import spadwarp_kernels as sk
-from helpers.estimators import PHOTONS, agreeing_cells, cells
+from helpers.estimators import PHOTONS, SEEDS, agreeing_cells, cells
 from helpers.scenes import ELSEWHERE, LAYERS, PENCIL, PLATE, PLUME, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp import simulate
@@ -26,14 +26,13 @@ def test_estimators_agree_in_every_component(axis_threshold, photons, device):
     """A raised near-axis threshold shows a wrong reading of the rule as 15 to 60 %; at the default it hides in 1 %."""
     one = scene(transport={"axis_threshold": axis_threshold})
     cells = agreeing_cells(one, device, photons=photons, clear=photons is PHOTONS)
-    assert (cells["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
+    assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("medium", "axis_threshold"), [(TABLE, 0.97), ({"phase_function": "fournier_forand"}, 1.0)])
-def test_estimators_agree_with_a_tabulated_phase_function(medium, axis_threshold, device):
-    """Two terms, one of them backward, under a raised near-axis threshold; a peak without a width."""
-    one = scene(medium=medium, transport={"axis_threshold": axis_threshold})
+def test_estimators_agree_with_a_tabulated_phase_function(device):
+    """Two terms, one of them backward, under a raised near-axis threshold."""
+    one = scene(medium=TABLE, transport={"axis_threshold": 0.97})
     agreeing_cells(one, device, photons={"analog": 30_000, "guided": 15_000})
 
 
@@ -139,7 +138,7 @@ VESSEL = {"builtin": "box", "size": [3.0, 2.0, 4.0], "translation": [0.0, 0.0, 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("events", [1, 2, 5])
+@pytest.mark.parametrize("events", [1, 3])
 def test_estimators_agree_under_a_cap_on_events(events, device):
     """White vessel, lossless water: no light is lost but by the cap, so that the last allowed event is a fair part.
 
@@ -155,10 +154,10 @@ def test_estimators_agree_under_a_cap_on_events(events, device):
     )
     found = agreeing_cells(one, device, photons={"analog": 58_000, "next_event": 20_000, "guided": 10_000})
     for name, values in found.items():
-        component = values.reshape(32, 3, -1).sum(axis=2)
-        mean, error = component.mean(axis=0), component.std(axis=0, ddof=1) / math.sqrt(32)
+        component = values.reshape(SEEDS, 3, -1).sum(axis=2)
+        mean, error = component.mean(axis=0), component.std(axis=0, ddof=1) / math.sqrt(SEEDS)
         assert (mean[[0, 2]] > 0).all() and (mean[1] > 0) == (events > 1)
-        assert (error <= (0.025 if name == "analog" else 0.005) * mean).all()
+        assert (error <= (0.032 if name == "analog" else 0.0065) * mean).all()
 
 
 @pytest.mark.parametrize(
@@ -190,7 +189,7 @@ def test_estimators_share_one_ledger(end, device):
     entry, found = next(iter(end)), ledger("next_event")
     assert "termination" in end or found == ledger("analog")
     assert all(found[name] > 0 for name in (entry, "exit_y_low", "absorbed_surface"))
-    means = [[ledger(name, 4000, seed)[entry] for seed in range(32)] for name in ("next_event", "guided")]
+    means = [[ledger(name, 4000, seed)[entry] for seed in range(SEEDS)] for name in ("next_event", "guided")]
     assert equal_means_p(*(np.array(values, float)[:, None] for values in means)) > 1e-3
 
 

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 import spadwarp
-from helpers.estimators import cells, means
+from helpers.estimators import SEEDS, cells, means
 from helpers.scenes import LAYERS, PLUME, scattered_once, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene.medium import grid_cells
@@ -87,9 +87,9 @@ def test_estimators_and_tracking_agree_through_a_plume(device):
         return cells(one, device, photons)
 
     guided = run("guided", "delta", 8000)
-    assert (guided.reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
+    assert (guided.reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
     total = guided.sum(axis=1)
-    assert total.std() / total.mean() / math.sqrt(32) < 0.01
+    assert total.std() / total.mean() / math.sqrt(SEEDS) < 0.01
     for other in (("guided", "regular", 8000), ("next_event", "delta", 8000), ("analog", "regular", 20_000)):
         assert equal_means_p(run(*other), guided) > 1e-3, other
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import spadwarp
-from helpers.estimators import agreeing_cells, means
+from helpers.estimators import SEEDS, agreeing_cells, means
 from helpers.scenes import BEYOND, LAYERS, PENCIL, PLATE, WATER, scene
 from reference.adding_doubling import stack
 from reference.single_scatter import Lidar, single_scatter_total
@@ -44,7 +44,7 @@ def test_layers_of_one_water_are_that_water(estimator, device):
 @pytest.mark.slow
 def test_estimators_agree_through_layers(device):
     cells = agreeing_cells(scene(medium=LAYERED), device, clear=True)
-    assert (cells["guided"].reshape(32, 3, -1).sum(axis=(0, 2)) > 0).all()
+    assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
 
 
 @pytest.mark.slow

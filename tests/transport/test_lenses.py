@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import spadwarp
-from helpers.estimators import PHOTONS, agreeing_cells
+from helpers.estimators import PHOTONS, SEEDS, agreeing_cells
 from helpers.opencv import project_points
 from helpers.scenes import PLATE, scene
 from spadwarp import simulate
@@ -37,8 +37,8 @@ def test_estimators_agree_behind_every_lens(camera, device):
     cells = agreeing_cells(one, device, photons=photons, pixels=True, converged=0.1, clear=clear)
     # Every component and pixel is seen.
     pixels = cells["guided"][:, -16:]
-    assert (pixels.std(axis=0) / pixels.mean(axis=0) / math.sqrt(32) < 0.1).all()
-    assert (cells["guided"][:, :24].reshape(32, 3, 8).sum(axis=(0, 2)) > 0).all()
+    assert (pixels.std(axis=0) / pixels.mean(axis=0) / math.sqrt(SEEDS) < 0.1).all()
+    assert (cells["guided"][:, :24].reshape(SEEDS, 3, 8).sum(axis=(0, 2)) > 0).all()
 
 
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])

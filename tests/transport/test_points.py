@@ -6,7 +6,7 @@ import pytest
 import spadwarp
 import spadwarp_kernels as sk
 from helpers.estimators import cells
-from helpers.scenes import BEYOND, ELSEWHERE, PLATE, scene
+from helpers.scenes import BEYOND, ELSEWHERE, scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
 from spadwarp import simulate
 from spadwarp.transport import trace
@@ -30,12 +30,9 @@ def with_points(one, points):
 
 @pytest.mark.physics
 @pytest.mark.slow
-@pytest.mark.parametrize(("medium", "targets", "points"), [({}, [PLATE], 2), (LAYERS, BARS, 3)])
-def test_more_points_have_the_expectation_of_one(medium, targets, points, device):
-    """A plate; in layers boxes that hide water from the lens, so that later points trace shadow rays of their own."""
-    one, more = (
-        cells(with_points(scene(medium=medium, targets=targets), n), device, 8000, pixels=True) for n in (1, points)
-    )
+def test_more_points_have_the_expectation_of_one(device):
+    """In layers, behind boxes that hide water from the lens, so that later points trace shadow rays of their own."""
+    one, more = (cells(with_points(scene(medium=LAYERS, targets=BARS), n), device, 8000, pixels=True) for n in (1, 3))
     assert equal_means_p(one, more) > 1e-3
     for found in (one, more):
         assert found.sum(axis=1).std() / found.sum(axis=1).mean() / np.sqrt(len(found)) < 0.015
@@ -43,8 +40,8 @@ def test_more_points_have_the_expectation_of_one(medium, targets, points, device
 
 @pytest.mark.physics
 def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
-    """Variance of 32 × 32 pixels' bins in water over 24 seeds: 1/2 and 1/3 if they were independent, a little more as
-    the points of a flight share its photon."""
+    """Variance of 32 × 32 pixels' bins in water over 24 seeds: 1/3 if they were independent, a little more as the
+    points of a flight share its photon."""
     sections = {
         "camera": {"width": 32, "height": 32, "horizontal_fov_deg": 20.0, "aperture_diameter": 0.02},
         "gate": {"bins": 16, "bin_width_ps": 1000.0},
@@ -56,8 +53,7 @@ def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
         light = [simulate(one, photons=20_000, seed=seed, device=device).histogram for seed in range(24)]
         return np.var(light, axis=0).sum(axis=(0, 1))[2:8]
 
-    single, double, triple = (variance(points) for points in (1, 2, 3))
-    assert 0.4 < np.median(double / single) < 0.7
+    single, triple = (variance(points) for points in (1, 3))
     assert 0.25 < np.median(triple / single) < 0.55
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import spadwarp
-from helpers.estimators import clear_at_the_lens
+from helpers.estimators import SEEDS, clear_at_the_lens
 from helpers.scenes import ELSEWHERE, PLATE, TREE, scene, single_scatter_case
 from helpers.statistics_of_samples import equal_means_p
 from reference.polarised_lidar import linear, stokes_factor
@@ -145,7 +145,7 @@ def atmosphere(table, mu, phi_deg):
 
 
 CASES = [(table, row) for table in TABLES for row in table.rows if row[0] == UPPER]
-ON_A_CPU = (2, 5, 10, 11, 12, 14, 17, 19)  # of each table two, one of them near the horizon
+ON_A_CPU = (2, 10, 14, 19)  # of each table one, two of them near the horizon
 
 
 def off_the_tables(table, row, photons, device):
@@ -163,8 +163,8 @@ def off_the_tables(table, row, photons, device):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:ballistic")  # hardly any light passes a slab twice without scattering
 def test_rayleigh_atmospheres_are_those_of_the_tables(device):
-    """Every row within 4 standard errors: on a GPU all rows, to a thousandth. On a CPU eight, to 0.4 %, but together
-    too: in the mean of I, which is known to 0.065 %, and in the sum of squares."""
+    """Every row within 4 standard errors: on a GPU all rows, to a thousandth. On a CPU four, to 0.4 %, but together
+    too: in the mean of I, which is known to 0.1 %, and in the sum of squares."""
     cpu = device == "cpu"
     cases = [CASES[case] for case in ON_A_CPU] if cpu else CASES
     counts = [((1_300_000, 500_000) if cpu else (60_000_000, 10_000_000))[row[1] > 0.02] for _, row in cases]
@@ -176,7 +176,7 @@ def test_rayleigh_atmospheres_are_those_of_the_tables(device):
     if cpu:
         weight = error[:, 0] ** -2.0
         mean, mean_error = (weight @ off[:, 0]) / weight.sum(), weight.sum() ** -0.5
-        assert mean_error < 6.5e-4
+        assert mean_error < 1e-3
         assert abs(mean) < 4.0 * mean_error
         assert stats.chi2.sf((z**2).sum(), z.size) > 1e-4
 
@@ -186,9 +186,9 @@ def agree(one, device):
     found = []
     for name, photons in (("analog", 20_000), ("guided", 10_000)):
         run = clear_at_the_lens(one).with_overrides({"transport.estimator": name})
-        rows = [totals(simulate(run, photons=photons, seed=seed, device=device)).ravel() for seed in range(32)]
+        rows = [totals(simulate(run, photons=photons, seed=seed, device=device)).ravel() for seed in range(SEEDS)]
         found.append(np.array(rows))
-    assert np.abs(found[1]).reshape(32, 4, -1)[:, 0].sum() > 0.0
+    assert np.abs(found[1]).reshape(SEEDS, 4, -1)[:, 0].sum() > 0.0
     assert equal_means_p(*found, 0.2) > 1e-3
 
 

@@ -69,7 +69,7 @@ def test_estimators_share_one_mean_behind_a_port(name, device):
     """Analog photons are refracted and must hit the lens themselves: they know nothing of solid angles."""
     photons, make = CASES[name]
     one = make().with_overrides({"medium.layers": None})
-    agreeing_cells(one, device, photons=photons, seeds=20, pixels=True, clear=True)
+    agreeing_cells(one, device, photons=photons, seeds=16, pixels=True, clear=True)
 
 
 def test_equal_indices_are_a_camera_in_the_water(device, monkeypatch):
