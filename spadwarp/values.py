@@ -307,7 +307,7 @@ def _fits(value: Any, kind: Any) -> bool:
         return False
     if isinstance(value, tuple) and plain is tuple and inner and inner[-1] is not Ellipsis:
         return len(value) == len(inner) and all(_fits(*pair) for pair in zip(value, inner, strict=True))
-    items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple | range) else ()
     return not inner or all(_fits(item, inner[len(inner) > 1 and isinstance(value, dict)]) for item in items)
 
 

@@ -122,14 +122,8 @@ class _Crosstalk(Effect):
     """λ gains a part of the detections of the four neighbours; a slope, as if their pile-up stayed as it is."""
 
     def apply(self, receiver: Receiver, hazard: Any) -> None:
-        from spadwarp_kernels import detection as kernels
-
-        detector = receiver.detector
-        if detector.crosstalk_probability > 0 and detector.mode == "free_running":
-            dead_time, period = detector.dead_time_ns * 1e-9, receiver.window.period
-            self._add(receiver, hazard, kernels.free_running_probabilities(hazard, dead_time=dead_time, period=period))
-        elif detector.crosstalk_probability > 0:
-            self._add(receiver, hazard, kernels.first_photon_probabilities(hazard))
+        if receiver.detector.crosstalk_probability > 0:
+            self._add(receiver, hazard, receiver.detections(hazard))
 
     def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
         import warp as wp
@@ -223,6 +217,48 @@ class Receiver:
         for effect in EFFECTS:
             effect.apply(self, hazard)
         return hazard
+
+    def detections(self, hazard: Any) -> Any:
+        """Expected detections per pulse of λ with pile-up, Warp float32 of the same shape."""
+        from spadwarp_kernels import detection as kernels
+
+        if self.detector.mode != "free_running":
+            return kernels.first_photon_probabilities(hazard)
+        dead_time = self.detector.dead_time_ns * 1e-9
+        return kernels.free_running_probabilities(hazard, dead_time=dead_time, period=self.window.period)
+
+    def background(self, rows: Any) -> Any:
+        """λ of what is not target, with its own crosstalk and afterpulses, Warp float32 `[pixel, bin]`, of source rows
+        of backscatter or None; of dark counts and ambient light alone `[pixel, 1]` where all bins are alike."""
+        import warp as wp
+
+        probability = self.detector.afterpulsing_probability
+        if not (probability or self.detector.crosstalk_probability):
+            return self.noise_alone() if rows is None else self.light(rows)
+        if rows is None:
+            shape = self.noise.size, int(self.matrix.source_bin.max(initial=0)) + 1
+            rows = wp.zeros(shape, dtype=float, device=self.noise.device)
+        known = self.hazard(rows)
+        if probability:
+            known, share = known.numpy(), probability * self._afterpulse_share()
+            every = known
+            for _ in range(math.ceil(math.log(1e-4, probability))):  # afterpulses have afterpulses
+                detections = self.detections(wp.array(every, dtype=float, device=rows.device)).numpy()
+                every = known + detections @ share.astype(np.float32)
+            known = wp.array(every, dtype=float, device=rows.device)
+        return known
+
+    def _afterpulse_share(self) -> NDArray[np.float64]:
+        """Of the afterpulses of a detection in a bin the part in each bin, `[bin, bin]`, of all pulses that follow; the
+        delay is exponential, and those of a first-photon detector begin with the next pulse."""
+        detector, edges, period = self.detector, self.window.edges, self.window.period
+        dead_time, delay = 1e-9 * detector.dead_time_ns, 1e-9 * detector.afterpulsing_time_constant_ns
+        middle, whole = 0.5 * (edges[1:] + edges[:-1]), -math.expm1(-period / delay)
+        if detector.mode != "free_running":
+            left = np.exp(-np.maximum(period - middle - dead_time, 0.0) / delay) / whole
+            return np.outer(left, -np.diff(np.exp(-edges / delay)))
+        turns, time = np.divmod(edges - (middle + dead_time)[:, None], period)
+        return np.diff(turns - np.expm1(-time / delay) / whole, axis=1)
 
     def slope(self, rows: Any) -> Any:
         """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
@@ -337,7 +373,7 @@ class Frames:
     light through the response, dark counts, ambient light, crosstalk."""
     background: NDArray[np.float32]
     """float32 `[H, W, 1 or T]`, expected background detections per pulse and bin before pile-up: dark counts, ambient
-    light and, where the source has it apart, backscatter."""
+    light and, where the source has it apart, backscatter; with the crosstalk and the afterpulses of these."""
     seed: int  # of the random numbers
     tags: TimeTags | None = None  # every detection, where it was asked for
     monte_carlo_noise: float | None = None
@@ -616,12 +652,12 @@ def detect(
         options |= {"shape": shape, "axis": axis, "device": rows.device, "camera_seed": camera_seed}
         receiver = Receiver.of(detector, laser, **options)
         seen, image = receiver.window, receiver.image
-        hazard, known = receiver.hazard(rows), receiver.noise_alone()
+        hazard, light = receiver.hazard(rows), None
         if background is not None:
-            rows, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
+            light, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
             if known_shape != shape:
                 raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
-            known = receiver.light(rows)
+        known = receiver.background(light)
         as_torch = is_torch(source) or out is not None
         if as_torch:
             out_shape = (*(() if summed else (numbers["frames"],)), *image, seen.recorded)
