@@ -253,10 +253,8 @@ class Result(Shown, ResultHead, Tallies):
         """Part of the light scattered in the water, in [0, 1], that the run may have missed: that of a forward peak
         which its photons are too few to see (`Scene.unseen_peak`). No standard error holds it. 1 where the table of
         the phase function is gone."""
-        ranges = self.truth.range[np.isfinite(self.truth.range)]
-        distance = float(ranges.min()) if ranges.size else 0.25 * float(self.path_edges[0] + self.path_edges[-1])
         try:
-            return self.scene.unseen_peak(self.photons, distance)[1]
+            return self.scene.unseen_peak(self.photons, self.truth.range)[1]
         except ConfigError:
             return 1.0
 
