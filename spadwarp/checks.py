@@ -640,17 +640,11 @@ def _check_polarisation(survey: Survey) -> None:
 
 def _check_peak(survey: Survey) -> None:
     """A forward peak that is too narrow for the photons to see it."""
-    scene, (estimator, photons) = survey.scene, (survey.scene.transport.estimator, survey.scene.transport.photons)
-    if scene.medium.range.scattering == 0.0:
-        return
-    angle, unseen = scene.unseen_peak(photons, survey.target_range or ())
-    if unseen > NOTABLE_UNSEEN:
-        text = (
-            f"{estimator}: up to {100.0 * unseen:.2g} % of the scattered light is of a forward peak, below "
-            f"{math.degrees(angle):.2g}°, that {photons:.3g} photons hardly see: it is missing as a rule, and not in "
-            f"standard errors; what helps: more photons{', guided' if estimator == 'next_event' else ''}"
-        )
-        survey.warn("transport.estimator", text, unseen=unseen, angle_deg=math.degrees(angle))
+    scene, seen = survey.scene, (survey.scene.transport.photons, survey.target_range or ())
+    angle, unseen = scene.unseen_peak(*seen)
+    if unseen > NOTABLE_UNSEEN and scene.medium.range.scattering > 0.0:
+        text, angle = scene.unseen_warning(*seen), math.degrees(angle)
+        survey.warn("transport.estimator", text, unseen=unseen, angle_deg=angle)
 
 
 def _check_statistics(survey: Survey) -> None:

@@ -17,7 +17,6 @@ from spadwarp.scene import noise_rate
 from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import ExpectedLight, LightTracer
-from spadwarp.values import percent
 
 if TYPE_CHECKING:
     from spadwarp.inverse.exposure import Exposure
@@ -74,12 +73,9 @@ class Renderer:
                 f"{bin_width * 1e12:.4g} ps: where in its bin a return lies is hardly known, "
                 "and the standard error of the depth is too small"
             )
-        unseen = self.scene.unseen_peak(self.photons, () if self.truth is None else self.truth.range)[1]
-        if unseen > NOTABLE_UNSEEN:
-            sentences.append(
-                f"up to {percent(unseen)} % of the scattered light is of a forward peak that {self.photons:.3g} "
-                "photons hardly see: the model lacks it, and standard errors do not contain what this changes"
-            )
+        seen = self.photons, () if self.truth is None else self.truth.range
+        if self.scene.unseen_peak(*seen)[1] > NOTABLE_UNSEEN:
+            sentences.append(self.scene.unseen_warning(*seen))
         return sentences
 
     @property

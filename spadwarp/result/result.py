@@ -289,11 +289,7 @@ class Result(Shown, ResultHead, Tallies):
         unseen: tuple[str, ...] = ()
         scattered, total = (float(part.sum(dtype=np.float64)) for part in (self.tallies[1:], self.tallies))
         if self.unseen_share * scattered > NOTABLE_UNSEEN * total:
-            unseen = (
-                f"{transport.estimator}: up to {100 * self.unseen_share:.2g} % of the scattered light, which has "
-                f"{100 * scattered / total:.2g} % of all, is of a forward peak that {self.photons:.3g} photons hardly "
-                f"see: it is not in standard errors; what helps: {', '.join(ways[:2])}",
-            )
+            unseen = (self.scene.unseen_warning(self.photons, self.truth.range),)
         return unseen + tuple(
             f"{name}: one of {batches} batches has {100 * share:.0f} % of the variance of its light (relative standard "
             f"error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "

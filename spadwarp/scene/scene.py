@@ -147,6 +147,15 @@ class Scene(Shown, Document):
             waters += [self.medium.model_copy(update={"anisotropy": g}) for g in self.medium.range.anisotropies]
         return max((phase_function(water).unseen_share(directions) for water in waters), key=lambda found: found[1])
 
+    def unseen_warning(self, photons: float, ranges: ArrayLike = ()) -> str:
+        """The sentence on `unseen_peak`."""
+        (angle, unseen), estimator = self.unseen_peak(photons, ranges), self.transport.estimator
+        return (
+            f"{estimator}: up to {100.0 * unseen:.2g} % of the scattered light is of a forward peak, below "
+            f"{math.degrees(angle):.2g}°, that {photons:.3g} photons hardly see: it is missing as a rule, and not in "
+            f"standard errors; what helps: more photons{', guided' if estimator == 'next_event' else ''}"
+        )
+
     @property
     def beam(self) -> Laser:
         """The laser with position and direction in the camera frame."""

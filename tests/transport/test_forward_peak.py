@@ -62,7 +62,7 @@ def test_unseen_share_is_the_peak_within_the_angle_of_ten_photons():
 
 
 def test_the_peak_of_a_layer_counts_as_the_mediums_own():
-    layered = {"layers": [{"start": 1.0, "anisotropy": 0.9999}]}
+    layered = {"layers": [{"start": 1.0, "extinction": 1.0, "albedo": 0.8, "anisotropy": 0.9999}]}
     found = peaked(layered, "next_event").unseen_peak(1e5)
     assert found == peaked({"anisotropy": 0.9999}, "next_event").unseen_peak(1e5)
     assert found[1] > 0.3 > peaked({}, "next_event").unseen_peak(1e5)[1]
