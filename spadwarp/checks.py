@@ -640,11 +640,11 @@ def _check_polarisation(survey: Survey) -> None:
 
 def _check_peak(survey: Survey) -> None:
     """A forward peak that is too narrow for the photons to see it."""
-    scene, seen = survey.scene, (survey.scene.transport.photons, survey.target_range or ())
-    angle, unseen = scene.unseen_peak(*seen)
+    scene, photons = survey.scene, survey.scene.transport.photons
+    angle, unseen = scene.unseen_peak(photons, survey.target_range or ())
     if unseen > NOTABLE_UNSEEN and scene.medium.range.scattering > 0.0:
-        text, angle = scene.unseen_warning(*seen), math.degrees(angle)
-        survey.warn("transport.estimator", text, unseen=unseen, angle_deg=angle)
+        text = scene.unseen_warning(photons, angle, unseen)
+        survey.warn("transport.estimator", text, unseen=unseen, angle_deg=math.degrees(angle))
 
 
 def _check_statistics(survey: Survey) -> None:

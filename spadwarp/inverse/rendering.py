@@ -73,9 +73,9 @@ class Renderer:
                 f"{bin_width * 1e12:.4g} ps: where in its bin a return lies is hardly known, "
                 "and the standard error of the depth is too small"
             )
-        seen = self.photons, () if self.truth is None else self.truth.range
-        if self.scene.unseen_peak(*seen)[1] > NOTABLE_UNSEEN:
-            sentences.append(self.scene.unseen_warning(*seen))
+        angle, unseen = self.scene.unseen_peak(self.photons, () if self.truth is None else self.truth.range)
+        if unseen > NOTABLE_UNSEEN:
+            sentences.append(self.scene.unseen_warning(self.photons, angle, unseen))
         return sentences
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
@@ -144,12 +145,13 @@ class Scene(Shown, Document):
             directions /= math.sin(0.5 * math.atan2(self.camera.aperture_radius, distance)) ** 2
         waters = [self.medium]
         if self.medium.phase_function == "henyey_greenstein":
-            waters += [self.medium.model_copy(update={"anisotropy": g}) for g in self.medium.range.anisotropies]
+            with contextlib.suppress(FileError):  # the file of the cells is gone
+                waters += [self.medium.model_copy(update={"anisotropy": g}) for g in self.medium.range.anisotropies]
         return max((phase_function(water).unseen_share(directions) for water in waters), key=lambda found: found[1])
 
-    def unseen_warning(self, photons: float, ranges: ArrayLike = ()) -> str:
-        """The sentence on `unseen_peak`."""
-        (angle, unseen), estimator = self.unseen_peak(photons, ranges), self.transport.estimator
+    def unseen_warning(self, photons: float, angle: float, unseen: float) -> str:
+        """The sentence on what `unseen_peak` found."""
+        estimator = self.transport.estimator
         return (
             f"{estimator}: up to {100.0 * unseen:.2g} % of the scattered light is of a forward peak, below "
             f"{math.degrees(angle):.2g}°, that {photons:.3g} photons hardly see: it is missing as a rule, and not in "
