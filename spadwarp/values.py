@@ -284,6 +284,8 @@ def _is_odd(value: Any) -> bool:
 def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of an annotated type, as far as it can be seen without using it up."""
     origin, inner = get_origin(kind), get_args(kind)
+    if hasattr(origin or kind, "__value__"):  # an alias, as those of NumPy are from Python 3.12 on
+        return _fits(value, (origin or kind).__value__)
     if origin in (Union, types.UnionType):
         return any(_fits(value, item) for item in inner)
     if origin is Annotated:
