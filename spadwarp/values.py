@@ -244,6 +244,8 @@ def _wrong_argument(
         single = parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
         if name not in ("self", "cls") and single and not _fits(value, kind):
             return f"{name} = {shown(value)} is not of the type {text}"
+        if "ArrayLike" in text and value is not None and not _holds_numbers(value):
+            return f"{name} = {shown(value)} holds no numbers"
         if "Array" in text or hasattr(value, "shape"):
             arrays.append(f"{name} [{', '.join(map(str, getattr(value, 'shape', [])))}]")
     words = " ".join(str(error).split())[:200] or type(error).__name__
@@ -264,8 +266,6 @@ def _wrong_argument(
 
 def _is_odd(value: Any) -> bool:
     """Whether a value holds nothing, no numbers, or none that are finite and below 2^31."""
-    import numpy as np
-
     if isinstance(value, str | bytes | os.PathLike):
         text = os.fsdecode(value)
         return not text or "\0" in text or not text.isprintable()
@@ -273,12 +273,20 @@ def _is_odd(value: Any) -> bool:
         return any(map(_is_odd, value.values() if isinstance(value, dict) else value))
     if value is None or not (type(value).__module__ in ("builtins", "numpy") or hasattr(value, "numpy")):
         return False
+    return not _holds_numbers(value, 2.0**31)
+
+
+def _holds_numbers(value: Any, limit: float | None = None) -> bool:
+    """Whether an array can be made of a value that holds numbers; with a limit, whether it does, and all are below."""
+    import numpy as np
+
     try:
         array = np.asarray(value.numpy() if hasattr(value, "numpy") else value)
         with np.errstate(all="ignore"):
-            return array.size == 0 or array.dtype.kind not in "biuf" or not bool((np.abs(array) < 2.0**31).all())
+            below = limit is None or (array.size > 0 and bool((np.abs(array) < limit).all()))
+            return array.dtype.kind in "biuf" and below
     except Exception:
-        return True
+        return False
 
 
 def _fits(value: Any, kind: Any) -> bool:
