@@ -304,7 +304,7 @@ def _fits(value: Any, kind: Any) -> bool:
         return kind is Any or value is None
     if kind is float or kind is int:
         needed = "__float__" if kind is float else "__index__"
-        single = not isinstance(value, type) and getattr(value, "ndim", 0) == 0
+        single = not isinstance(value, type | bool) and getattr(value, "ndim", 0) == 0
         if kind is int and getattr(getattr(value, "dtype", None), "kind", "i") not in ("i", "u", "b"):
             return False
         return single and (hasattr(value, needed) or (kind is float and hasattr(value, "__index__")))

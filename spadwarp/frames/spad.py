@@ -232,21 +232,20 @@ class Receiver:
         of backscatter or None; of dark counts and ambient light alone `[pixel, 1]` where all bins are alike."""
         import warp as wp
 
-        probability = self.detector.afterpulsing_probability
-        if not (probability or self.detector.crosstalk_probability):
-            return self.noise_alone() if rows is None else self.light(rows)
+        probability, device = self.detector.afterpulsing_probability, self.noise.device
         if rows is None:
+            if not (probability or self.detector.crosstalk_probability):
+                widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
+                return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=device)
             shape = self.noise.size, int(self.matrix.source_bin.max(initial=0)) + 1
-            rows = wp.zeros(shape, dtype=float, device=self.noise.device)
-        known = self.hazard(rows)
+            rows = wp.zeros(shape, dtype=float, device=device)
+        known = found = self.hazard(rows)
         if probability:
-            known, share = known.numpy(), probability * self._afterpulse_share()
-            every = known
+            share = (probability * self._afterpulse_share()).astype(np.float32)
             for _ in range(math.ceil(math.log(1e-4, probability))):  # afterpulses have afterpulses
-                detections = self.detections(wp.array(every, dtype=float, device=rows.device)).numpy()
-                every = known + detections @ share.astype(np.float32)
-            known = wp.array(every, dtype=float, device=rows.device)
-        return known
+                more = self.detections(found).numpy() @ share
+                found = wp.array(known.numpy() + more, dtype=float, device=device)
+        return found
 
     def _afterpulse_share(self) -> NDArray[np.float64]:
         """Of the afterpulses of a detection in a bin the part in each bin, `[bin, bin]`, of all pulses that follow; the
@@ -277,13 +276,6 @@ class Receiver:
         for effect in EFFECTS:
             effect.apply_to_slope(self, slope)
         return slope
-
-    def noise_alone(self) -> Any:
-        """Dark counts and ambient light per pulse, `[pixel, T]`, or `[pixel, 1]` where all bins are equally wide."""
-        import warp as wp
-
-        widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
-        return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=self.noise.device)
 
     def _through(self, rows: Any, noise: Any) -> Any:
         from spadwarp_kernels import detection as kernels

@@ -24,7 +24,6 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
 _ENOUGH = 5.0  # counts that a cell expects: then noise of its mean is small against the mean
-_BAD = 1e-3  # p-value
 _LEAST = 1e-12  # mean counts of the table
 _TURNS = 30  # of an iteration for the amount of light
 COMPONENTS = ("target", "water", "noise")
@@ -61,7 +60,7 @@ class Goodness:
     @property
     def is_bad(self) -> bool:
         """Whether p is below 0.001."""
-        return self.p < _BAD
+        return self.p < 1e-3
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers without the map, for JSON."""
@@ -128,12 +127,12 @@ def goodness_of(
     returns = np.argmax(pieces[number], axis=1)[:, None]
     for name, shift in (("time of the target", returns - bins.size // 2), ("time of the rest", 0 * returns)):
         order = (bins + shift) % bins.size
-        cells = _cells(np.take_along_axis(pieces[0], order, axis=1).sum(axis=0)[None])[0]
-        over_time = functools.partial(_over_time, order, cells)
+        starts, _ = _cells(np.take_along_axis(pieces[0], order, axis=1).sum(axis=0, keepdims=True))
+        over_time = functools.partial(_over_time, order, starts)
         chosen = (np.argmax(over_time(pieces[number:]), axis=0) == 0) == (name == "time of the target")
         if chosen.any():
             times.append(name)
-            ways[name] = functools.partial(_over_time, order, cells, chosen=chosen), None
+            ways[name] = functools.partial(over_time, chosen=chosen), None
     sums = ways["pixels and bins"][0](pieces)
     found = {name: _Cells(add_up(rows), add_up(pieces[:number])) for name, (add_up, _) in ways.items()}
     deviances = {name: one.deviance(lost.of(one.mean, *ways[name])) for name, one in found.items()}
@@ -158,10 +157,10 @@ def goodness_of(
     )
 
 
-def _over_time(order: NDArray[np.intp], cells: NDArray[np.intp], x: Any, chosen: Any = slice(None)) -> Any:
-    """Pixels of `[…, pixel, bin]`, each with its bins in an `order`, added up in the chosen cells."""
+def _over_time(order: NDArray[np.intp], starts: NDArray[np.intp], x: Any, chosen: Any = slice(None)) -> Any:
+    """Pixels of `[…, pixel, bin]`, each with its bins in an `order`, added up in those chosen of the cells."""
     summed = [np.take_along_axis(image, order, axis=1).sum(axis=0) for image in x.reshape(-1, *x.shape[-2:])]
-    return np.add.reduceat(np.reshape(summed, (*x.shape[:-2], x.shape[-1])), cells, axis=-1)[..., chosen]
+    return np.add.reduceat(np.reshape(summed, (*x.shape[:-2], x.shape[-1])), starts, axis=-1)[..., chosen]
 
 
 def _cells(mean: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
