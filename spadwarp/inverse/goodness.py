@@ -123,7 +123,7 @@ def goodness_of(
     }
     # A wrong response shows in the few bins of the return, is little among all, and lost where pixels are added up
     # whose returns lie apart.
-    bins, times = np.arange(rows.shape[1]), list[str]()
+    bins, times = np.arange(mean.shape[1]), list[str]()
     returns = np.argmax(pieces[number], axis=1)[:, None]
     for name, shift in (("time of the target", returns - bins.size // 2), ("time of the rest", 0 * returns)):
         order = (bins + shift) % bins.size
