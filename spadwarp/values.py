@@ -13,6 +13,7 @@ import array
 import difflib
 import errno
 import functools
+import inspect
 import math
 import operator
 import os
@@ -203,8 +204,7 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
             explain(error, arguments, named)
             raise
 
-    yields = function.__code__.co_flags & _GENERATOR
-    call: Any = functools.wraps(function)(items_of if yields else value_of)
+    call: Any = functools.wraps(function)(items_of if inspect.isgeneratorfunction(function) else value_of)
     call.__module__ = module  # where pickle finds it
     call.__guarded__ = True
     return call
@@ -212,8 +212,6 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
 
 # What libraries raise for values that are of the right type and yet cannot be used.
 _OF_VALUES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-
-_GENERATOR = 0x20  # flag of the code of a function that yields
 _FUNCTIONS = (types.FunctionType, types.MethodType, functools.partial)
 
 
@@ -222,8 +220,6 @@ def _wrong_argument(
 ) -> str:
     """The first argument that is not of the type that it is annotated with, or else the first that holds nothing, no
     numbers, or none that are finite and below 2^31, or else the arrays, where these do not fit; empty if none is."""
-    import inspect
-
     signature = inspect.signature(function)
     modules = [module for key, module in sys.modules.items() if key.startswith("spadwarp.")]
     names = {name: value for module in modules for name, value in vars(module).items()}
@@ -312,17 +308,14 @@ def _fits(value: Any, kind: Any) -> bool:
     if not isinstance(plain, type):
         return True
     if getattr(plain, "_is_protocol", False):
-        return all(hasattr(value, name) for name, member in vars(plain).items() if _is_of_protocol(name, member))
+        members = [name for name, member in vars(plain).items() if isinstance(member, types.FunctionType | property)]
+        return all(hasattr(value, name) for name in members if name not in ("__init__", "__subclasshook__"))
     if not isinstance(value, plain) or (inner and isinstance(value, str | bytes)):  # a text is no list of texts
         return False
     if isinstance(value, tuple) and plain is tuple and inner and inner[-1] is not Ellipsis:
         return len(value) == len(inner) and all(_fits(*pair) for pair in zip(value, inner, strict=True))
     items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple | range) else ()
     return not inner or all(_fits(item, inner[len(inner) > 1 and isinstance(value, dict)]) for item in items)
-
-
-def _is_of_protocol(name: str, member: Any) -> bool:
-    return isinstance(member, types.FunctionType | property) and name not in ("__init__", "__subclasshook__")
 
 
 # ---- Numbers and words, as text or from Python: of their kind and within their range, or refused by name.

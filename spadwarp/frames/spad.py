@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -105,40 +104,6 @@ class Window(NamedTuple):
         return (f"the source begins at {gate_start * 1e9:.6g} ns: {text} (start the source at 0 and give `window`)",)
 
 
-class Effect(ABC):
-    """An effect of the detector that changes λ, in place; a fit follows it by its slope. A new one takes fields in the
-    scene's section `detector`, maybe a kernel, and a class in `EFFECTS`."""
-
-    @abstractmethod
-    def apply(self, receiver: Receiver, hazard: Any) -> None:
-        """Changes λ, Warp float32 `[pixel, bin]`."""
-
-    @abstractmethod
-    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
-        """Changes a derivative of λ, of the same shape, by the derivative of the effect."""
-
-
-class _Crosstalk(Effect):
-    """λ gains a part of the detections of the four neighbours; a slope, as if their pile-up stayed as it is."""
-
-    def apply(self, receiver: Receiver, hazard: Any) -> None:
-        if receiver.detector.crosstalk_probability > 0:
-            self._add(receiver, hazard, receiver.detections(hazard))
-
-    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
-        import warp as wp
-
-        if receiver.detector.crosstalk_probability > 0:
-            self._add(receiver, slope, wp.clone(slope))
-
-    def _add(self, receiver: Receiver, rates: Any, neighbours: Any) -> None:
-        from spadwarp_kernels import detection as kernels
-
-        probability = receiver.detector.crosstalk_probability
-        kernels.add_crosstalk(rates, neighbours, image_width=receiver.image[1], probability=probability)
-
-
-EFFECTS: tuple[Effect, ...] = (_Crosstalk(),)  # on λ, in the order in which they act
 DRAWN_EFFECTS = ("afterpulsing_probability", "max_count")  # on single detections, 0 without: a fit refuses them
 
 
@@ -207,16 +172,26 @@ class Receiver:
         image, even = (shape[0], shape[1]), tdc_widths is None
         return cls(detector=detector, window=seen, image=image, noise=noise, matrix=matrix, equal_bins=even)
 
-    def light(self, rows: Any) -> Any:
+    def light(self, rows: Any, noise: Any = None) -> Any:
         """Light and noise in the detector's bins before its effects, Warp float32 `[pixel, bin]`, of source rows."""
-        return self._through(rows, self.noise)
+        from spadwarp_kernels import detection as kernels
+
+        options = {"width": np.diff(self.window.edges), "noise_rate": self.noise if noise is None else noise}
+        return kernels.expected_detections(rows, **self.matrix._asdict(), **options)
 
     def hazard(self, rows: Any) -> Any:
         """λ: expected detections per pulse and bin of a detector that is always ready, Warp float32 `[pixel, bin]`."""
         hazard = self.light(rows)
-        for effect in EFFECTS:
-            effect.apply(self, hazard)
+        if self.detector.crosstalk_probability > 0:
+            self._add_crosstalk(hazard, self.detections(hazard))
         return hazard
+
+    def _add_crosstalk(self, rates: Any, neighbours: Any) -> None:
+        """λ, or its slope, gains a part of the detections of the four neighbours, in place."""
+        from spadwarp_kernels import detection as kernels
+
+        probability = self.detector.crosstalk_probability
+        kernels.add_crosstalk(rates, neighbours, image_width=self.image[1], probability=probability)
 
     def detections(self, hazard: Any) -> Any:
         """Expected detections per pulse of λ with pile-up, Warp float32 of the same shape."""
@@ -263,7 +238,7 @@ class Receiver:
         """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
         import warp as wp
 
-        return self._followed(self._through(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)))
+        return self._followed(self.light(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)))
 
     def noise_slope(self) -> Any:
         """Derivative of λ by a noise rate [1/s] that all pixels share."""
@@ -273,15 +248,12 @@ class Receiver:
         return self._followed(wp.array(widths, device=self.noise.device))
 
     def _followed(self, slope: Any) -> Any:
-        for effect in EFFECTS:
-            effect.apply_to_slope(self, slope)
+        """With crosstalk, as if the pile-up of the neighbours stayed as it is."""
+        import warp as wp
+
+        if self.detector.crosstalk_probability > 0:
+            self._add_crosstalk(slope, wp.clone(slope))
         return slope
-
-    def _through(self, rows: Any, noise: Any) -> Any:
-        from spadwarp_kernels import detection as kernels
-
-        widths = np.diff(self.window.edges)
-        return kernels.expected_detections(rows, **self.matrix._asdict(), width=widths, noise_rate=noise)
 
 
 # Frames, and the law of their pile-up
