@@ -56,12 +56,11 @@ class Exposure:
         noise = self.monte_carlo_noise
         if noise is None or noise <= LIMIT:
             return []
-        text = (
-            f"its noise, the same in every frame, is {noise:.2g} times the shot noise (95th percentile of the pixels)"
-        )
         return [
-            f"the counts are simulated, and the simulation traced too few photons for {self.pulses} pulses: {text}; the "
-            f"standard errors do not contain it. {math.ceil((noise / LIMIT) ** 2)} times the photons would make it {LIMIT:g}"
+            f"the counts are simulated, and the simulation traced too few photons for {self.pulses} pulses: its noise, "
+            f"the same in every frame, is {noise:.2g} times the shot noise of the counts (95th percentile of the "
+            f"pixels); the standard errors do not contain it. {math.ceil((noise / LIMIT) ** 2)} times the photons "
+            f"would make it {LIMIT:g}"
         ]
 
 
