@@ -119,7 +119,7 @@ def in_words(error: BaseException) -> str | None:
     if isinstance(error, FileNotFoundError) and error.filename is None:
         return "the working directory is not there any more"
     if isinstance(error, OSError) and error.strerror:
-        names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+        names = " and ".join(str(name)[:1000] for name in (error.filename, error.filename2) if name is not None)
         return f"{names}: {error.strerror}" if names else error.strerror
     if isinstance(error, UnicodeError):
         return f"text that cannot be read or written: {text}"
