@@ -100,7 +100,7 @@ class Survey:
         # them [ns], optical depth and light of the nearest; None if there are none, or it lies at the lens centre.
         self.target_range = self.target_arrival_ns = self.optical_depth = self.on_axis = None
         if found := within_port(scene, triangles):
-            self.warn(*found.split(": " if found.startswith("camera") else " = ", 1))
+            self.warn(*found)
         illuminated = self.illuminated_part(triangles)
         if len(illuminated):
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
@@ -640,18 +640,10 @@ def _check_polarisation(survey: Survey) -> None:
 
 def _check_peak(survey: Survey) -> None:
     """A forward peak that is too narrow for the photons to see it."""
-    scene, (estimator, photons) = survey.scene, (survey.scene.transport.estimator, survey.scene.transport.photons)
-    if scene.medium.range.scattering == 0.0:
-        return
-    middle = 0.5 * (scene.gate.start + scene.gate.stop)
-    distance = survey.target_range[0] if survey.target_range else survey.range_of(middle)
-    angle, unseen = scene.unseen_peak(photons, distance)
-    if unseen > NOTABLE_UNSEEN:
-        text = (
-            f"{estimator}: up to {100.0 * unseen:.2g} % of the scattered light is of a forward peak, below "
-            f"{math.degrees(angle):.2g}°, that {photons:.3g} photons hardly see: it is missing as a rule, and not in "
-            f"standard errors; what helps: more photons{', guided' if estimator == 'next_event' else ''}"
-        )
+    scene, photons = survey.scene, survey.scene.transport.photons
+    angle, unseen = scene.unseen_peak(photons, survey.target_range or ())
+    if unseen > NOTABLE_UNSEEN and scene.medium.range.scattering > 0.0:
+        text = scene.unseen_warning(photons, angle, unseen)
         survey.warn("transport.estimator", text, unseen=unseen, angle_deg=math.degrees(angle))
 
 

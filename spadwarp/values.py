@@ -13,6 +13,7 @@ import array
 import difflib
 import errno
 import functools
+import inspect
 import math
 import operator
 import os
@@ -118,7 +119,7 @@ def in_words(error: BaseException) -> str | None:
     if isinstance(error, FileNotFoundError) and error.filename is None:
         return "the working directory is not there any more"
     if isinstance(error, OSError) and error.strerror:
-        names = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+        names = " and ".join(str(name)[:1000] for name in (error.filename, error.filename2) if name is not None)
         return f"{names}: {error.strerror}" if names else error.strerror
     if isinstance(error, UnicodeError):
         return f"text that cannot be read or written: {text}"
@@ -203,8 +204,7 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
             explain(error, arguments, named)
             raise
 
-    yields = function.__code__.co_flags & _GENERATOR
-    call: Any = functools.wraps(function)(items_of if yields else value_of)
+    call: Any = functools.wraps(function)(items_of if inspect.isgeneratorfunction(function) else value_of)
     call.__module__ = module  # where pickle finds it
     call.__guarded__ = True
     return call
@@ -212,8 +212,6 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
 
 # What libraries raise for values that are of the right type and yet cannot be used.
 _OF_VALUES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
-
-_GENERATOR = 0x20  # flag of the code of a function that yields
 _FUNCTIONS = (types.FunctionType, types.MethodType, functools.partial)
 
 
@@ -222,8 +220,6 @@ def _wrong_argument(
 ) -> str:
     """The first argument that is not of the type that it is annotated with, or else the first that holds nothing, no
     numbers, or none that are finite and below 2^31, or else the arrays, where these do not fit; empty if none is."""
-    import inspect
-
     signature = inspect.signature(function)
     modules = [module for key, module in sys.modules.items() if key.startswith("spadwarp.")]
     names = {name: value for module in modules for name, value in vars(module).items()}
@@ -244,6 +240,8 @@ def _wrong_argument(
         single = parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
         if name not in ("self", "cls") and single and not _fits(value, kind):
             return f"{name} = {shown(value)} is not of the type {text}"
+        if "ArrayLike" in text and value is not None and not _holds_numbers(value):
+            return f"{name} = {shown(value)} holds no numbers"
         if "Array" in text or hasattr(value, "shape"):
             arrays.append(f"{name} [{', '.join(map(str, getattr(value, 'shape', [])))}]")
     words = " ".join(str(error).split())[:200] or type(error).__name__
@@ -264,8 +262,6 @@ def _wrong_argument(
 
 def _is_odd(value: Any) -> bool:
     """Whether a value holds nothing, no numbers, or none that are finite and below 2^31."""
-    import numpy as np
-
     if isinstance(value, str | bytes | os.PathLike):
         text = os.fsdecode(value)
         return not text or "\0" in text or not text.isprintable()
@@ -273,17 +269,27 @@ def _is_odd(value: Any) -> bool:
         return any(map(_is_odd, value.values() if isinstance(value, dict) else value))
     if value is None or not (type(value).__module__ in ("builtins", "numpy") or hasattr(value, "numpy")):
         return False
+    return not _holds_numbers(value, 2.0**31)
+
+
+def _holds_numbers(value: Any, limit: float | None = None) -> bool:
+    """Whether an array can be made of a value that holds numbers; with a limit, whether it does, and all are below."""
+    import numpy as np
+
     try:
         array = np.asarray(value.numpy() if hasattr(value, "numpy") else value)
         with np.errstate(all="ignore"):
-            return array.size == 0 or array.dtype.kind not in "biuf" or not bool((np.abs(array) < 2.0**31).all())
+            below = limit is None or (array.size > 0 and bool((np.abs(array) < limit).all()))
+            return array.dtype.kind in "biuf" and below
     except Exception:
-        return True
+        return False
 
 
 def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of an annotated type, as far as it can be seen without using it up."""
     origin, inner = get_origin(kind), get_args(kind)
+    if hasattr(origin or kind, "__value__"):  # an alias, as those of NumPy are from Python 3.12 on
+        return _fits(value, (origin or kind).__value__)
     if origin in (Union, types.UnionType):
         return any(_fits(value, item) for item in inner)
     if origin is Annotated:
@@ -294,7 +300,7 @@ def _fits(value: Any, kind: Any) -> bool:
         return kind is Any or value is None
     if kind is float or kind is int:
         needed = "__float__" if kind is float else "__index__"
-        single = not isinstance(value, type) and getattr(value, "ndim", 0) == 0
+        single = not isinstance(value, type | bool) and getattr(value, "ndim", 0) == 0
         if kind is int and getattr(getattr(value, "dtype", None), "kind", "i") not in ("i", "u", "b"):
             return False
         return single and (hasattr(value, needed) or (kind is float and hasattr(value, "__index__")))
@@ -302,17 +308,14 @@ def _fits(value: Any, kind: Any) -> bool:
     if not isinstance(plain, type):
         return True
     if getattr(plain, "_is_protocol", False):
-        return all(hasattr(value, name) for name, member in vars(plain).items() if _is_of_protocol(name, member))
+        members = [name for name, member in vars(plain).items() if isinstance(member, types.FunctionType | property)]
+        return all(hasattr(value, name) for name in members if name not in ("__init__", "__subclasshook__"))
     if not isinstance(value, plain) or (inner and isinstance(value, str | bytes)):  # a text is no list of texts
         return False
     if isinstance(value, tuple) and plain is tuple and inner and inner[-1] is not Ellipsis:
         return len(value) == len(inner) and all(_fits(*pair) for pair in zip(value, inner, strict=True))
-    items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple | range) else ()
     return not inner or all(_fits(item, inner[len(inner) > 1 and isinstance(value, dict)]) for item in items)
-
-
-def _is_of_protocol(name: str, member: Any) -> bool:
-    return isinstance(member, types.FunctionType | property) and name not in ("__init__", "__subclasshook__")
 
 
 # ---- Numbers and words, as text or from Python: of their kind and within their range, or refused by name.

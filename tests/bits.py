@@ -166,7 +166,7 @@ def versions():
 def bits(name):
     digest = hashlib.sha256()
     # Some lasers stand where a housing as wide as the lens would be, which is refused since this was recorded.
-    with mock.patch("spadwarp.transport.model.within_port", lambda *_: ""):
+    with mock.patch("spadwarp.transport.model.within_port", lambda *_: None):
         for array in CASES[name]():
             array = np.ascontiguousarray(array)
             digest.update(f"{array.dtype} {array.shape}".encode() + array.tobytes())

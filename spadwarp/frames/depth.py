@@ -143,6 +143,8 @@ def arrival_time(
         found = kernels.arrival_bins(rows, method=method, background=known, response=response, **options)
         position: Any = tensor_of(found).double() if is_torch(histogram) else found.numpy().astype(np.float64)
         if significance is not None and "significance" in options:
+            if not hasattr(significance, "dtype"):
+                raise ArgumentError(f"significance = {shown(significance)} is no array or tensor")
             significance[...] = (tensor_of(tested) if is_torch(significance) else tested.numpy()).reshape(frame)
     return gate_start + (position.reshape(frame) - offset) * bin_width
 

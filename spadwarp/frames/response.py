@@ -42,8 +42,8 @@ class InstrumentResponse:
     tail: float = 0.0  # time constant of the exponential [s], 0: none
     times: ArrayLike | None = None  # of a measured curve instead: ascending [s]
     values: ArrayLike | None = None  # the curve at these times, ≥ 0, of any scale
-    _knots: Floats = field(init=False, repr=False)
-    _heights: Floats = field(init=False, repr=False)
+    _knots: Floats = field(init=False, repr=False, default_factory=lambda: np.empty(0))
+    _heights: Floats = field(init=False, repr=False, default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         for name in ("sigma", "tail"):

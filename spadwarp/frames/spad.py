@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -105,46 +104,6 @@ class Window(NamedTuple):
         return (f"the source begins at {gate_start * 1e9:.6g} ns: {text} (start the source at 0 and give `window`)",)
 
 
-class Effect(ABC):
-    """An effect of the detector that changes λ, in place; a fit follows it by its slope. A new one takes fields in the
-    scene's section `detector`, maybe a kernel, and a class in `EFFECTS`."""
-
-    @abstractmethod
-    def apply(self, receiver: Receiver, hazard: Any) -> None:
-        """Changes λ, Warp float32 `[pixel, bin]`."""
-
-    @abstractmethod
-    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
-        """Changes a derivative of λ, of the same shape, by the derivative of the effect."""
-
-
-class _Crosstalk(Effect):
-    """λ gains a part of the detections of the four neighbours; a slope, as if their pile-up stayed as it is."""
-
-    def apply(self, receiver: Receiver, hazard: Any) -> None:
-        from spadwarp_kernels import detection as kernels
-
-        detector = receiver.detector
-        if detector.crosstalk_probability > 0 and detector.mode == "free_running":
-            dead_time, period = detector.dead_time_ns * 1e-9, receiver.window.period
-            self._add(receiver, hazard, kernels.free_running_probabilities(hazard, dead_time=dead_time, period=period))
-        elif detector.crosstalk_probability > 0:
-            self._add(receiver, hazard, kernels.first_photon_probabilities(hazard))
-
-    def apply_to_slope(self, receiver: Receiver, slope: Any) -> None:
-        import warp as wp
-
-        if receiver.detector.crosstalk_probability > 0:
-            self._add(receiver, slope, wp.clone(slope))
-
-    def _add(self, receiver: Receiver, rates: Any, neighbours: Any) -> None:
-        from spadwarp_kernels import detection as kernels
-
-        probability = receiver.detector.crosstalk_probability
-        kernels.add_crosstalk(rates, neighbours, image_width=receiver.image[1], probability=probability)
-
-
-EFFECTS: tuple[Effect, ...] = (_Crosstalk(),)  # on λ, in the order in which they act
 DRAWN_EFFECTS = ("afterpulsing_probability", "max_count")  # on single detections, 0 without: a fit refuses them
 
 
@@ -213,22 +172,73 @@ class Receiver:
         image, even = (shape[0], shape[1]), tdc_widths is None
         return cls(detector=detector, window=seen, image=image, noise=noise, matrix=matrix, equal_bins=even)
 
-    def light(self, rows: Any) -> Any:
+    def light(self, rows: Any, noise: Any = None) -> Any:
         """Light and noise in the detector's bins before its effects, Warp float32 `[pixel, bin]`, of source rows."""
-        return self._through(rows, self.noise)
+        from spadwarp_kernels import detection as kernels
+
+        options = {"width": np.diff(self.window.edges), "noise_rate": self.noise if noise is None else noise}
+        return kernels.expected_detections(rows, **self.matrix._asdict(), **options)
 
     def hazard(self, rows: Any) -> Any:
         """λ: expected detections per pulse and bin of a detector that is always ready, Warp float32 `[pixel, bin]`."""
         hazard = self.light(rows)
-        for effect in EFFECTS:
-            effect.apply(self, hazard)
+        if self.detector.crosstalk_probability > 0:
+            self._add_crosstalk(hazard, self.detections(hazard))
         return hazard
+
+    def _add_crosstalk(self, rates: Any, neighbours: Any) -> None:
+        """λ, or its slope, gains a part of the detections of the four neighbours, in place."""
+        from spadwarp_kernels import detection as kernels
+
+        probability = self.detector.crosstalk_probability
+        kernels.add_crosstalk(rates, neighbours, image_width=self.image[1], probability=probability)
+
+    def detections(self, hazard: Any) -> Any:
+        """Expected detections per pulse of λ with pile-up, Warp float32 of the same shape."""
+        from spadwarp_kernels import detection as kernels
+
+        if self.detector.mode != "free_running":
+            return kernels.first_photon_probabilities(hazard)
+        dead_time = self.detector.dead_time_ns * 1e-9
+        return kernels.free_running_probabilities(hazard, dead_time=dead_time, period=self.window.period)
+
+    def background(self, rows: Any) -> Any:
+        """λ of what is not target, with its own crosstalk and afterpulses, Warp float32 `[pixel, bin]`, of source rows
+        of backscatter or None; of dark counts and ambient light alone `[pixel, 1]` where all bins are alike."""
+        import warp as wp
+
+        probability, device = self.detector.afterpulsing_probability, self.noise.device
+        if rows is None:
+            if not (probability or self.detector.crosstalk_probability):
+                widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
+                return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=device)
+            shape = self.noise.size, int(self.matrix.source_bin.max(initial=0)) + 1
+            rows = wp.zeros(shape, dtype=float, device=device)
+        known = found = self.hazard(rows)
+        if probability:
+            share = (probability * self._afterpulse_share()).astype(np.float32)
+            for _ in range(math.ceil(math.log(1e-4, probability))):  # afterpulses have afterpulses
+                more = self.detections(found).numpy() @ share
+                found = wp.array(known.numpy() + more, dtype=float, device=device)
+        return found
+
+    def _afterpulse_share(self) -> NDArray[np.float64]:
+        """Of the afterpulses of a detection in a bin the part in each bin, `[bin, bin]`, of all pulses that follow; the
+        delay is exponential, and those of a first-photon detector begin with the next pulse."""
+        detector, edges, period = self.detector, self.window.edges, self.window.period
+        dead_time, delay = 1e-9 * detector.dead_time_ns, 1e-9 * detector.afterpulsing_time_constant_ns
+        middle, whole = 0.5 * (edges[1:] + edges[:-1]), -math.expm1(-period / delay)
+        if detector.mode != "free_running":
+            left = np.exp(-np.maximum(period - middle - dead_time, 0.0) / delay) / whole
+            return np.outer(left, -np.diff(np.exp(-edges / delay)))
+        turns, time = np.divmod(edges - (middle + dead_time)[:, None], period)
+        return np.diff(turns - np.expm1(-time / delay) / whole, axis=1)
 
     def slope(self, rows: Any) -> Any:
         """Derivative of λ by what changes the source by `rows` `[pixel, source bin]`, which may be negative."""
         import warp as wp
 
-        return self._followed(self._through(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)))
+        return self._followed(self.light(rows, wp.zeros(rows.shape[0], dtype=wp.float32, device=rows.device)))
 
     def noise_slope(self) -> Any:
         """Derivative of λ by a noise rate [1/s] that all pixels share."""
@@ -238,22 +248,12 @@ class Receiver:
         return self._followed(wp.array(widths, device=self.noise.device))
 
     def _followed(self, slope: Any) -> Any:
-        for effect in EFFECTS:
-            effect.apply_to_slope(self, slope)
-        return slope
-
-    def noise_alone(self) -> Any:
-        """Dark counts and ambient light per pulse, `[pixel, T]`, or `[pixel, 1]` where all bins are equally wide."""
+        """With crosstalk, as if the pile-up of the neighbours stayed as it is."""
         import warp as wp
 
-        widths = np.diff(self.window.edges[: 2 if self.equal_bins else self.window.recorded + 1])
-        return wp.array((self.noise.numpy()[:, None] * widths).astype(np.float32), device=self.noise.device)
-
-    def _through(self, rows: Any, noise: Any) -> Any:
-        from spadwarp_kernels import detection as kernels
-
-        widths = np.diff(self.window.edges)
-        return kernels.expected_detections(rows, **self.matrix._asdict(), width=widths, noise_rate=noise)
+        if self.detector.crosstalk_probability > 0:
+            self._add_crosstalk(slope, wp.clone(slope))
+        return slope
 
 
 # Frames, and the law of their pile-up
@@ -337,7 +337,7 @@ class Frames:
     light through the response, dark counts, ambient light, crosstalk."""
     background: NDArray[np.float32]
     """float32 `[H, W, 1 or T]`, expected background detections per pulse and bin before pile-up: dark counts, ambient
-    light and, where the source has it apart, backscatter."""
+    light and, where the source has it apart, backscatter; with the crosstalk and the afterpulses of these."""
     seed: int  # of the random numbers
     tags: TimeTags | None = None  # every detection, where it was asked for
     monte_carlo_noise: float | None = None
@@ -616,12 +616,12 @@ def detect(
         options |= {"shape": shape, "axis": axis, "device": rows.device, "camera_seed": camera_seed}
         receiver = Receiver.of(detector, laser, **options)
         seen, image = receiver.window, receiver.image
-        hazard, known = receiver.hazard(rows), receiver.noise_alone()
+        hazard, light = receiver.hazard(rows), None
         if background is not None:
-            rows, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
+            light, known_shape = histogram_rows(background, name="background", device=rows.device, **form)
             if known_shape != shape:
                 raise ArgumentError(f"background has shape {known_shape}; that of the source, {shape}, is needed")
-            known = receiver.light(rows)
+        known = receiver.background(light)
         as_torch = is_torch(source) or out is not None
         if as_torch:
             out_shape = (*(() if summed else (numbers["frames"],)), *image, seen.recorded)

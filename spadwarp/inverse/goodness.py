@@ -24,7 +24,6 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
 _ENOUGH = 5.0  # counts that a cell expects: then noise of its mean is small against the mean
-_BAD = 1e-3  # p-value
 _LEAST = 1e-12  # mean counts of the table
 _TURNS = 30  # of an iteration for the amount of light
 COMPONENTS = ("target", "water", "noise")
@@ -50,8 +49,8 @@ class Goodness:
 
     p: float  # probability of deviances as large or larger than those of `parts`, if the model is right; NaN: not known
     parts: Mapping[str, Deviance]
-    """Deviances: "pixels and bins"; "image", the bins added up; the pixels added up, "time of the target" in bins in
-    which light of targets is the largest part, and "time of the rest"."""
+    """Deviances: "pixels and bins"; "image", the bins added up; the pixels added up, "time of the target" by the time
+    since the return, in bins in which light of targets is the largest part, and "time of the rest" in the others."""
     components: Mapping[str, Deviance]
     """Those of pixels and bins in which light of the "target", light of the "water", or "noise" (dark counts and
     ambient light) is the largest part of the mean."""
@@ -61,7 +60,7 @@ class Goodness:
     @property
     def is_bad(self) -> bool:
         """Whether p is below 0.001."""
-        return self.p < _BAD
+        return self.p < 1e-3
 
     def to_dict(self) -> dict[str, Any]:
         """The numbers without the map, for JSON."""
@@ -118,20 +117,22 @@ def goodness_of(
     image, rows = counts.shape[:2], counts.reshape(mean.shape)
     pieces, number = np.stack([mean, variance, *batches, *parts]).astype(np.float64), 2 + len(batches)
     first, pixel = _cells(pieces[0])
-    first_time, _ = _cells(pieces[:1].sum(axis=1).reshape(1, -1))
-
-    def over_time(x: Any) -> Any:
-        return np.add.reduceat(x.sum(axis=-2), first_time, axis=-1)
-
     ways: dict[str, tuple[Callable[[Any], Any], Any]] = {
         "pixels and bins": (lambda x: np.add.reduceat(x.reshape(*x.shape[:-2], rows.size), first, axis=-1), pixel),
         "image": (lambda x: x.sum(axis=-1), np.arange(len(rows))),
     }
-    # A wrong response shows in the few bins of the return, and is little among all.
-    times = {"time of the target": np.argmax(over_time(pieces[number:]), axis=0) == 0}
-    times["time of the rest"] = ~times["time of the target"]
-    times = {name: chosen for name, chosen in times.items() if chosen.any()}
-    ways |= {name: (functools.partial(_some, over_time, chosen), None) for name, chosen in times.items()}
+    # A wrong response shows in the few bins of the return, is little among all, and lost where pixels are added up
+    # whose returns lie apart.
+    bins, times = np.arange(mean.shape[1]), list[str]()
+    returns = np.argmax(pieces[number], axis=1)[:, None]
+    for name, shift in (("time of the target", returns - bins.size // 2), ("time of the rest", 0 * returns)):
+        order = (bins + shift) % bins.size
+        starts, _ = _cells(np.take_along_axis(pieces[0], order, axis=1).sum(axis=0, keepdims=True))
+        over_time = functools.partial(_over_time, order, starts)
+        chosen = (np.argmax(over_time(pieces[number:]), axis=0) == 0) == (name == "time of the target")
+        if chosen.any():
+            times.append(name)
+            ways[name] = functools.partial(over_time, chosen=chosen), None
     sums = ways["pixels and bins"][0](pieces)
     found = {name: _Cells(add_up(rows), add_up(pieces[:number])) for name, (add_up, _) in ways.items()}
     deviances = {name: one.deviance(lost.of(one.mean, *ways[name])) for name, one in found.items()}
@@ -156,8 +157,10 @@ def goodness_of(
     )
 
 
-def _some(add_up: Callable[[Any], Any], chosen: NDArray[np.bool_], x: Any) -> Any:
-    return add_up(x)[..., chosen]
+def _over_time(order: NDArray[np.intp], starts: NDArray[np.intp], x: Any, chosen: Any = slice(None)) -> Any:
+    """Pixels of `[…, pixel, bin]`, each with its bins in an `order`, added up in those chosen of the cells."""
+    summed = [np.take_along_axis(image, order, axis=1).sum(axis=0) for image in x.reshape(-1, *x.shape[-2:])]
+    return np.add.reduceat(np.reshape(summed, (*x.shape[:-2], x.shape[-1])), starts, axis=-1)[..., chosen]
 
 
 def _cells(mean: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

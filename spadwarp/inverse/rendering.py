@@ -14,6 +14,7 @@ from spadwarp.frames import Receiver, detector_response
 from spadwarp.frames.spad import Window
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, moved, with_values
 from spadwarp.scene import noise_rate
+from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import ExpectedLight, LightTracer
 
@@ -64,15 +65,18 @@ class Renderer:
         return response.fwhm if response.is_smooth else 0.0
 
     def warnings(self) -> list[str]:
-        """Sentences on what the linear model of the bins does not cover."""
-        width, bin_width = self._response_width, self.scene.gate.bin_width
-        if width >= _WIDEST_BIN * bin_width or all(unknown.name != DEPTH for unknown in self.unknowns):
-            return []
-        return [
-            f"depth: the instrument response, {width * 1e12:.3g} ps, is much shorter than a bin, "
-            f"{bin_width * 1e12:.4g} ps: where in its bin a return lies is hardly known, "
-            "and the standard error of the depth is too small"
-        ]
+        """Sentences on what the linear model of the bins, and the photons, do not cover."""
+        width, bin_width, sentences = self._response_width, self.scene.gate.bin_width, []
+        if width < _WIDEST_BIN * bin_width and any(unknown.name == DEPTH for unknown in self.unknowns):
+            sentences.append(
+                f"depth: the instrument response, {width * 1e12:.3g} ps, is much shorter than a bin, "
+                f"{bin_width * 1e12:.4g} ps: where in its bin a return lies is hardly known, "
+                "and the standard error of the depth is too small"
+            )
+        angle, unseen = self.scene.unseen_peak(self.photons, () if self.truth is None else self.truth.range)
+        if unseen > NOTABLE_UNSEEN:
+            sentences.append(self.scene.unseen_warning(self.photons, angle, unseen))
+        return sentences
 
     @property
     def window(self) -> Window:

@@ -17,7 +17,7 @@ from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.values import ArgumentError, ConfigError, Shown, check_choice, percent
+from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_choice, percent
 
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
@@ -249,16 +249,18 @@ class Result(Shown, ResultHead, Tallies):
         return _SignedValues(self, "channels", errors=True)
 
     @cached_property
+    def _unseen_peak(self) -> tuple[float, float]:
+        try:
+            return self.scene.unseen_peak(self.photons, self.truth.range)
+        except (ConfigError, FileError):
+            return math.pi, 1.0
+
+    @property
     def unseen_share(self) -> float:
         """Part of the light scattered in the water, in [0, 1], that the run may have missed: that of a forward peak
         which its photons are too few to see (`Scene.unseen_peak`). No standard error holds it. 1 where the table of
         the phase function is gone."""
-        ranges = self.truth.range[np.isfinite(self.truth.range)]
-        distance = float(ranges.min()) if ranges.size else 0.25 * float(self.path_edges[0] + self.path_edges[-1])
-        try:
-            return self.scene.unseen_peak(self.photons, distance)[1]
-        except ConfigError:
-            return 1.0
+        return self._unseen_peak[1]
 
     @property
     def relative_error(self) -> float:
@@ -291,11 +293,9 @@ class Result(Shown, ResultHead, Tallies):
         unseen: tuple[str, ...] = ()
         scattered, total = (float(part.sum(dtype=np.float64)) for part in (self.tallies[1:], self.tallies))
         if self.unseen_share * scattered > NOTABLE_UNSEEN * total:
-            unseen = (
-                f"{transport.estimator}: up to {100 * self.unseen_share:.2g} % of the scattered light, which has "
-                f"{100 * scattered / total:.2g} % of all, is of a forward peak that {self.photons:.3g} photons hardly "
-                f"see: it is not in standard errors; what helps: {', '.join(ways[:2])}",
-            )
+            unseen = (self.scene.unseen_warning(self.photons, *self._unseen_peak),)
+            if self.unseen_share == 1.0:
+                unseen = ("medium.phase_table is gone: how much of its forward peak was not seen is not known",)
         return unseen + tuple(
             f"{name}: one of {batches} batches has {100 * share:.0f} % of the variance of its light (relative standard "
             f"error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "

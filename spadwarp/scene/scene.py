@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator
 
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
@@ -127,10 +128,11 @@ class Scene(Shown, Document):
         """Positions of the beam: photon i is emitted at position i modulo this number."""
         return 1 if self.scan.mode == "none" else self.camera.width * self.camera.height
 
-    def unseen_peak(self, photons: float, distance: float) -> tuple[float, float]:
+    def unseen_peak(self, photons: float, ranges: ArrayLike = ()) -> tuple[float, float]:
         """The forward peak that so many photons hardly see: `PhaseFunction.unseen_share` of the directions in which
         the estimator looks for the lens. Those of `next_event` are anywhere; `guided` with a table aims at points of
-        the lens, each drawn apart from the light that flies into it, here from `distance` [m]. 0 for all others.
+        the lens, each drawn apart from the light that flies into it, here from the nearest of `ranges` [m] that is
+        finite, else the middle of the gate. 0 for all others. Of layers and cells with an own g the largest share.
 
         Raises what `phase_function` raises.
         """
@@ -138,8 +140,23 @@ class Scene(Shown, Document):
         if estimator == "analog" or (estimator == "guided" and not self.medium.has_phase_table):
             return 0.0, 0.0
         if estimator == "guided":
+            middle = 0.25 * self.medium.pulse_speed * (self.gate.start + self.gate.stop)
+            distance = min(np.extract(np.isfinite(ranges), ranges), default=middle)
             directions /= math.sin(0.5 * math.atan2(self.camera.aperture_radius, distance)) ** 2
-        return phase_function(self.medium).unseen_share(directions)
+        waters = [self.medium]
+        if self.medium.phase_function == "henyey_greenstein":
+            with contextlib.suppress(FileError):  # the file of the cells is gone
+                waters += [self.medium.model_copy(update={"anisotropy": g}) for g in self.medium.range.anisotropies]
+        return max((phase_function(water).unseen_share(directions) for water in waters), key=lambda found: found[1])
+
+    def unseen_warning(self, photons: float, angle: float, unseen: float) -> str:
+        """The sentence on what `unseen_peak` found."""
+        estimator = self.transport.estimator
+        return (
+            f"{estimator}: up to {100.0 * unseen:.2g} % of the scattered light is of a forward peak, below "
+            f"{math.degrees(angle):.2g}°, that {photons:.3g} photons hardly see: it is missing as a rule, and not in "
+            f"standard errors; what helps: more photons{', guided' if estimator == 'next_event' else ''}"
+        )
 
     @property
     def beam(self) -> Laser:

@@ -244,21 +244,21 @@ def points_inside(triangles: Floats, planes: Floats) -> Floats:
     return np.concatenate([_spread(triangles[whole]), _spread(cut)])
 
 
-def within_port(scene: Scene, triangles: Floats) -> str:
-    """What is in the housing or the window of the camera's port and is not meant for it: a laser that shines through no
-    port, or parts of triangles; empty where nothing is."""
+def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
+    """What is in the housing or the window of the camera's port and is not meant for it, a laser that shines through no
+    port, or parts of triangles: the field, and a text about it."""
     port, camera, laser = camera_port(scene), scene.camera, scene.beam
     if port is None or len(set(port.index)) == 1:
-        return ""
+        return None
     radius = 0.0 if camera.pinhole else camera.aperture_radius
     wide = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)
     if laser.port is None and port.houses(laser.position, wide, radius):
-        return (
-            f"laser.position = {list(laser.position)} is inside camera.port: laser.port = 'camera' lets it shine "
-            "through that window, a table [laser.port] through one of its own; in the water it is in front or beside"
+        return "laser.position", (
+            f"{list(laser.position)} is inside camera.port: laser.port = 'camera' lets it shine through that window, a "
+            "table [laser.port] through one of its own; in the water it is in front or beside"
         )
     if not len(triangles):
-        return ""
+        return None
     if port.shape == "flat":  # but for what touches it, which `points_inside` finds too
         planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), port.nearest - 2e-6]])
         inside = points_inside(triangles, planes)
@@ -268,8 +268,10 @@ def within_port(scene: Scene, triangles: Floats) -> str:
         found = closest_point(triangles, np.broadcast_to(port.centre, (len(triangles), 3)))
         outer = (port.radius + port.thickness) * (1.0 - 1e-6)
         inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
-    where = "camera.port: a target is within the housing or the window, at {} m in the camera's frame"
-    return where.format(inside[0].round(6).tolist()) if len(inside) else ""
+    if not len(inside):
+        return None
+    place = inside[0].round(6).tolist()
+    return "camera.port", f"a target is within the housing or the window, at {place} m in the camera's frame"
 
 
 def _spread(triangles: Floats) -> Floats:

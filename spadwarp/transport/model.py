@@ -429,7 +429,7 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
     the domain; and a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
     corners = np.zeros((0, 3, 3)) if mesh is None or scene.camera.port is None else mesh.vertices[mesh.faces]
     if camera and (found := within_port(scene, corners.astype(np.float64))):
-        raise ConfigError(found, source=scene.source)
+        raise ConfigError(": ".join(found), source=scene.source)
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
     ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)]

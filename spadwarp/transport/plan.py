@@ -104,8 +104,10 @@ def make_plan(
     resume: Result | None = None,
     derivatives: Iterable[str] | None = None,
     blocks: Sequence[int] | None = None,
+    kept: bool = True,
 ) -> Plan:
-    """The plan for the arguments of `simulate`; `resume` is that of the run, read.
+    """The plan for the arguments of `simulate`; `resume` is that of the run, read; only of light that is `kept` for
+    another run the scene's files are hashed.
 
     Raises `ArgumentError` for those that are out of range, `ConfigError` for those that cannot be combined.
     """
@@ -157,7 +159,7 @@ def make_plan(
         batch_size=batch_size,
         requested=ids,
         focus_distance=focus_distance(scene, mesh),
-        file_hashes=scene.file_hashes(),
+        file_hashes=scene.file_hashes() if kept else (),
         mesh=mesh,
         derivatives=names,
         launch_size=run.launch_size,

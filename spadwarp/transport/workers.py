@@ -583,7 +583,8 @@ class LightTracer:
         mesh_cache: dict[str, Any] | None = None,
         tally: Any = None,
     ) -> None:
-        plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=derivatives or None)
+        options: dict[str, Any] = {"photons": photons, "seed": seed, "derivatives": derivatives or None}
+        plan = make_plan(scene, RunOptions(), **options, kept=False)
         workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)
         self._scene, self._separate_targets, self._unit = scene, separate_targets, 1.0 / plan.scale
         self._names, self._worker = plan.derivatives, workers.tracers[0]

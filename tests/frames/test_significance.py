@@ -39,6 +39,24 @@ def test_frames_of_empty_water(mode):
     np.testing.assert_array_equal(np.isnan(corrected), np.isnan(time))
 
 
+@pytest.mark.parametrize("mode", ["first_photon", "free_running"])
+@pytest.mark.parametrize("wrap", [True, False])
+def test_the_background_has_its_own_crosstalk_and_afterpulses(mode, wrap):
+    """Counts of dark pixels, corrected for pile-up or with little of it, have the mean and the alarms of it."""
+    effects = {"crosstalk_probability": 0.03, "afterpulsing_probability": 0.2, "dead_time_ns": 5.0}
+    frames = empty(mode, **effects, dark_count_rate=2e5, afterpulsing_time_constant_ns=15.0, wrap=wrap)
+    seen = (frames.coates() if mode == "first_photon" else frames.counts / frames.pulses).mean(axis=(0, 1, 2))
+    known = frames.background.mean(axis=(0, 1))
+    error = np.sqrt(known.reshape(4, -1).sum(axis=1) / (frames.pulses * frames.counts[..., 0].size))
+    difference = seen.reshape(4, -1).sum(axis=1) - known.reshape(4, -1).sum(axis=1)
+    slack = 0.0 if mode == "first_photon" else 1e-2 * known.sum()  # lost in dead times
+    assert (np.abs(difference) < 4.5 * error + slack).all(), difference / error
+    assert known.sum() > 1.01 * frames.expected.mean(axis=(0, 1)).sum()
+    found = np.empty(frames.counts.shape[:3], np.float32)
+    frames.arrival_time("peak", significance=found, device="cpu")
+    assert within((found >= 2.0).sum(), 0.01 * found.size)
+
+
 def test_counts_without_a_known_background(tmp_path):
     """Its shape is that of all pixels; a wall in front of all of them is none of it."""
     counts = empty("first_photon").counts

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fuzz import command_lines, mutations
-from fuzz.corpus import Corpus
+from fuzz.corpus import SPECIAL, Corpus
 
 CALIBRATED = ("phase.csv", "beam.npy", "camera.yaml", "irf.csv", "target.obj", "target.mtl", "target.png")
 
@@ -17,7 +17,9 @@ CALIBRATED = ("phase.csv", "beam.npy", "camera.yaml", "irf.csv", "target.obj", "
 RUN = "simulate {0} --photons 100 --out out --quiet --device cpu"
 CHECK_OR_RUN = ("check {0}", RUN)
 ON_A_SCENE = (*CHECK_OR_RUN, "check {0} --json out.json", "load_scene {0}")
-ON_A_SCENE += ("sweep {0} --vary range=1,2 --out out --device cpu",)
+ON_A_SCENE += ("sweep {0} --vary range=1,2 --out out --device cpu", "plan {0} --photons 2000 --no-range --device cpu")
+ON_A_SCENE += ("fit counts.npy {0} --unknown medium.absorption --pulses 300 --photons 500 --out out --device cpu",)
+ON_A_SCENE += ("analytic {0} --out out --frames 1 --quiet --device cpu",)
 ON_A_MESH = ("info {0}", "check scene.toml --mesh {0}", RUN.replace("{0}", "scene.toml --mesh {0}"))
 MEDIAN = "denoise {0} --model median --out out --device cpu"
 RENDERED = (
@@ -60,9 +62,20 @@ def _case(r: random.Random, commands: Sequence[str], name: str, damaged: bytes, 
 
 
 def _scene(r: random.Random, corpus: Corpus) -> Case:
-    name, injected = r.choice(("scene.toml", "scene.toml", "calibrated.toml")), r.random() < 0.25
+    name, injected = r.choice(("scene.toml", "scene.toml", "calibrated.toml", *SPECIAL)), r.random() < 0.25
     damaged = (mutations.non_finite if injected else mutations.in_text)(r, corpus[name])
-    return _case(r, ON_A_SCENE, name, damaged, *(() if name == "scene.toml" else CALIBRATED), injected=injected)
+    others = CALIBRATED if name == "calibrated.toml" else ("cells.npz",)
+    return _case(r, ON_A_SCENE, name, damaged, "counts.npy", *others, injected=injected)
+
+
+def _changed(r: random.Random, corpus: Corpus) -> Case:
+    """A file that a scene names, or one that its mesh names, changes after the scene was run."""
+    name = r.choice((*CALIBRATED, "cells.npz"))
+    damage = mutations.in_bytes if name.endswith((".npy", ".png", ".npz")) else mutations.in_text
+    scene = "grid.toml" if name == "cells.npz" else "calibrated.toml"
+    new, other = damage(r, corpus[name]), {"calibrated.toml": CALIBRATED, "grid.toml": ("cells.npz",)}[scene]
+    files = {**dict.fromkeys((scene, *other)), f"new/{name}": new}
+    return Case(("changed", scene, name, r.choice(("simulate", "merge"))), files, ("out", "new", name))
 
 
 def _recipe(r: random.Random, corpus: Corpus) -> Case:
@@ -125,6 +138,7 @@ def _command_line(r: random.Random, corpus: Corpus) -> Case:
 
 CATEGORIES: dict[str, Callable[[random.Random, Corpus], Case]] = {
     "scene": _scene,
+    "changed": _changed,
     "recipe": _recipe,
     "grid": _beside_a_scene("cells.npz", "cells.h5"),
     "calibration": _beside_a_scene("camera.yaml", "camera.json", "camera.xml"),

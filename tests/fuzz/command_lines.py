@@ -106,4 +106,4 @@ def draw(r: random.Random) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return (*path, *words), (*OUTPUTS, *named, *initial)
 
 
-_NAMING = {"--out", "--json", "--ply", "--write", "--report", "--traceback", "--plots"}
+_NAMING = {"--out", "--json", "--ply", "--write", "--report", "--traceback", "--plots", "--picture", "--matrix"}

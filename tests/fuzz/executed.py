@@ -78,11 +78,46 @@ def _child(case: Case, folder: Path) -> tuple[int, str, list[str]]:
     command, *rest = case.arguments
     if command.startswith("load"):
         return _load(command, rest[0])
+    if command == "changed":
+        return *_changed(*rest), []
+    code, text = _command(case.arguments)
+    scene = [name for name in case.files if name.endswith("scene.toml") or name == "calibrated.toml"]
+    accepted = code == 0 and case.injected and scene
+    return code, text, _load("load_scene", scene[0])[2] if accepted else []
+
+
+def _changed(scene: str, name: str, command: str) -> tuple[int, str]:
+    """Runs a scene, puts another file in the place of one of its own, and continues the run, or merges with the next
+    part of it: refused by the name of the file, if it is another."""
+    same = Path(name).read_bytes() == Path("new", name).read_bytes()
+    run = ("simulate", scene, "--photons", "64", "--device", "cpu", "--quiet", "--out")
+    assert _command((*run, "out/a"))[0] == 0
+    os.replace(f"new/{name}", name)
+    goes_on = ("simulate", "--resume", "out/a", "--photons", "128", "--device", "cpu")
+    if command == "merge":
+        code, text = _command((*run, "out/b", "--first-photon", "64"))
+        if code != 0:
+            return code, text  # a damaged file
+        goes_on = ("merge", "out/a", "out/b", "--out", "out/c")
+    code, text = _command(goes_on)
+    # A result holds what its camera's calibration said, and the colours of its targets, and compares these.
+    compared = name == "camera.yaml" or name.endswith((".mtl", ".png"))
+    if (code != 0) if same else (code == 0 and not compared):
+        return BUG, f"{'refused' if same else 'accepted'} after {name} {'stayed' if same else 'changed'}: {text}"
+    return (
+        (code, text)
+        if same or compared or name in text or "name too long" in text
+        else (BUG, f"does not name {name}: {text}")
+    )
+
+
+def _command(arguments: tuple[str, ...]) -> tuple[int, str]:
+    """Exit code and stderr."""
     out, err = io.TextIOWrapper(io.BytesIO()), io.TextIOWrapper(io.BytesIO(), errors="replace")
     code = 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            command_lines.program()(list(case.arguments), prog_name="spadwarp")
+            command_lines.program()(list(arguments), prog_name="spadwarp")
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 1
         err.flush()
@@ -91,9 +126,7 @@ def _child(case: Case, folder: Path) -> tuple[int, str, list[str]]:
         with contextlib.suppress(OSError):
             text += Path(bug[1].rstrip(",")).read_text()[-1200:]
             os.unlink(bug[1].rstrip(","))
-    scene = [name for name in case.files if name.endswith("scene.toml") or name == "calibrated.toml"]
-    accepted = code == 0 and case.injected and scene
-    return code, text, _load("load_scene", scene[0])[2] if accepted else []
+    return code, text
 
 
 def _load(what: str, path: str) -> tuple[int, str, list[str]]:

@@ -70,6 +70,7 @@ def main() -> int:
     parser.add_argument(
         "--only", default=",".join([*CATEGORIES, "kernels", "api"]), help="categories, separated by commas"
     )
+    parser.add_argument("--seconds", type=float, default=1e9, help="after which no further case begins")
     parser.add_argument("--out", help="findings as JSON lines")
     options = parser.parse_args()
     names, findings, began = options.only.split(","), 0, time.monotonic()
@@ -87,6 +88,8 @@ def main() -> int:
         gc.collect()
         gc.freeze()  # else the first collection of every child copies this process's memory
         for number in range(options.first, options.first + options.cases):
+            if time.monotonic() > began + options.seconds:
+                break
             category = names[number % len(names)]
             verdict, text, about = verdict_of(category, number, corpus)
             counts[category][verdict] += 1
@@ -100,7 +103,7 @@ def main() -> int:
     print(f"{'':12}" + "".join(f"{verdict:>12}" for verdict in verdicts))
     for name, one in counts.items():
         print(f"{name:12}" + "".join(f"{one[verdict]:12}" for verdict in verdicts))
-    print(f"{options.cases} cases, {findings} findings, {time.monotonic() - began:.0f} s")
+    print(f"{sum(one.total() for one in counts.values())} cases, {findings} findings, {time.monotonic() - began:.0f} s")
     return 1 if findings else 0
 
 

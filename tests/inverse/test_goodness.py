@@ -40,12 +40,13 @@ def test_p_of_right_models_is_uniform(level, photons):
 
 @pytest.mark.parametrize("width", [0.85, 1.0, 1.15])
 def test_a_wrong_width_of_the_return_shows_in_its_bins(width):
-    """Of 2.6e4 counts of a return among 160 bins of decaying water, whose amounts fit."""
+    """Of 2.6e4 counts of returns among 160 bins of decaying water, whose amounts fit, in pixels at several ranges."""
     random, bins = np.random.default_rng(7), np.arange(160)
+    places = random.uniform(90.0, 110.0, (64, 1))
 
     def mean_of(sigma):
-        target = 2.5 * np.exp(-0.5 * ((bins - 100) / sigma) ** 2) / sigma
-        return np.stack([np.tile(part, (64, 1)) for part in (64 * target, 2.0 * np.exp(-bins / 30) + 0.05)])
+        target = 2.5 * np.exp(-0.5 * ((bins - places) / sigma) ** 2) / sigma
+        return np.stack([64 * target, np.tile(2.0 * np.exp(-bins / 30) + 0.05, (64, 1))])
 
     parts, found = mean_of(1.5).astype(np.float32), []
     for _ in range(20):

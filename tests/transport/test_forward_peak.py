@@ -57,6 +57,13 @@ def test_unseen_share_is_the_peak_within_the_angle_of_ten_photons():
     assert wide.unseen_share(1.0)[1] > 0.9
 
 
+def test_the_peak_of_a_layer_counts_as_the_mediums_own():
+    layered = {"layers": [{"start": 1.0, "extinction": 1.0, "albedo": 0.8, "anisotropy": 0.9999}]}
+    found = peaked(layered, "next_event").unseen_peak(1e5)
+    assert found == peaked({"anisotropy": 0.9999}, "next_event").unseen_peak(1e5)
+    assert found[1] > 0.3 > peaked({}, "next_event").unseen_peak(1e5)[1]
+
+
 def test_check_and_the_run_say_what_is_not_seen(device):
     one = peaked(WATER, "next_event", photons=20_000)
     (message,) = [found for found in check(one) if "forward peak" in found.text]

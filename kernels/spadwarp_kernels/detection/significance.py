@@ -17,6 +17,7 @@ import warp as wp
 from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_number
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO, log1p, one_minus_exp
+from spadwarp_kernels.base.philox import begin_sequence, sequence_word, u01_open
 
 __all__ = ["MIN_SIGNIFICANCE", "DetectionTest"]
 
@@ -31,7 +32,6 @@ _LN10, _LN_2PI = wp.constant(wp.float64(math.log(10.0))), wp.constant(wp.float64
 _MANY, _LEAST = wp.constant(wp.float64(1.0e9)), wp.constant(wp.float64(1.0e-30))
 _TERMS = wp.constant(64)  # of a tail, before the rest of it counts as a geometric series, which it stays below
 _HASH_START, _HASH_FACTOR = wp.uint32(2166136261), wp.uint32(16777619)  # Fowler, Noll and Vo
-_MIX_1, _MIX_2 = wp.uint32(0x85EBCA6B), wp.uint32(0xC2B2AE35)  # MurmurHash3
 
 
 @wp.struct
@@ -93,14 +93,6 @@ def _significance(
     return wp.max(-(log_p + wp.log(above + u * (either - above))) / _LN10, ZERO)
 
 
-@wp.func
-def _uniform(state: wp.uint32) -> wp.float64:
-    """In (0, 1)."""
-    mixed = (state ^ (state >> wp.uint32(16))) * _MIX_1
-    mixed = (mixed ^ (mixed >> wp.uint32(13))) * _MIX_2
-    return (wp.float64(mixed ^ (mixed >> wp.uint32(16))) + HALF) / wp.float64(4294967296.0)
-
-
 @memoised
 def _significance_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
@@ -159,8 +151,8 @@ def _significance_kernel(dtype: Any) -> wp.Kernel:
         significance[pixel] = 0.0
         if best[0] > ZERO:
             number = wp.float64(wp.max(halves - 1, 1))
-            found = _significance(best[1], best[2], best[3], number, _uniform(state), search.level_known)
-            significance[pixel] = float(found)
+            u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(state)))))
+            significance[pixel] = float(_significance(best[1], best[2], best[3], number, u, search.level_known))
 
     return significance_kernel
 

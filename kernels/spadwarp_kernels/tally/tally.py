@@ -68,6 +68,7 @@ def has_overflowed(tally: wp.array, *, signed: bool = False) -> bool:
     `tally` is an array of int64 with one axis.
     """
     check_array("tally", tally, wp.int64, (None,))
+    check_kind("signed", signed, bool)
     found = wp.zeros(1, dtype=int, device=tally.device)
     least = wp.int64(1 - (1 << 62) if signed else 0)
     wp.launch(find_overflow_kernel, dim=tally.size, inputs=[tally, least], outputs=[found], device=tally.device)
