@@ -3,7 +3,8 @@
 The deviance of counts n with mean m is D = 2 Σ [n ln(n/m) − n + m]. Of few counts it is not χ²: its mean and variance
 are sums over the Poisson distribution, for binomial counts times v/m and its square. Fitted unknowns lower the mean,
 noise of the simulation raises it, and both are computed. Besides that of all pixels and bins, there is one of the sums
-over the pixels and one of those over time: they see what is small in each pixel and bin.
+over the pixels and one of those over time: they see what is small in each pixel and bin. A response of another width
+has one degree of freedom, which none of these singles out: it has a score of its own (Rao 1948).
 """
 
 from __future__ import annotations
@@ -50,7 +51,8 @@ class Goodness:
     p: float  # probability of deviances as large or larger than those of `parts`, if the model is right; NaN: not known
     parts: Mapping[str, Deviance]
     """Deviances: "pixels and bins"; "image", the bins added up; the pixels added up, "time of the target" by the time
-    since the return, in bins in which light of targets is the largest part, and "time of the rest" in the others."""
+    since the return, in bins in which light of targets is the largest part, and "time of the rest" in the others;
+    "width": the square of the score by the width of the response, in its variances."""
     components: Mapping[str, Deviance]
     """Those of pixels and bins in which light of the "target", light of the "water", or "noise" (dark counts and
     ambient light) is the largest part of the mean."""
@@ -102,6 +104,13 @@ class Lost(NamedTuple):
             most += self.own_matrix[..., 0].size
         return min(max(loss, 0.0), float(most))
 
+    def beside(self, change: Floats, mean: Floats) -> Floats:
+        """Of a change of the mean `[pixel, bin]`, what no change of the fitted unknowns makes up for."""
+        (left, right), (own_left, own_right) = self.shared, self.own
+        taken = self.matrix @ np.einsum("ipt,pt->i", right, change / mean)
+        own = np.einsum("pij,jpt,pt->pi", self.own_matrix, own_right, change / mean)
+        return change - np.einsum("ipt,i->pt", left, taken) - np.einsum("ipt,pi->pt", own_left, own)
+
 
 def goodness_of(
     counts: NDArray[np.integer], mean: Rows, variance: Rows, batches: Sequence[Rows], lost: Lost, parts: Sequence[Rows]
@@ -136,6 +145,8 @@ def goodness_of(
     sums = ways["pixels and bins"][0](pieces)
     found = {name: _Cells(add_up(rows), add_up(pieces[:number])) for name, (add_up, _) in ways.items()}
     deviances = {name: one.deviance(lost.of(one.mean, *ways[name])) for name, one in found.items()}
+    if len(batches) > 1 and pieces[0].any():
+        deviances["width"] = _width(rows, pieces[:number], lost)
     cells = found["pixels and bins"]
     kinds = np.argmax(sums[number:], axis=0)
     excess, variances = (np.bincount(pixel, x) for x in (cells.each - cells.expected, cells.variance))
@@ -146,7 +157,8 @@ def goodness_of(
         whole.expected - per_pixel.expected,
         whole.standard_deviation**2 - per_pixel.standard_deviation**2,
     )
-    known = [p for p in (within, per_pixel.p, *(deviances[name].p for name in times)) if not np.isnan(p)]
+    known = [within, per_pixel.p, *(one.p for name, one in deviances.items() if name in (*times, "width"))]
+    known = [p for p in known if not np.isnan(p)]
     beyond = sum(deviances[name].deviance - deviances[name].expected for name in times)
     return Goodness(
         p=float(-np.expm1(len(known) * np.log1p(-min(known)))) if known and min(known) < 1.0 else 1.0,
@@ -154,6 +166,29 @@ def goodness_of(
         components={name: cells.of(kinds == k).deviance() for k, name in enumerate(COMPONENTS) if (kinds == k).any()},
         misfit=float(np.sqrt(max(beyond, 0.0) / max(rows.sum(), 1))),
         pixels=(excess / np.sqrt(np.maximum(variances, 1e-300))).reshape(image),
+    )
+
+
+def _width(counts: NDArray[np.integer], pieces: Floats, lost: Lost) -> Deviance:
+    """The square of the score of counts `[pixel, bin]` by the width of the response, in its variances: 1 in the mean.
+
+    A little more width adds the second difference of the mean over time. Taken from one half of the batches, it is
+    independent of the noise of the other half; what it is weighted by is the mean of a cell.
+    """
+    variance, batches = pieces[1], pieces[2:]
+    first, _ = _cells(pieces[0])
+    sizes = np.diff(first, append=counts.size)
+    mean = np.maximum(np.repeat(np.add.reduceat(pieces[0].ravel(), first) / sizes, sizes), _LEAST).reshape(counts.shape)
+    score = spread = 0.0
+    for half, other in ((batches[::2], batches[1::2]), (batches[1::2], batches[::2])):
+        change = lost.beside(np.diff(np.pad(half.mean(axis=0), ((0, 0), (1, 1)), "edge"), 2, axis=1), mean) / mean
+        score += 0.5 * float((change * (counts - other.mean(axis=0))).sum())
+        noise = np.einsum("bpt,pt->b", other, change).var(ddof=1) / len(other) if len(other) > 1 else 0.0
+        # The counts are the same for both halves, the noise is not.
+        spread += 0.5 * float((change**2 * variance).sum()) + 0.25 * noise
+    square = score**2 / spread if spread > 0.0 else 0.0
+    return Deviance(
+        deviance=square, expected=1.0, standard_deviation=2.0**0.5, p=_tail(square, 1.0, 2.0), counts=int(counts.sum())
     )
 
 
