@@ -70,7 +70,7 @@ def _ratios(scene: Scene, signal: Floats, light: Floats, background: Floats, err
         moved = weight * none
     else:
         variance, moved = (np.square(weight) * rate).sum(axis=1), weight
-    moved = np.square(error * _blurred(scene, moved)).sum(axis=1) * scene.detector.pulses_per_frame
+    moved = np.square(error * _blurred(scene, moved)).sum(axis=1) * scene.pulses_per_depth_frame
     return np.divide(moved, variance, out=np.full(len(moved), np.nan), where=variance > 0)
 
 

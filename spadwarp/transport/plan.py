@@ -40,15 +40,17 @@ _RANGES = {"threads": "[1, 4096]", "launch_size": f"[1, {1 << 26}]", "first_phot
 # Voxels that are read at the end of a batch for each of its photons, at most: 2 % of a photon's time, on a GPU too.
 _VOXELS_PER_PHOTON = 16
 
-# Batches of a run: the least that tell an error, and as many as large histograms allow. With a stopping rule more, so
-# that it can act early.
+# Batches of a run: the least that tell an error, and at most as many as large histograms allow; half as many again, or
+# twice, since their size is a power of two. With a stopping rule more, so that it can act early.
 _BATCHES, _STOPPING_BATCHES = (8, 32), (128, 1024)
+# A GPU stands still for 2 ms between batches (H200), 3 % of the time of so many photons.
+_GPU_BATCH = 1 << 26
 
 # Photons of a batch at most: some seconds of a GPU, so that several can share the work.
 _LARGEST_BATCH = 1 << 30
 
 # Where the error decides about the number of photons: of a batch at least, and voxels read for each.
-_AUTO_BATCH = {"cpu": 1 << 15, "cuda": 1 << 24}
+_AUTO_BATCH = {"cpu": 1 << 15, "cuda": 1 << 25}
 _AUTO_VOXELS_PER_PHOTON = {"cpu": 128, "cuda": 16}
 
 # Bins of all pixels, at most, whose errors are kept: in memory they take 88 bytes each, without errors 24.
@@ -153,7 +155,7 @@ def make_plan(
     if is_auto and shard is not None:
         raise ConfigError("photons = 'auto' cannot be combined with shard: no part knows the error of the whole")
     if batches:
-        wanted = _auto_batch_size(scene, kind) if is_auto else _batch_size(scene, photons, relative_error, shard)
+        wanted = _auto_batch_size(scene, kind) if is_auto else _batch_size(scene, photons, relative_error, shard, kind)
         batch_size = max(0 if resume is None else resume.batch_size, wanted)
     if is_auto and not batch_size:
         raise ConfigError("photons = 'auto' needs errors, which a histogram this large does not keep; give a number")
@@ -186,12 +188,16 @@ def make_plan(
     return plan
 
 
-def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
+def _batch_size(
+    scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None, kind: str
+) -> int:
     """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches."""
     bins = scene.camera.width * scene.camera.height * scene.gate.bins
     if bins > MOST_BINS_WITH_ERRORS and relative_error is None:
         return 0
     fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
+    if kind == "cuda" and relative_error is None:
+        most = min(max(photons // _GPU_BATCH, fewest), most)
     least = min(max(photons * _VOXELS_PER_PHOTON // (len(COMPONENTS) * bins), fewest), most)
     least = least if shard is None else max(least, shard[1])
     positions = scene.scan_positions

@@ -23,7 +23,7 @@ from spadwarp.parallel import Ray, interruptible
 from spadwarp.parallel.worker import Event
 from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
 from spadwarp.result.noise import NOISE_GOAL
-from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets
+from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets, unseen_warnings
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
@@ -165,7 +165,9 @@ def simulate(
             workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))
         result = _Run(plan, workers, resume, progress, run, stopped).result(relative_error, seconds)
     _warn_of_rounding(result)
-    for text in result.warnings:
+    # What shakes the errors counts where they decide.
+    by_error = relative_error is not None or plan.is_auto
+    for text in result.warnings if by_error else unseen_warnings(result):
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
     return result
 
