@@ -4,6 +4,7 @@ stored."""
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from spadwarp.result import Result, Truth, analyser_channel, degree_of_polarisat
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import RunOptions, simulate, truth_maps
-from spadwarp.values import ConfigError, path_from_time
+from spadwarp.values import ConfigError, SpadwarpWarning, path_from_time
 
 PROFILE_BINS = 64
 """Bins of `backscatter_profile`."""
@@ -219,7 +220,8 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     seen = returned > 0
     scene = with_exposure(scene, draw, returned[seen], most=_MOST_COUNTED_PULSES)
     pulses = min(scene.pulses_per_depth_frame, _MOST_COUNTED_PULSES)
-    frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
+    with warnings.catch_warnings(action="ignore", category=SpadwarpWarning):  # of noise, whose ratio is stored
+        frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
     time_bound = bound_of_result(result, pulses=pulses, device=device).sigma
     per_time = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
     profile = np.concatenate([[0.0], np.cumsum(water.sum(axis=(0, 1)))])
