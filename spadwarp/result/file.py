@@ -147,6 +147,11 @@ def load_result(path: str | Path) -> Result:
         moments = file.integers("batch_moments", bits=256)
         if not moments.keys() <= moments_of(COMPONENTS, [0] * len(COMPONENTS), 1, 1).keys():
             file.refuse("batch_moments", "are not those of the components")
+        batches, half_photons = (file.integer(name, default=0) for name in ("batches", "half_photons"))
+        if (head.batch_size > 0) != (batches > 0) or not 0 <= batches <= head.photons:
+            file.refuse("batches", f"= {batches} of {head.batch_size} photons cannot be those of {head.photons}")
+        if not 0 <= half_photons <= head.photons:
+            file.refuse("half_photons", f"= {half_photons} are more than the {head.photons} photons")
         made = file.table("provenance")
         parts = made.get("parts", [])
         if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
@@ -154,9 +159,9 @@ def load_result(path: str | Path) -> Result:
         return Result(
             **vars(head),
             tallies=tallies,
-            batches=file.integer("batches", default=0),
+            batches=batches,
             half=moment("half") if "half" in file else None,
-            half_photons=file.integer("half_photons", default=0),
+            half_photons=half_photons,
             second_moment=moment("second_moment"),
             truth=Truth(**maps),
             energy_balance=file.integers("energy_balance"),

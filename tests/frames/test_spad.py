@@ -1,7 +1,7 @@
 """The camera: from expected detections to frames of counts and depth; the noise of the simulation in them."""
 
-import math
 import dataclasses
+import math
 import warnings
 from types import SimpleNamespace
 
