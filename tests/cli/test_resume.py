@@ -55,8 +55,9 @@ def test_parts_are_merged_to_one_run(parts, scene, tmp_path):
     merged = spadwarp.load_result(both / "result.h5")
     whole = spadwarp.simulate(scene, device="cpu")
     assert_same(merged, whole)
-    assert np.array_equal(merged.half, whole.half) == (len(parts) == 3)  # batches of fewer photons have other numbers
-    assert np.array_equal(merged.second_moment, whole.second_moment) == (len(parts) == 3)
+    if len(parts) == 3:  # shards are cut between batches
+        assert np.array_equal(merged.half, whole.half)
+        assert np.array_equal(merged.second_moment, whole.second_moment)
     assert tables(both / "a.json")["photon_ranges"] == [[0, whole.photons]]
     words, last = " ".join(printed.stdout.split()), f"{whole.photons - 1:,}".replace(",", " ")
     assert f"photon ids 0 to {last}" in words and "energy balance exact" in words and (both / "depth.exr").is_file()
