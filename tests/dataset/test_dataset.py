@@ -242,6 +242,7 @@ def test_traced_scenes_hold_their_histograms(tmp_path):
         assert not verify_dataset(tmp_path / form)
         with h5py.File(tmp_path / form / "scenes.h5") as file:
             profile, edges = file["backscatter_profile"][...], file["profile_edges"][...]
+            assert (file["photons"][...] == 40_000).all() and (file["noise_ratio"][...] > 0).all()
         np.testing.assert_allclose((profile * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
         fields = ("noisy", "clean", "label", "intensity", "counts", "expected")
         items = list(iterate_dataset(tmp_path / form, "test", fields=fields))
@@ -259,6 +260,10 @@ def test_traced_scenes_hold_their_histograms(tmp_path):
             right = np.isfinite(noisy) & (item["label"][0] == 0) & np.isfinite(clean)
             assert np.median(np.abs(noisy - clean)[right]) < 0.05
     np.testing.assert_array_equal(totals["sparse"], totals["dense"])
+    make(recipe(**changes | {"monte_carlo.photons": "auto", "monte_carlo.time": 2.0}), tmp_path / "auto")
+    with h5py.File(tmp_path / "auto" / "scenes.h5") as file:
+        photons, ratio = file["photons"][...], file["noise_ratio"][...]
+    assert (photons % 2**15 == 0).all() and (photons > 40_000).all() and (ratio > 0).all()
 
 
 def plan_of_mesh(mesh, folder, *, scenes=1, yaw=0.0, **targets):

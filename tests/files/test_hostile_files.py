@@ -63,7 +63,7 @@ def valid(tmp_path_factory):
     """A folder with a valid file of every kind."""
     folder = tmp_path_factory.mktemp("valid")
     scene = make_scene(width=6, height=4, bins=16)
-    batches = {"second_moment": np.ones((2, 4, 6, 16), np.uint64), "batch_size": 10**8}
+    batches = {"second_moment": np.ones((2, 4, 6, 16), np.uint64), "batch_size": 10**8, "batches": 8}
     result = make_result(scene)
     spadwarp.result.save_result(type(result)(**{**vars(result), **batches}), folder / "result.h5")
     record_frames(result, folder / "frames.h5", pulses=1000, frames=2, seed=1, tags=True, device="cpu")

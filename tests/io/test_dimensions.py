@@ -20,7 +20,7 @@ ENGINES = ("h5netcdf", "netcdf4")
 def result():
     result = make_result(make_scene(width=WIDTH, height=HEIGHT, bins=BINS))
     moments = np.arange(2 * result.histogram.size, dtype=np.uint64).reshape(2, *result.histogram.shape)
-    return dataclasses.replace(result, second_moment=moments, batch_size=result.photons)
+    return dataclasses.replace(result, half=result.tallies, second_moment=moments, batch_size=result.photons, batches=1)
 
 
 @pytest.fixture(params=ENGINES)
