@@ -13,12 +13,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.optimize import nnls
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
@@ -63,71 +66,152 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
 
 def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruction:
     """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
-    scene, gate = result.scene, result.scene.gate
-    bins, height, width = gate.bins, scene.camera.height, scene.camera.width
-    direct, even, delay = _known_light(scene, result.focus_distance, device)
-    visible = 1.0 - np.minimum(np.cumsum(delay, axis=-1, dtype=np.float32), 1.0)
-    fine = [wp.array(part.reshape(height * width, -1), dtype=float, device=device) for part in (direct, even)]
-    ballistic = _delayed(fine[0], 0, 1, _FINE, bins).numpy().reshape(height, width, bins)
-    path = np.nan_to_num((result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width, nan=bins)
-    aligned, absolute = np.clip(np.rint(path).astype(int), 0, bins), np.zeros((height, width), int)
-    forward = _forward(fine, ballistic, 0.5 * (halves[0, 1] + halves[1, 1]), device)
-    parts = (ballistic, forward, _backscatter(visible, 0.5 * (halves[0, 2] + halves[1, 2])))
-    found, squares = np.zeros(halves.shape[1:], np.float32), np.zeros(halves.shape[2:], np.float32)
-    for k, (predicted, start) in enumerate(zip(parts, (absolute, aligned, absolute), strict=True)):
-        total = 0.5 * (halves[0, k].sum(dtype=np.float64) + halves[1, k].sum(dtype=np.float64))
-        if total > 0.0:
-            predicted = predicted * (total / max(predicted.sum(dtype=np.float64), 1e-300))
-            light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, device)
-            raw = result.tallies[k].sum(axis=-1, dtype=np.float64) * result.tally_value
-            found[k] = light * (raw.sum() / light.sum(dtype=np.float64))
-            squares += square
+    scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
+    direct, even, covered = _known_light(scene, result.focus_distance, device)
+    fine = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
+    ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
+    # Scattered light of a pixel without a target is that of the nearest target.
+    start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
+    nearest = distance_transform_edt(np.isnan(start), return_distances=False, return_indices=True)
+    aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, gate.bins).astype(np.int64)
+    mean = halves.mean(axis=0)
+    predictions = ballistic, _forward(*fine, ballistic, mean[1]), _backscatter(covered, mean[2])
+    found, squares = np.zeros_like(mean), np.zeros(mean.shape[1:], np.float32)
+    for k, (predicted, first) in enumerate(zip(predictions, (0 * aligned, aligned, 0 * aligned), strict=True)):
+        expected = predicted.sum(dtype=np.float64)
+        if result.tallies[k].any() and expected > 0.0:
+            predicted = predicted * np.float32(mean[k].sum(dtype=np.float64) / expected)
+            light, square = _smoothed(*halves[:, k], predicted, first, device)
+            raw = (result.tallies[k].sum(axis=-1, dtype=np.float64) * result.tally_value).sum()
+            found[k], squares = light * (raw / light.sum(dtype=np.float64)), squares + square
+        else:
+            found[k] = mean[k]
     return Reconstruction(histogram=found, error=np.sqrt(squares))
 
 
 def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
-    """From truth rays, `[H, W, fine bin]`: ballistic light and surfaces in even light; and the part of each pixel whose
-    surface is there, `[H, W, T]`."""
-    camera, gate, beam, count = scene.camera, scene.gate, scene.beam, scene.gate.bins * _FINE
-    model = build_model(scene, device, build_mesh(scene), camera=False)
-    height, width = camera.height, camera.width
-    light = np.zeros((2, height * width * count), np.float32)
-    if model.mesh is None:
-        covered = np.zeros((height, width, gate.bins), np.float32)
-        return light[0].reshape(height, width, -1), light[1].reshape(height, width, -1), covered
-    corners = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-    first = np.arange(height * width).reshape(height, width) * count
-    covered = np.zeros(height * width * gate.bins, np.float32)
-    for k in range(_RAYS):
-        place = (k + 0.5) / _RAYS, (k + 0.5) * 0.6180339887 % 1.0
-        view = np.concatenate([image_tangents(camera, corners + place), np.ones((height, width, 1))], axis=-1)
-        lens = np.zeros(3)
-        if camera.port is None and focus is not None and not camera.pinhole:
-            radius, angle = camera.aperture_radius * math.sqrt((k * 0.7548776662) % 1.0), 2.399963 * k * 7.0
-            lens = radius * np.array([math.cos(angle), math.sin(angle), 0.0])
-            view = view - lens / focus if math.isfinite(focus) else view
+    """From truth rays: ballistic light and surfaces in even light, `[H, W, fine bin]`; the part of each pixel whose
+    surface has light of a bin or of an earlier one, `[H, W, T]`."""
+    camera, gate, count = scene.camera, scene.gate, scene.gate.bins * _FINE
+    model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
+    voxels = shape[0] * shape[1] * count
+    found: list[tuple[Any, ...]] = [(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
+    first = np.arange(shape[0] * shape[1]).reshape(shape) * count
+    for place, lens in _places(scene, focus) if model.mesh is not None else ():
+        corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
+        view = np.concatenate([image_tangents(camera, corners + place), np.ones((*shape, 1))], axis=-1)
+        view = view - lens / (focus or math.inf)
         slant = np.linalg.norm(view, axis=-1, keepdims=True)
         lines = lines_of_sight(scene, view / slant)
-        along, normal, reflectance = trace_rays(model, lines.start + lens, lines.direction)
+        _, along, normal, reflectance = trace_rays(model, lines.start + lens, lines.direction, shape)
         point = lines.start + lens + along[..., None] * lines.direction
         direction, way, path = lines.light_at(point)
         path = path + along + lines.delay
-        source = np.nan_to_num(point - direction * way[..., None], nan=1e9)
-        lit = trace_rays(model, source, np.nan_to_num(direction, nan=1.0))[0] > way * (1.0 - 1e-4) - 1e-3
-        seen = reflectance * np.exp(-scene.medium.extinction * path) / slant[..., 0] ** 4
-        strength = np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
-        at = (path / scene.medium.pulse_speed - gate.start) / gate.bin_width
-        inside = np.isfinite(seen) & np.isfinite(strength) & (at < gate.bins)
-        covered += np.bincount(
-            ((first // _FINE) + np.maximum(at, 0).astype(np.int64, copy=False))[inside]
-            if at.dtype.kind == "i"
-            else (first[inside] // _FINE + np.maximum(at[inside], 0.0).astype(np.int64)),
-            minlength=covered.size,
-        )
-        inside &= at >= 0.0
-        fine = first[inside] + (at[inside] * _FINE).astype(np.int64)
-        even = seen[inside]
-        np.add.at(light[0], fine, even * (strength * lit * _beam(beam, direction))[inside])
-        np.add.at(light[1], fine, even)
-    shape = (height, width, count)
-    return light[0].reshape(shape), light[1].reshape(shape), (covered / _RAYS).reshape(height, width, gate.bins)
+        _, free, _, _ = trace_rays(model, point - direction * way[..., None], direction, shape)
+        lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
+        lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
+        even = reflectance * np.exp(-scene.medium.extinction * path) / slant[..., 0] ** 4
+        at = (path / scene.medium.pulse_speed - gate.start) / scene.gate.bin_width * _FINE
+        inside = np.isfinite(even + lit) & (at < count)
+        bins = np.where(at >= 0.0, at, 0.0)[inside].astype(np.int64)
+        seen = (at >= 0.0)[inside]
+        found.append((first[inside] + bins, (even * lit)[inside] * seen, even[inside] * seen))
+    index = np.concatenate([rays[0] for rays in found])
+    direct, even, hits = (
+        np.bincount(index, weights, voxels).astype(np.float32).reshape(*shape, count)
+        for weights in (*(np.concatenate([rays[k] for rays in found]) for k in (1, 2)), np.full(len(index), 1 / _RAYS))
+    )
+    return direct, even, np.cumsum(hits.reshape(*shape, -1, _FINE).sum(axis=-1), axis=-1)
+
+
+def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Places within a pixel, and points of a lens that is not behind a port [m], evenly by Kronecker sequences."""
+    camera = scene.camera
+    radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
+    for k in range(_RAYS):
+        u = (0.5 + (k + 1) * np.array([0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101])) % 1
+        r, angle = radius * math.sqrt(u[2]), 2.0 * math.pi * u[3]
+        yield u[:2], np.array([r * math.cos(angle), r * math.sin(angle), 0.0])
+
+
+def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Radiant intensity of the laser towards unit vectors, up to a factor; of beams that are no cones 1."""
+    beam = scene.beam
+    cosine = np.maximum((direction * np.asarray(beam.axis)).sum(axis=-1), 1e-6)
+    if scene.scan.mode != "none" or beam.profile not in ("uniform_cone", "gaussian"):
+        return np.ones(cosine.shape)
+    if beam.profile == "uniform_cone":
+        return (cosine >= math.cos(beam.half_angle)).astype(np.float64)
+    return np.exp(-2.0 * (cosine**-2 - 1.0) / math.tan(beam.half_angle) ** 2) / cosine**3
+
+
+def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
+    """Light `[pixel, fine bin]` by a delay of so many fine bins, in bins."""
+    late = wp.empty((fine.shape[0], fine.shape[1] // per_bin), dtype=float, device=fine.device)
+    wp.launch(sk.delay_kernel, dim=fine.shape[0], inputs=[fine, *delay, per_bin, late], device=fine.device)
+    return late
+
+
+def _forward(direct: wp.array, even: wp.array, ballistic: Cube, light: Cube) -> Cube:
+    """Prediction of forward-scattered light from its tallies."""
+    terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
+    terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
+    for radius in _BLURS:
+        blurred = _window_sums(_window_sums(ballistic, (radius, 0), direct.device), (radius, 0), direct.device)
+        pixels = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
+        terms += [_delayed(pixels, delay, 1).numpy() for delay in _BLURRED_DELAYS]
+    sums = [float(term.sum(dtype=np.float64)) for term in terms]
+    rows = np.stack([term.ravel() / total for term, total in zip(terms, sums, strict=True) if total > 0.0])
+    # Weights: the variance of light is about proportional to it.
+    level = _window_sums(light, (3, 2), direct.device).ravel()
+    root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
+    rows *= root
+    gram = (rows @ rows.T).astype(np.float64)
+    lower = np.linalg.cholesky(gram + 1e-9 * np.trace(gram) / len(gram) * np.eye(len(gram)))
+    factors, _ = nnls(lower.T, np.linalg.solve(lower, rows @ (light.ravel() * root)))
+    return ((factors.astype(np.float32) @ rows) / root).reshape(light.shape)
+
+
+def _backscatter(covered: Cube, light: Cube) -> Cube:
+    """Prediction of backscatter: of each bin the mean of pixels before their surface, and of those behind it."""
+    open_ = 1.0 - np.minimum(covered, 1.0)
+    parts = [(part, (part * light).sum(axis=(0, 1)), part.sum(axis=(0, 1))) for part in (open_, 1.0 - open_)]
+    return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
+
+
+def _window_sums(values: Cube, radius: tuple[int, int], device: wp.Device) -> Cube:
+    """Of numbers `[H, W, T]`."""
+    cubes = [wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(2)]
+    source = wp.array(np.repeat(values[..., None], 4, axis=-1), dtype=wp.vec4, device=device)
+    sk.window_sums(source, radius, *cubes)
+    return cubes[1].numpy()[..., 0]
+
+
+def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp.Device) -> tuple[Cube, Cube]:
+    """Light of a component and its squared error `[H, W, T]`. `start`: bin from which those of a pixel are counted."""
+    bins, shift = first.shape[-1], int(start.max()) - start
+    rows = np.arange(bins) + shift[..., None]
+    cubes = [first, second, 0.25 * (first - second) ** 2, predicted + _FLOOR * predicted.mean()]
+    shape = (*first.shape[:2], bins + int(shift.max()))
+    aligned = np.zeros((*shape, 4), np.float32)
+    for k, cube in enumerate(cubes):
+        np.put_along_axis(aligned[..., k], rows, cube, axis=-1)
+    scale = float(predicted.max())  # float32 holds the squares of what is near 1
+    aligned *= np.array([1.0, 1.0, 1.0 / scale, 1.0], np.float32) / scale
+    values = wp.array(aligned, dtype=wp.vec4, device=device)
+    sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
+
+    def launch(kernel: Any, *arrays: wp.array) -> None:
+        wp.launch(kernel, dim=shape, inputs=[*arrays], device=device)
+
+    for window in _WINDOWS:
+        sk.window_sums(values, window, work, sums)
+        launch(sk.estimate_kernel, values, sums, risk)
+        sk.window_sums(risk, _AROUND, work, around)
+        launch(sk.blend_kernel, values, sums, around, blended)
+    launch(sk.combine_kernel, values, blended, sums)
+    sk.window_sums(sums, _AROUND, work, around)
+    found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
+    bias = np.maximum(near[..., 0], 0.0) / np.maximum(near[..., 2], 1e-30) * own[..., 1]
+    light, square = 0.5 * scale * (found[..., 0] + found[..., 1]), scale**2 * (own[..., 0] + bias)
+    return tuple(np.take_along_axis(cube, rows, axis=-1) for cube in (light, square))  # type: ignore[return-value]
