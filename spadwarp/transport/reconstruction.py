@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -44,7 +45,7 @@ _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
 # Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
-_WINDOWS = ((0, 0), (0, 1), (1, 0), (1, 1), (1, 4), (2, 0), (2, 2), (4, 1), (4, 4), (8, 1), (8, 8), (16, 3), (32, 16))
+_WINDOWS = ((0, 0), (1, 0), (0, 2), (1, 2), (2, 1), (4, 2), (8, 4), (16, 8), (32, 32))
 _AROUND = (3, 2)
 _FLOOR = 1e-3  # of the mean: prediction where none is expected
 
@@ -76,16 +77,21 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
     aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, gate.bins).astype(np.int64)
     mean = halves.mean(axis=0)
     predictions = ballistic, _forward(*fine, ballistic, mean[1]), _backscatter(covered, mean[2])
-    found, squares = np.zeros_like(mean), np.zeros(mean.shape[1:], np.float32)
-    for k, (predicted, first) in enumerate(zip(predictions, (0 * aligned, aligned, 0 * aligned), strict=True)):
-        expected = predicted.sum(dtype=np.float64)
-        if result.tallies[k].any() and expected > 0.0:
-            predicted = predicted * np.float32(mean[k].sum(dtype=np.float64) / expected)
-            light, square = _smoothed(*halves[:, k], predicted, first, device)
-            raw = (result.tallies[k].sum(axis=-1, dtype=np.float64) * result.tally_value).sum()
-            found[k], squares = light * (raw / light.sum(dtype=np.float64)), squares + square
-        else:
+    found = np.zeros_like(mean)
+
+    def smooth(k: int) -> Cube:
+        expected = predictions[k].sum(dtype=np.float64)
+        if not (result.tallies[k].any() and expected > 0.0):
             found[k] = mean[k]
+            return np.zeros_like(mean[k])
+        predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / expected)
+        light, square = _smoothed(*halves[:, k], predicted, aligned if k == 1 else 0 * aligned, device)
+        raw = (result.tallies[k].sum(axis=-1, dtype=np.float64) * result.tally_value).sum()
+        found[k] = light * (raw / light.sum(dtype=np.float64))
+        return square
+
+    with ThreadPoolExecutor(1 if device.is_cuda else 2) as threads:
+        squares = sum(threads.map(smooth, (1, 0, 2)))
     return Reconstruction(histogram=found, error=np.sqrt(squares))
 
 

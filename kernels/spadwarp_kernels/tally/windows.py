@@ -56,8 +56,8 @@ def delay_kernel(fine: wp.array2d[float], first: int, last: int, per_bin: int, d
 @wp.func
 def _estimates(own: wp.vec4, sums: wp.vec4) -> wp.vec3:
     """Of both halves, and the variance of their mean."""
-    ratio = own[3] / wp.max(sums[3], 1.0e-30)
-    return wp.vec3(sums[0] * ratio, sums[1] * ratio, sums[2] * ratio * ratio)
+    ratio = own[3] / wp.max(wp.max(sums[3], own[3]), 1.0e-30)
+    return wp.vec3(sums[0] * ratio, sums[1] * ratio, wp.max(sums[2], 0.0) * ratio * ratio)
 
 
 @wp.func
