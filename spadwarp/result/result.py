@@ -757,6 +757,7 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
         batch_size=0 if moments is None else result.batch_size,
         batches=0 if moments is None else result.batches,
         batch_moments={},
+        reconstruction=None,
         channel_tallies=None,
         derivative_tallies=None,
         provenance={**result.provenance, "channel": channel},

@@ -525,7 +525,9 @@ def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int,
     if np.size(origins):
         passes = np.isfinite(origins + directions).all(axis=-1, keepdims=True)
         origins, directions = np.where(passes, origins, 1e9), np.where(passes, directions, [0.0, 0.0, 1.0])
-    rays: Any = [wp.array(part.astype(np.float32), dtype=wp.vec3, device=model.device) for part in (origins, directions)]
+    rays: Any = [
+        wp.array(part.astype(np.float32), dtype=wp.vec3, device=model.device) for part in (origins, directions)
+    ]
     depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
     normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
     inputs, outputs = [model.camera, model.surfaces, *rays], [depth, distance, normal, reflectance]

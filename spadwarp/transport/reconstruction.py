@@ -135,7 +135,9 @@ def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], N
     camera = scene.camera
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
     for k in range(_RAYS):
-        u = (0.5 + (k + 1) * np.array([0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101])) % 1
+        u = (
+            0.5 + (k + 1) * np.array([0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101])
+        ) % 1
         r, angle = radius * math.sqrt(u[2]), 2.0 * math.pi * u[3]
         yield u[:2], np.array([r * math.cos(angle), r * math.sin(angle), 0.0])
 
