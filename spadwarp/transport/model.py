@@ -503,7 +503,7 @@ def truth_maps(scene: SceneLike, *, device: str | None = None) -> Truth:
 
 def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     """`truth_maps` for a model that is already on its device."""
-    camera, device = scene.camera, model.device
+    camera = scene.camera
     shape = (camera.height, camera.width)
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)

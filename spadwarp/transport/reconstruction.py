@@ -38,6 +38,9 @@ __all__ = ["reconstruct"]
 Cube = NDArray[np.float32]
 
 _RAYS = 64  # within a pixel
+_PARTS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))  # of a ray, in its part of the pixel
+_WEIGHT = 1.0 / (_RAYS * len(_PARTS))
+_STEPS = 1.1673039782614187 ** -np.arange(1.0, 5.0)  # Kronecker sequence in four dimensions: powers of a plastic number
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
 # Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
 _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
@@ -45,8 +48,8 @@ _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
 # Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
-_WINDOWS = ((0, 0), (1, 0), (0, 2), (1, 2), (2, 1), (4, 2), (8, 4), (16, 8), (32, 32))
-_AROUND = (3, 2)
+_WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (2, 1), (4, 2), (8, 4), (16, 8), (32, 32))
+_AROUND = (4, 1)
 _FLOOR = 1e-3  # of the mean: prediction where none is expected
 
 
@@ -69,14 +72,14 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
     """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
     direct, even, covered = _known_light(scene, result.focus_distance, device)
-    fine = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
+    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
     ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
     # Scattered light of a pixel without a target is that of the nearest target.
     start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
     nearest = distance_transform_edt(np.isnan(start), return_distances=False, return_indices=True)
     aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, gate.bins).astype(np.int64)
     mean = halves.mean(axis=0)
-    predictions = ballistic, _forward(*fine, ballistic, mean[1]), _backscatter(covered, mean[2])
+    predictions = ballistic, _forward(fine[0], fine[1], ballistic, mean[1]), _backscatter(covered, mean[2])
     found = np.zeros_like(mean)
 
     def smooth(k: int) -> Cube:
@@ -85,7 +88,7 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
             found[k] = mean[k]
             return np.zeros_like(mean[k])
         predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / expected)
-        light, square = _smoothed(*halves[:, k], predicted, aligned if k == 1 else 0 * aligned, device)
+        light, square = _smoothed(halves[0, k], halves[1, k], predicted, aligned if k == 1 else 0 * aligned, device)
         raw = (result.tallies[k].sum(axis=-1, dtype=np.float64) * result.tally_value).sum()
         found[k] = light * (raw / light.sum(dtype=np.float64))
         return square
@@ -118,15 +121,23 @@ def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[
         lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
         even = reflectance * np.exp(-scene.medium.extinction * path) / slant[..., 0] ** 4
         at = (path / scene.medium.pulse_speed - gate.start) / scene.gate.bin_width * _FINE
-        inside = np.isfinite(even + lit) & (at < count)
-        bins = np.where(at >= 0.0, at, 0.0)[inside].astype(np.int64)
-        seen = (at >= 0.0)[inside]
-        found.append((first[inside] + bins, (even * lit)[inside] * seen, even[inside] * seen))
+        # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
+        towards = (normal * lines.direction).sum(axis=-1)[..., None]
+        slopes = []
+        for unit in np.eye(3)[:2]:
+            axis = unit * camera.pixel_tangent / (slant * math.sqrt(_RAYS))
+            moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
+            along_sight, along_light = (moved * lines.direction).sum(axis=-1), (moved * direction).sum(axis=-1)
+            slopes.append(along * (along_sight + along_light) * _FINE / (scene.medium.pulse_speed * gate.bin_width))
+        for right, down in _PARTS:
+            moment = at + right * slopes[0] + down * slopes[1]
+            inside = np.isfinite(even + lit + moment) & (moment < count)
+            seen = (moment >= 0.0)[inside] / len(_PARTS)
+            bins = np.maximum(moment[inside], 0.0).astype(np.int64)
+            found.append((first[inside] + bins, (even * lit)[inside] * seen, even[inside] * seen))
     index = np.concatenate([rays[0] for rays in found])
-    direct, even, hits = (
-        np.bincount(index, weights, voxels).astype(np.float32).reshape(*shape, count)
-        for weights in (*(np.concatenate([rays[k] for rays in found]) for k in (1, 2)), np.full(len(index), 1 / _RAYS))
-    )
+    light = [*(np.concatenate([rays[k] for rays in found]) for k in (1, 2)), np.full(len(index), _WEIGHT)]
+    direct, even, hits = (np.bincount(index, one, voxels).astype(np.float32).reshape(*shape, count) for one in light)
     return direct, even, np.cumsum(hits.reshape(*shape, -1, _FINE).sum(axis=-1), axis=-1)
 
 
@@ -160,13 +171,13 @@ def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
     return late
 
 
-def _forward(direct: wp.array, even: wp.array, ballistic: Cube, light: Cube) -> Cube:
+def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
     terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
     terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
     for radius in _BLURS:
         blurred = _window_sums(_window_sums(ballistic, (radius, 0), direct.device), (radius, 0), direct.device)
-        pixels = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
+        pixels: Any = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
         terms += [_delayed(pixels, delay, 1).numpy() for delay in _BLURRED_DELAYS]
     sums = [float(term.sum(dtype=np.float64)) for term in terms]
     rows = np.stack([term.ravel() / total for term, total in zip(terms, sums, strict=True) if total > 0.0])
@@ -190,7 +201,7 @@ def _backscatter(covered: Cube, light: Cube) -> Cube:
 def _window_sums(values: Cube, radius: tuple[int, int], device: wp.Device) -> Cube:
     """Of numbers `[H, W, T]`."""
     cubes = [wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(2)]
-    source = wp.array(np.repeat(values[..., None], 4, axis=-1), dtype=wp.vec4, device=device)
+    source: Any = wp.array(np.repeat(values[..., None], 4, axis=-1), dtype=wp.vec4, device=device)
     sk.window_sums(source, radius, *cubes)
     return cubes[1].numpy()[..., 0]
 
@@ -206,7 +217,7 @@ def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp
         np.put_along_axis(aligned[..., k], rows, cube, axis=-1)
     scale = float(predicted.max())  # float32 holds the squares of what is near 1
     aligned *= np.array([1.0, 1.0, 1.0 / scale, 1.0], np.float32) / scale
-    values = wp.array(aligned, dtype=wp.vec4, device=device)
+    values: Any = wp.array(aligned, dtype=wp.vec4, device=device)
     sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
 
     def launch(kernel: Any, *arrays: wp.array) -> None:
