@@ -37,10 +37,8 @@ __all__ = ["reconstruct"]
 
 Cube = NDArray[np.float32]
 
-_RAYS = 64  # within a pixel
-_PARTS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))  # of a ray, in its part of the pixel
-_WEIGHT = 1.0 / (_RAYS * len(_PARTS))
-_STEPS = 1.1673039782614187 ** -np.arange(1.0, 5.0)  # Kronecker sequence in four dimensions: powers of a plastic number
+_RAYS = 64  # within a pixel, a square number
+_STEPS = np.array([0.7548776662, 0.5698402910])  # additive sequence in two dimensions (Roberts 2018)
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
 # Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
 _DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
@@ -71,7 +69,11 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
 def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruction:
     """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
-    direct, even, covered = _known_light(scene, result.focus_distance, device)
+    focus = result.focus_distance
+    if focus is not None:  # lens points matter where a point is imaged over more than a pixel's half
+        blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)
+        focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None
+    direct, even, covered = _known_light(scene, focus, device)
     fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
     ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
     # Scattered light of a pixel without a target is that of the nearest target.
@@ -103,9 +105,10 @@ def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[
     surface has light of a bin or of an earlier one, `[H, W, T]`."""
     camera, gate, count = scene.camera, scene.gate, scene.gate.bins * _FINE
     model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
-    voxels = shape[0] * shape[1] * count
+    row = count + 2  # what comes after the gate
+    first = np.arange(shape[0] * shape[1]).reshape(shape) * row
     found: list[tuple[Any, ...]] = [(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
-    first = np.arange(shape[0] * shape[1]).reshape(shape) * count
+    hits = np.zeros(first.size * row)
     for place, lens in _places(scene, focus) if model.mesh is not None else ():
         corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
         view = np.concatenate([image_tangents(camera, corners + place), np.ones((*shape, 1))], axis=-1)
@@ -129,16 +132,24 @@ def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[
             moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
             along_sight, along_light = (moved * lines.direction).sum(axis=-1), (moved * direction).sum(axis=-1)
             slopes.append(along * (along_sight + along_light) * _FINE / (scene.medium.pulse_speed * gate.bin_width))
-        for right, down in _PARTS:
-            moment = at + right * slopes[0] + down * slopes[1]
-            inside = np.isfinite(even + lit + moment) & (moment < count)
-            seen = (moment >= 0.0)[inside] / len(_PARTS)
-            bins = np.maximum(moment[inside], 0.0).astype(np.int64)
-            found.append((first[inside] + bins, (even * lit)[inside] * seen, even[inside] * seen))
+        wide, narrow = np.maximum(*np.abs(slopes)), np.minimum(*np.abs(slopes))
+        inside = np.isfinite(even + lit + wide)
+        hits += np.bincount(first[inside] + np.clip(at[inside], 0, row - 1).astype(np.int64), minlength=hits.size)
+        start, width = at[inside], np.maximum(wide[inside], 1e-3)
+        for sign, moved in ((1.0, -0.5), (-1.0, 0.5)):  # evenly over the width: rises at its start, ends at its stop
+            for part in (-0.25, 0.25):
+                edge = np.clip(start + moved * width + part * narrow[inside], 0.0, count)
+                whole = edge.astype(np.int64)
+                for step, share in ((0, 1.0 - edge + whole), (1, edge - whole)):
+                    parts = (0.5 * sign / width) * share
+                    found.append((first[inside] + whole + step, (even * lit)[inside] * parts, even[inside] * parts))
     index = np.concatenate([rays[0] for rays in found])
-    light = [*(np.concatenate([rays[k] for rays in found]) for k in (1, 2)), np.full(len(index), _WEIGHT)]
-    direct, even, hits = (np.bincount(index, one, voxels).astype(np.float32).reshape(*shape, count) for one in light)
-    return direct, even, np.cumsum(hits.reshape(*shape, -1, _FINE).sum(axis=-1), axis=-1)
+    light = [np.concatenate([rays[k] for rays in found]) for k in (1, 2)]
+    rises = [np.bincount(index, part, hits.size).reshape(*shape, row) for part in light]
+    direct, plain = (np.cumsum(part, axis=-1) for part in rises)
+    covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / _RAYS
+    direct, plain, covered = (np.maximum(cube, 0.0).astype(np.float32) for cube in (direct, plain, covered))
+    return direct[..., :count], plain[..., :count], covered
 
 
 def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
