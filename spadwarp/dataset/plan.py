@@ -211,7 +211,7 @@ class SceneDraw:
     signal_photons: float | None  # of the median pixel, which decides the pulses; None: those of the scene
     fractions: tuple[float, ...]
     """Backscatter fraction of each frame; NaN where the photon rates decide, as with traced photons."""
-    photons: int | None  # number to trace; None for the analytic model
+    photons: int | Literal["auto"] | None  # to trace; None for the analytic model
     seed: int  # of photons and camera
     split_seed: int  # of the frames of the analytic model, together with their sample ids
 

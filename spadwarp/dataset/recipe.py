@@ -225,7 +225,10 @@ class MonteCarlo(Section):
     """Scenes that are traced photon by photon; their depth frames come from the counts of the camera."""
 
     share: float = field(0.0, "part of the scenes that are traced; the others are analytic", "[0, 1]")
-    photons: Whole = field(100_000_000, "photons of a scene", "[1, 1000000000000]")
+    photons: Annotated[Whole, Field(ge=1, le=10**12)] | Literal["auto"] = 100_000_000
+    """photons of a scene; "auto": until their noise is small beside that of a frame, or `time` is over; a number gives
+    the same bits again"""
+    time: float = field(60.0, 'seconds of a scene at most with "auto" [s]', "(0, 1e9]")
     depth_method: Method = field("matched", "how depth is found in counts")
     counts: Literal["none", "sparse", "dense", "smaller"] = field("smaller", "how the counts of frames are stored")
     channel: Channel = field("I", "light that counts: all, or what an analyser passes at or across its angle")

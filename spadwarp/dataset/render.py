@@ -4,7 +4,8 @@ stored."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,18 +15,20 @@ from spadwarp.analytic.model import pixel_maps, scene_optics
 from spadwarp.arrays import kernel_errors
 from spadwarp.dataset.plan import Plan, SceneDraw
 from spadwarp.device import pick_device
-from spadwarp.frames import Frames, crlb, detect
-from spadwarp.result import Truth, analyser_channel, degree_of_polarisation
+from spadwarp.frames import Frames, detect
+from spadwarp.frames.cramer_rao import bound_of_result
+from spadwarp.result import Result, Truth, analyser_channel, degree_of_polarisation
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
 from spadwarp.transport import RunOptions, simulate, truth_maps
-from spadwarp.values import ConfigError, path_from_time
+from spadwarp.values import ConfigError, SpadwarpWarning, path_from_time
 
 PROFILE_BINS = 64
 """Bins of `backscatter_profile`."""
 
 _MOST_PULSES = 2**40
 _MOST_COUNTED_PULSES = 2**31 - 1  # the camera counts in 32 bits
+_PILOT_PHOTONS = 1 << 18
 _COARSE = 8  # every eighth pixel of every eighth row decides the exposure
 
 Floats = NDArray[np.float64]
@@ -41,6 +44,8 @@ class RenderedScene:
     bound: NDArray[np.float32]  # Cramér–Rao bound of the depth in one frame, float32 `[H, W]` [m]; NaN for no estimate
     density: NDArray[np.float32]  # of the water's backscatter over depth on the axis [1/m], `[PROFILE_BINS]`
     edges: NDArray[np.float32]  # of its bins [m]
+    photons: int = 0  # that were traced; 0: analytic
+    noise_ratio: float = math.nan  # `Result.target_noise_ratio` of one frame; NaN: analytic, or not known
     signal: float  # expected detections of the return per pulse, median over the target's pixels
     backscatter: float  # expected detections of backscatter per pulse, median over all pixels
     depth: NDArray[np.uint16]  # of the frames as they are stored: codes `[K, H, W]`
@@ -196,26 +201,37 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     """Traces the scene's photons, exposes the camera for each frame and finds its depth."""
     assert draw.photons is not None
     scene = draw.scene
-    result = simulate(scene, photons=draw.photons, seed=draw.seed, device=device, run=RunOptions(threads=threads))
+    options: dict[str, Any] = {"seed": draw.seed, "device": device, "run": RunOptions(threads=threads)}
+    if draw.photons == "auto":
+        # The pulses of the frame, beside whose noise that of the simulation shall be small, follow from the light.
+        pilot = simulate(scene, photons=_PILOT_PHOTONS, **options)
+        if (found := _returned(pilot)).any():
+            scene = with_exposure(scene, draw, found[found > 0], most=_MOST_COUNTED_PULSES)
+        options["time"] = plan.recipe.monte_carlo.time
+    result = simulate(scene, photons=draw.photons, **options)
+    photons = result.photons
     if result.partial:
         raise KeyboardInterrupt
     polarisation = degree_of_polarisation(result).astype(np.float16) if result.channels else None
     result = analyser_channel(result, plan.recipe.monte_carlo.channel)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     water = result.component("backscatter")
-    returned = (result.histogram.sum(axis=-1) - water.sum(axis=-1)) * scale
-    seen = (returned > 0) & np.isfinite(result.truth.depth)
+    returned = _returned(result)
+    seen = returned > 0
     scene = with_exposure(scene, draw, returned[seen], most=_MOST_COUNTED_PULSES)
     pulses = min(scene.pulses_per_depth_frame, _MOST_COUNTED_PULSES)
-    frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
-    time_bound = crlb(result, pulses=pulses, device=device)
+    with warnings.catch_warnings(action="ignore", category=SpadwarpWarning):  # of noise, whose ratio is stored
+        frames = detect(result, pulses=pulses, frames=len(draw.fractions), seed=draw.seed, device=device)
+    time_bound = bound_of_result(result, pulses=pulses, device=device).sigma
     per_time = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
     profile = np.concatenate([[0.0], np.cumsum(water.sum(axis=(0, 1)))])
     return RenderedScene(
         draw=draw,
         scene=scene,
+        photons=photons,
+        noise_ratio=_noise_ratio(result, pulses),
         truth=result.truth,
-        bound=np.where(seen, time_bound * per_time, np.nan).astype(np.float32),
+        bound=np.where(seen & np.isfinite(time_bound), time_bound * per_time, np.nan).astype(np.float32),
         signal=float(np.median(returned[seen])) if seen.any() else 0.0,
         backscatter=float(np.median(water.sum(axis=-1))) * scale,
         **_profile(scene, result.path_edges, profile / max(profile[-1], 1e-300)),
@@ -223,6 +239,18 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
         expected=np.minimum(frames.expected * np.float32(pulses), 65504.0).astype(np.float16),
         polarisation=polarisation,
     )
+
+
+def _returned(result: Result) -> Floats:
+    """Expected detections per pulse of the light of targets, in the pixels that hold one; 0 in the others."""
+    light = result.tallies[:2].sum(axis=(0, 3)) * result.tally_value
+    scale = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
+    return np.where(np.isfinite(result.truth.depth), light * scale, 0.0)
+
+
+def _noise_ratio(result: Result, pulses: int) -> float:
+    exposed = result.scene.with_overrides({"analytic.pulses_per_depth_frame": pulses})
+    return replace(result, scene=exposed).target_noise_ratio if result.batches > 1 else math.nan
 
 
 def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> dict[str, Any]:

@@ -163,7 +163,6 @@ def _computed(rendered: RenderedScene) -> dict[str, Any]:
         "gate_near": range_from_time(scene.gate.start, index) + advance,
         "gate_far": range_from_time(scene.gate.stop, index) + advance,
         "target_reflectance": getattr(placed, "reflectance", np.nan),
-        "photons": draw.photons or 0,
         "pulse_fwhm": 1e-12 * scene.laser.pulse_fwhm_ps,
         "jitter_fwhm": 1e-12 * scene.detector.jitter_fwhm_ps,
         "config": config.encode(),

@@ -316,8 +316,8 @@ class Result(Shown, ResultHead, Tallies):
         """Noise of the simulation against that of the camera: float64 `[H, W]`, NaN where nothing returned.
 
         The variance that too few traced photons give the return of a pixel, over that which the photons of a frame of
-        `detector.pulses_per_frame` pulses have. The return is that of the target, or of all light where there is none,
-        as a matched filter adds it up: each bin with its expected light as the weight. Below 0.1 noise of the
+        `Scene.pulses_per_depth_frame` pulses have. The return is that of the target, or of all light where there is
+        none, as a matched filter adds it up: each bin with its expected light as the weight. Below 0.1 noise of the
         simulation does not show; above 1 it is all that shows. It falls as 1/photons.
 
         Raises as `standard_error` does.
@@ -352,28 +352,15 @@ class Result(Shown, ResultHead, Tallies):
     def warnings(self) -> tuple[str, ...]:
         """Reasons to mistrust the errors: a forward peak that the photons have not seen; components whose standard
         error rests on few heavy photons."""
-        transport, ways = self.scene.transport, ["more photons"]
-        if transport.estimator != "guided":
-            ways.append('estimator = "guided"')
-        elif self.scene.targets:
-            ways.append('in clear water between bright surfaces estimator = "next_event"')
-        if transport.termination == "roulette":
-            ways.append('termination = "cutoff"')
-        unseen: tuple[str, ...] = ()
-        scattered, total = (float(part.sum(dtype=np.float64)) for part in (self.tallies[1:], self.tallies))
-        if self.unseen_share * scattered > NOTABLE_UNSEEN * total:
-            unseen = (
-                f"{transport.estimator}: up to {100 * self.unseen_share:.2g} % of the scattered light, which has "
-                f"{100 * scattered / total:.2g} % of all, is of a forward peak that {self.photons:.3g} photons hardly "
-                f"see: it is not in standard errors; what helps: {', '.join(ways[:2])}",
-            )
-        return unseen + tuple(
-            f"{name}: one of {self.batches} batches has {100 * share:.0f} % of the variance of its light (relative "
-            f"standard error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "
-            f"helps: {', '.join(ways)}"
-            for name, (error, share) in component_errors(self).items()
-            if error > _SMALL_ERROR and share > _threshold(self.batches)
-        )
+        texts = unseen_warnings(self)
+        for name, (error, share) in component_errors(self).items():
+            if error > _SMALL_ERROR and share > _threshold(self.batches):
+                texts += (
+                    f"{name}: one of {self.batches} batches has {100 * share:.0f} % of the variance of its light "
+                    f"(relative standard error {percent(error)} %): few heavy photons decide it, and errors may be "
+                    f"larger than they seem; what helps: {', '.join(_ways(self.scene))}",
+                )
+        return texts
 
     @property
     def rounding_error(self) -> dict[str, float]:
@@ -657,6 +644,28 @@ def _short_names(names: Iterable[str]) -> list[str]:
 
 
 # Errors
+
+
+def unseen_warnings(result: Result) -> tuple[str, ...]:
+    """Of `Result.warnings` that of a forward peak, which no number of batches tells."""
+    scattered, total = (float(part.sum(dtype=np.float64)) for part in (result.tallies[1:], result.tallies))
+    if result.unseen_share * scattered <= NOTABLE_UNSEEN * total:
+        return ()
+    return (
+        f"{result.scene.transport.estimator}: up to {100 * result.unseen_share:.2g} % of the scattered light, which "
+        f"has {100 * scattered / total:.2g} % of all, is of a forward peak that {result.photons:.3g} photons hardly "
+        f"see: it is not in standard errors; what helps: {', '.join(_ways(result.scene)[:2])}",
+    )
+
+
+def _ways(scene: Scene) -> list[str]:
+    """To better errors."""
+    transport, ways = scene.transport, ["more photons"]
+    if transport.estimator != "guided":
+        ways.append('estimator = "guided"')
+    elif scene.targets:
+        ways.append('in clear water between bright surfaces estimator = "next_event"')
+    return [*ways, 'termination = "cutoff"'] if transport.termination == "roulette" else ways
 
 
 def component_errors(result: Result) -> dict[str, tuple[float, float]]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +40,18 @@ _RANGES = {"threads": "[1, 4096]", "launch_size": f"[1, {1 << 26}]", "first_phot
 # Voxels that are read at the end of a batch for each of its photons, at most: 2 % of a photon's time, on a GPU too.
 _VOXELS_PER_PHOTON = 16
 
-# Batches of a run: the least that tell an error, and as many as large histograms allow. With a stopping rule more, so
-# that it can act early.
+# Batches of a run: the least that tell an error, and at most as many as large histograms allow; half as many again, or
+# twice, since their size is a power of two. With a stopping rule more, so that it can act early.
 _BATCHES, _STOPPING_BATCHES = (8, 32), (128, 1024)
+# A GPU stands still for 2 ms between batches (H200), 3 % of the time of so many photons.
+_GPU_BATCH = 1 << 26
 
 # Photons of a batch at most: some seconds of a GPU, so that several can share the work.
 _LARGEST_BATCH = 1 << 30
+
+# Where the error decides about the number of photons: of a batch at least, and voxels read for each.
+_AUTO_BATCH = {"cpu": 1 << 15, "cuda": 1 << 25}
+_AUTO_VOXELS_PER_PHOTON = {"cpu": 128, "cuda": 16}
 
 # Bins of all pixels, at most, whose errors are kept: in memory they take 88 bytes each, without errors 24.
 MOST_BINS_WITH_ERRORS = 1 << 27
@@ -93,6 +99,7 @@ class Plan(ResultHead):
     mesh: TriangleMesh | None
     derivatives: tuple[str, ...] = ()
     launch_size: int | None = None
+    is_auto: bool = False  # whether the error decides how many of the `photons` are traced
 
     @property
     def scale(self) -> float:
@@ -104,20 +111,22 @@ def make_plan(
     scene: Scene,
     run: RunOptions,
     *,
-    photons: int | None,
+    photons: int | Literal["auto"] | None,
     seed: int | None,
     batches: bool = True,
+    kind: Literal["cpu", "cuda"] = "cpu",
     relative_error: float | None = None,
     resume: Result | None = None,
     derivatives: Iterable[str] | None = None,
     blocks: Sequence[int] | None = None,
 ) -> Plan:
     """The plan for the arguments of `simulate`; `resume` is that of the run, read. `batches`: whether errors are kept,
-    for which a run whose light alone is wanted has no use.
+    for which a run whose light alone is wanted has no use; `kind` of the devices.
 
     Raises `ArgumentError` for those that are out of range, `ConfigError` for those that cannot be combined.
     """
-    photons = None if photons is None else check_integer("photons", photons, _PHOTONS)
+    if photons is not None and photons != "auto":
+        photons = check_integer("photons", photons, _PHOTONS)
     seed = None if seed is None else check_integer("seed", seed, SEED)
     first_photon, shard, batch_size = run.first_photon, run.shard, 0
     if relative_error is not None:
@@ -129,19 +138,27 @@ def make_plan(
         _check_resumed(resume, run, seed)
         seed, first_photon, batches = resume.seed, resume.requested[0], resume.batch_size > 0
         photons = count([resume.requested]) if photons is None else photons
-        if photons <= resume.photons:
-            raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
         had = tuple(resume.derivatives)
         if derivatives is not None and names != had:
             text = f"the run to resume has {', '.join(had) or 'none'}, not {', '.join(names)}"
             raise ConfigError(f"derivatives: {text}")
         names = had
     photons = scene.transport.photons if photons is None else photons
-    if batches:
-        least = 0 if resume is None else resume.batch_size
-        batch_size = max(least, _batch_size(scene, photons, relative_error, shard))
     mesh = build_mesh(scene)
     scale, capacity = scale_and_capacity(scene, mesh)
+    most = min(capacity, int(_PHOTONS.high))
+    # A run by its error is interrupted with all the photons that there can be still asked for.
+    is_auto = photons == "auto" or (resume is not None and photons == most)
+    photons = most if photons == "auto" else photons
+    if resume is not None and photons <= resume.photons:
+        raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
+    if is_auto and shard is not None:
+        raise ConfigError("photons = 'auto' cannot be combined with shard: no part knows the error of the whole")
+    if batches:
+        wanted = _auto_batch_size(scene, kind) if is_auto else _batch_size(scene, photons, relative_error, shard, kind)
+        batch_size = max(0 if resume is None else resume.batch_size, wanted)
+    if is_auto and not batch_size:
+        raise ConfigError("photons = 'auto' needs errors, which a histogram this large does not keep; give a number")
     if photons > capacity:
         raise ConfigError(
             f"photons = {photons} is outside [1, {capacity}]: the unit of this scene's histogram is fine enough for "
@@ -164,22 +181,36 @@ def make_plan(
         mesh=mesh,
         derivatives=names,
         launch_size=run.launch_size,
+        is_auto=is_auto,
     )
     if resume is not None and (problem := difference(resume, plan)):
         raise ConfigError(f"resume: {problem}")
     return plan
 
 
-def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
+def _batch_size(
+    scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None, kind: str
+) -> int:
     """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches."""
     bins = scene.camera.width * scene.camera.height * scene.gate.bins
     if bins > MOST_BINS_WITH_ERRORS and relative_error is None:
         return 0
     fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
+    if kind == "cuda" and relative_error is None:
+        most = min(max(photons // _GPU_BATCH, fewest), most)
     least = min(max(photons * _VOXELS_PER_PHOTON // (len(COMPONENTS) * bins), fewest), most)
     least = least if shard is None else max(least, shard[1])
     positions = scene.scan_positions
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
+
+
+def _auto_batch_size(scene: Scene, kind: str) -> int:
+    """As `_batch_size`, for a number of photons that is not known: some hundredths of a second."""
+    bins = scene.camera.width * scene.camera.height * scene.gate.bins
+    if bins > MOST_BINS_WITH_ERRORS:
+        return 0
+    least = max(_AUTO_BATCH[kind], len(COMPONENTS) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
+    return scene.scan_positions << max(0, (least // scene.scan_positions - 1).bit_length())
 
 
 def _check_resumed(resume: Result, run: RunOptions, seed: int | None) -> None:

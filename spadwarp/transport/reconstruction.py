@@ -148,8 +148,8 @@ def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[
     rises = [np.bincount(index, part, hits.size).reshape(*shape, row) for part in light]
     direct, plain = (np.cumsum(part, axis=-1) for part in rises)
     covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / _RAYS
-    direct, plain, covered = (np.maximum(cube, 0.0).astype(np.float32) for cube in (direct, plain, covered))
-    return direct[..., :count], plain[..., :count], covered
+    known = [np.maximum(cube, 0.0).astype(np.float32) for cube in (direct[..., :count], plain[..., :count], covered)]
+    return known[0], known[1], known[2]
 
 
 def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:

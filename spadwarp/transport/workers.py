@@ -84,7 +84,11 @@ class _Histogram:
         """`[2, *shape]`, low and high halves; None without batches."""
         if self.batches is None:
             return None
-        return np.stack([_on_host(word).reshape(shape) for word in self.batches.second_moment])
+        words = np.empty((2, *shape), np.uint64)
+        for word, held in zip(self.batches.second_moment, words, strict=True):
+            wp.copy(wp.array(held.reshape(-1), dtype=wp.uint64, device="cpu", copy=False), word)
+        wp.synchronize_device(self.array.device)
+        return words
 
 
 class _Closed(NamedTuple):

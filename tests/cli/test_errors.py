@@ -84,7 +84,7 @@ simulate SCENE --out SCENE | is a file
 simulate SCENE --out SCENE/below | 1 | cannot be written
 simulate SCENE --resume DONE | SCENE
 simulate --resume DONE --seed 3 | --seed
-simulate --resume DONE | no more than the 20480
+simulate --resume DONE | no more than the 20000
 simulate --resume TMP | 1 | result.h5
 simulate missing.toml --out OUT | 1 | missing.toml
 check plane_6m | 1 | did you mean 'plane_5m'?

@@ -1,6 +1,7 @@
 """The camera: from expected detections to frames of counts and depth; the noise of the simulation in them."""
 
 import math
+import dataclasses
 import warnings
 from types import SimpleNamespace
 
@@ -269,8 +270,9 @@ def test_a_warning_with_numbers_or_a_note_that_nobody_knows(whole):
     with pytest.warns(SpadwarpWarning, match=r"Monte Carlo noise.* of the pixels, and .* photons instead of") as caught:
         frames = spadwarp.detect(whole, pulses=10**8, **keywords)
     assert len(caught) == 1 and frames.notes == ()
+    alone = dataclasses.replace(whole, second_moment=None, batch_size=0, batches=0)
     with warnings.catch_warnings(action="error"):
-        quiet, unknown = (spadwarp.detect(whole[known], pulses=1000, **keywords) for known in (True, False))
+        quiet, unknown = (spadwarp.detect(run, pulses=1000, **keywords) for run in (whole, alone))
     assert quiet.notes == () and "Monte Carlo noise is unknown" in unknown.notes[0]
 
 

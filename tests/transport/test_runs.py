@@ -389,8 +389,8 @@ def test_guided_warns_of_no_heavy_photons_where_next_event_does():
             warnings.simplefilter("always")
             result = simulate(one, photons=50_000, seed=seed, device="cpu")
         texts = [str(warning.message) for warning in caught if "of the variance" in str(warning.message)]
-        assert texts == list(result.warnings)
-        return bool(texts)
+        assert not texts  # no error was asked for
+        return any("of the variance" in text for text in result.warnings)
 
     counts = {name: sum(warned(name, seed) for seed in range(12)) for name in ("guided", "next_event")}
     assert counts["guided"] == 0 and counts["next_event"] >= 2
