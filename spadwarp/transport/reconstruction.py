@@ -46,7 +46,7 @@ _EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
 _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
 # Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
-_WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (2, 1), (4, 2), (8, 4), (16, 8), (32, 32))
+_WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
 _AROUND = (4, 1)
 _FLOOR = 1e-3  # of the mean: prediction where none is expected
 
@@ -153,15 +153,16 @@ def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[
 
 
 def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """Places within a pixel, and points of a lens that is not behind a port [m], evenly by Kronecker sequences."""
+    """Places within a pixel, and points of a lens that is not behind a port [m]."""
     camera = scene.camera
     radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
+    side = math.isqrt(_RAYS)
     for k in range(_RAYS):
-        u = (
-            0.5 + (k + 1) * np.array([0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101])
-        ) % 1
-        r, angle = radius * math.sqrt(u[2]), 2.0 * math.pi * u[3]
-        yield u[:2], np.array([r * math.cos(angle), r * math.sin(angle), 0.0])
+        column, line = k % side, k // side  # each of another column and another row of a finer grid
+        u, v = (k + 0.5) * _STEPS % 1.0
+        r, angle = radius * math.sqrt(u), 2.0 * math.pi * v
+        place = np.array([column + (line + 0.5) / side, line + (column + 0.5) / side]) / side
+        yield place, np.array([r * math.cos(angle), r * math.sin(angle), 0.0])
 
 
 def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float64]:
