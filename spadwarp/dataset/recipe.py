@@ -229,6 +229,9 @@ class MonteCarlo(Section):
     """photons of a scene; "auto": until their noise is small beside that of a frame, or `time` is over; a number gives
     the same bits again"""
     time: float = field(60.0, 'seconds of a scene at most with "auto" [s]', "(0, 1e9]")
+    reconstruct: bool | None = None
+    """whether frames come from the reconstructed light (`spadwarp.reconstruct`); by default with "auto" and channel "I"
+    """
     depth_method: Method = field("matched", "how depth is found in counts")
     counts: Literal["none", "sparse", "dense", "smaller"] = field("smaller", "how the counts of frames are stored")
     channel: Channel = field("I", "light that counts: all, or what an analyser passes at or across its angle")
@@ -238,6 +241,8 @@ class MonteCarlo(Section):
             yield "share is missing: 1 traces all scenes, 0.5 half of them; without it none is traced"
         if self.channel != "I" and self.share < 1.0:
             yield f"channel = {self.channel!r} needs share = 1: the analytic simulator has no polarisation"
+        if self.reconstruct and self.channel != "I":
+            yield f"reconstruct = true cannot be combined with channel = {self.channel!r}: it is of all light"
 
 
 class Recipe(Document):

@@ -20,7 +20,7 @@ from spadwarp.frames.cramer_rao import bound_of_result
 from spadwarp.result import Result, Truth, analyser_channel, degree_of_polarisation
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
-from spadwarp.transport import RunOptions, simulate, truth_maps
+from spadwarp.transport import RunOptions, reconstruct, simulate, truth_maps
 from spadwarp.values import ConfigError, SpadwarpWarning, path_from_time
 
 PROFILE_BINS = 64
@@ -214,8 +214,12 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
         raise KeyboardInterrupt
     polarisation = degree_of_polarisation(result).astype(np.float16) if result.channels else None
     result = analyser_channel(result, plan.recipe.monte_carlo.channel)
+    chosen = plan.recipe.monte_carlo
+    automatic = draw.photons == "auto" and chosen.channel == "I"
+    if (automatic if chosen.reconstruct is None else chosen.reconstruct) and result.batches > 1:
+        result = reconstruct(result, device=device)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
-    water = result.component("backscatter")
+    water = result.expected("backscatter")
     returned = _returned(result)
     seen = returned > 0
     scene = with_exposure(scene, draw, returned[seen], most=_MOST_COUNTED_PULSES)

@@ -1,0 +1,69 @@
+"""Reconstructed light: beside the tallies, of the same energy, nearer to the expectation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.ndimage import uniform_filter
+
+import spadwarp
+import spadwarp_kernels as sk
+from spadwarp.result import COMPONENTS, Result
+
+
+@pytest.fixture(scope="module")
+def runs() -> tuple[Result, Result]:
+    """The paper's staircase in few photons with its reconstruction, and other photons, 16 times as many."""
+    scene = spadwarp.load_scene("configs/scenes/staircase_15m.toml").with_overrides(
+        {"camera.width": 32, "camera.height": 24, "medium.extinction": 0.1}
+    )
+    few = spadwarp.simulate(scene, photons=100_000, seed=1, device="cpu")
+    return spadwarp.reconstruct(few, device="cpu"), spadwarp.simulate(scene, photons=1_600_000, seed=2, device="cpu")
+
+
+def test_energy_of_each_component_is_that_of_the_tallies(runs: tuple[Result, Result]) -> None:
+    result, _ = runs
+    for name in COMPONENTS:
+        assert result.expected(name).sum() == pytest.approx(result.component(name).sum(), rel=1e-6)
+
+
+def test_brightest_bins_have_a_quarter_of_the_squared_error(runs: tuple[Result, Result]) -> None:
+    """As 4 times the photons; the other run has 1/16 of the variance, and its error is in both sums."""
+    result, other = runs
+    target = np.isfinite(result.truth.depth)
+    peak = other.histogram.argmax(axis=-1)[..., None]
+    at = {name: np.take_along_axis(cube, peak, axis=-1)[target] for name, cube in (
+        ("traced", result.histogram), ("best", result.expected()), ("error", result.expected_error),
+        ("other", other.histogram), ("its", other.standard_error),
+    )}  # fmt: skip
+    best, traced = at["best"] - at["other"], at["traced"] - at["other"]
+    assert (best**2).sum() < 0.25 * (traced**2).sum()
+    # Stated errors cover it in most pixels; 0.95 is meant.
+    assert np.mean(np.abs(best) < 1.96 * np.hypot(at["error"], at["its"])) > 0.85
+
+
+def test_file_keeps_the_reconstruction_and_a_sum_has_none(runs: tuple[Result, Result], tmp_path) -> None:
+    result, _ = runs
+    again = spadwarp.load_result(result.save(tmp_path / "result.h5"))
+    assert again.reconstruction is not None and result.reconstruction is not None
+    for name, values in vars(result.reconstruction).items():
+        assert np.array_equal(values, getattr(again.reconstruction, name))
+    assert spadwarp.merge([result]).reconstruction is None
+
+
+def test_same_bits_again(runs: tuple[Result, Result]) -> None:
+    result, _ = runs
+    again = spadwarp.reconstruct(replace(result, reconstruction=None), device="cpu")
+    assert np.array_equal(result.expected(), again.expected())
+    assert np.array_equal(result.expected_error, again.expected_error)
+
+
+@pytest.mark.parametrize("radius", [(0, 0), (0, 2), (3, 0), (2, 4), (9, 40)])
+def test_window_sums_are_those_of_scipy(radius: tuple[int, int]) -> None:
+    values = np.random.default_rng(3).random((6, 70, 11, 4), np.float32)
+    arrays = [wp.array(values, dtype=wp.vec4, device="cpu"), *(wp.zeros(values.shape[:3], dtype=wp.vec4) for _ in "ab")]
+    sk.window_sums(arrays[0], radius, arrays[1], arrays[2])
+    size = (2 * radius[0] + 1, 2 * radius[0] + 1, 2 * radius[1] + 1, 1)
+    expected = uniform_filter(values.astype(np.float64), size, mode="constant") * np.prod(size)
+    np.testing.assert_allclose(arrays[2].numpy(), expected, rtol=2e-5, atol=1e-4)
