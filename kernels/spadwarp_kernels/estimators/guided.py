@@ -80,8 +80,9 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
 
 
 def make_choose_meeting(spec: TransportSpec) -> wp.Function:
-    """On its way to the first surface in view, light of the transmittance T reaches it with the chance sqrt(T), as in
-    water of half the optical depth: few photons do in turbid water, and all of the target's light comes from them."""
+    """Light on its way to the first surface in view, through a transmittance T, that would collide before it reaches it
+    with the chance sqrt(T) (1 - sqrt(T))/2 nevertheless: in turbid water few photons do, and all light of the target
+    comes from them. More would take too many from the light that the water scatters back."""
     water_extinction = spec.water.extinction
 
     @wp.func
@@ -95,9 +96,9 @@ def make_choose_meeting(spec: TransportSpec) -> wp.Function:
             seed = join_words(s.flight.block[0], s.flight.block[2])
             extinction = water_extinction(world.medium, world.layers, s.x, s.u, distance, seed)
             root = wp.exp(-0.5 * extinction * distance)
-            # The chance of a photon that would collide before the face; it keeps weights within the bound of
-            # `guided_part`. In steps of 1/256, for the last 8 bits of a word, which `u01` leaves.
-            chance = wp.min(root / (1.0 + root), 1.0 - s.weight.value / (LARGEST_WEIGHT_RATIO * s.analog_weight))
+            # Within the bound of weights of `guided_part`; in steps of 1/256, for the last 8 bits of a word, which `u01`
+            # leaves.
+            chance = wp.min(0.5 * root * (1.0 - root), 1.0 - s.weight.value / (LARGEST_WEIGHT_RATIO * s.analog_weight))
             steps = wp.floor(256.0 * wp.max(chance, 0.0))
             chance = steps / 256.0
             end.meets = end.meets or float(s.flight.sample_block[3] & wp.uint32(0xFF)) < steps
