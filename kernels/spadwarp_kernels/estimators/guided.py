@@ -96,8 +96,8 @@ def make_choose_meeting(spec: TransportSpec) -> wp.Function:
             seed = join_words(s.flight.block[0], s.flight.block[2])
             extinction = water_extinction(world.medium, world.layers, s.x, s.u, distance, seed)
             root = wp.exp(-0.5 * extinction * distance)
-            # Within the bound of weights of `guided_part`; in steps of 1/256, for the last 8 bits of a word, which `u01`
-            # leaves.
+            # Within the bound of weights of `guided_part`; in steps of 1/256, for the last 8 bits of a word, which
+            # `u01` leaves.
             chance = wp.min(0.5 * root * (1.0 - root), 1.0 - s.weight.value / (LARGEST_WEIGHT_RATIO * s.analog_weight))
             steps = wp.floor(256.0 * wp.max(chance, 0.0))
             chance = steps / 256.0
