@@ -169,8 +169,8 @@ def _guiding(scene: Scene, max_path: float) -> Any:
     return _filled(
         sk.Guiding(),
         probability=0.3 * min(1.0, math.sqrt((6.0 if in_grid else 10.0) / thickness)),
-        surface_probability=0.3,
-        anisotropy=1.0 - 0.03 * min(max(thickness / 6.0, 1.0), 4.0 / 3.0) if in_grid else 0.97,
+        surface_probability=0.8,
+        anisotropy=min(max(scene.medium.anisotropy or 0.0, 0.5), 0.99),
         return_probability=0.1 * min(1.0, 5.0 / thickness),
         return_anisotropy=0.5,
     )

@@ -27,6 +27,14 @@ class Direction:
     factor: float  # by which the weight changes: density of the physics over that of the draw
 
 
+@wp.struct
+class Meeting:
+    """How a flight with a face ahead of it ends."""
+
+    meets: bool  # on the face; else in the water before it
+    factor: float  # by which the weight changes: probability in the physics over that of the draw
+
+
 class Estimator(NamedTuple):
     """What a photon adds to the histogram, as Warp functions made for a spec; None for what the estimator does without.
 
@@ -41,6 +49,9 @@ class Estimator(NamedTuple):
     plan_flight: wp.Function | None = None
     """``(s, block, world) -> FlightPlan``, before a flight is traced; `block`: random words, the third and fourth for
     the lens."""
+    meet: wp.Function | None = None
+    """``(s, world, distance) -> Meeting``, whether the flight ends on the face at that distance [m], with another
+    chance than in the physics."""
     request_flight: wp.Function | None = None
     """``(s) -> Request``, the score of a flight whose planned interval is not empty."""
     request_event: wp.Function | None = None

@@ -8,7 +8,7 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of
-from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, random_block_keyed, u01, u01_fine
+from spadwarp_kernels.base.philox import STREAM_FLIGHT_SAMPLE, join_words, random_block_keyed, u01, u01_fine
 from spadwarp_kernels.base.rotations import cos_sin_word, one_minus_cosine, rotate_by, snap_from
 from spadwarp_kernels.optics.camera import clip_to_gate, lens_point
 from spadwarp_kernels.photon.queue import Request
@@ -28,7 +28,7 @@ from spadwarp_kernels.water.phase_functions import (
 )
 
 from .contribution import make_event_request, make_score, scores_collision
-from .estimator import Direction, Estimator, FlightPlan
+from .estimator import Direction, Estimator, FlightPlan, Meeting
 
 # A photon's weight is at most this times its analog weight, see `guided_part`.
 LARGEST_WEIGHT_RATIO = wp.constant(64.0)
@@ -43,6 +43,7 @@ def make_guided(spec: TransportSpec) -> Estimator:
     request_flight, request_event = make_requests(spec)
     return Estimator(
         plan_flight=make_plan_flight(spec),
+        meet=make_choose_meeting(spec) if spec.chooses_meetings else None,
         request_flight=request_flight,
         request_event=request_event,
         score=make_score(spec, flights=True),
@@ -76,6 +77,36 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
         return plan
 
     return plan_flight
+
+
+def make_choose_meeting(spec: TransportSpec) -> wp.Function:
+    """Light on its way to the first surface in view, through a transmittance T, that would collide before it reaches it
+    with the chance sqrt(T) (1 - sqrt(T))/2 nevertheless: in turbid water few photons do, and all light of the target
+    comes from them. More would take too many from the light that the water scatters back."""
+    water_extinction = spec.water.extinction
+
+    @wp.func
+    def choose_meeting(s: wp.ref[PhotonState], world: wp.ref[World], distance: float) -> Meeting:
+        end = Meeting()
+        end.meets = distance < s.flight.distance
+        end.factor = 1.0
+        interval = s.flight.interval
+        planned = interval[0] < interval[1] and interval[0] <= distance and distance <= interval[1]
+        if planned and s.surface_count == 0:
+            seed = join_words(s.flight.block[0], s.flight.block[2])
+            extinction = water_extinction(world.medium, world.layers, s.x, s.u, distance, seed)
+            root = wp.exp(-0.5 * extinction * distance)
+            # Within the bound of weights of `guided_part`; in steps of 1/256, for the last 8 bits of a word, which
+            # `u01` leaves.
+            chance = wp.min(0.5 * root * (1.0 - root), 1.0 - s.weight.value / (LARGEST_WEIGHT_RATIO * s.analog_weight))
+            steps = wp.floor(256.0 * wp.max(chance, 0.0))
+            chance = steps / 256.0
+            end.meets = end.meets or float(s.flight.sample_block[3] & wp.uint32(0xFF)) < steps
+            reached = root * root / wp.max(root * root * (1.0 - chance) + chance, 1.0e-30)
+            end.factor = wp.where(end.meets, reached, 1.0 / (1.0 - chance))
+        return end
+
+    return choose_meeting
 
 
 @wp.func
@@ -142,7 +173,7 @@ def make_sample_angle(phase: PhaseFunction) -> wp.Function:
     of the lobe towards the lens, of other directed light (back into the view), or of what the water scatters."""
     guide = phase.guide or HENYEY_GREENSTEIN_GUIDE
     phase_sample, lobe_sample = phase.sample, guide.lobe_sample
-    one_family = phase.name == HENYEY_GREENSTEIN.name and phase.guide is None
+    one_family = phase.name == HENYEY_GREENSTEIN.name
 
     @wp.func
     def sample_angle(
@@ -150,13 +181,13 @@ def make_sample_angle(phase: PhaseFunction) -> wp.Function:
     ) -> float:
         xi = u01_fine(word)
         if wp.static(one_family):
-            # One draw for all: the lanes of a warp take theirs together.
-            g = wp.where(directed, guiding.return_anisotropy, here.anisotropy)
-            return sample_henyey_greenstein(xi, wp.where(to_lens, guiding.anisotropy, g))
-        t = phase_sample(xi, here)
+            # One draw for both: the lanes of a warp take theirs together.
+            t = sample_henyey_greenstein(xi, wp.where(directed, guiding.return_anisotropy, here.anisotropy))
+        else:
+            t = phase_sample(xi, here)
         if to_lens:
             t = lobe_sample(xi, medium, guiding)
-        elif directed:
+        elif wp.static(not one_family) and directed:
             t = sample_henyey_greenstein(xi, guiding.return_anisotropy)
         return t
 
@@ -195,7 +226,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     tracks, collides = spec.water.profile is not None, spec.scores_collisions
     face_pdf, specular, sight = spec.faces.pdf, spec.faces.specular, spec.sight
     view_of, in_view, toward_middle = sight.view, sight.shows, sight.toward_middle
-    toward, toward_centre = sight.toward, sight.toward_centre
+    toward, toward_centre, gate_of = sight.toward, sight.toward_centre, sight.gate
 
     @wp.func
     def direct(
@@ -217,6 +248,9 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             # such histories are few and heavy. A grid that repeats layers has the histories of layers, and one chance.
             to_lens_chance = wp.where(s.u[2] < 0.0, to_lens_chance * (2.0 - to_lens_chance), to_lens_chance)
         to_lens_chance = wp.where(on_surface, at_surface, to_lens_chance)
+        # Light that goes straight to the lens and arrives before the gate is not worth a chance.
+        if s.path + wp.length(s.x) < gate_of(world.camera, world.gate).start:
+            to_lens_chance = 0.0
         met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_from(s.u, world.medium.axis_threshold)
         v = toward_centre(world.camera, s.x)

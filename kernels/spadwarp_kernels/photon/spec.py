@@ -127,6 +127,11 @@ class TransportSpec(NamedTuple):
         return self.varies and not self.random_albedo
 
     @property
+    def chooses_meetings(self) -> bool:
+        """Whether `guided` chooses the chance with which a flight meets a surface: in water without cells."""
+        return self.mesh and self.water.profile is None and not self.reflecting
+
+    @property
     def scores_collisions(self) -> bool:
         """Whether `guided` scores half the points of flights where the photon collides: where that is by chance."""
         return self.water.profile is not None and self.water.profile.draw is None

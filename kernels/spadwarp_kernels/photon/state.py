@@ -162,6 +162,7 @@ class Flight:
     interval: wp.vec2  # the part that an estimator wants to score [m]; empty for none
     lens: wp.vec3  # the point of the lens by which the flight is scored [m]
     lens_weight: float  # its density if it were uniform, over that of the draw
+    factor: float  # by which the weight changes at its end, see `Meeting`
 
 
 @wp.struct

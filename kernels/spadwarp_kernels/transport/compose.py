@@ -22,6 +22,7 @@ from .stages import (
     make_finish,
     make_flush,
     make_fly,
+    make_meet,
     make_prepare,
     make_scatter,
     make_trace,
@@ -36,6 +37,7 @@ class Stages(NamedTuple):
     begin: wp.Function  # ``(s, world, sink, emitted, id)``, to FLIGHT
     fly: wp.Function  # ``(s, world, draws, words)``, to EVENT or RAY
     trace: wp.Function  # ``(s, world)``, from RAY to EVENT, without other threads
+    meet: wp.Function  # ``(s, world, distance) -> bool``, whether the flight ends on the face at that distance [m]
     cross: wp.Function  # ``(s, world, sink)``, what the photon itself brings on its flight
     collide: wp.Function  # ``(s, world)``, to SCATTER or END
     scatter: wp.Function  # ``(s, world, sink, draws)``, to FLIGHT or END
@@ -74,6 +76,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     in_tree, flies_on = spec.mesh and not spec.faces.tried, estimator.cross is not None
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)
+    meet = make_meet(estimator.meet)
     deposit = make_deposit(spec.signed, len(spec.blocks), split)
     memory, push, pop = make_queue(spec, flights, scores, two_requests, in_tree)
     serve = _make_serve(spec, split, deposit, waits=in_tree and not alone) if scores else push
@@ -82,10 +85,11 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
         prepare=make_prepare(spec.stepped, bool(spec.blocks), cuda),
         emit=make_emit(spec),
         begin=make_begin(spec),
-        fly=make_fly(spec, estimator.plan_flight, spec.random_albedo, cuda),
-        trace=make_trace(in_tree),
+        fly=make_fly(spec, estimator.plan_flight, meet, spec.random_albedo, cuda),
+        trace=make_trace(meet, in_tree),
+        meet=meet,
         cross=make_cross(spec, estimator.cross, deposit),
-        collide=make_collide(spec, flies_on),
+        collide=make_collide(spec, estimator.meet is not None, flies_on),
         scatter=make_scatter(spec, estimator.direct, flies_on),
         finish=make_finish(spec.records, len(spec.derivatives)),
         flush=make_flush(not cuda and estimator.scores, spec.reflecting),

@@ -40,7 +40,6 @@ from spadwarp_kernels.photon.state import (
     WorldRef,
     first_state,
     is_planned,
-    shorten,
 )
 from spadwarp_kernels.surface.bvh import NO_NODE, Stack, inverse_direction, place, step_leaf, step_node
 from spadwarp_kernels.surface.ray_cast import surface_hit
@@ -264,9 +263,8 @@ def _make_end_walk(stages: Stages) -> wp.Function:
         if s.ray == SURFACE_RAY:
             s.surface_queries += 1
             if s.walk.found >= 0:
-                if s.walk.nearest < s.flight.distance:
+                if stages.meet(s, world, s.walk.nearest):
                     s.hit = surface_hit(world.surfaces, s.walk, s.u)
-                shorten(s.flight, s.walk.nearest)
             s.stage = EVENT
         else:
             s.shadow_queries += 1

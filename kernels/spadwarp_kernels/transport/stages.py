@@ -170,7 +170,27 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
 # ---- Fly: how far the photon flies before it collides, and whether a surface stands before that.
 
 
-def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, random_albedo: bool, cuda: bool) -> wp.Function:
+def make_meet(choose: wp.Function | None) -> wp.Function:
+    """The Warp function ``(s, world, distance) -> bool``: ends the flight on the face at that distance, or before it;
+    whether on the face. `choose`: with the chance of an estimator."""
+
+    @wp.func
+    def meet(s: PhotonRef, world: WorldRef, distance: float) -> bool:
+        meets = distance < s.flight.distance
+        if wp.static(choose is not None):
+            meeting = choose(s, world, distance)
+            s.flight.factor = meeting.factor
+            s.flight.distance = wp.where(meeting.meets, distance, s.flight.distance)
+            meets = meeting.meets
+        shorten(s.flight, distance)
+        return meets
+
+    return meet
+
+
+def make_fly(
+    spec: TransportSpec, plan_flight: wp.Function | None, meet: wp.Function, random_albedo: bool, cuda: bool
+) -> wp.Function:
     """The Warp function ``(s, world, draws, words)``: lets a photon fly, to EVENT or, where a tree of faces may be
     in its way, to RAY.
 
@@ -209,6 +229,7 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, random_albedo
             if is_planned(s.flight):
                 s.flight.reach = wp.max(s.flight.reach, s.flight.interval[1])
         s.hit.face = -1
+        s.flight.factor = 1.0
         s.stage = EVENT
         if wp.static(random_albedo):
             s.albedo = world.medium.albedo * u01(random_block_keyed(draws.keys, id, event, STREAM_ROULETTE)[1])
@@ -219,14 +240,13 @@ def make_fly(spec: TransportSpec, plan_flight: wp.Function | None, random_albedo
             # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
             met = nearest_patch(world.surfaces.patches, s.x, s.u, NOWHERE)
             s.surface_queries += 1
-            if met[0] < wp.min(s.flight.distance, NOWHERE):  # in water as thin as vacuum a flight is longer than that
+            if meet(s, world, met[0]) and met[0] < NOWHERE:  # in water as thin as vacuum a flight is longer than that
                 s.hit = patch_hit(world.surfaces, met)
-            shorten(s.flight, met[0])
 
     return fly
 
 
-def make_trace(has_bvh: bool) -> wp.Function:
+def make_trace(meet: wp.Function, has_bvh: bool) -> wp.Function:
     """The Warp function ``(s, world)``: the surface before a photon that waits for a ray, without other threads."""
 
     @wp.func
@@ -236,9 +256,8 @@ def make_trace(has_bvh: bool) -> wp.Function:
                 s.surface_queries += 1
                 hit = intersect_surfaces(world.surfaces, s.x, s.u, s.flight.reach, False)
                 if hit.face >= 0:
-                    if hit.distance < s.flight.distance:
+                    if meet(s, world, hit.distance):
                         s.hit = hit
-                    shorten(s.flight, hit.distance)
                 s.stage = EVENT
 
     return trace
@@ -256,10 +275,10 @@ class Collision:
     mirror: int  # face of the domain that reflects the photon there; else 0
 
 
-def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
+def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world)``: takes a photon to the end of its flight, and on to SCATTER or to END.
 
-    `flies_on`: see `make_continues`.
+    `chosen`: an estimator chooses what ends a flight; `flies_on`: see `make_continues`.
     """
     domain, local_albedo = spec.domain, spec.local_albedo
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
@@ -302,6 +321,9 @@ def make_collide(spec: TransportSpec, flies_on: bool) -> wp.Function:
     @wp.func
     def collide(s: PhotonRef, world: WorldRef):
         c = end_of_flight(s, world)
+        if wp.static(chosen):
+            reweigh(s.weight, s.flight.factor)
+            s.directed += s.weight.taken
         fly_carried(s.carried, world, s.x, s.u, c.distance)
         s.x = s.x + c.distance * s.u
         s.path += c.distance

@@ -157,7 +157,9 @@ class Guiding:
     """Chance p that a water collision draws its direction from the lobe about the lens, in [0, 1); with delta tracking
     1 - (1 - p)^2 for light that comes back, along u_z < 0."""
     surface_probability: float  # the same at a surface
-    anisotropy: float  # g of that Henyey-Greenstein lobe; phase functions with a guide have one of their own
+    anisotropy: float
+    """g, in (0, 1), of the Henyey-Greenstein water for which that lobe is best; phase functions with a guide have one
+    of their own"""
     return_probability: float
     """Chance that an event outside the view draws its direction from a lobe towards the optical axis, so that light
     that strayed comes back into the view more often, in [0, 1)."""
@@ -270,14 +272,35 @@ def _hg_density(chord: float, medium: Medium) -> float:
     return a2 / (q * wp.sqrt(q))
 
 
+# The lobe of `PhaseGuide`, over the chord c = 2 sin(theta/2) instead of the sine of theta: (1 - c/sqrt(a^2 + c^2))/c.
+# Its integral up to c is that of 2 pi a y, y = (c + a - sqrt(a^2 + c^2))/a.
+
+
+@wp.func
+def _lobe_width(guiding: Guiding) -> float:
+    return (1.0 - guiding.anisotropy) / wp.sqrt(guiding.anisotropy)
+
+
+@wp.func
+def _lobe_part(a: float) -> float:
+    """y at the largest chord, 2."""
+    return 1.0 - a / (wp.sqrt(a * a + 4.0) + 2.0)
+
+
 @wp.func
 def _hg_lobe_pdf(t: float, medium: Medium, guiding: Guiding) -> float:
-    return henyey_greenstein_pdf(t, guiding.anisotropy)
+    a = _lobe_width(guiding)
+    chord = wp.max(wp.sqrt(2.0 * t), 1.0e-6)
+    s = wp.sqrt(a * a + chord * chord)
+    return 2.0 * _INV_4PI * a / (_lobe_part(a) * chord * s * (s + chord))
 
 
 @wp.func
 def _hg_lobe_sample(xi: float, medium: Medium, guiding: Guiding) -> float:
-    return sample_henyey_greenstein(xi, guiding.anisotropy)
+    a = _lobe_width(guiding)
+    y = 1.0 - xi * _lobe_part(a)
+    chord = 0.5 * a * (1.0 - y) * (1.0 + y) / y
+    return wp.min(0.5 * chord * chord, 2.0)
 
 
 HENYEY_GREENSTEIN_GUIDE = PhaseGuide(_hg_complement, _hg_chord, _hg_density, _hg_lobe_pdf, _hg_lobe_sample, chord=True)
