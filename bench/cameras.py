@@ -58,9 +58,10 @@ def build(kind, config, options, device):
     poses = wp.array([wp.transform_identity()] * options.worlds, dtype=wp.transform, device=device)
     body_q = wp.clone(rest)
     if kind == "SpadCamera":
-        camera = sk.SpadCamera(config, options.worlds, device=device)
+        camera = sk.SpadCamera(config, options.worlds, frame="optical", device=device)
     else:
-        camera = sk.SpadTracer(shapes, config, options.worlds, photons=int(options.photons), lanes=options.lanes)
+        tracing = {"photons": int(options.photons), "lanes": options.lanes}
+        camera = sk.SpadTracer(shapes, config, options.worlds, frame="optical", **tracing)
 
     def step():
         wp.launch(move, rest.size, [camera.step, rest], [body_q], device=device)

@@ -14,6 +14,7 @@ import warp as wp
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
+    check_choice,
     check_device,
     check_integer,
     check_items,
@@ -24,11 +25,23 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.surface.mesh import Textures, no_textures
 from spadwarp_kernels.surface.reflectance import texture_at
 
-__all__ = ["SHAPE_KINDS", "Shapes", "make_shapes"]
+__all__ = ["CAMERA_FRAMES", "SHAPE_KINDS", "Shapes", "make_shapes"]
 
 wp.set_module_options({"enable_backward": False})
 
 SHAPE_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "cone", "mesh")
+CAMERA_FRAMES = {
+    "optical": (0.0, 0.0, 0.0, 1.0),
+    "opengl": (1.0, 0.0, 0.0, 0.0),
+    "forward_left_up": (-0.5, 0.5, -0.5, 0.5),
+}
+"""Conventions of a camera's pose, and the rotation (x, y, z, w) that takes the optical frame there.
+
+``optical``: +x right, +y down, +z forward (OpenCV; ROS, REP 103, `_optical` frames; Isaac Lab's "ros"). ``opengl``: +x
+right, +y up, -z forward (OpenGL, USD, Newton, MuJoCo; Isaac Lab's "opengl"). ``forward_left_up``: +x forward, +y left,
++z up (ROS, REP 103, bodies; Isaac Lab's "world").
+"""
+
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, CONE, MESH = (wp.constant(i) for i in range(len(SHAPE_KINDS)))
 
 # Components of a size that say something; those of a mesh may be negative, which mirrors it.
@@ -69,6 +82,7 @@ class Shapes:
     device: wp.Device  # Warp device of the arrays
     meshes: tuple[wp.Mesh, ...] = ()  # meshes that are kept alive with the shapes
     bodies: int = 0  # number of poses that `move_shapes` needs
+    frame: str | None = None  # the simulator's convention of camera poses, one of CAMERA_FRAMES; None: none is known
 
     def __len__(self) -> int:
         return int(self.table.kind.size)
@@ -87,6 +101,7 @@ def make_shapes(
     visible: Any = None,
     first_face: Any = None,
     textures: "Textures | None" = None,
+    frame: str | None = None,
     device: wp.DeviceLike = None,
 ) -> Shapes:
     """Shapes from arrays `[shapes]` of NumPy, lists, or Warp arrays, which are kept and not copied.
@@ -103,6 +118,7 @@ def make_shapes(
         worlds: Number of worlds.
         visible: Whether cameras see a shape; all by default. Read once, as `world`.
         first_face, textures: See `ShapeTable`.
+        frame: The simulator's convention of camera poses, one of CAMERA_FRAMES; cameras then need not be told.
         device: Where the arrays are.
 
     Raises:
@@ -110,6 +126,8 @@ def make_shapes(
             there is not.
     """
     device = check_device("device", device)
+    if frame is not None:
+        check_choice("frame", frame, CAMERA_FRAMES)
     worlds = check_integer("worlds", worlds, 1, 1 << 24)
     if not isinstance(kind, wp.array):
         kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in check_items("kind", kind)])
@@ -143,7 +161,7 @@ def make_shapes(
     table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
     table.first = wp.array(np.searchsorted(np.sort(slot), np.arange(worlds + 2)), dtype=int, device=device)
     table.pose = wp.clone(table.local)
-    return Shapes(table, worlds, device, meshes, int(table.body.numpy().max()) + 1)
+    return Shapes(table, worlds, device, meshes, int(table.body.numpy().max()) + 1, frame)
 
 
 def _column(name: str, value: Any, count: int, device: wp.Device) -> wp.array:

@@ -34,7 +34,7 @@ def newton_shapes(model: Any, *, reflectance: Any = None) -> Shapes:
     """The visible shapes of a finalised `newton.Model`, in all its worlds.
 
     Sizes, poses on bodies and meshes are the model's own arrays: what changes there is seen. Cameras are then updated
-    with `state.body_q`, and their poses are in the frame "opengl".
+    with `state.body_q`, and their poses are in the frame "opengl", which the shapes carry.
 
     Args:
         model: `newton.Model`.
@@ -65,6 +65,7 @@ def newton_shapes(model: Any, *, reflectance: Any = None) -> Shapes:
         world=model.shape_world.numpy(),
         worlds=max(int(model.world_count), 1),
         visible=visible,
+        frame="opengl",
         device=model.device,
     )
 
@@ -115,6 +116,7 @@ def mujoco_shapes(
         world=np.repeat(np.arange(worlds), count),
         worlds=worlds,
         visible=np.tile(np.isin(model.geom_group, list(groups)) & (rgba[:, 3] > 0.0), worlds),
+        frame="opengl",
         device=device,
     )
 

@@ -35,7 +35,7 @@ def room(device):
 
 def seen(device, config):
     """A camera in each world, which has looked at the room."""
-    camera = sk.SpadCamera(config, 2, device=device)
+    camera = sk.SpadCamera(config, 2, frame="optical", device=device)
     camera.update(room(device), transforms([STILL] * 2, device), transforms(BODIES, device))
     return camera
 
@@ -118,7 +118,7 @@ def test_images_of_the_simulator(device):
     slopes = np.sum(camera.normal.numpy() * normal.numpy(), axis=-1)
     assert np.median(slopes) > 0.9999 and (slopes > 0).all()
     # Normals in the world's frame: a camera turned by half a circle about its axis.
-    turned = sk.SpadCamera(config, 2, device=device)
+    turned = sk.SpadCamera(config, 2, frame="optical", device=device)
     world = on_device(normal.numpy() * (-1, -1, 1), device, wp.vec3)
     turned.update_from_images(depth, world, reflectance, camera_q=transforms([(0, 0, 0, 0, 0, 1, 0)] * 2, device))
     assert turned.normal.numpy() == pytest.approx(normal.numpy(), abs=1e-6)
@@ -135,7 +135,8 @@ def test_rates_are_those_of_the_analytic_model(device):
     view, normal = on_device(view, device, wp.vec3d), on_device(np.tile([0, 0, -1.0], (len(view), 1)), device, wp.vec3d)
     reflectance = wp.full(distance.size, 0.4, dtype=wp.float64, device=device)
     signal, arrival = (one.numpy() for one in sk.signal_map(config.lidar(), view, distance, normal, reflectance))
-    phase = on_device(config.phase_table(), device, wp.float64)
+    phase = sk.henyey_greenstein_density(1.0 - np.cos(np.linspace(0.0, np.pi, 4097)), config.anisotropy)
+    phase = on_device(phase, device, wp.float64)
     back = sk.single_scatter_table(config.lidar(), phase, view, distance)[2].numpy()
     dark = config.dark_rate * 2 * 7.5 / config.speed
     # The response carries what arrives at the gate's start over it, in both directions.

@@ -27,7 +27,7 @@ def triangle(last=2):
 
 
 def camera(cameras=1, **arguments):
-    return sk.SpadCamera(SMALL, cameras, **arguments, device="cpu")
+    return sk.SpadCamera(SMALL, cameras, **{"frame": "optical"} | arguments, device="cpu")
 
 
 def depths(cameras):
@@ -41,7 +41,7 @@ def boxes(**arguments):
 
 
 def one_step(kind, shapes, camera_q, body_q):
-    one = camera() if kind == "camera" else sk.SpadTracer(shapes, SMALL, photons=500)
+    one = camera() if kind == "camera" else sk.SpadTracer(shapes, SMALL, photons=500, frame="optical")
     one.update(*([shapes] if kind == "camera" else []), camera_q, body_q)
     return one
 
@@ -144,7 +144,7 @@ def test_what_changes_in_place_to_something_that_there_is_not(device):
     """Worlds of cameras and kinds of shapes: nothing is seen there."""
     world = wp.zeros(1, dtype=int, device=device)
     shapes = sk.make_shapes(["plane"], [(0, 0, 0)], local=[(0, 0, 4, 0, 0, 0, 1)], device=device)
-    one = sk.SpadCamera(SMALL, world=world, device=device)
+    one = sk.SpadCamera(SMALL, world=world, frame="optical", device=device)
     pose = wp.array([STILL], dtype=wp.transform, device=device)
     for there in (0, 7, -3):
         world.fill_(there)
