@@ -501,10 +501,11 @@ class WorldCameras:
             check_choice("outputs", one, CAMERA_OUTPUTS)
         sizes = {"cameras": self.cameras, "config.height": config.height, "config.width": config.width}
         image, self._rows = tuple(sizes.values()), self.cameras * config.height * config.width
-        check_memory("images", sizes, 44, device, rows=3)
-        sizes["config.bins"] = config.bins
+        pixels, sizes["config.bins"] = dict(sizes), config.bins
+        check_memory("images", pixels, 1, device, rows=3)
         needed = 4 * ("rates" in self.outputs) + 4 * ("histogram" in self.outputs)
         check_memory("rates and counts", sizes, needed + 16 // self.cameras, device, rows=0)
+        check_memory("images", pixels, 56, device, rows=3)
         if frame is not None:
             check_choice("frame", frame, CAMERA_FRAMES)
         self.frame = frame
