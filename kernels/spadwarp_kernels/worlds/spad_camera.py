@@ -136,7 +136,13 @@ def _world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.De
             rows = check_numbers(f"by_world[{name!r}]", given, 1)
             given = wp.array(rows.astype(wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
         check_array(f"by_world[{name!r}]", given, dtype, (worlds or None,), device)
-        high = config.gate[1] - config.gate[0] if name == "gate_delay" else 2**31 - 1 if name == "pulses" else 1e6
+        high = (
+            config.gate_distance[1] - config.gate_distance[0]
+            if name == "gate_delay"
+            else 2**31 - 1
+            if name == "pulses"
+            else 1e6
+        )
         check_values(f"by_world[{name!r}]", given, f"[0, {high}]")
         setattr(values, name, given)
         worlds = given.size

@@ -61,7 +61,10 @@ class SpadConfig:
     """3 x 3 in its place, as of OpenCV, ROS and Isaac Lab: (f_x, 0, c_x), (0, f_y, c_y), (0, 0, 1) [pixels], where the
     first pixel's centre is (0, 0). To read: `SpadCamera.camera_matrix`."""
     bins: int = 256  # time bins of a histogram
-    gate: tuple[float, float] = (0.5, 10.0)  # least and largest one-way distance in this water that is recorded [m]
+    gate_distance: tuple[float, float] = (
+        0.5,
+        10.0,
+    )  # least and largest one-way distance in this water that is recorded [m]
     pulses: int = 20_000  # of a frame
     pulse_energy: float = 2e-9  # [J]
     wavelength: float = 532e-9  # [m]
@@ -91,9 +94,9 @@ class SpadConfig:
         check_integer("config.pulses", self.pulses, 0)
         check_fields("config", self, _RANGES)
         self._check_field_of_view()
-        check_vector("config.gate", self.gate, size=2)
-        check_number("config.gate[0]", self.gate[0], "[0, inf)")
-        check_number("config.gate[1]", self.gate[1], f"({float(self.gate[0])}, inf)")
+        check_vector("config.gate_distance", self.gate_distance, size=2)
+        check_number("config.gate_distance[0]", self.gate_distance[0], "[0, inf)")
+        check_number("config.gate_distance[1]", self.gate_distance[1], f"({float(self.gate_distance[0])}, inf)")
         check_vector("config.laser_position", self.laser_position)
         if self.laser_half_angle is not None:
             check_number("config.laser_half_angle", self.laser_half_angle, "(0, 3.1416]")
@@ -146,7 +149,7 @@ class SpadConfig:
     @property
     def gate_paths(self) -> tuple[float, float]:
         """Paths from the laser to the lens at which the gate opens and closes [m]."""
-        return 2.0 * float(self.gate[0]), 2.0 * float(self.gate[1])
+        return 2.0 * float(self.gate_distance[0]), 2.0 * float(self.gate_distance[1])
 
     @property
     def bin_path(self) -> float:

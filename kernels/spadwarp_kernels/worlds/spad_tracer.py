@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_kind
-from spadwarp_kernels.optics.camera import Camera, Gate
-from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser
+from spadwarp_kernels.optics.camera import make_camera, make_gate
+from spadwarp_kernels.optics.laser import make_laser
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choices, update_surfaces
 from spadwarp_kernels.transport.launch import CUDA_THREADS, Data, Model, launch_transport, make_data
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import make_medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 from .shapes import BOX, CAPSULE, CONE, CYLINDER, MESH, PLANE, SPHERE, Shapes, ShapeTable
@@ -365,18 +365,12 @@ class SpadTracer(WorldCameras):
     def _build(self) -> None:
         """Meshes, surfaces and models; reads the points back."""
         config = self.config
-        medium, laser, camera, gate = Medium(), Laser(), Camera(), Gate()
+        medium = make_medium(config.absorption, config.scattering, anisotropy=config.anisotropy)
+        laser = make_laser("uniform_cone", half_angle=config.half_angle, position=config.laser_position)
+        lens = {"aperture_radius": config.aperture_radius, "focus": 0.5 * sum(config.gate_distance)}
+        camera = make_camera(config.width, config.height, config.pixel_tangent, **lens)
+        gate = make_gate(self._parts * config.bins, one_way_metres=config.gate_distance)
         limits, guiding = Limits(), Guiding()
-        medium.extinction = config.absorption + config.scattering
-        medium.albedo = config.scattering / medium.extinction if medium.extinction > 0.0 else 0.0
-        medium.anisotropy, medium.axis_threshold = config.anisotropy, 1.0
-        laser.position, laser.axis = wp.vec3(*config.laser_position), wp.vec3(0.0, 0.0, 1.0)
-        laser.profile, laser.spread = LASER_PROFILES.index("uniform_cone"), 1.0 - math.cos(config.half_angle)
-        camera.width, camera.height, camera.pixel_tangent = config.width, config.height, config.pixel_tangent
-        camera.aperture_radius, camera.aperture_area = config.aperture_radius, math.pi * config.aperture_radius**2
-        camera.inverse_focus = 2.0 / (config.gate[0] + config.gate[1])
-        gate.start, gate.stop = config.gate_paths
-        gate.bins, gate.bins_per_metre = self._parts * config.bins, self._parts / config.bin_path
         limits.max_path, limits.max_collisions, limits.weight_cutoff = gate.stop, 64, _ROULETTE_BELOW
         guiding.probability = guiding.surface_probability = 0.3
         guiding.anisotropy, guiding.return_probability, guiding.return_anisotropy = 0.97, 0.1, 0.5

@@ -127,7 +127,7 @@ def test_images_of_the_simulator(device):
 def test_rates_are_those_of_the_analytic_model(device):
     """Over the bins: the signal of `signal_map`, the backscatter of `single_scatter_table`, the dark counts."""
     z = np.linspace(2.0, 5.0, 18 * 24, dtype=np.float32).reshape(1, 18, 24)
-    gate = {"gate": (0.5, 8.0), "bins": 200}
+    gate = {"gate_distance": (0.5, 8.0), "bins": 200}
     camera = facing(device, z, **gate, dark_rate=5e4)
     config, rates = camera.config, camera.rates.numpy().reshape(-1, 200).astype(float)
     view = config.lines_of_sight()

@@ -12,7 +12,7 @@ from helpers.meshes import mesh_of
 from helpers.worlds import STILL, transforms
 from spadwarp_kernels.worlds.shapes import move_shapes
 
-SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
+SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate_distance=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
 
 
 LARGE = dataclasses.replace(SMALL, width=192, height=192, bins=64)
@@ -97,7 +97,7 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
     ("call", "text"),
     [
         (lambda: sk.SpadConfig(pde=1.5), r"config.pde = 1.5 is outside \[0, 1\]"),
-        (lambda: sk.SpadConfig(gate=(5.0, 2.0)), r"config.gate\[1\] = 2.0 is outside \(5.0, inf\)"),
+        (lambda: sk.SpadConfig(gate_distance=(5.0, 2.0)), r"config.gate_distance\[1\] = 2.0 is outside \(5.0, inf\)"),
         (lambda: sk.SpadConfig(timing_sigma=1e3), "config.timing_sigma = 1000.0 s is .* bins"),
         (lambda: sk.SpadConfig(seed=None), "config.seed = None is not an integer"),
         (lambda: sk.SpadCamera(frame="usd", device="cpu"), "frame = 'usd' is not one of 'optical', 'opengl'"),
