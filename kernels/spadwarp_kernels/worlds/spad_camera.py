@@ -569,7 +569,7 @@ class WorldCameras:
             if offset is not None:
                 raise ArgumentError("offset is a pose on a body; body is needed with it")
             return
-        rows = check_numbers("body", body.numpy() if isinstance(body, wp.array) else body)
+        rows = check_numbers("body", body.numpy() if isinstance(body, wp.array) else np.array(body))
         if rows.shape not in ((), (self.cameras,)) or (rows < 0).any() or (rows != np.rint(rows)).any():
             raise ArgumentError(f"body = {rows.tolist()} is not the index of a body for each of {self.cameras} cameras")
         rows = np.broadcast_to(rows, self.cameras).astype(np.int32)
