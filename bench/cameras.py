@@ -6,8 +6,9 @@
 
 A world is a floor, a wall and ten bodies, which move in the graph. The capture itself shows that a step neither waits
 for the device nor reads from it: CUDA refuses both while it captures. Before the timing, replays are held to plain
-calls, bit by bit; after it, the depth in clear water to the truth. The outputs are depths alone, but for those of the cameras
-that are compared; "by world" has water of its own in each world. Without photons the tracer is left out.
+calls, bit by bit; after it, the depth in clear water to the truth. The outputs
+are depths alone, but for those of the cameras that are compared; "by world" has water of its own in each world.
+Without photons the tracer is left out.
 """
 
 import argparse

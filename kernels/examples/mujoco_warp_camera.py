@@ -1,4 +1,4 @@
-"""Single-photon cameras in a MuJoCo Warp simulation: on a falling box over a floor in murky water, in several worlds."""
+"""Single-photon cameras in a MuJoCo Warp simulation: on a falling box over a ball in murky water, in many worlds."""
 
 import mujoco
 import mujoco_warp as mjw

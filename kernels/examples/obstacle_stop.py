@@ -24,7 +24,7 @@ def nearest_obstacle(distance, status):
     return np.median(found[:, :SEEN], axis=1)
 
 
-def main(extinctions=np.linspace(0.2, 4.0, 20), start=12.0, device=None):
+def main(extinctions, start=12.0, device=None):
     """Clearance that each vehicle keeps [m], and the range at which it began to brake [m]; 0 or less is a crash."""
     worlds = len(extinctions)
     water = {"scattering": 0.7 * np.asarray(extinctions), "absorption": 0.3 * np.asarray(extinctions)}

@@ -443,10 +443,11 @@ def _save_npz(path: Path, arrays: Mapping[str, Any]) -> Path:
 def _write_npz(frames: FrameSequence, path: Path, chosen: range) -> Path:
     """As `_write_npy`, with axes."""
     every = [frames.frame(number) for number in chosen]
-    first, few = every[0], len(chosen) == 1
+    first, name = every[0], "depth" if every[0].counts is None else "counts"
+    images = [one.images["Z"] if one.counts is None else one.counts for one in every]
+    arrays: dict[str, Any] = {name: images[0] if len(images) == 1 else np.stack(images)}
     if first.counts is None:
-        return _save_npz(path, {"depth": first.images["Z"] if few else np.stack([one.images["Z"] for one in every])})
-    arrays = {"counts": first.counts if few else np.stack([one.counts for one in every])}
+        return _save_npz(path, arrays)
     arrays |= _time_axis(first.gate_start, first.bin_width, first.counts.shape[-1])
     arrays |= {"pulses": first.pulses} | ({} if first.depth is None else {"true_depth": first.depth})
     return _save_npz(path, arrays)

@@ -61,6 +61,7 @@ def newton_shapes(model: Any, *, reflectance: Any = None) -> Shapes:
         body=model.shape_body,
         local=model.shape_transform,
         mesh=model.shape_source_ptr,
+        meshes=_meshes_of(model),
         reflectance=reflectance,
         world=model.shape_world.numpy(),
         worlds=max(int(model.world_count), 1),
@@ -68,6 +69,13 @@ def newton_shapes(model: Any, *, reflectance: Any = None) -> Shapes:
         frame="opengl",
         device=model.device,
     )
+
+
+def _meshes_of(model: Any) -> list[wp.Mesh]:
+    """The meshes that a finalised model of Newton keeps in its lists, those of height fields too, and its shapes'."""
+    lists = [value for value in vars(model).values() if isinstance(value, (list, tuple))]
+    sources = [getattr(one, "mesh", None) for one in model.shape_source]
+    return [one for value in [*lists, sources] for one in value if isinstance(one, wp.Mesh)]
 
 
 def mujoco_shapes(

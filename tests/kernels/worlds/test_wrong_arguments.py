@@ -80,7 +80,7 @@ def test_poses_of_a_first_step(kind):
         ({"world": [[0], [0, 1]]}, "world is not an array: its rows have different lengths"),
         ({"worlds": 2**31 - 1}, r"worlds = 2147483647 is outside \[1, 16777216\]"),
         ({"visible": "yes"}, "visible is .*; true or false for each of 2 shapes is needed"),
-        ({"kind": ["mesh"] * 2, "mesh": [12345] * 2}, r"mesh\[0\] is not the id of a wp.Mesh that exists"),
+        ({"kind": ["mesh"] * 2, "mesh": [12345] * 2}, r"mesh\[0\] is not the id of a wp.Mesh in meshes"),
         ({"kind": ["mesh"] * 2, "mesh": [triangle(9)] * 2}, r"mesh\[0\].indices\[2\] = 9 is outside \[0, 2\]"),
         ({"kind": ["mesh"] * 2, "mesh": [triangle()] * 2, "first_face": 99}, "reach beyond the 0 faces of textures"),
     ],
@@ -134,7 +134,7 @@ def test_errors_name_the_argument(call, text):
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
 def test_a_mesh_lives_as_long_as_its_shapes(kind):
     mesh = triangle()
-    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], device="cpu")
+    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], meshes=[mesh], device="cpu")
     del mesh
     gc.collect()
     assert np.nanmin(one_step(kind, shapes, poses(STILL), None).true_depth.numpy()) == pytest.approx(3.0)
