@@ -8,8 +8,8 @@ import json
 import os
 import shutil
 import tarfile
-import warnings
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
