@@ -185,7 +185,8 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     """The delay of the largest score."""
     score_of = _make_score(dtype, likelihood)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    # Unrolled and inlined at four places, the likelihood has 220 KB of code for a GPU.
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
     def find(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
         coarse_step = search.coarse_step

@@ -330,9 +330,15 @@ def _expected(sensor: Sensor, light: PixelLight, k: int, water: float) -> float:
     return light.dark + water * _below(-0.5 * (low + high)) + wp.max(surface, 0.0)
 
 
+_FRAME_BLOCK = 128
+
+
 @memoised
 def _frame_kernel(traced: bool) -> wp.Kernel:
-    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
+    # Four blocks on a multiprocessor: without the bound the surface's light takes the registers of all bins.
+    @wp.kernel(
+        enable_backward=False, module="unique", module_options={"max_unroll": 1}, launch_bounds=(_FRAME_BLOCK, 4)
+    )
     def frame(
         first: int,
         first_row: int,
@@ -717,7 +723,7 @@ class WorldCameras:
             inputs += [part[name] for name in ("true_distance", "normal", "reflectance", "water", "rates", "histogram")]
             inputs += [part["known"], self._margin, part["counts"], part["significance"], part["window"]]
             kernel = _frame_kernel(part["water"] is not None)
-            launch_pixels(kernel, stop - start, inputs, device=self.device)
+            launch_pixels(kernel, stop - start, inputs, device=self.device, block_dim=_FRAME_BLOCK)
             arrival = None
             if "depth" in self.outputs:
                 arrival = part["arrival"]
