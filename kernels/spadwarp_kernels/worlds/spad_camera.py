@@ -524,6 +524,7 @@ class WorldCameras:
         self._set_worlds(world)
         self._set_mount(body, offset)
         self._period = check_number("update_period", update_period, "[0, inf)")
+        self._masked = False  # whether a step has had a mask
         self._age = wp.full(self.cameras, math.inf, dtype=float, device=device)
         self._due = wp.ones(self.cameras, dtype=int, device=device)
         self._poses_checked = False
@@ -700,7 +701,8 @@ class WorldCameras:
         """Which cameras are due."""
         if active is not None:
             check_array("active", active, wp.bool, (None,), self.device)
-        elif self._period == 0.0:
+            self._masked = True
+        elif self._period == 0.0 and not self._masked:
             return
         inputs = [self._world, active, check_number("dt", dt, "[0, inf)"), self._period * (1.0 - 1e-5)]
         wp.launch(_schedule_kernel, self.cameras, inputs, [self._age, self._due], device=self.device)
@@ -912,6 +914,8 @@ class SpadCamera(WorldCameras):
         *,
         along_ray: bool = False,
         camera_q: wp.array | None = None,
+        active: wp.array | None = None,
+        dt: float = 0.0,
     ) -> None:
         """A step from what the simulator's own camera has rendered, `[cameras, height, width]`.
 
@@ -921,8 +925,9 @@ class SpadCamera(WorldCameras):
                 the slope of the depth.
             reflectance: float32 in [0, 1], or a number.
             along_ray: Depth is the distance from the lens, as Newton's `depth_image` is.
-            camera_q: As in `update`.
+            camera_q, active, dt: As in `update`.
         """
+        self._schedule(active, dt)
         shape = self.true_depth.shape
         check_array("depth", depth, wp.float32, shape, self.device)
         number = 0.0

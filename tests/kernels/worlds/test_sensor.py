@@ -152,6 +152,11 @@ def test_worlds_that_are_updated(device):
         assert camera.step.numpy()[0] == step + 1
     new = [[not np.array_equal(a[world], b[world]) for world in range(2)] for a, b in itertools.pairwise(seen)]
     assert new == [[False, False], [True, False], [False, True]]
+    camera = sk.SpadCamera(CONFIG, 2, frame="optical", device=device)
+    camera.update(shapes, poses, active=wp.array([False, True], dtype=wp.bool, device=device))
+    assert [one.any() for one in camera.counts.numpy()] == [False, True]
+    camera.update(shapes, poses)
+    assert all(one.any() for one in camera.counts.numpy())
 
 
 def test_rays_of_a_scanner(device):
