@@ -14,8 +14,8 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.analytic.depth_frames import depth_of_path
-from spadwarp_kernels.analytic.optics import IN_WATER, Lidar, beam_fluence, beam_path
-from spadwarp_kernels.analytic.rates import collection, radiometric_signal
+from spadwarp_kernels.analytic.optics import IN_WATER, Lidar, beam_path
+from spadwarp_kernels.analytic.rates import radiometric_signal
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
@@ -26,7 +26,6 @@ from spadwarp_kernels.base.arguments import (
     check_kind,
     check_number,
     check_numbers,
-    check_values,
 )
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.detection.arrival_time import ArrivalEstimator
@@ -34,7 +33,7 @@ from spadwarp_kernels.detection.counts import FirstPhotons, draw_bin
 from spadwarp_kernels.detection.significance import Windows, begin_search, offer_bin, significance_of
 
 from .shapes import CAMERA_FRAMES, Shapes, ShapeTable, check_poses, intersect_shapes, move_shapes
-from .spad_config import SpadConfig
+from .spad_config import SpadConfig, WorldValues, scattering_table, world_value, world_values
 
 __all__ = ["CAMERA_OUTPUTS", "CAMERA_STATUS", "SpadCamera"]
 
@@ -60,93 +59,6 @@ def optical_to(frame: Any) -> wp.transform:
     """The pose of the optical frame in a camera frame of `CAMERA_FRAMES`; raises `ArgumentError`."""
     check_choice("frame", frame, CAMERA_FRAMES)
     return wp.transform(wp.vec3(0.0), wp.quat(*CAMERA_FRAMES[frame]))
-
-
-# ---- The water's light.
-
-
-@wp.kernel(enable_backward=False)
-def _table_kernel(
-    first: int, lidar: Lidar, width: wp.float64, g: wp.float64, view: wp.array[wp.vec3d], table: wp.array2d[float]
-):
-    """Mean over each bin of the single-scatter rate, for a scattering coefficient of 1 / m, times its width. Launch:
-    pixels."""
-    i = first + wp.tid()
-    one = wp.float64(1.0)
-    half = wp.float64(0.5)
-    u = view[i]
-    p = lidar.laser
-    scale = lidar.photons * lidar.pde * collection(lidar, u[2]) * width / wp.float64(4.0)
-    scale *= (one - g * g) / (wp.float64(4.0) * wp.float64(wp.pi))
-    for k in range(table.shape[1]):
-        total = wp.float64(0.0)
-        for n in range(4):
-            path = lidar.speed * lidar.start + (wp.float64(k) + (wp.float64(n) + half) / wp.float64(4.0)) * width
-            r = (path * path - wp.dot(p, p)) * half / (path - wp.dot(u, p))
-            s = path - r  # from the laser
-            if r >= lidar.nearest and s > wp.float64(0.0):
-                y = r * u - p
-                back = wp.dot(y, u) / s
-                density = wp.pow(one + g * g + wp.float64(2.0) * g * back, wp.float64(-1.5))
-                total += density * beam_fluence(lidar, y, s * s) * wp.exp(-lidar.extinction * path) / (one + back)
-        table[i, k] = float(scale * total)
-
-
-def scattering_table(config: SpadConfig, view: np.ndarray, bins: int, device: wp.Device) -> np.ndarray:
-    """Detections of single scattering without a target, blurred by the response, per pulse and bin, in the config's
-    water but for a scattering coefficient of 1 / m, float32 `[pixels, bins]`; waits for the device."""
-    table = wp.zeros((len(view), bins), dtype=float, device=device)
-    inputs = [config.lidar(), config.bin_path, config.anisotropy, wp.array(view, dtype=wp.vec3d, device=device), table]
-    launch_pixels(_table_kernel, len(view), inputs, device=device)
-    taps, lowest = config.bin_response()
-    padded = np.pad(table.numpy(), ((0, 0), (-lowest, -lowest)))
-    return np.lib.stride_tricks.sliding_window_view(padded, taps.size, axis=1) @ taps.astype(np.float32)
-
-
-# ---- What differs from world to world.
-
-
-@wp.struct
-class WorldValues:
-    """What may differ from world to world, `[worlds]`; without entries it is that of the `SpadConfig`."""
-
-    absorption: wp.array[float]
-    scattering: wp.array[float]
-    pulse_energy: wp.array[float]
-    dark_rate: wp.array[float]
-    pulses: wp.array[int]
-    gate_delay: wp.array[float]  # by which the gate opens and closes later [one-way m]
-
-
-@wp.func
-def _value(values: wp.array[float], world: int, otherwise: float) -> float:
-    if world >= 0 and world < values.shape[0]:
-        return values[world]
-    return otherwise
-
-
-def _world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.Device) -> tuple[WorldValues, int]:
-    """Arrays of checked values, and the number of worlds that they are for; 0 for none."""
-    values, worlds = WorldValues(), 0
-    check_kind("by_world", by_world, Mapping)
-    for name, given in by_world.items():
-        check_choice("by_world", name, WorldValues.vars)
-        dtype = WorldValues.vars[name].type.dtype
-        if not isinstance(given, wp.array):
-            rows = check_numbers(f"by_world[{name!r}]", given, 1)
-            given = wp.array(rows.astype(wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
-        check_array(f"by_world[{name!r}]", given, dtype, (worlds or None,), device)
-        high = (
-            config.gate_distance[1] - config.gate_distance[0]
-            if name == "gate_delay"
-            else 2**31 - 1
-            if name == "pulses"
-            else 1e6
-        )
-        check_values(f"by_world[{name!r}]", given, f"[0, {high}]")
-        setattr(values, name, given)
-        worlds = given.size
-    return values, worlds
 
 
 # ---- Rays.
@@ -257,8 +169,8 @@ def _light(sensor: Sensor, pixel: int, world: int, distance: float, normal: wp.v
     light = PixelLight()
     lidar = sensor.lidar
     values = sensor.values
-    scattering = _value(values.scattering, world, float(lidar.scattering))
-    absorption = _value(values.absorption, world, float(lidar.extinction - lidar.scattering))
+    scattering = world_value(values.scattering, world, float(lidar.scattering))
+    absorption = world_value(values.absorption, world, float(lidar.extinction - lidar.scattering))
     light.decay = wp.where(
         values.scattering.shape[0] + values.absorption.shape[0] > 0,
         scattering + absorption - float(lidar.extinction),
@@ -266,12 +178,12 @@ def _light(sensor: Sensor, pixel: int, world: int, distance: float, normal: wp.v
     )
     brightness = float(1.0)
     if values.pulse_energy.shape[0] > 0:
-        brightness = _value(values.pulse_energy, world, sensor.pulse_energy) / sensor.pulse_energy
+        brightness = world_value(values.pulse_energy, world, sensor.pulse_energy) / sensor.pulse_energy
     light.water = brightness * scattering
     light.dark = sensor.dark
     if values.dark_rate.shape[0] > 0:
-        light.dark = _value(values.dark_rate, world, 0.0) * sensor.bin_path / float(lidar.speed)
-    later = 2.0 * wp.max(_value(values.gate_delay, world, 0.0), 0.0)
+        light.dark = world_value(values.dark_rate, world, 0.0) * sensor.bin_path / float(lidar.speed)
+    later = 2.0 * wp.max(world_value(values.gate_delay, world, 0.0), 0.0)
     light.delay = later / sensor.bin_path
     light.start = sensor.gate_start + later
     light.row = pixel % sensor.table.shape[0]
@@ -437,7 +349,7 @@ def _depth_kernel(
     if sensor.scans:
         ray = wp.vec3(0.0, 0.0, 1.0)
     world = sensor.world[v]
-    start = sensor.gate_start + 2.0 * _value(sensor.values.gate_delay, world, 0.0)
+    start = sensor.gate_start + 2.0 * world_value(sensor.values.gate_delay, world, 0.0)
     depth[i] = wp.NAN
     distance[i] = wp.NAN
     status[i] = NO_RETURN
@@ -544,7 +456,7 @@ class WorldCameras:
         self._lines = config.lines_of_sight() if rays is None else self._checked_rays(rays)
         self._scans = rays is not None
         self._view = wp.array(self._lines, dtype=wp.vec3, device=device)
-        self._values, worlds = _world_values(by_world or {}, config, device)
+        self._values, worlds = world_values(by_world or {}, config, device)
         self._by_world = worlds > 0
         if worlds and self._most_worlds > worlds:
             raise ArgumentError(f"by_world has arrays of {worlds} worlds; the cameras are in {self._most_worlds}")

@@ -1,28 +1,36 @@
 """The laser, the SPAD array and the water of the cameras for simulators, and their formulas."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.analytic.optics import BACKSCATTER_SOURCES, Lidar
+from spadwarp_kernels.analytic.optics import BACKSCATTER_SOURCES, Lidar, beam_fluence
+from spadwarp_kernels.analytic.rates import collection
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
+    check_array,
     check_choice,
     check_fields,
     check_integer,
+    check_kind,
     check_number,
     check_numbers,
+    check_values,
     check_vector,
 )
+from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES
 from spadwarp_kernels.detection.significance import MIN_SIGNIFICANCE
 from spadwarp_kernels.optics.camera import C0
 from spadwarp_kernels.optics.laser import LASER_PROFILES
 
 __all__ = ["SpadConfig"]
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 PLANCK = 6.62607015e-34  # [J s]
 
@@ -223,3 +231,90 @@ class SpadConfig:
 def _normal_integral(z: float) -> float:
     """Integral of the normal distribution function up to z."""
     return z * 0.5 * math.erfc(-z / math.sqrt(2.0)) + math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+
+
+# ---- The water's light.
+
+
+@wp.kernel(enable_backward=False)
+def _table_kernel(
+    first: int, lidar: Lidar, width: wp.float64, g: wp.float64, view: wp.array[wp.vec3d], table: wp.array2d[float]
+):
+    """Mean over each bin of the single-scatter rate, for a scattering coefficient of 1 / m, times its width. Launch:
+    pixels."""
+    i = first + wp.tid()
+    one = wp.float64(1.0)
+    half = wp.float64(0.5)
+    u = view[i]
+    p = lidar.laser
+    scale = lidar.photons * lidar.pde * collection(lidar, u[2]) * width / wp.float64(4.0)
+    scale *= (one - g * g) / (wp.float64(4.0) * wp.float64(wp.pi))
+    for k in range(table.shape[1]):
+        total = wp.float64(0.0)
+        for n in range(4):
+            path = lidar.speed * lidar.start + (wp.float64(k) + (wp.float64(n) + half) / wp.float64(4.0)) * width
+            r = (path * path - wp.dot(p, p)) * half / (path - wp.dot(u, p))
+            s = path - r  # from the laser
+            if r >= lidar.nearest and s > wp.float64(0.0):
+                y = r * u - p
+                back = wp.dot(y, u) / s
+                density = wp.pow(one + g * g + wp.float64(2.0) * g * back, wp.float64(-1.5))
+                total += density * beam_fluence(lidar, y, s * s) * wp.exp(-lidar.extinction * path) / (one + back)
+        table[i, k] = float(scale * total)
+
+
+def scattering_table(config: SpadConfig, view: np.ndarray, bins: int, device: wp.Device) -> np.ndarray:
+    """Detections of single scattering without a target, blurred by the response, per pulse and bin, in the config's
+    water but for a scattering coefficient of 1 / m, float32 `[pixels, bins]`; waits for the device."""
+    table = wp.zeros((len(view), bins), dtype=float, device=device)
+    inputs = [config.lidar(), config.bin_path, config.anisotropy, wp.array(view, dtype=wp.vec3d, device=device), table]
+    launch_pixels(_table_kernel, len(view), inputs, device=device)
+    taps, lowest = config.bin_response()
+    padded = np.pad(table.numpy(), ((0, 0), (-lowest, -lowest)))
+    return np.lib.stride_tricks.sliding_window_view(padded, taps.size, axis=1) @ taps.astype(np.float32)
+
+
+# ---- What differs from world to world.
+
+
+@wp.struct
+class WorldValues:
+    """What may differ from world to world, `[worlds]`; without entries it is that of the `SpadConfig`."""
+
+    absorption: wp.array[float]
+    scattering: wp.array[float]
+    pulse_energy: wp.array[float]
+    dark_rate: wp.array[float]
+    pulses: wp.array[int]
+    gate_delay: wp.array[float]  # by which the gate opens and closes later [one-way m]
+
+
+@wp.func
+def world_value(values: wp.array[float], world: int, otherwise: float) -> float:
+    if world >= 0 and world < values.shape[0]:
+        return values[world]
+    return otherwise
+
+
+def world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.Device) -> tuple[WorldValues, int]:
+    """Arrays of checked values, and the number of worlds that they are for; 0 for none."""
+    values, worlds = WorldValues(), 0
+    check_kind("by_world", by_world, Mapping)
+    for name, given in by_world.items():
+        check_choice("by_world", name, WorldValues.vars)
+        dtype = WorldValues.vars[name].type.dtype
+        if not isinstance(given, wp.array):
+            rows = check_numbers(f"by_world[{name!r}]", given, 1)
+            given = wp.array(rows.astype(wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
+        check_array(f"by_world[{name!r}]", given, dtype, (worlds or None,), device)
+        high = (
+            config.gate_distance[1] - config.gate_distance[0]
+            if name == "gate_delay"
+            else 2**31 - 1
+            if name == "pulses"
+            else 1e6
+        )
+        check_values(f"by_world[{name!r}]", given, f"[0, {high}]")
+        setattr(values, name, given)
+        worlds = given.size
+    return values, worlds
