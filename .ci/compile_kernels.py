@@ -3,7 +3,7 @@
 python .ci/compile_kernels.py
 
 With both packages installed, on Linux x86-64, before the wheels are built. The scenes that come with the package are
-run with both estimators, their counts drawn and their depth estimated; Warp compiles for `x86-64-v3` meanwhile, and
+run with both estimators, their counts drawn and their depth estimated, and a camera for simulators is run; Warp compiles for `x86-64-v3` meanwhile, and
 keeps the objects under the names that it looks for later.
 """
 
@@ -19,6 +19,7 @@ import warp as wp
 import warp._src.build
 
 import spadwarp
+import spadwarp_kernels as sk
 from spadwarp.io import paths as examples
 from spadwarp_kernels.base import kernels as compiled
 
@@ -50,6 +51,16 @@ def run_common() -> None:
         print(name, flush=True)
 
 
+def run_cameras() -> None:
+    """The cameras for simulators with shapes that are no meshes."""
+    pose = wp.array([wp.transform_identity()], dtype=wp.transform, device="cpu")
+    shapes = sk.make_shapes(["plane"], [(0, 0, 0)], local=[(0, 0, 3, 0, 0, 0, 1)], frame="optical", device="cpu")
+    for method in ("centroid", "matched", "likelihood"):
+        camera = sk.SpadCamera(sk.SpadConfig(width=4, height=4, method=method), device="cpu")
+        camera.update(shapes, pose)
+        camera.update_from_images(camera.true_depth)
+
+
 def pack(cache: Path) -> None:
     with zipfile.ZipFile(compiled.ARCHIVE, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         archive.writestr(compiled.MANIFEST, json.dumps(compiled.this_system()))
@@ -67,6 +78,7 @@ def main() -> None:
         wp.config.kernel_cache_dir = cache
         compile_for_target()
         run_common()
+        run_cameras()
         pack(Path(wp.config.kernel_cache_dir))
 
 

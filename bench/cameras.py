@@ -1,11 +1,14 @@
 """Steps per second of SpadCamera and SpadTracer in many worlds, each step one CUDA graph.
 
     python bench/cameras.py                          # 16 worlds x 160 x 120 x 256 bins, 1e6 photons a world
+    python bench/cameras.py --worlds 4096 --size 64 48 --photons 0 --steps 20
     python bench/cameras.py --device cpu --worlds 1 --size 32 24 --bins 64 --photons 2e4 --steps 2
 
 A world is a floor, a wall and ten bodies, which move in the graph. The capture itself shows that a step neither waits
 for the device nor reads from it: CUDA refuses both while it captures. Before the timing, replays are held to plain
-calls, bit by bit; after it, the depth in clear water to the truth.
+calls, bit by bit; after it, the depth in clear water to the truth. The outputs
+are depths alone, but for those of the cameras that are compared; "by world" has water of its own in each world.
+Without photons the tracer is left out.
 """
 
 import argparse
@@ -52,15 +55,16 @@ def move(step: wp.array(dtype=wp.int64), rest: wp.array(dtype=wp.transform), bod
     body_q[k] = wp.transform(wp.transform_get_translation(rest[k]) + shift, wp.transform_get_rotation(rest[k]))
 
 
-def build(kind, config, options, device):
+def build(kind, config, options, device, **choices):
     """A camera and the function that is a step of the simulation and of it."""
     shapes, rest = scene(options.worlds, device)
     poses = wp.array([wp.transform_identity()] * options.worlds, dtype=wp.transform, device=device)
     body_q = wp.clone(rest)
     if kind == "SpadCamera":
-        camera = sk.SpadCamera(config, options.worlds, device=device)
+        camera = sk.SpadCamera(config, options.worlds, frame="optical", device=device, **choices)
     else:
-        camera = sk.SpadTracer(shapes, config, options.worlds, photons=int(options.photons), lanes=options.lanes)
+        tracing = {"photons": int(options.photons), "lanes": options.lanes}
+        camera = sk.SpadTracer(shapes, config, options.worlds, frame="optical", **tracing, **choices)
 
     def step():
         wp.launch(move, rest.size, [camera.step, rest], [body_q], device=device)
@@ -80,7 +84,8 @@ def captured(camera, step, device):
     return capture.graph
 
 
-def measure(kind, config, options, device):
+def check_replay(kind, config, options, device):
+    """A replay is a call, bit by bit."""
     camera, step = build(kind, config, options, device)
     graph = captured(camera, step, device)
     other, other_step = build(kind, config, options, device)
@@ -91,14 +96,28 @@ def measure(kind, config, options, device):
         mine, theirs = getattr(camera, name).numpy(), getattr(other, name).numpy()
         if not np.array_equal(mine, theirs, equal_nan=True):
             raise SystemExit(f"{kind}: the replay's {name} is not that of a call")
-    del other, other_step
+
+
+def measure(kind, config, options, device, by_world=False):
+    before = device.free_memory if device.is_cuda else 0
+    choices = {"outputs": ("depth",)}
+    if by_world:
+        draw = np.random.default_rng(2).uniform
+        choices["by_world"] = {
+            "scattering": draw(0.1, 0.4, options.worlds),
+            "absorption": draw(0.05, 0.2, options.worlds),
+        }
+    camera, step = build(kind, config, options, device, **choices)
+    graph = captured(camera, step, device)
     wp.synchronize_device(device)
+    memory = (before - device.free_memory) / 1e9 if device.is_cuda else float("nan")
     began = time.perf_counter()
     for _ in range(options.steps):
         wp.capture_launch(graph)
     wp.synchronize_device(device)
     rate = options.steps / (time.perf_counter() - began)
-    print(f"{kind:11s} {config.method:10s} {rate:9.2f} steps/s, {rate * options.worlds:10.1f} images/s", flush=True)
+    name = f"{kind:10s} {config.method:10s}{' by world' if by_world else '':9s}"
+    print(f"{name} {rate:9.2f} steps/s, {rate * options.worlds:10.1f} images/s, {memory:6.2f} GB", flush=True)
 
 
 def clear_water(config, options, device):
@@ -127,7 +146,12 @@ def main():
     print(f"{options.worlds} worlds x {width} x {height} x {options.bins} bins on {device.name}, Warp {wp.__version__}")
     for method in ("centroid", "matched", "likelihood"):
         measure("SpadCamera", dataclasses.replace(config, method=method), options, device)
-    measure("SpadTracer", config, options, device)
+    measure("SpadCamera", dataclasses.replace(config, method="matched"), options, device, by_world=True)
+    if options.photons:
+        measure("SpadTracer", config, options, device)
+    options.worlds = min(options.worlds, 16)
+    for kind in ("SpadCamera", "SpadTracer") if options.photons else ("SpadCamera",):
+        check_replay(kind, config, options, device)
     clear_water(config, options, device)
 
 

@@ -1,4 +1,4 @@
-"""Single-photon cameras in a MuJoCo Warp simulation: a ball falls into murky water, in several worlds at once."""
+"""Single-photon cameras in a MuJoCo Warp simulation: on a falling box over a ball in murky water, in many worlds."""
 
 import mujoco
 import mujoco_warp as mjw
@@ -6,30 +6,27 @@ import warp as wp
 
 import spadwarp_kernels as sk
 
-SCENE = """<mujoco><option timestep="0.01"/><worldbody>
-  <geom type="plane" size="0 0 1" rgba="0.5 0.5 0.5 1"/>
-  <body pos="0 0 1.5"><freejoint/><geom type="sphere" size="0.3" rgba="0.8 0.7 0.2 1"/></body>
-  <camera pos="0 -3 1" xyaxes="1 0 0 0 0.2 1" fovy="50"/>
-</worldbody></mujoco>"""
+SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="0 0 1"/>
+  <geom type="sphere" size="0.3" pos="0 0.3 0.3"/>
+  <body pos="0 0 3"><freejoint/><geom type="box" size="0.3 0.2 0.2"/></body></worldbody></mujoco>"""
 
 
-def main(worlds=4, steps=60, device=None):
-    """The depth images of the last step, `[worlds, height, width]`."""
+def main(worlds=4, steps=20, device=None):
+    """The camera after the last step; its images are `[worlds, height, width]`."""
     host = mujoco.MjModel.from_xml_string(SCENE)
     with wp.ScopedDevice(device):
         model, data = mjw.put_model(host), mjw.make_data(host, nworld=worlds)
-        shapes = sk.mujoco_shapes(host, worlds)
-        camera = sk.SpadCamera(sk.SpadConfig(width=80, height=60), worlds, frame="opengl")
-        bodies = wp.empty(worlds * host.nbody, dtype=wp.transform)
-        poses = wp.empty(worlds, dtype=wp.transform)
+        shapes, bodies = sk.mujoco_shapes(host, worlds), wp.empty(worlds * host.nbody, dtype=wp.transform)
+        config = sk.SpadConfig(width=80, height=60, vertical_fov=0.8)
+        mount = {"body": [w * host.nbody + 1 for w in range(worlds)], "offset": (0.0, 0.0, -0.25, 0.0, 0.0, 0.0, 1.0)}
+        camera = sk.SpadCamera(config, worlds, **mount, outputs=("depth",))
         for _ in range(steps):
             mjw.step(model, data)
             sk.write_poses(data.xpos, data.xquat, bodies)
-            sk.write_poses(data.cam_xpos[:, 0], data.cam_xmat[:, 0], poses)
-            camera.update(shapes, poses, bodies)
-    return camera.depth
+            camera.update(shapes, body_q=bodies)
+    return camera
 
 
 if __name__ == "__main__":
-    depth = main().numpy()
+    depth = main().depth.numpy()
     print(f"depth {depth.shape}, {depth[0, 30, 40]:.3f} m in the middle of the first image")

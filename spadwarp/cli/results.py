@@ -149,8 +149,8 @@ def _frames(text: str) -> int | slice:
 # Formats of frames in the order of writing: those that not every source has go first, so that nothing is written where
 # one is refused. The files of each in a folder, as patterns.
 _FORMATS: dict[str, tuple[str, ...]] = {"fusion": ("{}.txt", "intensity/{}-[0-9]*.mat", "spad/{}-[0-9]*_p1.mat")}
-_FORMATS |= {one: (f"{{}}.{one}", f"{{}}-[0-9]*.{one}") for one in ("ptu", "mat", "npy", "exr", "xml")}
-_Format = Literal["npy", "mat", "ptu", "exr", "xml", "fusion", "parquet", "webdataset", "zarr"]
+_FORMATS |= {one: (f"{{}}.{one}", f"{{}}-[0-9]*.{one}") for one in ("ptu", "mat", "npy", "npz", "exr", "png", "xml")}
+_Format = Literal["npy", "npz", "png", "mat", "ptu", "exr", "xml", "fusion", "parquet", "webdataset", "zarr"]
 _Frames = Annotated[int | slice, _frames]
 
 
@@ -171,6 +171,8 @@ def export(
 
     \b
     npy     NumPy: [height, width, bin], with frames before that; depth where there are no counts
+    npz     the same with its axis time [s], bin_width, gate_start and true_depth [m]
+    png     depth in millimetres, 16 bits, as OpenCV and ROS read it; one file a frame
     mat     MATLAB, one file a frame, as single-photon denoisers read: sparse spad, rates, bin from 1, bin_size [s]
     ptu     PicoQuant T3 image, one record a detection
     exr     images: depth, intensity, truth; one file a frame

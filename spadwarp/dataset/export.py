@@ -9,6 +9,7 @@ import os
 import shutil
 import tarfile
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -176,7 +177,10 @@ def _write_parquet(source: _Source, out: Path, size: int) -> None:
             array = pa.ListArray.from_arrays(pa.array(np.arange(0, len(array) + 1, side, dtype=np.int32)), array)
         return array
 
-    schema = pa.schema([(name, array_of(column, []).type) for name, column in source.columns.items()])
+    schema = pa.schema(
+        pa.field(name, array_of(one, []).type, metadata={"unit": one.unit, "description": one.meaning})
+        for name, one in source.columns.items()
+    )
     per_row = sum(int(np.prod(column.shape)) * 4 for column in source.columns.values())
     group = int(np.clip((1 << 26) // max(per_row, 1), 1, 1000))  # rows of 64 MiB
     (out / "data").mkdir()
@@ -235,6 +239,11 @@ def _write_zarr(source: _Source, out: Path, size: int) -> None:
             for name, column in source.columns.items():
                 kind = np.dtypes.StringDType() if column.is_text else column.kind
                 group[name][first : first + len(block)] = np.array([row[name] for row in block], dtype=kind)
+    # Readers look for the metadata of all arrays in one place; zarr remarks that its version 3 does not yet say so.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for path in (None, *source.sizes):
+            zarr.consolidate_metadata(store.store, path=path)
 
 
 def histogram_features(counts: ArrayLike, scene: Scene) -> NDArray[np.float32]:

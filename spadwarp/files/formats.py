@@ -30,7 +30,7 @@ from spadwarp.values import ArgumentError, FileError, check_choice, check_intege
 
 __all__ = ["FORMATS", "export", "export_sensor_fusion", "open_source", "sequence"]
 
-FORMATS = (".npy", ".mat", ".ptu", ".exr", *CALIBRATION_ENDINGS)
+FORMATS = (".npy", ".npz", ".png", ".mat", ".ptu", ".exr", *CALIBRATION_ENDINGS)
 """Endings of the files that `export` writes."""
 
 _DATASET_IMAGES = {"Z": "noisy", "truth.Z": "clean", "background": "label", "intensity": "intensity", "bound": "bound"}
@@ -237,6 +237,10 @@ def export(
     - `.npy`: a result's expected histogram `[H, W, T]` (fraction of the emitted photons); counts `[H, W, T]`, of many
       frames `[frames, H, W, T]`; where there is depth alone, as in datasets of the analytic simulator, depth `[H, W]`
       or `[frames, H, W]` [m].
+    - `.npz`: the same as `histogram`, `counts` or `depth`, with its axis `time` [s], the bins' centres, `bin_width` and
+      `gate_start` [s], and `true_depth` [m] where it is one.
+    - `.png`: depth of one frame in whole millimetres, 16 bits, 0 without one or beyond 65.535 m, as OpenCV and ROS
+      (`16UC1`) read it.
     - `.mat`: counts of one frame as the simulated data that single-photon denoisers train on (Lindell et al. 2018):
       `spad` sparse `[W·H, T]`, whose row is y + H·x; `rates` `[H, W, T]`, the expected counts that `spad` was drawn
       from; `bin` `[H, W]`, the bin of the true time of flight counted from 1, 0 without one; `bin_size` [s]; `depth`
@@ -251,7 +255,7 @@ def export(
     Args:
         source: A `Result`, `Frames`, the file of one (`result.h5`, `frames.h5`, `analytic.h5`), or the folder of a
             dataset.
-        path: The file. Of many frames `.mat` and `.exr` hold one each: `name-00000.mat`, `name-00001.mat`, …
+        path: The file. Of many frames `.mat`, `.exr` and `.png` hold one each: `name-00000.mat`, `name-00001.mat`, …
         frames: Only this one, from 0, or these.
         split: Of a dataset: "train", "validation", "test" or "all".
         result: The result that the `Frames` were drawn from; `.mat` needs its truth.
@@ -274,9 +278,10 @@ def export(
         if channel != "I":
             raise ArgumentError(f"channel = {channel!r}: only results have channels")
         chosen = _chosen(opened, frames)
-        if ending in (".npy", ".ptu"):
-            return [(_write_npy if ending == ".npy" else _write_ptu)(opened, path, chosen)]
-        write = _write_mat if ending == ".mat" else _write_exr_frame
+        whole = {".npy": _write_npy, ".npz": _write_npz, ".ptu": _write_ptu}
+        if ending in whole:
+            return [whole[ending](opened, path, chosen)]
+        write = {".mat": _write_mat, ".exr": _write_exr_frame, ".png": _write_png}[ending]
         numbered = {number: path.with_name(f"{path.stem}-{number:05}{path.suffix}") for number in chosen}
         return [write(opened, numbered[number] if len(chosen) > 1 else path, number) for number in chosen]
     except ModuleNotFoundError as error:
@@ -384,6 +389,12 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
         raise ArgumentError(f"frames = {frames}: a result holds expected histograms, not frames")
     if ending == ".npy":
         return write_array(path, result.histogram)
+    if ending == ".npz":
+        gate = result.scene.gate
+        axes = _time_axis(gate.start, gate.bin_width, gate.bins)
+        return _save_npz(path, {"histogram": result.histogram, **axes, "true_depth": result.truth.depth})
+    if ending == ".png":
+        return _save_png(path, result.depth())
     if ending == ".exr":
         channels: dict[str, Any] = {"Z": result.depth(), "intensity": result.intensity}
         for name, tallies in zip(COMPONENTS, result.tallies, strict=True):
@@ -417,6 +428,46 @@ def _write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
         array.flush()
         del array
     return path
+
+
+def _time_axis(start: float, width: float, bins: int) -> dict[str, Any]:
+    return {"time": start + (np.arange(bins) + 0.5) * width, "bin_width": width, "gate_start": start}
+
+
+def _save_npz(path: Path, arrays: Mapping[str, Any]) -> Path:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    return path
+
+
+def _write_npz(frames: FrameSequence, path: Path, chosen: range) -> Path:
+    """As `_write_npy`, with axes."""
+    every = [frames.frame(number) for number in chosen]
+    first, name = every[0], "depth" if every[0].counts is None else "counts"
+    images = [one.images["Z"] if one.counts is None else one.counts for one in every]
+    arrays: dict[str, Any] = {name: images[0] if len(images) == 1 else np.stack(images)}
+    if first.counts is None:
+        return _save_npz(path, arrays)
+    arrays |= _time_axis(first.gate_start, first.bin_width, first.counts.shape[-1])
+    arrays |= {"pulses": first.pulses} | ({} if first.depth is None else {"true_depth": first.depth})
+    return _save_npz(path, arrays)
+
+
+def _save_png(path: Path, depth: NDArray[Any]) -> Path:
+    from PIL import Image
+
+    millimetres = np.nan_to_num(np.rint(1e3 * np.asarray(depth, np.float64)))
+    millimetres[(millimetres < 0) | (millimetres > 65535)] = 0
+    with atomic_path(path) as temporary:
+        Image.fromarray(millimetres.astype(np.uint16)).save(temporary, format="PNG")
+    return path
+
+
+def _write_png(frames: FrameSequence, path: Path, number: int) -> Path:
+    images = frames.frame(number).images
+    if "Z" not in images:
+        raise ArgumentError(f"{frames.name}: frame {number} has no depth, which .png is for")
+    return _save_png(path, images["Z"])
 
 
 def _write_mat(
@@ -483,6 +534,9 @@ def _write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
     sync = max(first.period or 0.0, bins * first.bin_width)
     # A pixel lasts long enough for its detections, one a sync.
     pixel_time = sync * max(most, 1)
+    # Side of a pixel at the median depth of what it looks at [um]; 1 where that is not known.
+    seen = np.nan if first.depth is None or np.isnan(first.depth).all() else float(np.nanmedian(first.depth))
+    side = 1.0 if first.scene is None or np.isnan(seen) else 1e6 * seen * first.scene.camera.pixel_tangent
     comment = (
         f"Counts of a simulated SPAD array, {first.pulses} pulses a frame. "
         f"Bin 0 begins at {first.gate_start * 1e9:.6f} ns of flight."
@@ -495,6 +549,7 @@ def _write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:
             global_resolution=sync,
             tcspc_resolution=first.bin_width,
             pixel_time=pixel_time,
+            pixel_resolution=side,
             record_type=ptufile.PtuRecordType.GenericT3,
             comment=comment,
             tags={

@@ -116,7 +116,7 @@ def test_xarray_opens_zarr(folder, tmp_path):
     xarray = pytest.importorskip("xarray")
     out = export_dataset(folder, tmp_path / "zarr", "zarr", fields=(*FIELDS, "normal", "counts"))
     reader = FrameReader(folder, "train", fields=(*FIELDS, "normal"))
-    with xarray.open_zarr(out / "frames.zarr", group="train", consolidated=False) as rows:
+    with xarray.open_zarr(out / "frames.zarr", group="train") as rows:
         assert rows.noisy.dims == ("frame", "y", "x") and rows.noisy.attrs["units"] == "m"
         assert rows.normal.dims == ("frame", "axis", "y", "x") and rows.counts.dims == ("frame", "bin", "y", "x")
         for number, item in enumerate(reader):

@@ -54,6 +54,26 @@ def spad_of(file, width=WIDTH, height=HEIGHT):
     return np.asarray(file["spad"].todense()).reshape(width, height, -1).transpose(2, 1, 0)
 
 
+def test_npz_has_axes(source, detection, result, tmp_path):
+    spadwarp.export(source, tmp_path / "all.npz")
+    with np.load(tmp_path / "all.npz") as file:
+        assert np.array_equal(file["counts"], detection.counts)
+        assert file["time"].shape == (detection.counts.shape[-1],)
+        assert file["time"][0] == pytest.approx(file["gate_start"] + 0.5 * file["bin_width"])
+    spadwarp.export(result, tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as file:
+        assert np.array_equal(file["histogram"], result.histogram)
+        assert np.array_equal(file["true_depth"], result.truth.depth, equal_nan=True)
+
+
+def test_png_is_depth_in_millimetres(result, tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    spadwarp.export(result, tmp_path / "a.png")
+    depth, image = result.depth(), imageio.imread(tmp_path / "a.png")
+    assert image.dtype == np.uint16
+    np.testing.assert_allclose(image[np.isfinite(depth)], 1e3 * depth[np.isfinite(depth)], atol=0.51)
+
+
 def test_npy(source, detection, result, tmp_path):
     assert spadwarp.export(source, tmp_path / "all.npy") == [tmp_path / "all.npy"]
     assert np.array_equal(np.load(tmp_path / "all.npy"), detection.counts)

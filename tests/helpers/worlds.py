@@ -5,7 +5,7 @@ import warp as wp
 
 import spadwarp_kernels as sk
 
-SMALL = {"width": 16, "height": 12, "bins": 64, "gate": (0.5, 6.0), "pulse_energy": 1e-12, "pulses": 1000}
+SMALL = {"width": 16, "height": 12, "bins": 64, "gate_distance": (0.5, 6.0), "pulse_energy": 1e-12, "pulses": 1000}
 STILL = (0, 0, 0, 0, 0, 0, 1)
 
 

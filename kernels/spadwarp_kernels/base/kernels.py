@@ -52,7 +52,9 @@ def memoised(make: Callable[P, R]) -> Callable[P, R]:
 # ---- Kernels with one thread a pixel: launches over any number of them, on every core of a CPU.
 
 
-def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any, threads: int = 0) -> None:
+def launch_pixels(
+    kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, device: Any, threads: int = 0, block_dim: int = 256
+) -> None:
     """Launch a kernel over `count` pixels; its first argument is the first pixel of the launch, `inputs` follow.
 
     On the CPU, where a launch runs on one core and releases the GIL, the pixels are shared out over threads (0: one for
@@ -62,7 +64,7 @@ def launch_pixels(kernel: wp.Kernel, count: int, inputs: Sequence[Any], *, devic
     if count == 0:
         return
     if device.is_cuda or device.is_capturing:
-        wp.launch(kernel, count, [0, *inputs], device=device)
+        wp.launch(kernel, count, [0, *inputs], device=device, block_dim=block_dim)
         return
     wp.load_module(kernel.module, device=device)  # compiled once, before the threads
     workers = threads or os.cpu_count() or 1

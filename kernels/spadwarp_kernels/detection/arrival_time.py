@@ -185,7 +185,8 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
     """The delay of the largest score."""
     score_of = _make_score(dtype, likelihood)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    # Unrolled and inlined at four places, the likelihood has 220 KB of code for a GPU.
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
     def find(first_pixel: int, histogram: wp.array2d[dtype], search: _Search, arrival: wp.array[float]):
         pixel = first_pixel + wp.tid()
         coarse_step = search.coarse_step
@@ -277,8 +278,8 @@ class ArrivalEstimator:
         search.response = wp.array(taps.astype(np.float32), device=self.device)
         search.min_significance = check_number("min_significance", min_significance, "[0, 1e6]")
         test = {"first": first, "stop": stop, "background": background if "profile" not in test else None, **test}
-        self._test = DetectionTest(bins, self.device, half_width / 1.5 if width is None else width, **test)
-        search.half_width_of_window = self._test.half_width
+        self.test = DetectionTest(bins, self.device, half_width / 1.5 if width is None else width, **test)
+        search.half_width_of_window = self.test.half_width
 
     def __call__(self, histogram: wp.array, arrival: wp.array, significance: wp.array | None = None) -> None:
         """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`, and of counts, where there is an
@@ -286,16 +287,34 @@ class ArrivalEstimator:
         check_array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
         check_array("arrival", arrival, wp.float32, (pixels,), self.device)
-        make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
-        kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
         search = self._search
         if search.min_significance > 0.0 or significance is not None:
             if search.window is None or search.window.shape != (pixels,):
                 search.window, search.significance = (wp.empty(pixels, kind, self.device) for kind in (int, float))
             if significance is not None:
                 search.significance = significance
-            self._test(histogram, search.significance, search.window)
-        launch_pixels(kernel, pixels, [histogram, search, arrival], device=self.device)
+            self.test(histogram, search.significance, search.window)
+        self._locate(histogram, arrival)
+
+    def _locate(self, histogram: wp.array, arrival: wp.array) -> None:
+        make = _peak_kernel if self.method in ("peak", "centroid") else _search_kernel
+        kernel = make(histogram.dtype, self.method in ("centroid", "likelihood"))
+        launch_pixels(kernel, arrival.size, [histogram, self._search, arrival], device=self.device)
+
+    def locate(
+        self,
+        histogram: wp.array,
+        arrival: wp.array,
+        significance: wp.array,
+        window: wp.array,
+        background: wp.array | None = None,
+    ) -> None:
+        """As a call, of pixels that the caller has tested by `test.windows`; with `background` that is their own."""
+        search = self._search
+        search.significance, search.window = significance, window
+        if background is not None:
+            search.background = background
+        self._locate(histogram, arrival)
 
 
 def arrival_bins(

@@ -358,6 +358,46 @@ def _exponential(seed: wp.uint64, id: wp.uint64, purpose: wp.uint32, block: wp.u
     return -wp.log(wp.float64(1.0) - u[0])
 
 
+@wp.struct
+class FirstPhotons:
+    """Counts of first photons, drawn bin by bin."""
+
+    left: int  # pulses without a count so far
+    count: int  # of the bin
+    waiting: int
+    wait: wp.float64  # hazard, summed over the pulses left, up to the next count
+    block: wp.uint32  # of random numbers
+
+
+@wp.func
+def draw_bin(draws: FirstPhotons, hazard: float, seed: wp.uint64, id: wp.uint64) -> FirstPhotons:
+    """The counts of the next bin; `id` names the pixel and frame."""
+    draws.count = 0
+    h = wp.float64(hazard)
+    if h > wp.float64(0.0) and draws.left > 0:
+        if wp.float64(draws.left) * h < _SPARSE:
+            # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
+            if draws.waiting == 0:
+                draws.wait = _exponential(seed, id, PURPOSE_COUNTS, draws.block)
+                draws.block = draws.block + _ONE
+                draws.waiting = 1
+            while draws.left > 0 and draws.wait < wp.float64(draws.left) * h:
+                h = h - draws.wait / wp.float64(draws.left)
+                draws.left = draws.left - 1
+                draws.count = draws.count + 1
+                draws.wait = _exponential(seed, id, PURPOSE_COUNTS, draws.block)
+                draws.block = draws.block + _ONE
+            draws.wait = draws.wait - wp.float64(draws.left) * h
+        else:
+            # Exponential waits have no memory: the one begun may be dropped.
+            draws.waiting = 0
+            count, block = binomial(draws.left, h, seed, id, PURPOSE_COUNTS, draws.block)
+            draws.count = count
+            draws.block = block
+            draws.left = draws.left - count
+    return draws
+
+
 @wp.kernel(enable_backward=False)
 def _first_photon_kernel(
     first_row: int,
@@ -377,34 +417,12 @@ def _first_photon_kernel(
     for part in range(summed):
         frame = wp.uint64(first_frame[0]) + wp.uint64(row / pixels * summed + part)
         id = frame * wp.uint64(pixels) + wp.uint64(pixel)
-        block = wp.uint32(0)
-        left = int(pulses)  # pulses without a count so far
-        waiting = int(0)
-        wait = wp.float64(0.0)  # hazard, summed over the pulses left, up to the next count
+        draws = FirstPhotons()
+        draws.left = pulses
         for k in range(hazard.shape[1]):
-            h = wp.float64(hazard[pixel, k])
-            if h > wp.float64(0.0) and left > 0:
-                count = int(0)
-                if wp.float64(left) * h < _SPARSE:
-                    # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
-                    if waiting == 0:
-                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                        block = block + _ONE
-                        waiting = 1
-                    while left > 0 and wait < wp.float64(left) * h:
-                        h = h - wait / wp.float64(left)
-                        left = left - 1
-                        count = count + 1
-                        wait = _exponential(seed, id, PURPOSE_COUNTS, block)
-                        block = block + _ONE
-                    wait = wait - wp.float64(left) * h
-                else:
-                    # Exponential waits have no memory: the one begun may be dropped.
-                    waiting = 0
-                    count, block = binomial(left, h, seed, id, PURPOSE_COUNTS, block)
-                    left = left - count
-                if count > 0:
-                    counts[row, k] = counts[row, k] + wp.min(count, depth)
+            draws = draw_bin(draws, hazard[pixel, k], seed, id)
+            if draws.count > 0:
+                counts[row, k] = counts[row, k] + wp.min(draws.count, depth)
 
 
 def first_photon_counts(

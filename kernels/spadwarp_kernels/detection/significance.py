@@ -93,6 +93,77 @@ def _significance(
     return wp.max(-(log_p + wp.log(above + u * (either - above))) / _LN10, ZERO)
 
 
+@wp.struct
+class WindowSearch:
+    """The best window of the bins of a pixel that have been offered so far, one after the other."""
+
+    pulses: wp.float64  # of the histogram, see `DetectionTest`; 0: any number of counts
+    total: wp.float64  # counts of the pixel, where the level is not known
+    level: wp.float64  # of the background
+    before: wp.float64  # counts before the window
+    last_n: wp.float64  # counts and background of the half before, and of this one
+    last_b: wp.float64
+    own_n: wp.float64
+    own_b: wp.float64
+    best: wp.vec4d  # deviance, counts, mean, trials
+    window: int  # its first bin
+    state: wp.uint32  # hash of the counts
+
+
+@wp.func
+def begin_search(search: Windows, pixel: int) -> WindowSearch:
+    """The search in the bins from `search.first` on, with a known level."""
+    s = WindowSearch()
+    s.pulses = search.pulses
+    s.level = ONE
+    s.best = wp.vec4d(ZERO, ZERO, ONE, ONE)
+    s.window = search.first
+    s.state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
+    return s
+
+
+@wp.func
+def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, background: float) -> WindowSearch:
+    """The next bin, k in [first, stop), of a pixel; at the end of a half the window that it closes is looked at."""
+    if count > wp.int64(0):
+        s.own_n += wp.float64(count)
+        s.state = (((s.state ^ wp.uint32(k)) * _HASH_FACTOR) ^ wp.uint32(count)) * _HASH_FACTOR
+    s.own_b += wp.float64(background)
+    m = (k - search.first) / search.half_width
+    start = search.first + m * search.half_width
+    if k + 1 == wp.min(start + search.half_width, search.stop):
+        n = s.last_n + s.own_n
+        mean = wp.max((s.last_b + s.own_b) * s.level, _LEAST)
+        trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
+        if s.pulses > ZERO:
+            trials = wp.max(s.pulses - s.before, n)
+            mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
+        # The deviance is at most the square of the excess over the variance: most windows end here.
+        single = search.stop - search.first <= search.half_width
+        if (m > 0 or single) and n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials):
+            value = _deviance(n, mean, trials)
+            if value > s.best[0]:
+                s.best = wp.vec4d(value, n, mean, trials)
+                s.window = wp.max(start - search.half_width, search.first)
+        s.before += s.last_n
+        s.last_n = s.own_n
+        s.last_b = s.own_b
+        s.own_n = ZERO
+        s.own_b = ZERO
+    return s
+
+
+@wp.func
+def significance_of(search: Windows, s: WindowSearch) -> float:
+    """Of the best window of all."""
+    if s.best[0] <= ZERO:
+        return 0.0
+    halves = (search.stop - search.first + search.half_width - 1) / search.half_width
+    number = wp.float64(wp.max(halves - 1, 1))
+    u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(s.state)))))
+    return float(_significance(s.best[1], s.best[2], s.best[3], number, u, search.level_known))
+
+
 @memoised
 def _significance_kernel(dtype: Any) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
@@ -107,52 +178,19 @@ def _significance_kernel(dtype: Any) -> wp.Kernel:
         pixel = first_pixel + wp.tid()
         background = search.background[pixel % search.background.shape[0]]
         last_column = background.shape[0] - 1
-        before = ZERO  # counts before the window
+        s = begin_search(search, pixel)
         for k in range(wp.where(search.pulses > ZERO, search.first, 0)):
-            before += wp.float64(counts[pixel, k])
-        total = ZERO
-        level = ONE
+            s.before += wp.float64(counts[pixel, k])
         if not search.level_known:
+            level = ZERO
             for k in range(search.first, search.stop):
-                total += wp.float64(counts[pixel, k])
+                s.total += wp.float64(counts[pixel, k])
                 level += wp.float64(background[wp.min(k, last_column)])
-            level = total / wp.max(level - ONE, _LEAST)
-        state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
-        halves = (search.stop - search.first + search.half_width - 1) / search.half_width
-        last_n = ZERO
-        last_b = ZERO
-        best = wp.vec4d(ZERO, ZERO, ONE, ONE)  # deviance, counts, mean, trials
-        window[pixel] = search.first
-        for m in range(halves):
-            start = search.first + m * search.half_width
-            n = last_n
-            own = ZERO
-            b = ZERO
-            for k in range(start, wp.min(start + search.half_width, search.stop)):
-                if counts[pixel, k] > counts.dtype(0):
-                    own += wp.float64(counts[pixel, k])
-                    state = (((state ^ wp.uint32(k)) * _HASH_FACTOR) ^ wp.uint32(counts[pixel, k])) * _HASH_FACTOR
-                b += wp.float64(background[wp.min(k, last_column)])
-            n += own
-            mean = wp.max((last_b + b) * level, _LEAST)
-            trials = wp.where(search.level_known, _MANY * (n + mean), total)
-            if search.pulses > ZERO:
-                trials = wp.max(search.pulses - before, n)
-                mean = wp.max(trials * one_minus_exp(mean / search.pulses), _LEAST)
-            # The deviance is at most the square of the excess over the variance: most windows end here.
-            if (m > 0 or halves == 1) and n > mean and (n - mean) * (n - mean) > best[0] * mean * (ONE - mean / trials):
-                value = _deviance(n, mean, trials)
-                if value > best[0]:
-                    best = wp.vec4d(value, n, mean, trials)
-                    window[pixel] = wp.max(start - search.half_width, search.first)
-            before += last_n
-            last_n = own
-            last_b = b
-        significance[pixel] = 0.0
-        if best[0] > ZERO:
-            number = wp.float64(wp.max(halves - 1, 1))
-            u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(state)))))
-            significance[pixel] = float(_significance(best[1], best[2], best[3], number, u, search.level_known))
+            s.level = s.total / wp.max(level, _LEAST)
+        for k in range(search.first, search.stop):
+            s = offer_bin(search, s, k, wp.int64(counts[pixel, k]), background[wp.min(k, last_column)])
+        window[pixel] = s.window
+        significance[pixel] = significance_of(search, s)
 
     return significance_kernel
 
@@ -189,7 +227,7 @@ class DetectionTest:
         stop: int | None = None,
     ) -> None:
         self.device, self.bins = wp.get_device(device), check_integer("bins", bins, 0)
-        self._windows = windows = Windows()
+        self.windows = windows = Windows()
         windows.first = check_integer("first", first, 0, bins)
         windows.stop = bins if stop is None else check_integer("stop", stop, first, bins)
         windows.half_width = self.half_width = max(1, math.ceil(0.75 * check_number("width", width, "[0, 1e6]")))
@@ -209,5 +247,5 @@ class DetectionTest:
         shape = (counts.shape[0],)
         check_array("significance", significance, wp.float32, shape, self.device)
         check_array("window", window, wp.int32, shape, self.device)
-        inputs = [counts, self._windows, significance, window]
+        inputs = [counts, self.windows, significance, window]
         launch_pixels(_significance_kernel(counts.dtype), shape[0], inputs, device=self.device)

@@ -3,17 +3,25 @@
 Image coordinates are in pixels, (0.5, 0.5) is the first pixel's centre. Tangents are x/z and y/z of a direction.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_fields, check_integer, check_number, check_struct
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_fields,
+    check_integer,
+    check_number,
+    check_struct,
+    check_vector,
+)
 from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
 
-__all__ = ["C0", "CALIBRATED", "PLAIN", "Camera", "Gate", "Lens"]
+__all__ = ["C0", "CALIBRATED", "PLAIN", "Camera", "Gate", "Lens", "make_camera", "make_gate"]
 
 
 @wp.struct
@@ -222,6 +230,72 @@ class Gate:
     stop: float  # path at which it ends [m], before the last bin does if histories may not be as long
     bins_per_metre: float  # 1/w [1/m]
     bins: int  # number of bins
+
+
+def make_camera(
+    width: int,
+    height: int,
+    pixel_tangent: float,
+    *,
+    aperture_radius: float = 0.0,
+    aperture_area: float | None = None,
+    focus: float = math.inf,
+) -> Camera:
+    """A camera whose numbers fit each other, see `Camera`.
+
+    Args:
+        width, height: Of the image [pixels].
+        pixel_tangent: Pixel pitch over focal length, such as 2 tan(fov / 2) / width.
+        aperture_radius: Of the lens [m]; 0 images all depths sharply, and needs `aperture_area`.
+        aperture_area: That collects light [m^2]; by default, and within 1 % of it, that of the radius.
+        focus: Depth that is imaged sharply [m].
+
+    Raises:
+        ArgumentError: A number out of range, or an area that is not that of the radius.
+    """
+    camera = Camera()
+    camera.width, camera.height = check_integer("width", width, 1), check_integer("height", height, 1)
+    camera.pixel_tangent = check_number("pixel_tangent", pixel_tangent, "(0, inf)")
+    radius = check_number("aperture_radius", aperture_radius, "[0, inf)")
+    area = check_number("aperture_area", math.pi * radius**2 if aperture_area is None else aperture_area, "[0, inf)")
+    if radius > 0.0 and abs(area - math.pi * radius**2) > 0.01 * math.pi * radius**2:
+        disc = f"that of aperture_radius = {radius} m is {math.pi * radius**2:.4g} m^2"
+        raise ArgumentError(f"aperture_area = {area} m^2, and {disc}; a lens of another area has aperture_radius = 0")
+    if area == 0.0:
+        raise ArgumentError("aperture_radius = 0 needs aperture_area [m^2]: a camera of no area sees nothing")
+    camera.aperture_radius, camera.aperture_area = radius, area
+    camera.inverse_focus = 0.0 if focus == math.inf else 1.0 / check_number("focus", focus, "(0, inf)")
+    return camera
+
+
+def make_gate(
+    bins: int,
+    *,
+    one_way_metres: tuple[float, float] | None = None,
+    two_way_seconds: tuple[float, float] | None = None,
+    group_index: float | None = None,
+) -> Gate:
+    """A gate of equal bins between distances from the camera, or between times of flight there and back.
+
+    Args:
+        bins: Their number.
+        one_way_metres: Distances at which it opens and closes [m].
+        two_way_seconds: In their place, times after the pulse [s], with the `group_index` of the water.
+
+    Raises:
+        ArgumentError: A number out of range, or both or neither of the two.
+    """
+    if (one_way_metres is None) == (two_way_seconds is None) or (two_way_seconds is None) != (group_index is None):
+        raise ArgumentError("one_way_metres, or two_way_seconds and group_index: one of the two is needed")
+    name, ends = ("one_way_metres", one_way_metres) if one_way_metres else ("two_way_seconds", two_way_seconds)
+    check_vector(name, ends, size=2)
+    scale = 2.0 if group_index is None else C0 / check_number("group_index", group_index, "[1, inf)")
+    start = check_number(f"{name}[0]", ends[0], "[0, inf)")
+    stop = check_number(f"{name}[1]", ends[1], f"({start}, inf)")
+    gate = Gate()
+    gate.bins = check_integer("bins", bins, 1)
+    gate.start, gate.stop, gate.bins_per_metre = scale * start, scale * stop, gate.bins / (scale * (stop - start))
+    return gate
 
 
 BEFORE = wp.constant(-1)

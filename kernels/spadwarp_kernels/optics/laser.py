@@ -1,19 +1,21 @@
 """The pulsed laser: where photons start and where they go."""
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_numbers
+from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_number, check_numbers, check_vector
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
 
 from .port import Port, PortKind
 
-__all__ = ["LASER_PROFILES", "Laser", "Scan", "emit_photon", "profile_tables"]
+__all__ = ["LASER_PROFILES", "Laser", "Scan", "emit_photon", "make_laser", "profile_tables"]
 
 LASER_PROFILES = ("uniform_cone", "gaussian", "collimated")
 
@@ -36,6 +38,49 @@ class Laser:
     port: Port
     """What is between the laser and the water, in the frame of the camera, see `make_flat_port`; read by specs with a
     port of the laser alone."""
+
+
+def make_laser(
+    profile: str,
+    *,
+    half_angle: float | None = None,
+    radius: float | None = None,
+    position: Sequence[float] = (0.0, 0.0, 0.0),
+    axis: Sequence[float] = (0.0, 0.0, 1.0),
+) -> Laser:
+    """A laser of one of LASER_PROFILES, in camera coordinates.
+
+    Args:
+        profile: "uniform_cone", "gaussian" or "collimated".
+        half_angle: Of the cone [rad], up to π, or at which a gaussian beam has 1/e^2 of its irradiance, below π / 2.
+        radius: Of a collimated beam [m]; 0 is a pencil beam.
+        position: Of its exit pupil [m].
+        axis: Of the beam, of any length but 0.
+
+    Raises:
+        ArgumentError: A number out of range, or one that the profile does not have.
+    """
+    check_choice("profile", profile, LASER_PROFILES)
+    needed, other = ("radius", half_angle) if profile == "collimated" else ("half_angle", radius)
+    value = {"radius": radius, "half_angle": half_angle}[needed]
+    if value is None or other is not None:
+        raise ArgumentError(f"profile = {profile!r} needs {needed}, and that alone")
+    interval = {"uniform_cone": "(0, 3.1416]", "gaussian": "(0, 1.57]", "collimated": "[0, inf)"}[profile]
+    value = check_number(needed, value, interval)
+    check_vector("position", position)
+    check_vector("axis", axis)
+    length = math.hypot(*axis)
+    check_number("length of axis", length, "(0, inf)")
+    laser = Laser()
+    laser.position, laser.axis = wp.vec3(*position), wp.vec3(*(x / length for x in axis))
+    laser.profile = LASER_PROFILES.index(profile)
+    if profile == "collimated":
+        laser.radius = value
+    elif profile == "gaussian":
+        laser.tan2 = math.tan(value) ** 2
+    else:
+        laser.spread = 2.0 * math.sin(0.5 * min(value, math.pi)) ** 2
+    return laser
 
 
 @wp.func

@@ -49,8 +49,8 @@ class TransportSpec(NamedTuple):
     stepped: bool = False
     """Photons are numbered from `data.offset[0]` on, which is on the device: a captured launch can draw new ones."""
     merged: bool = False
-    """The tally is [pixel, bin], for the light of all components together. The ledger's counts of what is below one
-    unit do not tell components then."""
+    """The tally is [2, pixel, bin], of light that has met a surface, and of backscatter. The ledger's counts of what is
+    below one unit do not tell components then."""
     port: PortKind | None = None
     """What the camera looks through, FLAT_PORT or DOME_PORT, as `Camera.port` describes it; None: it is in the
     water."""

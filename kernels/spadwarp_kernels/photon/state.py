@@ -303,10 +303,13 @@ def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: 
     return (component * camera.width * camera.height + pixel) * gate.bins + k
 
 
+BACKSCATTER = wp.constant(COMPONENTS.index("backscatter"))
+
+
 @wp.func
 def merged_index(camera: Camera, gate: Gate, pixel: int, path: float, component: int) -> int:
-    """`tally_index` for the light of all components together."""
-    return tally_index(camera, gate, pixel, path, 0)
+    """`tally_index` for a tally [2, pixel, bin] of light that has met a surface, and of backscatter."""
+    return tally_index(camera, gate, pixel, path, component / BACKSCATTER)
 
 
 @wp.func

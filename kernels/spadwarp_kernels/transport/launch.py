@@ -321,7 +321,7 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, photon_count: int
     def check(name: str, dtype: type, size: int | None) -> None:
         check_array(f"data.{name}", getattr(data, name), dtype, (size,), device, contiguous=True)
 
-    bins = model.tally_size // len(COMPONENTS) if spec.merged else model.tally_size
+    bins = 2 * model.tally_size // len(COMPONENTS) if spec.merged else model.tally_size
     check("tally", wp.int64, check_integer("bins of the tally", bins, 1) if scores else None)
     signed = spec.signed + len(spec.blocks) * model.derivatives.blocks.count if scores else 0
     if signed or data.gradients is not None:

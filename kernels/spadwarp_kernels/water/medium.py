@@ -24,7 +24,7 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
-__all__ = ["Grid", "Layers", "Medium", "free_path", "make_layers"]
+__all__ = ["Grid", "Layers", "Medium", "free_path", "make_layers", "make_medium"]
 
 
 @wp.struct
@@ -39,6 +39,21 @@ class Medium:
     functions of your own that the transport kernel calls then see 2."""
     per_bit: float  # -ln(2)/c [m], 0 in vacuum; filled by `launch_transport`
     phase: DensityTables  # of the phase function TABULATED, from `make_phase_tables`; left alone otherwise
+
+
+def make_medium(absorption: float, scattering: float, *, anisotropy: float = 0.0) -> Medium:
+    """Water from its coefficients [1/m], 0 or more, with the mean cosine g of its phase function in (-1, 1).
+
+    Raises:
+        ArgumentError: A number out of range.
+    """
+    medium = Medium()
+    absorption = check_number("absorption", absorption, "[0, inf)")
+    scattering = check_number("scattering", scattering, "[0, inf)")
+    medium.extinction = absorption + scattering
+    medium.albedo = scattering / medium.extinction if medium.extinction > 0.0 else 0.0
+    medium.anisotropy, medium.axis_threshold = check_number("anisotropy", anisotropy, "(-1, 1)"), 1.0
+    return medium
 
 
 def ready_medium(copy: Medium, medium: Medium) -> None:

@@ -4,7 +4,7 @@ Shapes other than meshes are met in closed form, in their own frame: centred at 
 MuJoCo. Surfaces have two sides.
 """
 
-import gc
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ import warp as wp
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
+    check_choice,
     check_device,
     check_integer,
     check_items,
@@ -24,11 +25,23 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.surface.mesh import Textures, no_textures
 from spadwarp_kernels.surface.reflectance import texture_at
 
-__all__ = ["SHAPE_KINDS", "Shapes", "make_shapes"]
+__all__ = ["CAMERA_FRAMES", "SHAPE_KINDS", "Shapes", "make_shapes"]
 
 wp.set_module_options({"enable_backward": False})
 
 SHAPE_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "cone", "mesh")
+CAMERA_FRAMES = {
+    "optical": (0.0, 0.0, 0.0, 1.0),
+    "opengl": (1.0, 0.0, 0.0, 0.0),
+    "forward_left_up": (-0.5, 0.5, -0.5, 0.5),
+}
+"""Conventions of a camera's pose, and the rotation (x, y, z, w) that takes the optical frame there.
+
+``optical``: +x right, +y down, +z forward (OpenCV; ROS, REP 103, `_optical` frames; Isaac Lab's "ros"). ``opengl``: +x
+right, +y up, -z forward (OpenGL, USD, Newton, MuJoCo; Isaac Lab's "opengl"). ``forward_left_up``: +x forward, +y left,
++z up (ROS, REP 103, bodies; Isaac Lab's "world").
+"""
+
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, CONE, MESH = (wp.constant(i) for i in range(len(SHAPE_KINDS)))
 
 # Components of a size that say something; those of a mesh may be negative, which mirrors it.
@@ -69,6 +82,7 @@ class Shapes:
     device: wp.Device  # Warp device of the arrays
     meshes: tuple[wp.Mesh, ...] = ()  # meshes that are kept alive with the shapes
     bodies: int = 0  # number of poses that `move_shapes` needs
+    frame: str | None = None  # the simulator's convention of camera poses, one of CAMERA_FRAMES; None: none is known
 
     def __len__(self) -> int:
         return int(self.table.kind.size)
@@ -81,12 +95,14 @@ def make_shapes(
     body: Any = None,
     local: Any = None,
     mesh: Any = None,
+    meshes: Iterable[wp.Mesh] = (),
     reflectance: Any = 0.2,
     world: Any = None,
     worlds: int = 1,
     visible: Any = None,
     first_face: Any = None,
     textures: "Textures | None" = None,
+    frame: str | None = None,
     device: wp.DeviceLike = None,
 ) -> Shapes:
     """Shapes from arrays `[shapes]` of NumPy, lists, or Warp arrays, which are kept and not copied.
@@ -96,13 +112,15 @@ def make_shapes(
         size: [m], see `ShapeTable`.
         body: -1, the default, stands still in its world.
         local: Poses on the bodies (x, y, z, qx, qy, qz, qw).
-        mesh: `wp.Mesh` objects, or ids of such; None or 0 for the other kinds. The shapes keep them alive.
+        mesh: `wp.Mesh` objects, or ids of those in `meshes`; None or 0 for the other kinds.
+        meshes: `wp.Mesh` objects whose ids are in `mesh`. The shapes keep those alive that they use.
         reflectance: A number, or one for each shape.
         world: Index of the world of each shape, -1 for a shape that stands in all; read once, on the host. By default
             all stand in world 0, or in all worlds if there are several.
         worlds: Number of worlds.
         visible: Whether cameras see a shape; all by default. Read once, as `world`.
         first_face, textures: See `ShapeTable`.
+        frame: The simulator's convention of camera poses, one of CAMERA_FRAMES; cameras then need not be told.
         device: Where the arrays are.
 
     Raises:
@@ -110,6 +128,8 @@ def make_shapes(
             there is not.
     """
     device = check_device("device", device)
+    if frame is not None:
+        check_choice("frame", frame, CAMERA_FRAMES)
     worlds = check_integer("worlds", worlds, 1, 1 << 24)
     if not isinstance(kind, wp.array):
         kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in check_items("kind", kind)])
@@ -117,10 +137,10 @@ def make_shapes(
             names = ", ".join(SHAPE_KINDS)
             raise ArgumentError(f"kind = {kind.tolist()} is not a list of {names}, or of their indices")
     count = kind.shape[0]
-    meshes: tuple[wp.Mesh, ...] = ()
+    given = {one.id: one for one in check_items("meshes", meshes)}
     if mesh is not None and not isinstance(mesh, wp.array):
         mesh = check_items("mesh", mesh)
-        meshes = tuple(one for one in mesh if isinstance(one, wp.Mesh))
+        given |= {one.id: one for one in mesh if isinstance(one, wp.Mesh)}
         mesh = [one.id if isinstance(one, wp.Mesh) else check_integer("mesh", one or 0, 0, 2**64 - 1) for one in mesh]
     table = ShapeTable()
     defaults = {"body": -1, "local": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "mesh": 0, "first_face": -1}
@@ -138,12 +158,12 @@ def make_shapes(
         kind_given = f"{visible.dtype} of shape {visible.shape}"
         raise ArgumentError(f"visible is {kind_given}; true or false for each of {count} shapes is needed")
     seen = np.flatnonzero(np.broadcast_to(visible, (count,)))
-    meshes = _check_shapes(table, seen, meshes)
+    used = _check_shapes(table, seen, given)
     slot = np.where(world < 0, worlds, world)[seen]
     table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
     table.first = wp.array(np.searchsorted(np.sort(slot), np.arange(worlds + 2)), dtype=int, device=device)
     table.pose = wp.clone(table.local)
-    return Shapes(table, worlds, device, meshes, int(table.body.numpy().max()) + 1)
+    return Shapes(table, worlds, device, used, int(table.body.numpy().max()) + 1, frame)
 
 
 def _column(name: str, value: Any, count: int, device: wp.Device) -> wp.array:
@@ -188,8 +208,8 @@ def check_poses(name: str, poses: wp.array, count: int | None = None) -> None:
         )
 
 
-def _check_shapes(table: ShapeTable, seen: np.ndarray, given: tuple[wp.Mesh, ...]) -> tuple[wp.Mesh, ...]:
-    """Shapes that are in range; returns the meshes that they use, as far as they can be found by their ids."""
+def _check_shapes(table: ShapeTable, seen: np.ndarray, given: dict[int, wp.Mesh]) -> tuple[wp.Mesh, ...]:
+    """Shapes that are in range; returns the meshes that they use."""
     ranges = {"kind": f"[0, {len(SHAPE_KINDS) - 1}]", "reflectance": "[0, 1]", "body": "[-1, 2147483647]"}
     for name, interval in ranges.items():
         check_values(name, getattr(table, name), interval)
@@ -203,28 +223,21 @@ def _check_shapes(table: ShapeTable, seen: np.ndarray, given: tuple[wp.Mesh, ...
         )
     meshed = np.flatnonzero(kind == MESH)
     ids = table.mesh.numpy()[meshed].tolist()
-    known = {one.id: one for one in given}
-    if not set(ids) <= set(known):
-        # All meshes of this process: an id of none is a pointer to anything.
-        live = (one for one in gc.get_objects() if issubclass(type(one), wp.Mesh))
-        known |= {one.id: one for one in live if getattr(one, "id", None)}
-    faces = {mesh: _checked_faces(int(meshed[ids.index(mesh)]), mesh, known.get(mesh)) for mesh in dict.fromkeys(ids)}
+    faces = {mesh: _checked_faces(int(meshed[ids.index(mesh)]), mesh, given.get(mesh)) for mesh in dict.fromkeys(ids)}
     first, rows = table.first_face.numpy(), table.textures.face.size
     for k, mesh in zip(meshed, ids, strict=True):
         if first[k] >= 0 and first[k] + faces[mesh] > rows:
             reach = f"{faces[mesh]} faces of mesh[{k}] reach beyond the {rows} faces of textures"
             raise ArgumentError(f"first_face[{k}] = {first[k]} and {reach}")
-    return tuple(known[mesh] for mesh in faces if mesh in known)
+    return tuple(given[mesh] for mesh in faces)
 
 
 def _checked_faces(k: int, id: int, mesh: wp.Mesh | None) -> int:
-    """Number of the faces of a shape's mesh, whose indices are in range; 1 where it is not found."""
+    """Number of the faces of a shape's mesh, whose indices are in range."""
     if id == 0:
         raise ArgumentError(f"kind[{k}] is a mesh and mesh[{k}] = 0 is none")
     if mesh is None:
-        if gc.get_freeze_count():  # some objects are not listed
-            return 1
-        raise ArgumentError(f"mesh[{k}] is not the id of a wp.Mesh that exists; keep the wp.Mesh, or give it instead")
+        raise ArgumentError(f"mesh[{k}] is not the id of a wp.Mesh in meshes; give the wp.Mesh itself, or it in meshes")
     check_values(f"mesh[{k}].indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
     return mesh.indices.size // 3
 

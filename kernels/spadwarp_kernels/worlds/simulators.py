@@ -34,7 +34,7 @@ def newton_shapes(model: Any, *, reflectance: Any = None) -> Shapes:
     """The visible shapes of a finalised `newton.Model`, in all its worlds.
 
     Sizes, poses on bodies and meshes are the model's own arrays: what changes there is seen. Cameras are then updated
-    with `state.body_q`, and their poses are in the frame "opengl".
+    with `state.body_q`, and their poses are in the frame "opengl", which the shapes carry.
 
     Args:
         model: `newton.Model`.
@@ -61,12 +61,21 @@ def newton_shapes(model: Any, *, reflectance: Any = None) -> Shapes:
         body=model.shape_body,
         local=model.shape_transform,
         mesh=model.shape_source_ptr,
+        meshes=_meshes_of(model),
         reflectance=reflectance,
         world=model.shape_world.numpy(),
         worlds=max(int(model.world_count), 1),
         visible=visible,
+        frame="opengl",
         device=model.device,
     )
+
+
+def _meshes_of(model: Any) -> list[wp.Mesh]:
+    """The meshes that a finalised model of Newton keeps in its lists, those of height fields too, and its shapes'."""
+    lists = [value for value in vars(model).values() if isinstance(value, (list, tuple))]
+    sources = [getattr(one, "mesh", None) for one in model.shape_source]
+    return [one for value in [*lists, sources] for one in value if isinstance(one, wp.Mesh)]
 
 
 def mujoco_shapes(
@@ -115,6 +124,7 @@ def mujoco_shapes(
         world=np.repeat(np.arange(worlds), count),
         worlds=worlds,
         visible=np.tile(np.isin(model.geom_group, list(groups)) & (rgba[:, 3] > 0.0), worlds),
+        frame="opengl",
         device=device,
     )
 

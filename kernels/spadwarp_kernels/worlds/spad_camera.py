@@ -1,5 +1,5 @@
-"""Single-photon cameras in water, in many worlds: their configuration, what both kinds share, and the fast one, in
-closed form: one surface and single scattering a pixel, for all worlds in one launch.
+"""Single-photon cameras in water, in many worlds: what both kinds share, and the fast one, in closed form: one surface
+and single scattering a pixel, for all worlds in one launch.
 
 Everything that stands in a camera here (laser, normals, points) is in the optical frame; poses are given in the frame
 that the caller's simulator uses.
@@ -8,56 +8,51 @@ that the caller's simulator uses.
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from spadwarp_kernels.analytic.depth_frames import depth_of_path
-from spadwarp_kernels.analytic.optics import BACKSCATTER_SOURCES, IN_WATER, Lidar, beam_path
-from spadwarp_kernels.analytic.rates import Scattering, make_scattering, radiometric_signal, single_scatter_rate
+from spadwarp_kernels.analytic.optics import IN_WATER, Lidar, beam_path
+from spadwarp_kernels.analytic.rates import radiometric_signal
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_choice,
     check_device,
-    check_fields,
     check_integer,
     check_items,
     check_kind,
     check_number,
-    check_vector,
+    check_numbers,
 )
-from spadwarp_kernels.base.kernels import launch_pixels
-from spadwarp_kernels.detection.arrival_time import PHASES, ArrivalEstimator
-from spadwarp_kernels.detection.counts import first_photon_counts
-from spadwarp_kernels.detection.significance import MIN_SIGNIFICANCE
-from spadwarp_kernels.optics.camera import C0
-from spadwarp_kernels.optics.laser import LASER_PROFILES
-from spadwarp_kernels.water.phase_functions import henyey_greenstein_density
+from spadwarp_kernels.base.kernels import launch_pixels, memoised
+from spadwarp_kernels.detection.arrival_time import ArrivalEstimator
+from spadwarp_kernels.detection.counts import FirstPhotons, draw_bin
+from spadwarp_kernels.detection.significance import Windows, begin_search, offer_bin, significance_of
 
-from .shapes import Shapes, ShapeTable, check_poses, intersect_shapes, move_shapes
+from .shapes import CAMERA_FRAMES, Shapes, ShapeTable, check_poses, intersect_shapes, move_shapes
+from .spad_config import SpadConfig, WorldValues, scattering_table, world_value, world_values
 
-__all__ = ["CAMERA_FRAMES", "SpadCamera", "SpadConfig"]
+__all__ = ["CAMERA_OUTPUTS", "CAMERA_STATUS", "SpadCamera"]
 
 # Unrolled loops would make the compilation for a GPU take a minute.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
+CAMERA_OUTPUTS = ("rates", "histogram", "depth")
+"""Outputs that a caller chooses: those with bins need memory, and a depth needs an estimate."""
+
+CAMERA_STATUS = ("target", "no_return", "saturated", "outside_gate")
+"""Words for the numbers of a camera's `status`."""
+TARGET, NO_RETURN, SATURATED, OUTSIDE_GATE = (wp.constant(i) for i in range(len(CAMERA_STATUS)))
+
+# Part of the pulses that count at which a pixel is saturated: three mean photons a pulse.
+_SATURATION = wp.constant(0.95)
+
+_ROWS = 1 << 18  # pixels that are drawn side by side: enough for a GPU, and 270 MB of counts of 256 bins
+
 _see = IN_WATER.see
-
-PLANCK = 6.62607015e-34  # [J s]
-
-CAMERA_FRAMES = {
-    "optical": (0.0, 0.0, 0.0, 1.0),
-    "opengl": (1.0, 0.0, 0.0, 0.0),
-    "forward_left_up": (-0.5, 0.5, -0.5, 0.5),
-}
-"""Conventions of a camera's pose, and the rotation (x, y, z, w) that takes the optical frame there.
-
-``optical``: +x right, +y down, +z forward (OpenCV; ROS, REP 103, `_optical` frames). ``opengl``: +x right, +y up, -z
-forward (OpenGL, USD, Newton, MuJoCo). ``forward_left_up``: +x forward, +y left, +z up (ROS, REP 103, bodies).
-"""
 
 
 def optical_to(frame: Any) -> wp.transform:
@@ -66,207 +61,35 @@ def optical_to(frame: Any) -> wp.transform:
     return wp.transform(wp.vec3(0.0), wp.quat(*CAMERA_FRAMES[frame]))
 
 
-_RANGES = {
-    "horizontal_fov": "(0, 3.1)",
-    "pulse_energy": "[0, 1e6]",
-    "wavelength": "(0, 1]",
-    "pde": "[0, 1]",
-    "dark_rate": "[0, inf)",
-    "timing_sigma": "(0, inf)",
-    "aperture_radius": "(0, inf)",
-    "absorption": "[0, inf)",
-    "scattering": "[0, inf)",
-    "anisotropy": "(-1, 1)",
-    "group_index": "[1, inf)",
-    "nearest": "(0, inf)",
-    "min_significance": "[0, 1e6]",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class SpadConfig:
-    """A pulsed laser beside a SPAD array in water: what `SpadCamera` and `SpadTracer` take.
-
-    Raises:
-        ArgumentError: A number out of range.
-    """
-
-    width: int = 160  # of the image [pixels]
-    height: int = 120  # of the image [pixels]
-    horizontal_fov: float = 1.2
-    """Full angle [rad]; pixels are square. See `vertical_fov` for that of Newton and MuJoCo."""
-    bins: int = 256  # time bins of a histogram
-    gate: tuple[float, float] = (0.5, 10.0)  # what is recorded, as distance in this water along the optical axis [m]
-    pulses: int = 20_000  # of a frame
-    pulse_energy: float = 2e-9  # [J]
-    wavelength: float = 532e-9  # [m]
-    pde: float = 0.25  # photon detection efficiency, PDP times fill factor
-    dark_rate: float = 1000.0  # dark counts and ambient light of a pixel [1/s]
-    timing_sigma: float = 200e-12  # standard deviation of pulse and timing jitter together [s]
-    aperture_radius: float = 0.01  # [m]
-    laser_position: tuple[float, float, float] = (0.05, 0.0, 0.0)
-    """In the optical frame [m]: +x right, +y down, +z forward. The beam goes along +z."""
-    laser_half_angle: float | None = None  # of its uniform cone [rad]; None covers the corners of the image
-    absorption: float = 0.1  # of the water [1/m]; 0 in air
-    scattering: float = 0.2  # of the water [1/m]; 0 in air
-    anisotropy: float = 0.924  # g of its Henyey–Greenstein phase function
-    group_index: float = 1.3638  # c0 over the group velocity
-    nearest: float = 0.05  # distance below which the water's backscatter is left out [m]
-    method: str = "centroid"
-    """Of the depth: "centroid", "peak", "matched" or "likelihood", see `arrival_bins`. The expected counts of an image
-    without targets are taken as known background."""
-    min_significance: float = MIN_SIGNIFICANCE
-    """Of a pixel that has a depth, −log10 of the probability that background alone looks like it, see `DetectionTest`.
-    0: every pixel reports."""
-    seed: int = 1  # 64-bit
-
-    def __post_init__(self) -> None:
-        for name in ("width", "height", "bins"):
-            check_integer(f"config.{name}", getattr(self, name), 1)
-        check_integer("config.pulses", self.pulses, 0)
-        check_fields("config", self, _RANGES)
-        check_vector("config.gate", self.gate, size=2)
-        check_number("config.gate[0]", self.gate[0], "[0, inf)")
-        check_number("config.gate[1]", self.gate[1], f"({float(self.gate[0])}, inf)")
-        check_vector("config.laser_position", self.laser_position)
-        if self.laser_half_angle is not None:
-            check_number("config.laser_half_angle", self.laser_half_angle, "(0, 3.1416]")
-        check_choice("config.method", self.method, ("centroid", "peak", "matched", "likelihood"))
-        check_integer("config.seed", self.seed, 0, 2**64 - 1)
-        if (bins := self._sigma_bins) > 1e4:
-            width = f"bins of {self.bin_path / self.speed:.3g} s"
-            raise ArgumentError(
-                f"config.timing_sigma = {self.timing_sigma} s is {bins:.3g} {width}; 10000 are possible"
-            )
-
-    @property
-    def pixel_tangent(self) -> float:
-        """Pixel pitch over focal length."""
-        return 2.0 * math.tan(0.5 * self.horizontal_fov) / self.width
-
-    @property
-    def vertical_fov(self) -> float:
-        """Full angle [rad]."""
-        return 2.0 * math.atan(0.5 * self.height * self.pixel_tangent)
-
-    @property
-    def speed(self) -> float:
-        """Group velocity [m/s]."""
-        return C0 / self.group_index
-
-    @property
-    def gate_paths(self) -> tuple[float, float]:
-        """Paths from the laser to the lens at which the gate opens and closes [m]."""
-        return 2.0 * float(self.gate[0]), 2.0 * float(self.gate[1])
-
-    @property
-    def bin_path(self) -> float:
-        """Width of a bin [m of path]."""
-        start, stop = self.gate_paths
-        return (stop - start) / self.bins
-
-    @property
-    def _sigma_bins(self) -> float:
-        return self.timing_sigma * self.speed / self.bin_path
-
-    @property
-    def half_angle(self) -> float:
-        """Of the laser's cone [rad]."""
-        if self.laser_half_angle is not None:
-            return float(self.laser_half_angle)
-        corner = 0.5 * self.pixel_tangent * math.hypot(self.width, self.height)
-        return min(1.1 * math.atan(corner), 0.5 * math.pi)
-
-    @property
-    def photons(self) -> float:
-        """Of a pulse."""
-        return self.pulse_energy * self.wavelength / (PLANCK * C0)
-
-    def lidar(self) -> Lidar:
-        """The struct of the analytic functions."""
-        lidar = Lidar()
-        lidar.photons, lidar.pde, lidar.dark = self.photons, self.pde, self.dark_rate
-        lidar.scattering, lidar.extinction = self.scattering, self.absorption + self.scattering
-        lidar.speed = self.speed
-        lidar.laser, lidar.axis = wp.vec3d(*self.laser_position), wp.vec3d(0.0, 0.0, 1.0)
-        lidar.profile, lidar.spread = LASER_PROFILES.index("uniform_cone"), 1.0 - math.cos(self.half_angle)
-        lidar.tan2 = math.tan(min(self.half_angle, 1.57)) ** 2
-        lidar.pixel_tangent, lidar.aperture_area = self.pixel_tangent, math.pi * self.aperture_radius**2
-        lidar.start, lidar.stop = (path / self.speed for path in self.gate_paths)
-        lidar.sigma = self.timing_sigma
-        lidar.source, lidar.nearest = BACKSCATTER_SOURCES.index("single_scatter"), self.nearest
-        return lidar
-
-    def lines_of_sight(self) -> np.ndarray:
-        """Unit vectors through the pixel centres in the optical frame, float64 `[height * width, 3]`."""
-        column = (np.arange(self.width) + 0.5 - 0.5 * self.width) * self.pixel_tangent
-        row = (np.arange(self.height) + 0.5 - 0.5 * self.height) * self.pixel_tangent
-        x, y = np.meshgrid(column, row)
-        view = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-        return view / np.linalg.norm(view, axis=1, keepdims=True)
-
-    def phase_table(self) -> np.ndarray:
-        """The phase function at 4097 angles uniform on [0, π] [1/sr]."""
-        return henyey_greenstein_density(1.0 - np.cos(np.linspace(0.0, np.pi, 4097)), self.anisotropy)
-
-    def response(self) -> tuple[np.ndarray, int]:
-        """The Gaussian response in bins for `arrival_bins`, `[PHASES, taps]`, and its lowest tap."""
-        sigma = self._sigma_bins
-        reach = math.ceil(5.0 * sigma) + 1
-        edges = np.arange(-reach, reach + 2)[None, :] - np.arange(int(PHASES))[:, None] / int(PHASES)
-        cumulative = 0.5 * (1.0 + np.vectorize(math.erf)(edges / (math.sqrt(2.0) * sigma)))
-        return np.diff(cumulative, axis=1), -reach
-
-    def bin_response(self, parts: int = 1) -> tuple[np.ndarray, int]:
-        """Shares in a bin of the light that is spread evenly over each of the parts of the bins about it.
-
-        Returns float64 `[taps]` and the first tap's part, counted from the first part of the bin.
-        """
-        sigma = self._sigma_bins
-        reach = math.ceil(5.0 * sigma)
-        edges = np.arange(-reach * parts, (reach + 1) * parts + 1) / parts
-        after, before = (np.array([_normal_integral((end - s) / sigma) for s in edges]) for end in (1.0, 0.0))
-        return -parts * sigma * np.diff(after - before), -reach * parts
-
-
-def _normal_integral(z: float) -> float:
-    """Integral of the normal distribution function up to z."""
-    return z * 0.5 * math.erfc(-z / math.sqrt(2.0)) + math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+# ---- Rays.
 
 
 @wp.kernel(enable_backward=False)
-def _backscatter_kernel(
-    first: int, lidar: Lidar, water: Scattering, view: wp.array[wp.vec3d], rates: wp.array2d[float]
+def _schedule_kernel(
+    world: wp.array[int], active: wp.array[wp.bool], dt: float, period: float, age: wp.array[float], due: wp.array[int]
 ):
-    """Mean over each bin of the single-scatter rate times its width. Launch: pixels."""
-    i = first + wp.tid()
-    bins = rates.shape[1]
-    width = (lidar.stop - lidar.start) / wp.float64(bins)
-    sight = _see(lidar.ports, view[i])
-    for k in range(bins):
-        total = wp.float64(0.0)
-        for n in range(4):
-            time = lidar.start + (wp.float64(k) + (wp.float64(n) + wp.float64(0.5)) / wp.float64(4.0)) * width
-            total += single_scatter_rate(lidar, water, sight, time)
-        rates[i, k] = float(total * width / wp.float64(4.0))
+    """Which cameras see at this step. Launch: cameras."""
+    v = wp.tid()
+    age[v] = age[v] + dt
+    w = world[v]
+    is_due = age[v] >= period
+    if active.shape[0] > 0:
+        is_due = is_due and w >= 0 and w < active.shape[0] and active[w]
+    due[v] = wp.where(is_due, 1, 0)
+    if is_due:
+        age[v] = 0.0
 
 
-def backscatter_rates(config: SpadConfig, device: wp.Device) -> np.ndarray:
-    """Detections of single scattering without a target, blurred by the response, per pulse and bin, float32 `[pixels,
-    bins]`; waits for the device."""
-    rates = wp.zeros((config.width * config.height, config.bins), dtype=float, device=device)
-    if config.scattering > 0.0:
-        phase = wp.array(config.phase_table(), dtype=wp.float64, device=device)
-        view = wp.array(config.lines_of_sight(), dtype=wp.vec3d, device=device)
-        lidar = config.lidar()
-        inputs = [lidar, make_scattering(lidar, phase, device), view, rates]
-        launch_pixels(_backscatter_kernel, rates.shape[0], inputs, device=device)
-    taps, lowest = config.bin_response()
-    padded = np.pad(rates.numpy(), ((0, 0), (-lowest, -lowest)))
-    return np.lib.stride_tricks.sliding_window_view(padded, taps.size, axis=1) @ taps.astype(np.float32)
-
-
-# ---- Both kinds of cameras.
+@wp.kernel(enable_backward=False)
+def _mount_kernel(
+    body: wp.array[int],
+    offset: wp.array[wp.transform],
+    body_q: wp.array[wp.transform],
+    camera_q: wp.array[wp.transform],
+):
+    """Launch: cameras."""
+    v = wp.tid()
+    camera_q[v] = wp.transform_multiply(body_q[body[v]], offset[v])
 
 
 @wp.kernel(enable_backward=False)
@@ -275,62 +98,288 @@ def _trace_kernel(
     camera_q: wp.array[wp.transform],
     optical: wp.transform,
     world: wp.array[int],
+    due: wp.array[int],
     view: wp.array[wp.vec3],
     # Out, [cameras, height, width]:
+    distance: wp.array3d[float],
     depth: wp.array3d[float],
     normal: wp.array3d[wp.vec3],
     reflectance: wp.array3d[float],
 ):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
+    if due[v] == 0:
+        return
     pose = wp.transform_multiply(camera_q[v], optical)
     u = view[i * depth.shape[2] + j]
     x = wp.transform_get_translation(pose)
     hit, hit_reflectance = intersect_shapes(shapes, world[v], x, wp.transform_vector(pose, u))
+    distance[v, i, j] = wp.NAN
     depth[v, i, j] = wp.NAN
     normal[v, i, j] = wp.vec3(wp.NAN)
     reflectance[v, i, j] = wp.NAN
     if hit.distance >= 0.0:
+        distance[v, i, j] = hit.distance
         depth[v, i, j] = hit.distance * u[2]
         normal[v, i, j] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), hit.normal)
         reflectance[v, i, j] = hit_reflectance
 
 
+# ---- Frames.
+
+
+@wp.struct
+class Sensor:
+    """What the frames of all cameras have in common."""
+
+    lidar: Lidar
+    values: WorldValues
+    world: wp.array[int]
+    due: wp.array[int]  # whether a camera sees at this step
+    step: wp.array[wp.int64]
+    view: wp.array[wp.vec3]  # unit vectors of the pixels in the optical frame
+    scans: bool  # each ray has the laser and the axis of a scanner, which turns with it
+    table: wp.array2d[float]  # see `scattering_table`; one row of a scanner's rays
+    gate_start: float  # [m of path]
+    bin_path: float  # [m of path]
+    sigma_path: float  # [m of path]
+    dark: float  # dark counts per pulse and bin
+    bins: int
+    pulse_energy: float  # [J]
+    pulses: int
+    seed: wp.uint64
+
+
+@wp.struct
+class PixelLight:
+    """What a pixel gets."""
+
+    signal: float  # of the surface, detections per pulse
+    path: float  # of its light [m], infinite where there is none
+    start: float  # at which the gate opens [m of path]
+    delay: float  # of the gate [bins]
+    water: float  # by which the table is multiplied
+    decay: float  # and by exp(-decay * path) [1/m]
+    dark: float  # per pulse and bin
+    row: int  # of the table
+
+
+@wp.func
+def _light(sensor: Sensor, pixel: int, world: int, distance: float, normal: wp.vec3, reflectance: float) -> PixelLight:
+    light = PixelLight()
+    lidar = sensor.lidar
+    values = sensor.values
+    scattering = world_value(values.scattering, world, float(lidar.scattering))
+    absorption = world_value(values.absorption, world, float(lidar.extinction - lidar.scattering))
+    light.decay = wp.where(
+        values.scattering.shape[0] + values.absorption.shape[0] > 0,
+        scattering + absorption - float(lidar.extinction),
+        0.0,
+    )
+    brightness = float(1.0)
+    if values.pulse_energy.shape[0] > 0:
+        brightness = world_value(values.pulse_energy, world, sensor.pulse_energy) / sensor.pulse_energy
+    light.water = brightness * scattering
+    light.dark = sensor.dark
+    if values.dark_rate.shape[0] > 0:
+        light.dark = world_value(values.dark_rate, world, 0.0) * sensor.bin_path / float(lidar.speed)
+    later = 2.0 * wp.max(world_value(values.gate_delay, world, 0.0), 0.0)
+    light.delay = later / sensor.bin_path
+    light.start = sensor.gate_start + later
+    light.row = pixel % sensor.table.shape[0]
+    light.path = wp.inf
+    if distance > 0.0:
+        u = wp.vec3d(sensor.view[pixel])
+        n = normal
+        if sensor.scans:
+            u = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+            n = wp.quat_rotate(wp.quat_between_vectors(sensor.view[pixel], wp.vec3(0.0, 0.0, 1.0)), normal)
+        r = wp.float64(distance)
+        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(n), wp.float64(reflectance))
+        light.path = float(beam_path(lidar, r * u) + r)
+        if value > wp.float64(0.0) and wp.isfinite(value):
+            light.signal = float(value) * brightness
+            if light.decay != 0.0:
+                light.signal *= wp.exp(-light.decay * light.path)
+    return light
+
+
+@wp.func
+def _below(z: float) -> float:
+    """Probability below z standard deviations."""
+    return 0.5 * wp.erfc(-0.70710678118654752 * z)
+
+
+@wp.func
+def _background(sensor: Sensor, light: PixelLight, k: int) -> float:
+    """The water's detections per pulse in a bin, where nothing is in the way."""
+    value = float(0.0)
+    if light.delay == 0.0:
+        value = sensor.table[light.row, k]
+    else:
+        place = float(k) + light.delay
+        j = wp.min(int(place), sensor.table.shape[1] - 2)
+        after = wp.min(place - float(j), 1.0)
+        value = (1.0 - after) * sensor.table[light.row, j] + after * sensor.table[light.row, j + 1]
+    value *= light.water
+    if light.decay != 0.0:
+        value *= wp.exp(-light.decay * (light.start + (float(k) + 0.5) * sensor.bin_path))
+    return value
+
+
+@wp.func
+def _expected(sensor: Sensor, light: PixelLight, k: int, water: float) -> float:
+    """Detections per pulse in a bin: surface, backscatter up to it, dark counts."""
+    scale = 1.0 / sensor.sigma_path
+    low = (light.start + float(k) * sensor.bin_path - light.path) * scale
+    high = low + sensor.bin_path * scale
+    if high < -9.0:
+        return light.dark + water
+    if low > 9.0:
+        return light.dark
+    # From the side on which both are small, where a difference keeps its digits.
+    surface = wp.where(low > 0.0, _below(-low) - _below(-high), _below(high) - _below(low)) * light.signal
+    return light.dark + water * _below(-0.5 * (low + high)) + wp.max(surface, 0.0)
+
+
+_FRAME_BLOCK = 128
+
+
+@memoised
+def _frame_kernel(traced: bool) -> wp.Kernel:
+    # Four blocks on a multiprocessor: without the bound the surface's light takes the registers of all bins.
+    @wp.kernel(
+        enable_backward=False, module="unique", module_options={"max_unroll": 1}, launch_bounds=(_FRAME_BLOCK, 4)
+    )
+    def frame(
+        first: int,
+        first_row: int,
+        rows: wp.uint64,
+        sensor: Sensor,
+        windows: Windows,
+        # In, [rows of this launch]:
+        distance: wp.array[float],
+        normal: wp.array[wp.vec3],
+        reflectance: wp.array[float],
+        water: wp.array2d[float],
+        # Out, [rows of this launch], but for arrays without entries; rates are read if they are traced:
+        rates: wp.array2d[float],
+        histogram: wp.array2d[int],
+        known: wp.array2d[float],
+        margin: int,
+        counts: wp.array[int],
+        significance: wp.array[float],
+        window: wp.array[int],
+    ):
+        """Counts of a pixel, the background that it knows, and the significance of its best window. Launch: rows, each
+        a pixel of a camera."""
+        i = first + wp.tid()
+        row = first_row + i
+        pixel = row % sensor.view.shape[0]
+        v = row / sensor.view.shape[0]
+        if sensor.due[v] == 0:
+            return
+        world = sensor.world[v]
+        pulses = sensor.pulses
+        if world >= 0 and world < sensor.values.pulses.shape[0]:
+            pulses = sensor.values.pulses[world]
+        light = PixelLight()
+        if wp.static(traced):
+            light.dark = sensor.dark
+        else:
+            light = _light(sensor, pixel, world, distance[i], normal[i], reflectance[i])
+        id = wp.uint64(sensor.step[0]) * rows + wp.uint64(row)
+        draws = FirstPhotons()
+        draws.left = pulses
+        search = begin_search(windows, row)
+        search.pulses = wp.float64(pulses)
+        for k in range(histogram.shape[1]):
+            level = float(0.0)
+            rate = float(0.0)
+            if wp.static(traced):
+                level = water[i, k]
+                rate = rates[i, k]
+            else:
+                level = _background(sensor, light, k)
+                rate = _expected(sensor, light, k, level)
+                if rates.shape[0] > 0:
+                    rates[i, k] = rate
+            draws = draw_bin(draws, rate, sensor.seed, id)
+            histogram[i, k] = draws.count
+            search = offer_bin(windows, search, k, wp.int64(draws.count), float(pulses) * (level + light.dark))
+        counts[i] = pulses - draws.left
+        significance[i] = significance_of(windows, search)
+        window[i] = search.window
+        if known.shape[0] > 0:
+            low = wp.max(search.window - margin, 0)
+            for k in range(low, wp.min(search.window + margin, histogram.shape[1])):
+                level = water[i, k] if wp.static(traced) else _background(sensor, light, k)
+                known[i, k] = float(pulses) * (level + light.dark)
+
+    return frame
+
+
 @wp.kernel(enable_backward=False)
 def _depth_kernel(
-    arrival: wp.array[float],
-    view: wp.array[wp.vec3],
+    first: int,
+    first_row: int,
+    advance: int,
+    sensor: Sensor,
     laser: wp.vec3,
-    gate_start: float,
-    bin_path: float,
-    histogram: wp.array2d[int],
+    # In, [rows of this launch]:
+    arrival: wp.array[float],
+    counts: wp.array[int],
+    true_distance: wp.array[float],
     # Out:
     depth: wp.array[float],
-    counts: wp.array[int],
-    step: wp.array[wp.int64],
+    distance: wp.array[float],
+    status: wp.array[int],
 ):
-    """Planar depth, the counts of all bins, and the next step. Launch: cameras x pixels."""
-    row = wp.tid()
-    if row == 0:
-        step[0] = step[0] + wp.int64(1)
-    pixel = row % view.shape[0]
-    total = int(0)
-    for k in range(histogram.shape[1]):
-        total += histogram[row, k]
-    counts[row] = total
-    depth[row] = wp.NAN
-    if wp.isfinite(arrival[row]):
-        z = depth_of_path(laser, view[pixel], gate_start + arrival[row] * bin_path)
+    """Depths, their status, and with the last rows the next step. Launch: rows, each a pixel of a camera."""
+    i = first + wp.tid()
+    if i == 0 and advance > 0:
+        sensor.step[0] = sensor.step[0] + wp.int64(1)
+    row = first_row + i
+    pixel = row % sensor.view.shape[0]
+    v = row / sensor.view.shape[0]
+    if sensor.due[v] == 0:
+        return
+    u = sensor.view[pixel]
+    ray = u
+    if sensor.scans:
+        ray = wp.vec3(0.0, 0.0, 1.0)
+    world = sensor.world[v]
+    start = sensor.gate_start + 2.0 * world_value(sensor.values.gate_delay, world, 0.0)
+    depth[i] = wp.NAN
+    distance[i] = wp.NAN
+    status[i] = NO_RETURN
+    if arrival.shape[0] > 0 and wp.isfinite(arrival[i]):
+        z = depth_of_path(laser, ray, start + arrival[i] * sensor.bin_path)
         if z > 0.0:
-            depth[row] = z
+            distance[i] = z / ray[2]
+            depth[i] = wp.where(sensor.scans, z * u[2], z)
+            status[i] = TARGET
+    pulses = float(sensor.pulses)
+    if world >= 0 and world < sensor.values.pulses.shape[0]:
+        pulses = float(sensor.values.pulses[world])
+    if pulses > 0.0 and float(counts[i]) >= _SATURATION * pulses:
+        status[i] = SATURATED
+    elif status[i] == NO_RETURN and true_distance[i] > 0.0:
+        path = true_distance[i] + wp.length(true_distance[i] * ray - laser)
+        if path < start or path > start + float(sensor.bins) * sensor.bin_path:
+            status[i] = OUTSIDE_GATE
 
 
 @wp.kernel(enable_backward=False)
-def _points_kernel(depth: wp.array3d[float], view: wp.array[wp.vec3], pose: wp.transform, points: wp.array3d[wp.vec3]):
+def _points_kernel(
+    distance: wp.array3d[float], view: wp.array[wp.vec3], pose: wp.transform, points: wp.array3d[wp.vec3]
+):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
-    u = view[i * depth.shape[2] + j]
-    points[v, i, j] = wp.transform_point(pose, depth[v, i, j] / u[2] * u)
+    points[v, i, j] = wp.transform_point(pose, distance[v, i, j] * view[i * distance.shape[2] + j])
+
+
+# ---- Both kinds of cameras.
 
 
 def check_memory(what: str, sizes: Mapping[str, int], item_bytes: int, device: wp.Device, *, rows: int = 1) -> None:
@@ -358,84 +407,256 @@ class WorldCameras:
         cameras: int,
         *,
         world: wp.array | Sequence[int] | None,
-        frame: str,
+        frame: str | None,
+        outputs: Sequence[str],
+        body: Any,
+        offset: Any,
+        update_period: float,
+        rays: Any = None,
+        by_world: Mapping[str, Any] | None = None,
         device: wp.DeviceLike,
     ) -> None:
         self.config = config = SpadConfig() if config is None else config
         check_kind("config", config, SpadConfig)
         self.device = device = check_device("device", device)
         self.cameras = check_integer("cameras", cameras, 1)
+        self.outputs = tuple(check_items("outputs", outputs))
+        for one in self.outputs:
+            check_choice("outputs", one, CAMERA_OUTPUTS)
         sizes = {"cameras": self.cameras, "config.height": config.height, "config.width": config.width}
-        image = tuple(sizes.values())
-        sizes["config.bins"] = config.bins
-        check_memory("rates, counts and background", sizes, 8 + 24 // self.cameras, device, rows=3)
-        self._optical = optical_to(frame)
-        self._most_worlds = 0
-        if isinstance(world, wp.array):
-            self._world = check_array("world", world, wp.int32, (self.cameras,), device)
-        else:
-            items = range(self.cameras) if world is None else check_items("world", world)
-            worlds = [check_integer("world", one, 0) for one in items]
-            if len(worlds) != self.cameras:
-                text = f"world has {len(worlds)} entries; one for each of {self.cameras} cameras is needed"
-                raise ArgumentError(text)
-            self._world, self._most_worlds = wp.array(worlds, dtype=int, device=device), max(worlds) + 1
+        image, self._rows = tuple(sizes.values()), self.cameras * config.height * config.width
+        pixels, sizes["config.bins"] = dict(sizes), config.bins
+        check_memory("images", pixels, 1, device, rows=3)
+        needed = 4 * ("rates" in self.outputs) + 4 * ("histogram" in self.outputs)
+        check_memory("rates and counts", sizes, needed + 16 // self.cameras, device, rows=0)
+        check_memory("images", pixels, 56, device, rows=3)
+        if frame is not None:
+            check_choice("frame", frame, CAMERA_FRAMES)
+        self.frame = frame
+        self._set_worlds(world)
+        self._set_mount(body, offset)
+        self._period = check_number("update_period", update_period, "[0, inf)")
+        self._masked = False  # whether a step has had a mask
+        self._age = wp.full(self.cameras, math.inf, dtype=float, device=device)
+        self._due = wp.ones(self.cameras, dtype=int, device=device)
         self._poses_checked = False
-        self.rates = wp.zeros((*image, config.bins), dtype=float, device=device)
-        self.histogram = wp.zeros((*image, config.bins), dtype=int, device=device)
-        self.counts = wp.zeros(image, dtype=int, device=device)
-        self.depth, self.true_depth = (wp.full(image, wp.nan, dtype=float, device=device) for _ in range(2))
+
+        def full(name: str) -> tuple[int, ...]:
+            return (*image, config.bins) if name in self.outputs else (0, 0, 0, 0)
+
+        self.rates = wp.zeros(full("rates"), dtype=float, device=device)
+        self.histogram = wp.zeros(full("histogram"), dtype=int, device=device)
+        self.counts, self.status = (wp.zeros(image, dtype=int, device=device) for _ in range(2))
+        self.depth, self.distance, self.true_depth, self.true_distance = (
+            wp.full(image, wp.nan, dtype=float, device=device) for _ in range(4)
+        )
         self.normal = wp.zeros(image, dtype=wp.vec3, device=device)
         self.reflectance, self.significance = (wp.zeros(image, dtype=float, device=device) for _ in range(2))
         self.step = wp.zeros(1, dtype=wp.int64, device=device)
-        self._view = wp.array(config.lines_of_sight(), dtype=wp.vec3, device=device)
+        self._lines = config.lines_of_sight() if rays is None else self._checked_rays(rays)
+        self._scans = rays is not None
+        self._view = wp.array(self._lines, dtype=wp.vec3, device=device)
+        self._values, worlds = world_values(by_world or {}, config, device)
+        self._by_world = worlds > 0
+        if worlds and self._most_worlds > worlds:
+            raise ArgumentError(f"by_world has arrays of {worlds} worlds; the cameras are in {self._most_worlds}")
+        if config.pulse_energy == 0.0 and self._values.pulse_energy is not None:
+            raise ArgumentError("by_world['pulse_energy'] needs config.pulse_energy > 0, to which it is relative")
 
-    def _tabulate(self) -> None:
-        """Light and responses that no shape changes: seconds of work, after all arguments are checked."""
+    def _checked_rays(self, rays: Any) -> np.ndarray:
+        shape = (self.config.height, self.config.width, 3)
+        lines = check_numbers("rays", rays.numpy() if isinstance(rays, wp.array) else rays)
+        length = np.linalg.norm(lines, axis=-1, keepdims=True)
+        if lines.shape != shape or not (length > 0.0).all():
+            raise ArgumentError(f"rays have shape {lines.shape}; directions (height, width, 3) = {shape} are needed")
+        return (lines / length).reshape(-1, 3)
+
+    def _set_worlds(self, world: wp.array | Sequence[int] | None) -> None:
+        self._most_worlds = 0
+        if isinstance(world, wp.array):
+            self._world = check_array("world", world, wp.int32, (self.cameras,), self.device)
+            return
+        items = range(self.cameras) if world is None else check_items("world", world)
+        worlds = [check_integer("world", one, 0) for one in items]
+        if len(worlds) != self.cameras:
+            raise ArgumentError(f"world has {len(worlds)} entries; one for each of {self.cameras} cameras is needed")
+        self._world, self._most_worlds = wp.array(worlds, dtype=int, device=self.device), max(worlds) + 1
+
+    def _set_mount(self, body: Any, offset: Any) -> None:
+        self._bodies = 0
+        if body is None:
+            if offset is not None:
+                raise ArgumentError("offset is a pose on a body; body is needed with it")
+            return
+        rows = check_numbers("body", body.numpy() if isinstance(body, wp.array) else np.array(body))
+        if rows.shape not in ((), (self.cameras,)) or (rows < 0).any() or (rows != np.rint(rows)).any():
+            raise ArgumentError(f"body = {rows.tolist()} is not the index of a body for each of {self.cameras} cameras")
+        rows = np.broadcast_to(rows, self.cameras).astype(np.int32)
+        self._body, self._bodies = wp.array(rows, dtype=int, device=self.device), int(rows.max()) + 1
+        poses = np.array((0, 0, 0, 0, 0, 0, 1) if offset is None else offset, np.float32)
+        if poses.shape not in ((7,), (self.cameras, 7)):
+            raise ArgumentError(f"offset has shape {poses.shape}; (x, y, z, qx, qy, qz, qw) for each camera is needed")
+        self._offset = wp.array(np.broadcast_to(poses, (self.cameras, 7)), dtype=wp.transform, device=self.device)
+        check_poses("offset", self._offset)
+        self._camera_q = wp.zeros(self.cameras, dtype=wp.transform, device=self.device)
+
+    @property
+    def camera_matrix(self) -> np.ndarray:
+        """Of OpenCV and ROS: (f_x, 0, c_x), (0, f_y, c_y), (0, 0, 1) [pixels], the first pixel's centre at (0, 0)."""
+        if self._scans:
+            raise ArgumentError("rays have no camera matrix")
+        return self.config.intrinsics
+
+    @property
+    def output(self) -> dict[str, wp.array]:
+        """The images by their names in Isaac Lab's cameras; planar depth and that along the ray are told apart."""
+        return {
+            "distance_to_image_plane": self.depth,
+            "distance_to_camera": self.distance,
+            "normals": self.normal,
+            "counts": self.counts,
+            "status": self.status,
+        }
+
+    def _matrix(self, rows: int, dtype: Any = float) -> wp.array:
+        """[rows, bins], of which a GPU has rows side by side, so that its threads read together."""
+        bins = self.config.bins
+        if self.device.is_cuda:
+            return wp.empty((bins, rows), dtype=dtype, device=self.device).transpose()
+        return wp.empty((rows, bins), dtype=dtype, device=self.device)
+
+    def _columns(self, values: np.ndarray) -> wp.array:
+        """As `_matrix`, of values."""
+        if self.device.is_cuda:
+            return wp.array(np.ascontiguousarray(values.T), dtype=float, device=self.device).transpose()
+        return wp.array(np.ascontiguousarray(values), dtype=float, device=self.device)
+
+    def _tabulate(self, light: wp.array | None = None, water: wp.array | None = None) -> None:
+        """Light and responses that no shape changes, after all arguments are checked. `light`, `water`: rates
+        `[rows, bins]` of all light and of the water's alone, where they are traced."""
         config, device = self.config, self.device
-        background = backscatter_rates(config, device)
-        self._background = wp.array(background, dtype=float, device=device)
-        self._rows = (self.cameras * config.height * config.width, config.bins)
-        self._arrival = wp.empty(self._rows[0], dtype=float, device=device)
-        self._dark = config.dark_rate * config.bin_path / config.speed
-        known = wp.array(config.pulses * (background + self._dark), dtype=float, device=device)
+        lines = np.array([[0.0, 0.0, 1.0]]) if self._scans else self._lines
+        bins = config.bins * (1 if self._values.gate_delay is None else 2)
+        table = np.zeros((1, bins), np.float32) if light else scattering_table(config, lines, bins, device)
+        sensor = self._sensor = Sensor()
+        sensor.lidar, sensor.values, sensor.table = config.lidar(), self._values, self._columns(table)
+        sensor.world, sensor.due, sensor.step, sensor.view = self._world, self._due, self.step, self._view
+        sensor.scans, sensor.bins, sensor.pulses, sensor.seed = self._scans, config.bins, config.pulses, config.seed
+        sensor.gate_start, sensor.bin_path = config.gate_paths[0], config.bin_path
+        sensor.sigma_path = config.timing_sigma * config.speed
+        sensor.dark = config.dark_rate * config.bin_path / config.speed
+        sensor.pulse_energy = config.pulse_energy
+        known = config.pulses * (config.scattering * table[:, : config.bins] + sensor.dark)
+        known = self._columns(known)
         response, lowest_tap = config.response()
         taps = {"response": response, "lowest_tap": lowest_tap, "half_width": -lowest_tap - 1}
         taps |= {"min_significance": config.min_significance, "width": 2.355 * config._sigma_bins}
         self._estimate = ArrivalEstimator(config.bins, device, config.method, known, **taps, pulses=config.pulses)
+        # Bins beside the first one of the best window in which an estimator reads the background.
+        margin = 4 * self._estimate.test.half_width + 2 * response.shape[1]
+        self._margin = margin if config.min_significance > 0.0 else config.bins
+        pixels = len(self._lines)
+        own = self._by_world or water is not None
+        rows = max(_ROWS // pixels, 1) * pixels
+        self._launches = []
+        scratch = [self._matrix(min(rows, self._rows), int)] if "histogram" not in self.outputs else []
+        own_known = self._matrix(min(rows, self._rows)) if own else None
+        window, arrival = wp.empty(rows, dtype=int, device=device), wp.empty(rows, dtype=float, device=device)
+        flat = {name: getattr(self, name).flatten() for name in _IMAGES}
+        for start in range(0, self._rows, rows):
+            stop = min(start + rows, self._rows)
+            part = {name: array[start:stop] for name, array in flat.items()}
+            for name in ("rates", "histogram"):
+                array = getattr(self, name)
+                part[name] = array.reshape((self._rows, config.bins))[start:stop] if array.size else None
+            if scratch:
+                part["histogram"] = scratch[0][: stop - start]
+            part["known"] = own_known[: stop - start] if own_known else None
+            part["water"] = None
+            if light is not None and water is not None:
+                part["rates"], part["water"] = light[start:stop], water[start:stop]
+            part |= {"window": window[: stop - start], "arrival": arrival[: stop - start]}
+            self._launches.append((start, stop, part))
 
-    def _cast_rays(self, shapes: Shapes, camera_q: wp.array, body_q: wp.array | None) -> None:
-        """Moves the shapes and casts a ray a pixel."""
-        check_kind("shapes", shapes, Shapes)
-        check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+    def _pose(self, shapes: Shapes, camera_q: wp.array | None, body_q: wp.array | None) -> wp.array:
+        """Poses of the cameras, which are checked at the first step."""
         if self._most_worlds > shapes.worlds:
             raise ArgumentError(f"world = {self._most_worlds - 1} is none of the {shapes.worlds} worlds of the shapes")
         if not (self._poses_checked or self.device.is_capturing):  # once: later steps wait for nothing
-            check_poses("camera_q", camera_q)
+            if camera_q is not None:
+                check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+                check_poses("camera_q", camera_q)
             if body_q is not None:
                 check_array("body_q", body_q, wp.transform, (None,), self.device)
-                check_poses("body_q", body_q, shapes.bodies)
+                check_poses("body_q", body_q, max(shapes.bodies, self._bodies))
             self._poses_checked = True
+        if not self._bodies:
+            return check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+        if camera_q is not None:
+            raise ArgumentError("camera_q: cameras on a body have the pose of the body and offset")
+        check_array("body_q", body_q, wp.transform, (None,), self.device)
+        if body_q.size < self._bodies:
+            raise ArgumentError(f"body_q has {body_q.size} poses; a camera is on body {self._bodies - 1}")
+        inputs = [self._body, self._offset, body_q]
+        wp.launch(_mount_kernel, self.cameras, inputs, [self._camera_q], device=self.device)
+        return self._camera_q
+
+    def _optical(self, frame: str | None) -> wp.transform:
+        """The pose of the optical frame in that of the poses: the camera's, which agrees with the shapes'."""
+        if frame and self.frame and frame != self.frame:
+            raise ArgumentError(f"frame = {self.frame!r}; the poses of cameras of these shapes are {frame!r}")
+        if not (frame or self.frame):
+            raise ArgumentError(f"frame is not given: say which of {', '.join(CAMERA_FRAMES)} the poses are")
+        return optical_to(frame or self.frame)
+
+    def _schedule(self, active: wp.array | None, dt: float) -> None:
+        """Which cameras are due."""
+        if active is not None:
+            check_array("active", active, wp.bool, (None,), self.device)
+            self._masked = True
+        elif self._period == 0.0 and not self._masked:
+            return
+        inputs = [self._world, active, check_number("dt", dt, "[0, inf)"), self._period * (1.0 - 1e-5)]
+        wp.launch(_schedule_kernel, self.cameras, inputs, [self._age, self._due], device=self.device)
+
+    def _cast_rays(self, shapes: Shapes, camera_q: wp.array | None, body_q: wp.array | None) -> wp.array:
+        """Moves the shapes, casts a ray a pixel, and returns the poses of the cameras."""
+        check_kind("shapes", shapes, Shapes)
+        optical, poses = self._optical(shapes.frame), self._pose(shapes, camera_q, body_q)
         move_shapes(shapes, body_q)
-        inputs = [shapes.table, camera_q, self._optical, self._world, self._view]
-        outputs = [self.true_depth, self.normal, self.reflectance]
+        inputs = [shapes.table, poses, optical, self._world, self._due, self._view]
+        outputs = [self.true_distance, self.true_depth, self.normal, self.reflectance]
         wp.launch(_trace_kernel, self.true_depth.shape, inputs, outputs, device=self.device)
+        return poses
 
     def _detect(self) -> None:
-        """Counts and depth of all cameras from their rates, and the next step; nothing is allocated or read."""
-        config = self.config
-        rates, counts = self.rates.reshape(self._rows), self.histogram.reshape(self._rows)
-        first_photon_counts(rates, pulses=config.pulses, first_frame=self.step, seed=config.seed, counts=counts)
-        self._estimate(counts, self._arrival, self.significance.flatten())
-        inputs = [self._arrival, self._view, wp.vec3(*config.laser_position), config.gate_paths[0], config.bin_path]
-        outputs = [self.depth.flatten(), self.counts.flatten(), self.step]
-        wp.launch(_depth_kernel, self._rows[0], [*inputs, counts], outputs, device=self.device)
+        """Counts and depth of all cameras, and the next step; nothing is allocated or read."""
+        estimate, sensor, laser = self._estimate, self._sensor, wp.vec3(*self.config.laser_position)
+        for start, stop, part in self._launches:
+            inputs = [start, self._rows, sensor, estimate.test.windows]
+            inputs += [part[name] for name in ("true_distance", "normal", "reflectance", "water", "rates", "histogram")]
+            inputs += [part["known"], self._margin, part["counts"], part["significance"], part["window"]]
+            kernel = _frame_kernel(part["water"] is not None)
+            launch_pixels(kernel, stop - start, inputs, device=self.device, block_dim=_FRAME_BLOCK)
+            arrival = None
+            if "depth" in self.outputs:
+                arrival = part["arrival"]
+                known = {} if part["known"] is None else {"background": part["known"]}
+                estimate.locate(part["histogram"], arrival, part["significance"], part["window"], **known)
+            inputs = [start, int(stop == self._rows), sensor, laser, arrival, part["counts"], part["true_distance"]]
+            inputs += [part["depth"], part["distance"], part["status"]]
+            launch_pixels(_depth_kernel, stop - start, inputs, device=self.device)
 
     def point_cloud(self, out: wp.array, *, frame: str = "optical") -> None:
-        """Points of the noisy depth, vec3 `[cameras, height, width]` [m], in a frame of CAMERA_FRAMES; NaN for none."""
+        """Points of the noisy depth, vec3 `[cameras, height, width]` [m], in a frame of CAMERA_FRAMES; NaN for none.
+
+        A row of 12 bytes a point: the data of a `PointCloud2` with the fields x, y and z of FLOAT32."""
         check_array("out", out, wp.vec3, self.depth.shape, self.device)
-        inputs = [self.depth, self._view, optical_to(frame)]
+        inputs = [self.distance, self._view, optical_to(frame)]
         wp.launch(_points_kernel, self.depth.shape, inputs, [out], device=self.device)
+
+
+_IMAGES = ("true_distance", "normal", "reflectance", "counts", "significance", "depth", "distance", "status")
 
 
 # ---- The fast camera.
@@ -453,6 +674,7 @@ def _images_kernel(
     reflectance_in: wp.array3d[float],
     one_reflectance: float,
     # Out:
+    distance: wp.array3d[float],
     depth: wp.array3d[float],
     normal: wp.array3d[wp.vec3],
     reflectance: wp.array3d[float],
@@ -461,10 +683,12 @@ def _images_kernel(
     v, i, j = wp.tid()
     width = depth.shape[2]
     u = view[i * width + j]
-    z = depth_in[v, i, j]
-    if along_ray:
-        z = z * u[2]
-    depth[v, i, j] = wp.where(wp.isfinite(z) and z > 0.0, z, wp.NAN)
+    s = depth_in[v, i, j]
+    if not along_ray:
+        s = s / u[2]
+    s = wp.where(wp.isfinite(s) and s > 0.0, s, wp.NAN)
+    distance[v, i, j] = s
+    depth[v, i, j] = s * u[2]
     value = one_reflectance
     if reflectance_in.shape[0] > 0:
         value = reflectance_in[v, i, j]
@@ -508,61 +732,6 @@ def _edge(view: wp.array[wp.vec3], depth: wp.array3d[float], along_ray: bool, v:
     return best
 
 
-@wp.kernel(enable_backward=False)
-def _signal_kernel(
-    lidar: Lidar,
-    view: wp.array[wp.vec3],
-    depth: wp.array[float],
-    normal: wp.array[wp.vec3],
-    reflectance: wp.array[float],
-    # Out:
-    signal: wp.array[float],
-    path: wp.array[float],
-):
-    """Detections per pulse of the surface, and its path, infinite where there is none. Launch: cameras x pixels."""
-    row = wp.tid()
-    u = wp.vec3d(view[row % view.shape[0]])
-    signal[row] = 0.0
-    path[row] = wp.inf
-    if depth[row] > 0.0:
-        r = wp.float64(depth[row]) / u[2]
-        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(normal[row]), wp.float64(reflectance[row]))
-        path[row] = float(beam_path(lidar, r * u) + r)
-        if value > wp.float64(0.0) and wp.isfinite(value):
-            signal[row] = float(value)
-
-
-@wp.func
-def _below(z: float) -> float:
-    """Probability below z standard deviations."""
-    return 0.5 * wp.erfc(-0.70710678118654752 * z)
-
-
-@wp.kernel(enable_backward=False)
-def _rates_kernel(
-    signal: wp.array[float],
-    path: wp.array[float],
-    background: wp.array2d[float],
-    gate_start: float,
-    bin_path: float,
-    sigma_path: float,
-    dark: float,
-    # Out:
-    rates: wp.array2d[float],
-):
-    """Expected detections per pulse: surface, backscatter up to it, dark counts. Launch: (cameras x pixels, bins)."""
-    row, k = wp.tid()
-    scale = 1.0 / sigma_path
-    low = (gate_start + float(k) * bin_path - path[row]) * scale
-    high = low + bin_path * scale
-    surface = float(0.0)
-    if low < 9.0 and high > -9.0:
-        # From the side on which both are small, where a difference keeps its digits.
-        surface = wp.where(low > 0.0, _below(-low) - _below(-high), _below(high) - _below(low)) * signal[row]
-    water = background[row % background.shape[0], k] * _below(-0.5 * (low + high))
-    rates[row, k] = dark + water + wp.max(surface, 0.0)
-
-
 class SpadCamera(WorldCameras):
     """Single-photon cameras in many worlds: histograms, counts and noisy depth of all in a few launches.
 
@@ -571,12 +740,22 @@ class SpadCamera(WorldCameras):
     counter on the device: it can be captured in a CUDA graph.
 
     Args:
-        config: Laser, detector and water; the same for all cameras.
+        config: Laser, detector and water.
         cameras: Their number.
         world: World of each camera, as in Newton; by default camera k is in world k. Kept if it is an array on the
             device, which may change.
-        frame: Of the cameras' poses, one of CAMERA_FRAMES: "optical" (+z forward, y down), "opengl" (-z forward, y up:
-            Newton, MuJoCo, USD), "forward_left_up" (bodies in ROS).
+        frame: Of the cameras' poses, one of CAMERA_FRAMES: "optical" (+z forward, y down), "opengl" (-z forward, y up),
+            "forward_left_up". Shapes of Newton and MuJoCo carry theirs, "opengl"; with others it must be given.
+        outputs: Which of CAMERA_OUTPUTS are made. Without "rates" and "histogram" no bins are stored.
+        by_world: What differs from world to world, `[worlds]`, by name: "absorption", "scattering" [1/m],
+            "pulse_energy" [J], "dark_rate" [1/s], "pulses", and "gate_delay", by which the gate opens and closes later
+            [one-way m], at most its length. Warp arrays are kept, and may change in place. The blur of the response is
+            that in the config's water.
+        rays: Directions in the optical frame `[height, width, 3]` in place of an image: each is that of a scanner,
+            whose laser and pixel (`config.pixel_fov`) turn with it.
+        body, offset: Index of the body in `body_q` that carries each camera, and the camera's pose on it (x, y, z, qx,
+            qy, qz, qw), `[cameras, 7]` or one for all.
+        update_period: Time between two frames of a camera [s], of which `update` is told by `dt`; 0: every step.
         device: Of the arrays.
 
     Attributes:
@@ -585,9 +764,12 @@ class SpadCamera(WorldCameras):
         counts: Sum of the histogram, int32 `[cameras, height, width]`.
         depth: Planar depth (z of the optical frame) from the histogram [m], float32 `[cameras, height, width]`; NaN
             where nothing was detected.
+        distance: As `depth`, along the ray of the pixel.
+        status: Index into CAMERA_STATUS, int32 `[cameras, height, width]`: a depth; none; saturated: 95 % of the pulses
+            have counted; none, and the surface that is there lies outside the gate.
         significance: Of the detection, float32 `[cameras, height, width]`, see `SpadConfig.min_significance`.
-        true_depth, normal, reflectance: What is there, `[cameras, height, width]`: planar depth [m], unit normals to
-            the camera in the optical frame, reflectance; NaN for none.
+        true_depth, true_distance, normal, reflectance: What is there, `[cameras, height, width]`: depths [m], unit
+            normals to the camera in the optical frame, reflectance; NaN for none.
         step: Number of the next step, int64 `[1]`. A step's random numbers depend on `config.seed` and it alone.
 
     Raises:
@@ -600,24 +782,41 @@ class SpadCamera(WorldCameras):
         cameras: int = 1,
         *,
         world: wp.array | Sequence[int] | None = None,
-        frame: str = "optical",
+        frame: str | None = None,
+        outputs: Sequence[str] = CAMERA_OUTPUTS,
+        by_world: Mapping[str, Any] | None = None,
+        rays: Any = None,
+        body: Any = None,
+        offset: Any = None,
+        update_period: float = 0.0,
         device: wp.DeviceLike = None,
     ) -> None:
-        super().__init__(config, cameras, world=world, frame=frame, device=device)
+        options: dict[str, Any] = {"body": body, "offset": offset, "update_period": update_period, "rays": rays}
+        options |= {"by_world": by_world, "outputs": outputs}
+        super().__init__(config, cameras, world=world, frame=frame, **options, device=device)
         self._tabulate()
-        self._lidar = self.config.lidar()
-        self._signal, self._path = (wp.zeros(self._rows[0], dtype=float, device=self.device) for _ in range(2))
 
-    def update(self, shapes: Shapes, camera_q: wp.array, body_q: wp.array | None = None) -> None:
+    def update(
+        self,
+        shapes: Shapes,
+        camera_q: wp.array | None = None,
+        body_q: wp.array | None = None,
+        *,
+        active: wp.array | None = None,
+        dt: float = 0.0,
+    ) -> None:
         """A step: moves the shapes, casts a ray a pixel, and draws a frame.
 
         Args:
             shapes: From `make_shapes`, `newton_shapes` or `mujoco_shapes`.
-            camera_q: Poses of the cameras in their worlds, `wp.transform` `[cameras]`.
+            camera_q: Poses of the cameras in their worlds, `wp.transform` `[cameras]`; None of those on a body.
             body_q: Poses of the bodies, `wp.transform` `[bodies]`, as Newton's `state.body_q`.
+            active: Worlds that are seen, bool `[worlds]`; the images of the others stay as they are. Default: all.
+            dt: Time since the last step [s], for `update_period`.
         """
+        self._schedule(active, dt)
         self._cast_rays(shapes, camera_q, body_q)
-        self._draw()
+        self._detect()
 
     def update_from_images(
         self,
@@ -627,6 +826,8 @@ class SpadCamera(WorldCameras):
         *,
         along_ray: bool = False,
         camera_q: wp.array | None = None,
+        active: wp.array | None = None,
+        dt: float = 0.0,
     ) -> None:
         """A step from what the simulator's own camera has rendered, `[cameras, height, width]`.
 
@@ -636,8 +837,9 @@ class SpadCamera(WorldCameras):
                 the slope of the depth.
             reflectance: float32 in [0, 1], or a number.
             along_ray: Depth is the distance from the lens, as Newton's `depth_image` is.
-            camera_q: As in `update`.
+            camera_q, active, dt: As in `update`.
         """
+        self._schedule(active, dt)
         shape = self.true_depth.shape
         check_array("depth", depth, wp.float32, shape, self.device)
         number = 0.0
@@ -649,18 +851,8 @@ class SpadCamera(WorldCameras):
             check_array("normal", normal, wp.vec3, shape, self.device)
         if camera_q is not None:
             check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
-        inputs = [self._view, depth, bool(along_ray), normal, camera_q, self._optical, reflectance, number]
-        outputs = [self.true_depth, self.normal, self.reflectance]
+        optical = wp.transform_identity() if normal is None else self._optical("optical" if not self.frame else None)
+        inputs = [self._view, depth, bool(along_ray), normal, camera_q, optical, reflectance, number]
+        outputs = [self.true_distance, self.true_depth, self.normal, self.reflectance]
         wp.launch(_images_kernel, shape, inputs, outputs, device=self.device)
-        self._draw()
-
-    def _draw(self) -> None:
-        """Signal, rates, counts and depth from the images of what is there."""
-        config = self.config
-        inputs = [self._lidar, self._view, self.true_depth.flatten(), self.normal.flatten(), self.reflectance.flatten()]
-        outputs = [self._signal, self._path]
-        wp.launch(_signal_kernel, self._rows[0], inputs, outputs, device=self.device)
-        inputs = [self._signal, self._path, self._background, config.gate_paths[0], config.bin_path]
-        inputs += [config.timing_sigma * config.speed, self._dark]
-        wp.launch(_rates_kernel, self._rows, inputs, [self.rates.reshape(self._rows)], device=self.device)
         self._detect()

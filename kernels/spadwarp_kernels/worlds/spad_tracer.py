@@ -9,17 +9,18 @@ import numpy as np
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_kind
-from spadwarp_kernels.optics.camera import Camera, Gate
-from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser
+from spadwarp_kernels.optics.camera import make_camera, make_gate
+from spadwarp_kernels.optics.laser import make_laser
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.surface.mesh import Textures, make_surfaces, surface_choices, update_surfaces
 from spadwarp_kernels.transport.launch import CUDA_THREADS, Data, Model, launch_transport, make_data
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Medium
+from spadwarp_kernels.water.medium import make_medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 from .shapes import BOX, CAPSULE, CONE, CYLINDER, MESH, PLANE, SPHERE, Shapes, ShapeTable
-from .spad_camera import SpadConfig, WorldCameras, check_memory
+from .spad_camera import CAMERA_OUTPUTS, WorldCameras, check_memory
+from .spad_config import SpadConfig
 
 __all__ = ["SpadTracer"]
 
@@ -204,22 +205,28 @@ def _rates_kernel(
     lowest: int,
     # Out:
     rates: wp.array2d[float],
+    water: wp.array2d[float],
 ):
-    """Expected detections per pulse of one camera: light of the tally, blurred by the response, whose taps have zeros
-    for the _RUN - 1 bins before and after it. Launch: (pixels, runs of bins)."""
+    """Expected detections per pulse of one camera, and those of backscatter: light of the tally, blurred by the
+    response, whose taps have zeros for the _RUN - 1 bins before and after it. Launch: (pixels, runs of bins)."""
     pixel, run = wp.tid()
+    pixels = rates.shape[0]
     parts = tally.shape[1] / rates.shape[1]
     first = run * _RUN
     start = first * parts + lowest
     after = parts * (_RUN - 1)
     total = _Run(dark)
+    scattered = _Run(0.0)
     for s in range(wp.max(0, -start), wp.min(taps.shape[0] - after, tally.shape[1] - start)):
-        light = float(wp.float64(tally[pixel, start + s]) * factor)
+        back = float(wp.float64(tally[pixels + pixel, start + s]) * factor)
+        light = float(wp.float64(tally[pixel, start + s]) * factor) + back
         for r in range(wp.static(_RUN)):
             total[r] += taps[s + after - parts * r] * light
+            scattered[r] += taps[s + after - parts * r] * back
     for r in range(wp.static(_RUN)):
         if first + r < rates.shape[1]:
             rates[pixel, first + r] = total[r]
+            water[pixel, first + r] = scattered[r]
 
 
 @wp.kernel(enable_backward=False)
@@ -238,17 +245,18 @@ class SpadTracer(WorldCameras):
     Args:
         shapes: What stands in the worlds. Kinds and meshes stay; poses, sizes, reflectance and the points of meshes may
             change in place.
-        config, cameras, frame, device: As for `SpadCamera`.
+        config, cameras, frame, outputs, body, offset, device: As for `SpadCamera`.
         world: World of each camera, a list; by default camera k is in world k.
         photons: Of a step and camera, 1 ... 2^26.
         estimator: "guided" or "next_event".
         oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
-        lanes: Cameras that a GPU traces side by side, each with memory of its own: 8 B a pixel and bin of the tally.
+        lanes: Cameras that a GPU traces side by side, each with memory of its own: 16 B a pixel and bin of the tally.
         use_warp_bvh: See `make_surfaces`.
 
     Attributes:
-        rates, histogram, counts, depth, true_depth, normal, reflectance, step: As of `SpadCamera`; `rates` have the
-            noise of the photons that were traced.
+        rates, histogram, counts, depth, distance, status, significance, true_depth, normal, reflectance, step: As of
+            `SpadCamera`; `rates` have the noise of the photons that were traced. A detection is told from the traced
+            light that has met no surface.
         data: Ledger of the last step, for `read_ledger`, and the tally of one of the cameras.
 
     Raises:
@@ -263,7 +271,10 @@ class SpadTracer(WorldCameras):
         *,
         photons: int = 1_000_000,
         world: Sequence[int] | None = None,
-        frame: str = "optical",
+        frame: str | None = None,
+        outputs: Sequence[str] = CAMERA_OUTPUTS,
+        body: Any = None,
+        offset: Any = None,
         estimator: str = "guided",
         oversampling: int = 4,
         lanes: int = 8,
@@ -272,9 +283,15 @@ class SpadTracer(WorldCameras):
     ) -> None:
         check_kind("shapes", shapes, Shapes)
         self._parts = check_integer("oversampling", oversampling, 1, 1024)
-        super().__init__(config, cameras, world=world, frame=frame, device=shapes.device if device is None else device)
+        options: dict[str, Any] = {"body": body, "offset": offset, "update_period": 0.0, "outputs": outputs}
+        options["device"] = shapes.device if device is None else device
+        super().__init__(config, cameras, world=world, frame=frame, **options)
+        if self.config.camera_matrix is not None:
+            raise ArgumentError(
+                "config.camera_matrix: SpadTracer has square pixels about the axis; give a field of view"
+            )
         sizes = {f"config.{name}": getattr(self.config, name) for name in ("height", "width", "bins")}
-        check_memory("tallies", {**sizes, "oversampling": self._parts}, 8, shapes.device, rows=4)
+        check_memory("tallies", {**sizes, "oversampling": self._parts}, 16, shapes.device, rows=4)
         if self.device != shapes.device:
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
         check_choice("estimator", estimator, ESTIMATORS)
@@ -287,7 +304,10 @@ class SpadTracer(WorldCameras):
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(np.pad(taps, (_RUN - 1) * self._parts), dtype=float, device=self.device)
         lanes = check_integer("lanes", lanes, 1, 64)
-        self._tabulate()
+        bins = (self._rows, self.config.bins)
+        self._light = self.rates.reshape(bins) if self.rates.size else wp.empty(bins, dtype=float, device=self.device)
+        self._water = wp.empty(bins, dtype=float, device=self.device)
+        self._tabulate(self._light, self._water)
         self._lane_count = min(lanes, self.cameras if self.device.is_cuda else 1)
         self._estimator = estimator
         self._models: list[Model] = []
@@ -296,10 +316,10 @@ class SpadTracer(WorldCameras):
         self._lanes: list[tuple[wp.Stream | None, Data]] = []
         self.data: Data | None = None
 
-    def update(self, camera_q: wp.array, body_q: wp.array | None = None) -> None:
+    def update(self, camera_q: wp.array | None = None, body_q: wp.array | None = None) -> None:
         """A step; see `SpadCamera.update`."""
-        self._cast_rays(self.shapes, camera_q, body_q)
-        self._meshes.place(camera_q, self._optical, self.config.gate_paths[1])
+        poses = self._cast_rays(self.shapes, camera_q, body_q)
+        self._meshes.place(poses, self._optical(self.shapes.frame), self.config.gate_paths[1])
         if not self._models:
             self._build()
         data, models = self.data, self._models
@@ -329,11 +349,11 @@ class SpadTracer(WorldCameras):
         )
         pixels = config.height * config.width
         factor = config.photons * config.pde / (model.scale * photons)
-        tally = data.tally.reshape((pixels, model.gate.bins))
-        rates = self.rates[v].reshape((pixels, config.bins))
+        tally = data.tally.reshape((2 * pixels, model.gate.bins))
+        outputs = [rows[v * pixels : (v + 1) * pixels] for rows in (self._light, self._water)]
         runs = (pixels, -(-config.bins // int(_RUN)))
-        inputs = [tally, factor, self._dark, self._taps, self._lowest]
-        wp.launch(_rates_kernel, runs, inputs, [rates], device=self.device)
+        inputs = [tally, factor, self._sensor.dark, self._taps, self._lowest]
+        wp.launch(_rates_kernel, runs, inputs, outputs, device=self.device)
 
     def rebuild(self) -> None:
         """Builds the trees anew at the next step, for where things are then: faster rays where they have moved far.
@@ -345,18 +365,12 @@ class SpadTracer(WorldCameras):
     def _build(self) -> None:
         """Meshes, surfaces and models; reads the points back."""
         config = self.config
-        medium, laser, camera, gate = Medium(), Laser(), Camera(), Gate()
+        medium = make_medium(config.absorption, config.scattering, anisotropy=config.anisotropy)
+        laser = make_laser("uniform_cone", half_angle=config.half_angle, position=config.laser_position)
+        lens = {"aperture_radius": config.aperture_radius, "focus": 0.5 * sum(config.gate_distance)}
+        camera = make_camera(config.width, config.height, config.pixel_tangent, **lens)
+        gate = make_gate(self._parts * config.bins, one_way_metres=config.gate_distance)
         limits, guiding = Limits(), Guiding()
-        medium.extinction = config.absorption + config.scattering
-        medium.albedo = config.scattering / medium.extinction if medium.extinction > 0.0 else 0.0
-        medium.anisotropy, medium.axis_threshold = config.anisotropy, 1.0
-        laser.position, laser.axis = wp.vec3(*config.laser_position), wp.vec3(0.0, 0.0, 1.0)
-        laser.profile, laser.spread = LASER_PROFILES.index("uniform_cone"), 1.0 - math.cos(config.half_angle)
-        camera.width, camera.height, camera.pixel_tangent = config.width, config.height, config.pixel_tangent
-        camera.aperture_radius, camera.aperture_area = config.aperture_radius, math.pi * config.aperture_radius**2
-        camera.inverse_focus = 2.0 / (config.gate[0] + config.gate[1])
-        gate.start, gate.stop = config.gate_paths
-        gate.bins, gate.bins_per_metre = self._parts * config.bins, self._parts / config.bin_path
         limits.max_path, limits.max_collisions, limits.weight_cutoff = gate.stop, 64, _ROULETTE_BELOW
         guiding.probability = guiding.surface_probability = 0.3
         guiding.anisotropy, guiding.return_probability, guiding.return_anisotropy = 0.97, 0.1, 0.5
@@ -378,7 +392,7 @@ class SpadTracer(WorldCameras):
         if self.data is None:
             shared = make_data(models[0], histogram=False)
             for k in range(self._lane_count):
-                tally = wp.zeros(config.height * config.width * gate.bins, dtype=wp.int64, device=self.device)
+                tally = wp.zeros(2 * config.height * config.width * gate.bins, dtype=wp.int64, device=self.device)
                 data = dataclasses.replace(shared, tally=tally, cursor=wp.zeros(1, dtype=int, device=self.device))
                 self._lanes.append((wp.Stream(self.device) if k else None, data))
             self.data = self._lanes[0][1]

@@ -35,7 +35,7 @@ def room(device):
 
 def seen(device, config):
     """A camera in each world, which has looked at the room."""
-    camera = sk.SpadCamera(config, 2, device=device)
+    camera = sk.SpadCamera(config, 2, frame="optical", device=device)
     camera.update(room(device), transforms([STILL] * 2, device), transforms(BODIES, device))
     return camera
 
@@ -96,7 +96,7 @@ def test_frames_name_one_pose(device):
     row, column = np.argwhere(np.abs(image - 2.7) < 1e-3).mean(axis=0)
     assert row < 19.5 and column < 29.5  # the box is above and to the left
     points = wp.empty((1, 40, 60), dtype=wp.vec3, device=device)
-    camera.depth.assign(images[0][None])
+    camera.distance.assign(camera.true_distance)
     camera.point_cloud(points, frame="forward_left_up")
     floor = points.numpy()[0, -3:].reshape(-1, 3)
     assert floor[:, 2] == pytest.approx(-1.0, abs=1e-4) and (floor[:, 0] > 0).all()
@@ -118,7 +118,7 @@ def test_images_of_the_simulator(device):
     slopes = np.sum(camera.normal.numpy() * normal.numpy(), axis=-1)
     assert np.median(slopes) > 0.9999 and (slopes > 0).all()
     # Normals in the world's frame: a camera turned by half a circle about its axis.
-    turned = sk.SpadCamera(config, 2, device=device)
+    turned = sk.SpadCamera(config, 2, frame="optical", device=device)
     world = on_device(normal.numpy() * (-1, -1, 1), device, wp.vec3)
     turned.update_from_images(depth, world, reflectance, camera_q=transforms([(0, 0, 0, 0, 0, 1, 0)] * 2, device))
     assert turned.normal.numpy() == pytest.approx(normal.numpy(), abs=1e-6)
@@ -127,7 +127,7 @@ def test_images_of_the_simulator(device):
 def test_rates_are_those_of_the_analytic_model(device):
     """Over the bins: the signal of `signal_map`, the backscatter of `single_scatter_table`, the dark counts."""
     z = np.linspace(2.0, 5.0, 18 * 24, dtype=np.float32).reshape(1, 18, 24)
-    gate = {"gate": (0.5, 8.0), "bins": 200}
+    gate = {"gate_distance": (0.5, 8.0), "bins": 200}
     camera = facing(device, z, **gate, dark_rate=5e4)
     config, rates = camera.config, camera.rates.numpy().reshape(-1, 200).astype(float)
     view = config.lines_of_sight()
@@ -135,7 +135,8 @@ def test_rates_are_those_of_the_analytic_model(device):
     view, normal = on_device(view, device, wp.vec3d), on_device(np.tile([0, 0, -1.0], (len(view), 1)), device, wp.vec3d)
     reflectance = wp.full(distance.size, 0.4, dtype=wp.float64, device=device)
     signal, arrival = (one.numpy() for one in sk.signal_map(config.lidar(), view, distance, normal, reflectance))
-    phase = on_device(config.phase_table(), device, wp.float64)
+    phase = sk.henyey_greenstein_density(1.0 - np.cos(np.linspace(0.0, np.pi, 4097)), config.anisotropy)
+    phase = on_device(phase, device, wp.float64)
     back = sk.single_scatter_table(config.lidar(), phase, view, distance)[2].numpy()
     dark = config.dark_rate * 2 * 7.5 / config.speed
     # The response carries what arrives at the gate's start over it, in both directions.

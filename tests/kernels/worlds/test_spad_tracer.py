@@ -16,11 +16,11 @@ def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
     fine = dataclasses.replace(config, width=64, height=48, dark_rate=0.0)  # the camera's rays are at pixel centres
     shapes, bodies = garden(device)
     poses = transforms([(0.1, 0, -0.2, 0, 0, 0, 1), STILL], device)
-    camera = sk.SpadCamera(fine, 2, device=device)
+    camera = sk.SpadCamera(fine, 2, frame="optical", device=device)
     camera.update(shapes, poses, bodies)
     dark = config.dark_rate * config.bin_path / config.speed
     theirs = camera.rates.numpy().astype(float).reshape(2, 12, 4, 16, 4, 64).sum(axis=(2, 4))
-    tracer = sk.SpadTracer(shapes, config, 2, photons=400_000, use_warp_bvh=use_warp_bvh)
+    tracer = sk.SpadTracer(shapes, config, 2, photons=400_000, frame="optical", use_warp_bvh=use_warp_bvh)
     tracer.update(poses, bodies)
     mine = tracer.rates.numpy() - dark
     for world in range(2):
@@ -35,7 +35,7 @@ def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
     mean = [one[1] @ path / one[1].sum(axis=-1) for one in (mine, theirs)]
     width = config.bin_path / 4  # of a bin of the tally
     assert np.median(abs(mean[0] - mean[1])) < 0.2 * width and abs(np.median(mean[0] - mean[1])) < 0.1 * width
-    camera = sk.SpadCamera(config, 2, device=device)
+    camera = sk.SpadCamera(config, 2, frame="optical", device=device)
     camera.update(shapes, poses, bodies)
     assert np.array_equal(tracer.true_depth.numpy(), camera.true_depth.numpy())
 
@@ -52,7 +52,7 @@ def test_the_map_of_the_view_skips_rays_and_changes_no_bit(device, monkeypatch):
             local=[(0, 1, 0, 0.7071068, 0, 0, 0.7071068), (0, 0, 4, 0, 0, 0, 1), *[(0, 0, 0, 0.6, 0, 0, 0.8)] * 2],
             device=device,
         )
-        tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), photons=20_000)
+        tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), photons=20_000, frame="optical")
         pose = transforms([STILL], device)
         for x in (-0.5, 0.5):
             tracer.update(pose, transforms([(x, 0.2, 2, 0, 0, 0, 1), (-x, 0, 3, 0, 0, 0, 1)], device))
@@ -71,7 +71,7 @@ def test_the_map_of_the_view_skips_rays_and_changes_no_bit(device, monkeypatch):
 def test_steps_have_photons_of_their_own(device):
     """Their mean converges as that of independent runs does."""
     shapes, bodies = garden(device)
-    tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), 2, photons=5_000)
+    tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), 2, photons=5_000, frame="optical")
     sums = []
     for _ in range(16):
         tracer.update(transforms([STILL] * 2, device), bodies)

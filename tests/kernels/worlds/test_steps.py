@@ -16,9 +16,9 @@ def small_step(kind, device):
     """A camera, the bodies that it sees, and its step."""
     (shapes, bodies), poses, config = garden(device), transforms([STILL] * 2, device), sk.SpadConfig(**SMALL)
     if kind == "tracer":
-        camera = sk.SpadTracer(shapes, config, 2, photons=20_000)
+        camera = sk.SpadTracer(shapes, config, 2, photons=20_000, frame="optical")
         return camera, bodies, lambda: camera.update(poses, bodies)
-    camera = sk.SpadCamera(config, 2, device=device)
+    camera = sk.SpadCamera(config, 2, frame="optical", device=device)
     points = wp.empty((2, 12, 16), dtype=wp.vec3, device=device)
 
     def step():

@@ -12,7 +12,7 @@ from helpers.meshes import mesh_of
 from helpers.worlds import STILL, transforms
 from spadwarp_kernels.worlds.shapes import move_shapes
 
-SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
+SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate_distance=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
 
 
 LARGE = dataclasses.replace(SMALL, width=192, height=192, bins=64)
@@ -27,7 +27,7 @@ def triangle(last=2):
 
 
 def camera(cameras=1, **arguments):
-    return sk.SpadCamera(SMALL, cameras, **arguments, device="cpu")
+    return sk.SpadCamera(SMALL, cameras, **{"frame": "optical"} | arguments, device="cpu")
 
 
 def depths(cameras):
@@ -41,7 +41,7 @@ def boxes(**arguments):
 
 
 def one_step(kind, shapes, camera_q, body_q):
-    one = camera() if kind == "camera" else sk.SpadTracer(shapes, SMALL, photons=500)
+    one = camera() if kind == "camera" else sk.SpadTracer(shapes, SMALL, photons=500, frame="optical")
     one.update(*([shapes] if kind == "camera" else []), camera_q, body_q)
     return one
 
@@ -80,7 +80,7 @@ def test_poses_of_a_first_step(kind):
         ({"world": [[0], [0, 1]]}, "world is not an array: its rows have different lengths"),
         ({"worlds": 2**31 - 1}, r"worlds = 2147483647 is outside \[1, 16777216\]"),
         ({"visible": "yes"}, "visible is .*; true or false for each of 2 shapes is needed"),
-        ({"kind": ["mesh"] * 2, "mesh": [12345] * 2}, r"mesh\[0\] is not the id of a wp.Mesh that exists"),
+        ({"kind": ["mesh"] * 2, "mesh": [12345] * 2}, r"mesh\[0\] is not the id of a wp.Mesh in meshes"),
         ({"kind": ["mesh"] * 2, "mesh": [triangle(9)] * 2}, r"mesh\[0\].indices\[2\] = 9 is outside \[0, 2\]"),
         ({"kind": ["mesh"] * 2, "mesh": [triangle()] * 2, "first_face": 99}, "reach beyond the 0 faces of textures"),
     ],
@@ -97,7 +97,7 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
     ("call", "text"),
     [
         (lambda: sk.SpadConfig(pde=1.5), r"config.pde = 1.5 is outside \[0, 1\]"),
-        (lambda: sk.SpadConfig(gate=(5.0, 2.0)), r"config.gate\[1\] = 2.0 is outside \(5.0, inf\)"),
+        (lambda: sk.SpadConfig(gate_distance=(5.0, 2.0)), r"config.gate_distance\[1\] = 2.0 is outside \(5.0, inf\)"),
         (lambda: sk.SpadConfig(timing_sigma=1e3), "config.timing_sigma = 1000.0 s is .* bins"),
         (lambda: sk.SpadConfig(seed=None), "config.seed = None is not an integer"),
         (lambda: sk.SpadCamera(frame="usd", device="cpu"), "frame = 'usd' is not one of 'optical', 'opengl'"),
@@ -134,7 +134,7 @@ def test_errors_name_the_argument(call, text):
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
 def test_a_mesh_lives_as_long_as_its_shapes(kind):
     mesh = triangle()
-    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], device="cpu")
+    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], meshes=[mesh], device="cpu")
     del mesh
     gc.collect()
     assert np.nanmin(one_step(kind, shapes, poses(STILL), None).true_depth.numpy()) == pytest.approx(3.0)
@@ -144,7 +144,7 @@ def test_what_changes_in_place_to_something_that_there_is_not(device):
     """Worlds of cameras and kinds of shapes: nothing is seen there."""
     world = wp.zeros(1, dtype=int, device=device)
     shapes = sk.make_shapes(["plane"], [(0, 0, 0)], local=[(0, 0, 4, 0, 0, 0, 1)], device=device)
-    one = sk.SpadCamera(SMALL, world=world, device=device)
+    one = sk.SpadCamera(SMALL, world=world, frame="optical", device=device)
     pose = wp.array([STILL], dtype=wp.transform, device=device)
     for there in (0, 7, -3):
         world.fill_(there)
