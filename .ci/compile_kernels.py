@@ -3,8 +3,8 @@
 python .ci/compile_kernels.py
 
 With both packages installed, on Linux x86-64, before the wheels are built. The scenes that come with the package are
-run with both estimators, their counts drawn and their depth estimated, and a camera for simulators is run; Warp compiles for `x86-64-v3` meanwhile, and
-keeps the objects under the names that it looks for later.
+run with both estimators, their counts drawn and their depth estimated, and a camera for simulators is run; Warp
+compiles for `x86-64-v3` meanwhile, and keeps the objects under the names that it looks for later.
 """
 
 import contextlib

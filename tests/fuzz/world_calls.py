@@ -11,7 +11,8 @@ _STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 def valid_calls(mesh: wp.Mesh) -> dict:
     config = dict(
-        width=6, height=4, horizontal_fov=1.0, bins=8, gate_distance=(0.5, 8.0), pulses=20, pulse_energy=2e-9, wavelength=532e-9,
+        width=6, height=4, horizontal_fov=1.0, bins=8, gate_distance=(0.5, 8.0), pulses=20, pulse_energy=2e-9,
+        wavelength=532e-9,
         pde=0.2, dark_rate=1e3, timing_sigma=2e-10, aperture_radius=0.01, laser_position=(0.05, 0.0, 0.0), nearest=0.05,
         laser_half_angle=0.5, absorption=0.1, scattering=0.2, anisotropy=0.9, group_index=1.3, method="peak", seed=1,
     )  # fmt: skip
