@@ -677,10 +677,16 @@ def _check_statistics(survey: Survey) -> None:
         photons = signal * traced / scene.scan_positions / emitted
         if photons < 10.0:
             text = f"analog: only about {photons:.2g} of {traced:.3g} photons reach a pixel unscattered"
+            text += _enough(traced, photons)
             survey.warn("transport.estimator", text, photons_per_pixel=photons)
     elif samples < 10.0:
         text = f"only about {samples:.2g} of {traced:.3g} photons reach what a pixel sees unscattered"
+        text += _enough(traced, samples)
         survey.warn("transport.photons", text, samples_per_pixel=samples)
+
+
+def _enough(traced: float, samples: float) -> str:
+    return f"; about {10.0 * traced / samples:.1e} would be enough" if samples > 0.0 else ""
 
 
 # The water: its coefficients, phase function and cells, and what ends a photon's history in it

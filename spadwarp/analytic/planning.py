@@ -494,9 +494,8 @@ def measure(
     its modulus.
     """
     # The traced scene with what a detector sees of the wanted one.
-    names = ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")
-    laser = runs[0].scene.laser.model_copy(update={name: getattr(scene.laser, name) for name in names})
-    seen_by = runs[0].scene.model_copy(update={"laser": laser, "detector": scene.detector})
+    laser = {name: getattr(scene.laser, name) for name in ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")}
+    seen_by = runs[0].scene.with_overrides(laser=laser).model_copy(update={"detector": scene.detector})
     first, second = (analyser_channel(dataclasses.replace(run, scene=seen_by), channel) for run in runs)
     both = merge([first, second])
     clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
