@@ -40,7 +40,7 @@ def run_common() -> None:
         for estimator in ("guided", "next_event"):
             scene = spadwarp.load_scene(name, {"transport.estimator": estimator})
             photons = 64 * scene.scan_positions
-            result = spadwarp.simulate(scene, photons=photons, device="cpu", uncertainty=estimator == "guided")
+            result = spadwarp.simulate(scene, photons=photons, device="cpu")
         response = spadwarp.frames.detector_response(scene.detector, scene.laser)
         result.depth(device="cpu")
         result.depth(method="matched", irf=response, device="cpu")

@@ -252,10 +252,10 @@ def measure(case: Case, device: wp.Device, photons: int | None, repeats: int) ->
     size, tally_bytes = facts["size"], facts.get("tally_bytes")
     del run_number  # and its histograms, before the next run makes its own
     error = check = None
-    if case.error and tally_bytes is not None:  # from a separate run, since batches take time
+    if case.error and tally_bytes is not None:  # from a separate run, whose photons are counted in batches
         scene = Scene.from_dict(case.scene)
         photons = max(min(size["photons"], _usual_photons(device)), 2 * scene.scan_positions)
-        result = simulate(scene, photons=photons, device=device.alias, uncertainty=True)
+        result = simulate(scene, photons=photons, device=device.alias)
         error = result.relative_error * math.sqrt(result.photons / rates["photons"])
     if case.absorbed is not None:
         check = _absorbed(case, device, size["photons"], *case.absorbed)

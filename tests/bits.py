@@ -116,7 +116,7 @@ def of_dataset():
 
 def of_parts():
     """Two runs that go on from each other, and two shards."""
-    first = spadwarp.simulate(scene(), photons=5_000, seed=5, device="cpu", uncertainty=True)
+    first = spadwarp.simulate(scene(), photons=5_000, seed=5, device="cpu")
     whole = spadwarp.simulate(scene(), photons=10_000, run=spadwarp.RunOptions(resume=first), device="cpu")
     return [whole.tallies, whole.standard_error]
 

@@ -45,10 +45,7 @@ def device(request):
 
 @pytest.fixture(scope="session")
 def whole():
-    return {
-        uncertainty: spadwarp.simulate(scene(), **RUN, device="cpu", uncertainty=uncertainty)
-        for uncertainty in (False, True)
-    }
+    return spadwarp.simulate(scene(), **RUN, device="cpu")
 
 
 @pytest.fixture(scope="session")

@@ -77,7 +77,7 @@ def differences() -> Floats:
 
 def gauss_newton(scene: Scene, extinction: Floats, counts: Floats, pulses: float, **run: Any) -> tuple[Floats, Floats]:
     """A step from blocks of an extinction, none below that of the clear water, and the standard error there [1/m]."""
-    result = spadwarp.simulate(scene, derivatives=["medium.grid.extinction"], blocks=BLOCKS, uncertainty=True, **run)
+    result = spadwarp.simulate(scene, derivatives=["medium.grid.extinction"], blocks=BLOCKS, **run)
     scale = pulses * scene.laser.photons_per_pulse * scene.detections_per_photon
     expected, noise = scale * result.histogram.ravel(), scale * result.standard_error.ravel()
     slopes = scale * result.derivatives["medium.grid.extinction"].sum(axis=3).reshape(extinction.size, -1).T

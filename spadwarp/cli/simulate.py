@@ -37,7 +37,6 @@ def simulate(
     overrides: list[str] | None = None,
     threads: int | None = None,
     records: bool = False,
-    uncertainty: bool = False,
     relative_error: float | None = None,
     derivatives: str | None = None,
     resume: Path | None = None,
@@ -61,10 +60,8 @@ def simulate(
         seed: Key of the random numbers. By default the scene's.
         threads: CPU threads; by default one for each core.
         records: Also write the terminal state of every photon: records.h5.
-        uncertainty: Keep batches, to which --photons is rounded up, for the standard error of every bin; twice the
-            memory.
         relative_error (X): Stop at this relative error of the bins that decide the depth (0.02: 2 %), or after
-            --photons in whole batches.
+            --photons.
         derivatives (NAME,...): Also the derivatives of the histogram by these parameters, 8 at most:
             medium.absorption, medium.scattering, medium.anisotropy, medium.layers[0].scattering,
             targets[0].reflectance, ...; short, absorption, where one alone can be meant. medium.grid.absorption,
@@ -98,7 +95,7 @@ def simulate(
     else:
         text = "cannot be combined with --trajectory"
         opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
-        opt.refuse(text, "--records", "--uncertainty", "--relative-error", "--derivatives")
+        opt.refuse(text, "--records", "--relative-error", "--derivatives")
     earlier = None
     if resume is not None:
         text = "cannot be combined with --resume: the run has it"
@@ -124,11 +121,8 @@ def simulate(
     if engine is None:
         spadwarp.transport.prepare_kernels(devices)
     _warn(read, devices)
-    batches = uncertainty or relative_error is not None or (earlier is not None and earlier.batch_size > 0)
     names = _parameters(read, derivatives, earlier)
-    _prepare_directory(
-        out, read, earlier, scene, derivatives=len(names), batches=batches, records=records, checkpoint=checkpoint > 0
-    )
+    _prepare_directory(out, read, earlier, scene, derivatives=len(names), records=records, checkpoint=checkpoint > 0)
     with _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
             read,
@@ -136,7 +130,6 @@ def simulate(
             device=devices,
             engine=engine,
             progress=report,
-            uncertainty=uncertainty,
             relative_error=relative_error,
             derivatives=names,
             run=spadwarp.RunOptions(
@@ -264,7 +257,7 @@ def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
         "depth_m": [float(returned.min()), float(returned.max())] if returned.size else None,
         "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
     }
-    if result.second_moment is not None and result.photons >= 2 * result.batch_size:
+    if result.batches > 1:
         found["relative_error"] = result.relative_error
     return {**found, "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"}
 
@@ -295,7 +288,7 @@ def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
     """
     files = spadwarp.files
     result = spadwarp.merge(opt.load_run(place) for place in runs)
-    needed = files.bytes_needed(result.scene, batches=result.batch_size > 0, derivatives=len(result.derivatives))
+    needed = files.bytes_needed(result.scene, derivatives=len(result.derivatives))
     check_outputs(out, files.RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
     made = files.write_run(result, out, device=device)
     say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))

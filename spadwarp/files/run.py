@@ -168,12 +168,11 @@ def remove_checkpoint(out: str | Path) -> None:
     remove_temporaries(path)
 
 
-def bytes_needed(
-    scene: Scene, *, batches: bool = False, records: bool = False, checkpoint: bool = False, derivatives: int = 0
-) -> int:
+def bytes_needed(scene: Scene, *, records: bool = False, checkpoint: bool = False, derivatives: int = 0) -> int:
     """Upper bound of what a run with so many derivatives writes [bytes]; compression takes off most of it."""
     signed = derivatives + len(scene.camera.tallied_channels)
-    tallies = (1 + signed) * (5 if batches else 3) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+    # Tallies and squares by bin, and of light the tallies of one half of the photons.
+    tallies = (8 + 5 * signed) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
     photons = scene.transport.photons if records else 0
     return (2 if checkpoint else 1) * tallies + _OTHER_BYTES + _RECORD_BYTES * photons
 

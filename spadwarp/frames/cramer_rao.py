@@ -159,7 +159,7 @@ def bound_of_result(
     signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
     background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     variance = None
-    if result.second_moment is not None and result.photons >= 2 * result.batch_size:
+    if result.batches > 1:
         # The errors are those of all light: the signal has its part of the variance.
         light = result.histogram * scale
         part = np.divide(signal, light, out=np.zeros_like(light), where=light > 0)
@@ -199,7 +199,7 @@ def crlb(
 
     The scattered return moves with the target and counts as signal; backscatter, dark counts and ambient light do not.
     The scene's instrument response is applied. Noise of the simulation, which counts as information, is subtracted
-    where the result keeps standard errors (`simulate(..., uncertainty=True)`): inf where it is all there is.
+    where the result keeps standard errors: inf where it is all there is.
 
     `result`: of `spadwarp.simulate`, or its path; `pulses`: of one depth frame; default: the scene's,
     `Scene.pulses_per_depth_frame`; `law`, `device`: see `information_from_histogram`. Raises `ArgumentError` where

@@ -475,7 +475,7 @@ class MonteCarloNoise:
 
 
 UNKNOWN = (
-    "Monte Carlo noise is unknown: the result keeps no standard errors (simulate with --uncertainty); the noise of its "
+    "Monte Carlo noise is unknown: the result keeps no standard errors; the noise of its "
     "histograms is drawn as if it were light, the same in every frame, and counts as information in the Cramér–Rao "
     "bound, which is too small where few photons were traced"
 )
@@ -495,7 +495,7 @@ def monte_carlo_noise(
 
     `detector`, `laser`: sections of a scene; default: those of the result's.
     """
-    if not isinstance(result, Result) or result.second_moment is None or result.photons < 2 * result.batch_size:
+    if not isinstance(result, Result) or result.batches < 2:
         return None
     scene = result.scene
     detector, laser = detector or scene.detector, laser or scene.laser

@@ -118,7 +118,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
     }
     for name, array in vars(result.truth).items():
         variables[name] = (ARRAYS[f"truth/{name}"][1], array, *ARRAYS[f"truth/{name}"][2:])
-    if result.second_moment is not None and result.photons >= 2 * result.batch_size:
+    if result.batches > 1:
         variables["standard_error"] = (cube[1:], result.standard_error, "1", "of the histogram of all light")
     if result.derivatives:
         slopes = np.stack([*result.derivatives.values()])

@@ -28,7 +28,7 @@ from spadwarp.result.result import (
     signed_of,
     water_of,
 )
-from spadwarp.result.tallies import Range, SignedTallies, added, joined, moments_of, total_of
+from spadwarp.result.tallies import Range, SignedTallies, added, joined, moments_of, rebatched, total_of
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, shown
@@ -49,8 +49,8 @@ _READ_ME = (
     "tallies: [component, height, width, bin]. In a scan photons_per_position [height, width] stands for photons. "
     "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
     "time * 299792458 / group_index is the path in metres, laser to target to lens. "
-    "second_moment, in runs with errors: low and high 64 bits of the sum over photons / batch_size batches of the "
-    "squared tally. "
+    "second_moment, where errors are kept: low and high 64 bits of the sum over batches of the squared tally over the "
+    "photons of the batch in units of batch_size; half: the tallies of the half of the batches whose number is even. "
     "derivatives/tallies, where they were asked for: [parameter, component, height, width, bin], signed; times "
     "derivatives/unit over photons it is the derivative of the fraction with respect to the parameter. "
     "channels/tallies, of a camera that records polarisation: the same for each channel, the fraction that it gets. "
@@ -145,7 +145,7 @@ def load_result(path: str | Path) -> Result:
             if np.isinf(values).any():
                 file.refuse(f"truth/{name}", "is infinite in some pixels")
         moments = file.integers("batch_moments", bits=256)
-        if moments and moments.keys() != moments_of(COMPONENTS, [0] * len(COMPONENTS)).keys():
+        if not moments.keys() <= moments_of(COMPONENTS, [0] * len(COMPONENTS), 1, 1).keys():
             file.refuse("batch_moments", "are not those of the components")
         made = file.table("provenance")
         parts = made.get("parts", [])
@@ -154,6 +154,9 @@ def load_result(path: str | Path) -> Result:
         return Result(
             **vars(head),
             tallies=tallies,
+            batches=file.integer("batches", default=0),
+            half=moment("half") if "half" in file else None,
+            half_photons=file.integer("half_photons", default=0),
             second_moment=moment("second_moment"),
             truth=Truth(**maps),
             energy_balance=file.integers("energy_balance"),
@@ -230,6 +233,8 @@ def _attributes(result: Result) -> dict[str, Any]:
         "energy_balance_unit": result.energy_balance_unit,
         "partial": result.partial,
         "batch_size": result.batch_size,
+        "batches": result.batches,
+        "half_photons": result.half_photons,
         "file_hashes": " ".join(result.file_hashes),
         "components": list(COMPONENTS),
         "gate_start": gate.start,
@@ -263,11 +268,11 @@ def merge(results: Iterable[ResultLike]) -> Result:
 
     `results` are results or their paths.
 
-    The ids may leave gaps, which `simulate(resume=)` fills. Each part's provenance is in `provenance["parts"]`,
-    with its ids.
+    Standard errors are those of the batches that the parts had. The ids may leave gaps, which `simulate(resume=)` fills.
+    Each part's provenance is in `provenance["parts"]`, with its ids.
 
-    Raises `ArgumentError`: no list of results; `ConfigError`: different scenes (photons and output aside), seeds, units
-    or batches, or ids that overlap.
+    Raises `ArgumentError`: no list of results; `ConfigError`: different scenes (photons and output aside), seeds or
+    units, some with errors and some without, or ids that overlap.
     """
     if isinstance(results, str | os.PathLike | Result) or not isinstance(results, Iterable):
         raise ArgumentError(f"results = {shown(results)} is not a list of results or of their paths")
@@ -282,9 +287,12 @@ def merge(results: Iterable[ResultLike]) -> Result:
         ranges = joined(ids for part in parts for ids in part.photon_ranges)
     except ConfigError as error:
         raise ConfigError(f"merge: {error}") from error
+    size = max(part.batch_size for part in parts)
+    total = total_of(*(rebatched(part, size // part.batch_size if size else 1) for part in parts))
     return replace(
         first,
-        **vars(total_of(*parts)),
+        **vars(total),
+        batch_size=size,
         photons=sum(part.photons for part in parts),
         timing=added(*(part.timing for part in parts)),
         provenance=_joined_provenance((part.provenance, part.photon_ranges) for part in parts),

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
+from spadwarp.result.noise import noise_ratios, photons_needed, target_noise_ratio
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.sight import lines_of_sight
@@ -22,7 +23,7 @@ from spadwarp.values import ArgumentError, ConfigError, Shown, check_choice, per
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "Result", "Truth"]
+__all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "Half", "Result", "Truth"]
 __all__ += ["analyser_channel", "component_errors", "degree_of_polarisation"]
 
 Component = Literal["ballistic", "forward_scattered", "backscatter"]
@@ -41,7 +42,7 @@ _FALSE_ALARM = 1e-4
 # Relative standard errors that are smaller are good enough whatever carries them.
 _SMALL_ERROR = 0.005
 
-_NO_BATCHES = "the result holds no batches; simulate with uncertainty=True and more photons"
+_NO_BATCHES = "the result has no errors: fewer than two batches of photons were kept; simulate with more photons"
 _CAMERAS = "simulate with camera.polarisation = 'analyser' or 'stokes'"
 
 
@@ -53,6 +54,7 @@ _SIGNED = {
 
 ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
     "tallies": (np.int64, ("component", *_VOXELS), "1", "times unit over photons: fraction of the emitted photons"),
+    "half": (np.int64, ("component", *_VOXELS), "1", "tallies of the batches with an even number"),
     "second_moment": (np.uint64, ("word", *_VOXELS), "1", "sum over batches of the squared tally"),
     "truth/depth": (np.float32, PIXELS, "m", "true planar depth"),
     "truth/range": (np.float32, PIXELS, "m", "true distance along the line of sight"),
@@ -124,10 +126,18 @@ class ResultHead:
     partial: bool = False  # whether the run was interrupted; `photons` then counts those that were done
     photon_ranges: Sequence[tuple[int, int]] = ()
     """The ids of the photons as [start, stop) pairs; runs with disjoint ids can be added by `merge`."""
-    batch_size: int = 0  # photons of a batch where errors were asked for, else 0; every range is whole batches then
+    batch_size: int = 0  # photons of a batch, the first and last of a run aside; 0: no errors are kept
     requested: tuple[int, int] = (0, 0)  # ids [start, stop) that were asked for; an interrupted run has a part of them
     focus_distance: float | None = None  # depth that the lens images sharply [m]; None: all of them, for a pinhole
     file_hashes: tuple[str, ...] = ()  # SHA-256 of each of `scene.files` when the photons were traced
+
+
+class Half(NamedTuple):
+    """One of two independent halves of a run."""
+
+    tallies: NDArray[np.int64]  # int64 `[3, H, W, T]`, as of `Tallies`
+    photons: int  # emitted
+    tally_value: Floats  # expected fraction of emitted photons per tally unit, float64 `[H, W]`
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -144,12 +154,14 @@ class Result(Shown, ResultHead, Tallies):
             object.__setattr__(self, "photon_ranges", ((0, self.photons),))
         if self.requested == (0, 0):
             object.__setattr__(self, "requested", (self.photon_ranges[0][0], self.photon_ranges[-1][1]))
-        ids, batch = self.photon_ranges, self.batch_size
+        ids = self.photon_ranges
         if self.photons <= 0 or count(ids) != self.photons:
             text = f"the {count(ids)} ids of photon_ranges, more than 0, are needed"
             raise ArgumentError(f"photons = {self.photons}; {text}")
-        if self.second_moment is not None and (batch <= 0 or any((stop - start) % batch for start, stop in ids)):
-            raise ArgumentError(f"photon_ranges = {ids} are not whole batches of {batch}")
+        if self.second_moment is not None and not (self.batch_size > 0 and 1 <= self.batches <= self.photons):
+            raise ArgumentError(f"batches = {self.batches} of {self.batch_size} photons cannot be those of the run")
+        if not 0 <= self.half_photons <= self.photons:
+            raise ArgumentError(f"half_photons = {self.half_photons} is outside [0, {self.photons}]")
         signed, expected = signed_of(self), self.scene.camera.tallied_channels
         channels = signed["channels"].names if "channels" in signed else ()
         if channels != expected:
@@ -234,8 +246,7 @@ class Result(Shown, ResultHead, Tallies):
 
         Raises `ConfigError`: the run has no batches, or only one.
         """
-        moments, batches = _batches_of(self)
-        return standard_error(self.tallies, moments, batches) * self.tally_value[..., None]
+        return standard_error(self.tallies, *_batches_of(self)) * self.tally_value[..., None]
 
     @property
     def derivative_errors(self) -> Mapping[str, Floats]:
@@ -261,25 +272,59 @@ class Result(Shown, ResultHead, Tallies):
             return 1.0
 
     @property
+    def halves(self) -> tuple[Half, Half]:
+        """Two independent runs, of the batches with even and odd numbers, whose sum the result is.
+
+        Raises `ConfigError`: the run has no batches, or only one.
+        """
+        if self.half is None or not 0 < self.half_photons < self.photons:
+            raise ConfigError(_NO_BATCHES)
+        rest = self.photons - self.half_photons
+        return Half(self.half, self.half_photons, self.tally_value * (self.photons / self.half_photons)), Half(
+            self.tallies - self.half, rest, self.tally_value * (self.photons / rest)
+        )
+
+    @cached_property
+    def noise_ratio(self) -> Floats:
+        """Noise of the simulation against that of the camera: float64 `[H, W]`, NaN where nothing returned.
+
+        The variance that too few traced photons give the return of a pixel, over that which the photons of a frame of
+        `detector.pulses_per_frame` pulses have. The return is that of the target, or of all light where there is none,
+        as a matched filter adds it up: each bin with its expected light as the weight. Below 0.1 noise of the
+        simulation does not show; above 1 it is all that shows. It falls as 1/photons.
+
+        Raises as `standard_error` does.
+        """
+        pixels = np.arange(self.truth.depth.size)
+        return noise_ratios(self, _batches_of(self)[0], pixels).reshape(self.truth.depth.shape)
+
+    @cached_property
+    def target_noise_ratio(self) -> float:
+        """Median of `noise_ratio` over the pixels of the target in which light returned, or over all without a target;
+        of 1024 of them spread over the image where there are more. Infinite if nothing returned. Raises as
+        `standard_error` does."""
+        return target_noise_ratio(self, _batches_of(self)[0])
+
+    @property
     def relative_error(self) -> float:
         """Relative error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of the
         pixels that hold a target, or of all without any, in which anything returned. The standard error, plus what is
         missing if `unseen_share` of the scattered light is. Infinite if nothing returned."""
-        moments, batches = _batches_of(self)
+        moments, batches, ratio = _batches_of(self)
         # Row by row: of a large histogram nothing is copied.
         peak = np.stack([row.sum(axis=0).argmax(axis=1) for row in self.tallies.swapaxes(0, 1)])[None, ..., None]
         tallies = np.take_along_axis(self.tallies, peak, axis=3)[..., 0]
         value, unseen = tallies.sum(axis=0), self.unseen_share
         missing = tallies[1:].sum(axis=0) * (unseen / max(1.0 - unseen, 1e-12))
-        error = missing + standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], batches)
+        error = missing + standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], batches, ratio)
         target = np.isfinite(self.truth.depth)
         returned = (value > 0) & (target | ~target.any())
         return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Reasons to mistrust the errors: a forward peak that the photons have not seen; in results with batches
-        (`uncertainty=True`, or `relative_error`), components whose standard error rests on few heavy photons."""
+        """Reasons to mistrust the errors: a forward peak that the photons have not seen; components whose standard
+        error rests on few heavy photons."""
         transport, ways = self.scene.transport, ["more photons"]
         if transport.estimator != "guided":
             ways.append('estimator = "guided"')
@@ -287,7 +332,6 @@ class Result(Shown, ResultHead, Tallies):
             ways.append('in clear water between bright surfaces estimator = "next_event"')
         if transport.termination == "roulette":
             ways.append('termination = "cutoff"')
-        batches = self.photons // max(self.batch_size, 1)
         unseen: tuple[str, ...] = ()
         scattered, total = (float(part.sum(dtype=np.float64)) for part in (self.tallies[1:], self.tallies))
         if self.unseen_share * scattered > NOTABLE_UNSEEN * total:
@@ -297,11 +341,11 @@ class Result(Shown, ResultHead, Tallies):
                 f"see: it is not in standard errors; what helps: {', '.join(ways[:2])}",
             )
         return unseen + tuple(
-            f"{name}: one of {batches} batches has {100 * share:.0f} % of the variance of its light (relative standard "
-            f"error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "
+            f"{name}: one of {self.batches} batches has {100 * share:.0f} % of the variance of its light (relative "
+            f"standard error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "
             f"helps: {', '.join(ways)}"
             for name, (error, share) in component_errors(self).items()
-            if error > _SMALL_ERROR and share > _threshold(batches)
+            if error > _SMALL_ERROR and share > _threshold(self.batches)
         )
 
     @property
@@ -406,11 +450,20 @@ class Result(Shown, ResultHead, Tallies):
             "rounding_error": {name: x if x < math.inf else None for name, x in self.rounding_error.items()},
             "unseen_share": self.unseen_share,
             "warnings": list(self.warnings),
+            **self._noise_summary(),
             **({"derivatives": _short_names(self.derivatives)} if self.derivatives else {}),
             **_polarisation_summary(self),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }
+
+    def _noise_summary(self) -> dict[str, Any]:
+        if self.batches < 2:
+            return {"noise_ratio": None, "relative_error": None}
+        numbers = {"noise_ratio": self.target_noise_ratio, "relative_error": self.relative_error}
+        photons, seconds = photons_needed(self)
+        numbers |= {"photons_needed": photons, "seconds_needed": seconds}
+        return {name: number if math.isfinite(number) else None for name, number in numbers.items()}
 
     def to_xarray(self) -> Any:
         """Histograms, depth and truth with coordinates and units: see `spadwarp.result.to_xarray`."""
@@ -433,7 +486,7 @@ def signed_of(result: Result) -> dict[str, SignedTallies]:
 
 def arrays_of(result: Result) -> dict[str, NDArray[Any]]:
     """The arrays of a result, of those of `ARRAYS`."""
-    found: dict[str, Any] = {"tallies": result.tallies, "second_moment": result.second_moment}
+    found: dict[str, Any] = {name: getattr(result, name) for name in ("tallies", "half", "second_moment")}
     for group, signed in signed_of(result).items():
         found |= {f"{group}/tallies": signed.tallies, f"{group}/second_moment": signed.second_moment}
         found[f"{group}/unit"] = np.array(signed.units)
@@ -473,7 +526,8 @@ def difference(a: ResultHead, b: ResultHead) -> str:
     for path, now, before in zip(a.scene.files, a.file_hashes, b.file_hashes, strict=False):
         if now != before:
             return f"{path} is another file than it was: its content has changed between the runs"
-    pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit", "batch_size")}
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in ("seed", "unit")}
+    pairs["presence of errors"] = a.batch_size > 0, b.batch_size > 0
     if isinstance(a, Result) and isinstance(b, Result):
         pairs["list of derivatives"] = tuple(a.derivatives), tuple(b.derivatives)
         pairs["channel"] = a.provenance.get("channel"), b.provenance.get("channel")
@@ -545,9 +599,9 @@ class _SignedValues(Mapping[str, Floats]):
         value = (unit / result.unit * result.tally_value)[..., None]
         if not self._errors:
             return tallies * value
-        _, batches = _batches_of(result)
+        _, batches, ratio = _batches_of(result)
         assert moments is not None
-        return standard_error(tallies, moments, batches) * value
+        return standard_error(tallies, moments, batches, ratio) * value
 
     def __repr__(self) -> str:
         return f"{{{', '.join(map(repr, self))}}}"
@@ -599,32 +653,32 @@ def largest_share(result: Result) -> float:
 def _spreads(result: Result) -> dict[Component, tuple[int, int, int, int]]:
     """Of components that vary: number n of batches, total, n times the sum of squared deviations of the batches from
     their mean, n times the largest deviation."""
-    moments = result.batch_moments
-    if not moments or result.photons < 2 * result.batch_size:
+    moments, photons, size, found = result.batch_moments, result.photons, result.batch_size, {}
+    if not moments or result.batches < 2:
         return {}
-    batches, found = result.photons // result.batch_size, {}
     for name, tally in zip(COMPONENTS, result.tallies, strict=True):
         # In rows and halves, since a sum over all voxels may exceed 64 bits.
         total = sum((int((row >> 32).sum()) << 32) + int((row & 0xFFFFFFFF).sum()) for row in tally)
-        # In integers: no cancellation.
-        spread = batches * moments[f"{name}_squares"] - total * total
-        furthest = max(batches * moments[f"{name}_largest"] - total, total - batches * moments[f"{name}_smallest"])
+        # In integers: no cancellation. Where no batch has `batch_size` photons, none is known to be far from the mean.
+        spread = (photons * moments[f"{name}_squares"] - size * total * total) // size
+        ends = [moments[key] for key in (f"{name}_largest", f"{name}_smallest") if key in moments]
+        furthest = max((abs(photons * end - size * total) // size for end in ends), default=0)
         if total > 0 and spread > 0:
-            found[name] = batches, total, spread, furthest
+            found[name] = result.batches, total, spread, furthest
     return found
 
 
-def _batches_of(result: Result) -> tuple[NDArray[np.uint64], int]:
-    """The second moments of a result's batches and their number. Raises `ConfigError` where there are too few."""
-    if result.second_moment is None or result.photons < 2 * result.batch_size:
+def _batches_of(result: Result) -> tuple[NDArray[np.uint64], int, float]:
+    """The last arguments of `standard_error`. Raises `ConfigError` where there are too few batches."""
+    if result.second_moment is None or result.batches < 2:
         raise ConfigError(_NO_BATCHES)
-    return result.second_moment, result.photons // result.batch_size
+    return result.second_moment, result.batches, result.photons / result.batch_size
 
 
 def pixel_standard_error(result: Result, row: int, column: int) -> Floats:
     """`Result.standard_error` of one pixel, float64 `[T]`, without that of the others."""
-    moments, batches = _batches_of(result)
-    error = standard_error(result.tallies[:, row, column], moments[:, row, column], batches)
+    moments, batches, ratio = _batches_of(result)
+    error = standard_error(result.tallies[:, row, column], moments[:, row, column], batches, ratio)
     return np.asarray(error * result.tally_value[row, column])
 
 
@@ -669,8 +723,10 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
         scene=_behind_analyser(result.scene),
         tallies=tallies,
         unit=unit,
+        half=None,
         second_moment=moments,
         batch_size=0 if moments is None else result.batch_size,
+        batches=0 if moments is None else result.batches,
         batch_moments={},
         channel_tallies=None,
         derivative_tallies=None,

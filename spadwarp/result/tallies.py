@@ -49,12 +49,17 @@ class Tallies:
     """Numbers of events, of contributions that were clipped or not a number, and by component of those of less than one
     tally unit, see `Result.rounding_error`; light before and after the gate in tally units (`guided` aims inside the
     gate and counts there what its surfaces score alone)."""
+    batches: int = 0  # batches of photons whose spread gives standard errors; 0: none were kept
+    half: NDArray[np.int64] | None = None
+    """int64 `[3, H, W, T]`, the tallies of the batches of one half: those with an even number, first photon id over
+    `batch_size`; `tallies - half` is the other half, independent of it. None without batches."""
+    half_photons: int = 0  # emitted photons of that half
     second_moment: NDArray[np.uint64] | None = None
-    """uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally of all components;
-    None without batches."""
+    """uint64 `[2, H, W, T]`, low and high half of the 128-bit sum over batches of the squared tally of all components,
+    over the photons of the batch in units of `batch_size`; None without batches."""
     batch_moments: Mapping[str, int] = field(default_factory=dict)
-    """By component, over batches of its tally summed over voxels: `…_squares` (their sum), `…_smallest` and
-    `…_largest`; empty without batches."""
+    """By component, over batches of its tally summed over voxels: `…_squares` (their sum, as that of `second_moment`),
+    and over batches of `batch_size` photons `…_smallest` and `…_largest`; empty without batches."""
     derivative_tallies: SignedTallies | None = None  # of the derivatives that were asked for; None if there are none
     channel_tallies: SignedTallies | None = None  # of the camera's channels but "I", the histogram; None: no others
 
@@ -72,9 +77,13 @@ def total_of(*parts: Tallies) -> Tallies:
             raise ConfigError(f"the results count different things in their {name}: {', '.join(sorted(strange))}")
         counts[name] = added(*each)
     tallies, second_moment = _added_arrays(parts)
+    halves = [part.half for part in parts if part.half is not None]
     return Tallies(
         tallies=tallies,
         **counts,
+        batches=sum(part.batches for part in parts),
+        half=np.sum(halves, axis=0) if len(halves) == len(parts) else None,
+        half_photons=sum(part.half_photons for part in parts),
         second_moment=second_moment,
         batch_moments=joined_moments(*(part.batch_moments for part in parts)),
         derivative_tallies=_signed_total([part.derivative_tallies for part in parts]),
@@ -134,28 +143,57 @@ def check_capacity(*tallies: NDArray[np.int64]) -> None:
 _JOINS: dict[str, Callable[[int, int], int]] = {"squares": operator.add, "smallest": min, "largest": max}
 
 
-def moments_of(names: Sequence[str], totals: Sequence[int]) -> dict[str, int]:
+def moments_of(names: Sequence[str], totals: Sequence[int], photons: int, batch_size: int) -> dict[str, int]:
     """`Tallies.batch_moments` of one batch, from its components' names and totals [tally units]."""
-    values = zip(names, totals, strict=True)
-    return {
-        f"{name}_{kind}": total * total if kind == "squares" else total for name, total in values for kind in _JOINS
-    }
+    moments = dict[str, int]()
+    for name, total in zip(names, totals, strict=True):
+        moments[f"{name}_squares"] = total * total * batch_size // photons
+        if photons == batch_size:
+            moments |= {f"{name}_smallest": total, f"{name}_largest": total}
+    return moments
 
 
-def joined_moments(first: Mapping[str, int], *others: Mapping[str, int]) -> dict[str, int]:
+def joined_moments(*parts: Mapping[str, int]) -> dict[str, int]:
     """`Tallies.batch_moments` of the batches of all."""
-    total = dict(first)
-    for other in others:
-        total = {name: _JOINS[name.rpartition("_")[2]](value, other[name]) for name, value in total.items()}
+    total = dict[str, int]()
+    for part in parts:
+        for name, value in part.items():
+            total[name] = _JOINS[name.rpartition("_")[2]](total[name], value) if name in total else value
     return total
 
 
-def standard_error(tallies: NDArray[np.int64], second_moment: NDArray[np.uint64], batches: int) -> NDArray[np.float64]:
-    """Standard error of the sum over components of tallies `[3, ...]`, in their unit, from the spread of batches."""
+def rebatched(part: Tallies, ratio: int) -> Tallies:
+    """Tallies whose squares are in units of `ratio` times their batch size, a power of two: those of more photons."""
+    if ratio == 1 or part.second_moment is None:
+        return part
+    shift = np.uint64(ratio.bit_length() - 1)
+    moments = {name: value * ratio for name, value in part.batch_moments.items() if name.endswith("_squares")}
+    signed = {}
+    for name in ("derivative_tallies", "channel_tallies"):
+        if (group := getattr(part, name)) is not None:
+            assert group.second_moment is not None
+            signed[name] = replace(group, second_moment=_shifted(group.second_moment, shift))
+    return replace(part, batch_moments=moments, second_moment=_shifted(part.second_moment, shift), **signed)
+
+
+def _shifted(wide: NDArray[np.uint64], shift: np.uint64) -> NDArray[np.uint64]:
+    """128-bit integers, low and high halves, times a power of two > 1."""
+    low, high = wide
+    return np.stack([low << shift, high << shift | low >> np.uint64(64) - shift])
+
+
+def standard_error(
+    tallies: NDArray[np.int64], second_moment: NDArray[np.uint64], batches: int, ratio: float
+) -> NDArray[np.float64]:
+    """Standard error of the sum over components of tallies `[3, ...]`, in their unit, from the spread of batches;
+    `ratio`: all photons over `batch_size`.
+
+    With x of a batch of n photons, N photons and X in all B batches, Σ (x - n X/N)²/n = Σ x²/n - X²/N has the mean
+    (B - 1) times the variance of a photon's light, whatever the sizes of the batches.
+    """
     total = tallies.sum(axis=0).astype(np.float64)
     squares = second_moment[1] * 2.0**64 + second_moment[0]
-    variance = np.maximum(squares - total**2 / batches, 0.0) / (batches - 1)
-    return np.sqrt(batches * variance)
+    return np.sqrt(np.maximum(squares * ratio - total**2, 0.0) / (batches - 1))
 
 
 # Photon ids, as [start, stop)
@@ -199,7 +237,7 @@ def count(ranges: Iterable[Range]) -> int:
 
 
 def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
-    """Part `shard[0]`, from 1, of `shard[1]` equal parts of a span of whole units.
+    """Part `shard[0]`, from 1, of `shard[1]` nearly equal parts of a span, cut at multiples of a unit.
 
     Raises `ConfigError`: there are more parts than units.
     """
@@ -207,7 +245,9 @@ def shard_of(span: Range, shard: tuple[int, int], unit: int) -> Range:
     units = (stop - start) // unit
     if units < parts:
         raise ConfigError(f"shard = {number}/{parts}: {stop - start} photons are {units} units of {unit}, too few")
-    return start + unit * (units * (number - 1) // parts), start + unit * (units * number // parts)
+    inner = [unit * (start // unit + units * part // parts) for part in range(1, parts)]
+    edges = [start, *inner, stop]
+    return edges[number - 1], edges[number]
 
 
 class IdQueue:
@@ -217,14 +257,15 @@ class IdQueue:
         self._ranges = list[Range]()
         self.put_back(ranges)
 
-    def take(self, size: int) -> Range | None:
-        """At most `size` ids; None if none are left."""
+    def take(self, size: int, unit: int = 1) -> Range | None:
+        """At most `size` ids, up to a multiple of `unit` where more are left; None if none are left."""
         if not self._ranges:
             return None
         start, stop = self._ranges.pop()
-        if stop - start > size:
-            self._ranges.append((start + size, stop))
-            stop = start + size
+        end = (start // unit + max(size // unit, 1)) * unit
+        if stop > end:
+            self._ranges.append((end, stop))
+            stop = end
         self.left -= stop - start
         return start, stop
 

@@ -40,8 +40,15 @@ _RANGES = {"threads": "[1, 4096]", "launch_size": f"[1, {1 << 26}]", "first_phot
 # Voxels that are read at the end of a batch for each of its photons, at most: 2 % of a photon's time, on a GPU too.
 _VOXELS_PER_PHOTON = 16
 
-# Photons of a batch at most: some seconds of a GPU, so that several can share the work and little is lost.
+# Batches of a run: the least that tell an error, and as many as large histograms allow. With a stopping rule more, so
+# that it can act early.
+_BATCHES, _STOPPING_BATCHES = (8, 32), (128, 1024)
+
+# Photons of a batch at most: some seconds of a GPU, so that several can share the work.
 _LARGEST_BATCH = 1 << 30
+
+# Bins of all pixels, at most, whose errors are kept: in memory they take 88 bytes each, without errors 24.
+MOST_BINS_WITH_ERRORS = 1 << 27
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,13 +106,14 @@ def make_plan(
     *,
     photons: int | None,
     seed: int | None,
-    batches: bool = False,
+    batches: bool = True,
     relative_error: float | None = None,
     resume: Result | None = None,
     derivatives: Iterable[str] | None = None,
     blocks: Sequence[int] | None = None,
 ) -> Plan:
-    """The plan for the arguments of `simulate`; `resume` is that of the run, read.
+    """The plan for the arguments of `simulate`; `resume` is that of the run, read. `batches`: whether errors are kept,
+    for which a run whose light alone is wanted has no use.
 
     Raises `ArgumentError` for those that are out of range, `ConfigError` for those that cannot be combined.
     """
@@ -116,11 +124,10 @@ def make_plan(
         check_real("relative_error", relative_error, "(0, 1)")
         if shard is not None:
             raise ConfigError("relative_error cannot be combined with shard: no part knows the error of the whole")
-    batches = batches or relative_error is not None
     names = () if derivatives is None else resolve_derivatives(scene, derivatives, blocks)
     if resume is not None:
-        _check_resumed(resume, run, seed, batches)
-        seed, first_photon, batch_size = resume.seed, resume.requested[0], resume.batch_size
+        _check_resumed(resume, run, seed)
+        seed, first_photon, batches = resume.seed, resume.requested[0], resume.batch_size > 0
         photons = count([resume.requested]) if photons is None else photons
         if photons <= resume.photons:
             raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
@@ -130,13 +137,9 @@ def make_plan(
             raise ConfigError(f"derivatives: {text}")
         names = had
     photons = scene.transport.photons if photons is None else photons
-    if batches and resume is None:
-        batch_size = _batch_size(scene, photons, relative_error, shard)
-    if batch_size:
-        photons = -(-photons // batch_size) * batch_size
-        if first_photon % batch_size:
-            text = f"is not a multiple of {batch_size}, the photons of a batch"
-            raise ConfigError(f"first_photon = {first_photon} {text}")
+    if batches:
+        least = 0 if resume is None else resume.batch_size
+        batch_size = max(least, _batch_size(scene, photons, relative_error, shard))
     mesh = build_mesh(scene)
     scale, capacity = scale_and_capacity(scene, mesh)
     if photons > capacity:
@@ -168,26 +171,23 @@ def make_plan(
 
 
 def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None) -> int:
-    """A power of two, times the positions of a scan so that every batch has whole rounds of it."""
-    least = 32
-    if relative_error is not None:
-        # With a stopping rule more batches, so that it can act early; in a large histogram, all of which is read at the
-        # end of a batch, fewer.
-        voxels = len(COMPONENTS) * scene.camera.width * scene.camera.height * scene.gate.bins
-        least = min(max(photons * _VOXELS_PER_PHOTON // voxels, 128), 1024)
+    """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches."""
+    bins = scene.camera.width * scene.camera.height * scene.gate.bins
+    if bins > MOST_BINS_WITH_ERRORS and relative_error is None:
+        return 0
+    fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
+    least = min(max(photons * _VOXELS_PER_PHOTON // (len(COMPONENTS) * bins), fewest), most)
     least = least if shard is None else max(least, shard[1])
     positions = scene.scan_positions
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
 
 
-def _check_resumed(resume: Result, run: RunOptions, seed: int | None, batches: bool) -> None:
+def _check_resumed(resume: Result, run: RunOptions, seed: int | None) -> None:
     for name in ("first_photon", "shard"):
         if value := getattr(run, name):
             raise ConfigError(f"{name} = {value} cannot be combined with resume, which has the photon ids of its run")
     if seed not in (None, resume.seed):
         raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
-    if batches and not resume.batch_size:
-        raise ConfigError("uncertainty: the run to resume has no batches")
     if channel := resume.provenance.get("channel"):
         raise ConfigError(f"resume: the result holds {channel}-polarised light alone; resume the run that it is of")
 

@@ -64,7 +64,6 @@ def simulate(
     device: str | None = None,
     engine: Ray | None = None,
     progress: Progress | None = None,
-    uncertainty: bool = False,
     relative_error: float | None = None,
     derivatives: Iterable[str] | None = None,
     blocks: Sequence[int] | None = None,
@@ -86,13 +85,11 @@ def simulate(
         engine: `spadwarp.Ray(...)` to run on its workers; `device` is then "cpu" or "cuda".
         progress: Called from the caller's thread with ("compile", 0, 0) before kernels are compiled or loaded, then
             with ("trace", photons done, photons asked for); any other first word is a remark for the user.
-        uncertainty: Count photons in batches, for `Result.standard_error`. They are rounded up to whole batches, by at
-            most 1/32, in a scan to one photon a position at least; the histogram takes 2 2/3 times the memory.
-        relative_error: Stop when `Result.relative_error` is about this; implies `uncertainty`, and `photons` is the
-            most that are traced. The error is looked at after 32 batches of 1/128 to 1/1024 of the photons, and then
-            where it says that the goal will be reached, whatever the device. There the run goes on by a part of its
-            photons that is then fixed, so that it does not end because rare heavy photons have not arrived yet; if they
-            do then, the error is larger than asked for. See "Which estimator, how many photons".
+        relative_error: Stop when `Result.relative_error` is about this; `photons` is the most that are traced. The
+            error is looked at after 32 batches of 1/128 to 1/1024 of the photons, and then where it says that the goal
+            will be reached, whatever the device. There the run goes on by a part of its photons that is then fixed, so
+            that it does not end because rare heavy photons have not arrived yet; if they do then, the error is larger
+            than asked for. See "Which estimator, how many photons".
         derivatives: Parameters by which the histogram is differentiated, for `Result.derivatives`, 8 at most:
             "medium.absorption", "medium.scattering", "medium.anisotropy", "medium.layers[1].scattering",
             "targets[0].reflectance"; short, "absorption", where one parameter alone can be meant. By default none, or
@@ -109,8 +106,9 @@ def simulate(
             only vertices moved its tree is refitted and not built anew. Without `engine`.
         run: Threads and launches, photon ids of a part of a run, resuming and checkpoints; see `RunOptions`.
 
-    Returns the result. After Ctrl-C or SIGTERM it holds the photons (or batches) that were done and is marked
-    `partial`.
+    Returns the result, which knows its standard errors from batches of its photons (8 to 63, with `relative_error` 128
+    to 2047; `Result.batches`); a histogram of more than 2^27 bins keeps none. After Ctrl-C or SIGTERM it holds the
+    photons that were done and is marked `partial`.
 
     Raises:
         ArgumentError: An argument of the wrong kind or out of range.
@@ -129,7 +127,6 @@ def simulate(
         run,
         photons=photons,
         seed=seed,
-        batches=uncertainty,
         relative_error=relative_error,
         resume=resume,
         derivatives=derivatives,
@@ -281,7 +278,7 @@ class _Run:
                 self._workers.collect(worker)
             elif stopped or (self._collecting is not None and self._workers.must_rest):
                 continue
-            elif block := self._waiting.take(self._size(worker)):
+            elif block := self._waiting.take(self._size(worker), self._plan.batch_size or 1):
                 self._running[worker] = block
                 self._workers.send(worker, trace_block, block)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import queue
 import threading
@@ -29,6 +30,7 @@ from spadwarp.result.tallies import (
     Range,
     Ranges,
     added,
+    count,
     joined,
     joined_moments,
     moments_of,
@@ -54,8 +56,11 @@ class _Histogram:
 
     def __init__(self, array: wp.array, *, signed: bool, batched: bool, total: wp.array | None = None) -> None:
         self.array, self._signed = array, signed
-        self.batches = sk.Batches(array, len(COMPONENTS), total=total, signed=signed) if batched else None
+        self.batches = (
+            sk.Batches(array, len(COMPONENTS), total=total, signed=signed, halved=not signed) if batched else None
+        )
         self.total: wp.array = array if self.batches is None else self.batches.total
+        self.half: wp.array | None = None if self.batches is None else self.batches.half
 
     def has_overflowed(self) -> bool:
         if self.batches is not None:
@@ -69,21 +74,44 @@ class _Histogram:
             sk.add_tallies(self.array, other.array)
 
     def clear(self) -> None:
-        for array in (self.array, *(() if self.batches is None else (self.total, *self.batches.second_moment))):
+        arrays = [self.array]
+        if self.batches is not None:
+            arrays += [self.total, *self.batches.second_moment, *([] if self.half is None else [self.half])]
+        for array in arrays:
             array.zero_()
 
     def second_moment(self, shape: Sequence[int]) -> NDArray[np.uint64] | None:
         """`[2, *shape]`, low and high halves; None without batches."""
         if self.batches is None:
             return None
-        return np.stack([half.numpy().reshape(shape) for half in self.batches.second_moment])
+        return np.stack([_on_host(word).reshape(shape) for word in self.batches.second_moment])
+
+
+class _Closed(NamedTuple):
+    """What closed batches left beside their arrays, as in `Tallies`."""
+
+    energy_balance: dict[str, int]
+    counters: dict[str, int]
+    batch_moments: dict[str, int]
+    batches: int = 1
+    half_photons: int = 0
+
+    def plus(self, more: _Closed) -> _Closed:
+        return _Closed(
+            added(self.energy_balance, more.energy_balance),
+            added(self.counters, more.counters),
+            joined_moments(self.batch_moments, more.batch_moments),
+            self.batches + more.batches,
+            self.half_photons + more.half_photons,
+        )
 
 
 class DeviceWorker:
     """A device with a model and tallies of its own, or the caller's.
 
     Its threads launch at a time; on a CPU all of them add to one tally, with atomics of their own. A batch has
-    `batch_size` photons; 0: no batches. `signed` names the spec's derivatives, or else its channels.
+    `batch_size` photons, the first and last of a run fewer; 0: no batches. `signed` names the spec's derivatives, or
+    else its channels.
     """
 
     def __init__(
@@ -112,7 +140,7 @@ class DeviceWorker:
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device, model=model, photon_count=most)
-        self._closed: tuple[dict[str, int], dict[str, int], dict[str, int]] | None = None  # of batches
+        self._closed: _Closed | None = None
 
     def _launched(self, spans: Iterable[Range]) -> Iterator[Range]:
         """Traces a launch for each span and yields it when that has ended; a GPU has the next before."""
@@ -138,23 +166,19 @@ class DeviceWorker:
     def trace(
         self, block: Range, *, stopped: threading.Event, report: Callable[[int], None] = lambda photons: None
     ) -> Ranges:
-        """Traces photons; returns the ids that were done before `stopped` was set, with batches those of whole ones.
+        """Traces photons; returns the ids that were done before `stopped` was set.
 
         `report` gets the photons of each launch, from the thread that ran it.
         """
-        done, size = list[Range](), self._batch_size or block[1] - block[0]
+        done, size = list[Range](), self._batch_size or block[1]
+        edges = [block[0], *range((block[0] // size + 1) * size, block[1], size), block[1]]
         with device_errors(self.model.device):
-            for first in range(*block, size):
-                part = first, first + size
+            for part in itertools.pairwise(edges):
                 traced = self._trace(part, stopped, report)
-                if not self._batch_size:
-                    done += traced
-                elif traced == (part,):
-                    self._close_batch()
-                    done.append(part)
-                else:
-                    for array in (self.data.ledger, *(histogram.array for histogram in self._histograms)):
-                        array.zero_()
+                if self._batch_size and traced:
+                    self._close_batch(traced)
+                done += traced
+                if stopped.is_set():
                     break
             self._check_overflow()
         return joined(done)
@@ -197,21 +221,20 @@ class DeviceWorker:
             raise failures[0]
         return joined(done)
 
-    def _close_batch(self) -> None:
-        """Adds a batch whose photons are all done to the totals."""
+    def _close_batch(self, ids: Ranges) -> None:
+        """Adds a batch of these photons to the totals."""
+        photons, size = count(ids), self._batch_size
+        in_half = ids[0][0] // size % 2 == 0
         for histogram in self._histograms:
             assert histogram.batches is not None
-            histogram.batches.close(histogram.array, threads=self._threads)
+            histogram.batches.close(histogram.array, in_half=in_half, part=photons / size, threads=self._threads)
         assert self._histograms[0].batches is not None
-        moments = moments_of(COMPONENTS, self._histograms[0].batches.take_sums())
-        self._add_closed((*sk.read_ledger(self.data), moments))
+        moments = moments_of(COMPONENTS, self._histograms[0].batches.take_sums(), photons, size)
+        self._add_closed(_Closed(*sk.read_ledger(self.data), moments, half_photons=photons if in_half else 0))
         self.data.ledger.zero_()
 
-    def _add_closed(self, more: tuple[dict[str, int], dict[str, int], dict[str, int]]) -> None:
-        """Energy balance, counters and moments of closed batches."""
-        if (mine := self._closed) is not None:
-            more = added(mine[0], more[0]), added(mine[1], more[1]), joined_moments(mine[2], more[2])
-        self._closed = more
+    def _add_closed(self, more: _Closed) -> None:
+        self._closed = more if self._closed is None else self._closed.plus(more)
 
     def take_over(self, other: DeviceWorker) -> None:
         """Moves the tallies of another worker of the same run here; both must rest."""
@@ -227,14 +250,13 @@ class DeviceWorker:
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
         with device_errors(self.model.device):
-            energy_balance, counters, moments = self._closed or (*sk.read_ledger(self.data), {})
+            closed = self._closed or _Closed(*sk.read_ledger(self.data), {}, batches=0)
             signed, histogram = self._signed_tallies(), self._histograms[0]
             return Tallies(
-                tallies=_on_host(histogram.total, self.model.device).reshape(self._shape),
-                energy_balance=energy_balance,
-                counters=counters,
+                tallies=_on_host(histogram.total).reshape(self._shape),
+                **closed._asdict(),
+                half=None if histogram.half is None else _on_host(histogram.half).reshape(self._shape),
                 second_moment=histogram.second_moment(self._shape[1:]),
-                batch_moments=dict(moments),
                 derivative_tallies=None if self._spec.channels else signed,
                 channel_tallies=signed if self._spec.channels else None,
             )
@@ -266,16 +288,17 @@ class DeviceWorker:
             histogram.clear()
 
 
-def _on_host(array: wp.array, device: wp.Device) -> NDArray[np.int64]:
+def _on_host(array: wp.array) -> NDArray[Any]:
     """A copy of an array of a GPU in memory of NumPy, which asks Linux for pages of 2 MiB; on a CPU the array's own.
 
     97 MiB of an H200 are there in 31 ms, those of `array.numpy()` in 72 ms, most of it for new pages: in memory that
     was used before they are in 7 ms.
     """
+    device: Any = array.device
     if not device.is_cuda:
         return np.asarray(array.numpy())
-    held = np.empty(array.shape, np.int64)
-    wp.copy(wp.array(held, dtype=wp.int64, device="cpu", copy=False), array)
+    held = np.empty(array.shape, wp.dtype_to_numpy(array.dtype))
+    wp.copy(wp.array(held, dtype=array.dtype, device="cpu", copy=False), array)
     wp.synchronize_device(device)
     return held
 
@@ -359,7 +382,7 @@ class LocalWorkers:
         if kind == "cuda":  # a run of few photons needs no kernel of larger launches
             size = min(size, max(1, plan.photons))
         threads = 1 if kind == "cuda" else max(1, (threads or core_count()) // len(devices))
-        copies = (2 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))
+        copies = (3 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))
         choices: Any = {"copies": copies, "scale": plan.scale, "mesh_cache": mesh_cache}
         began = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
@@ -463,7 +486,7 @@ class ClusterWorkers(RayWorkers):
         camera = plan.scene.camera
         voxels = camera.width * camera.height * plan.scene.gate.bins
         histograms = 1 + len(plan.derivatives) + len(camera.tallied_channels)
-        size = 8 * (len(COMPONENTS) + (2 if plan.batch_size else 0)) * histograms * voxels
+        size = 8 * (len(COMPONENTS) + (2 + len(COMPONENTS) if plan.batch_size else 0)) * histograms * voxels
         super().__init__(engine, device, prepare=functools.partial(_prepare, plan), value_bytes=size, note=note)
         self._total: Tallies | None = None
         self.timing: dict[str, float] = {}
@@ -583,7 +606,8 @@ class LightTracer:
         mesh_cache: dict[str, Any] | None = None,
         tally: Any = None,
     ) -> None:
-        plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=derivatives or None)
+        names = derivatives or None
+        plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=names, batches=False)
         workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)
         self._scene, self._separate_targets, self._unit = scene, separate_targets, 1.0 / plan.scale
         self._names, self._worker = plan.derivatives, workers.tracers[0]

@@ -194,7 +194,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
     time = 1e9 * result.bin_edges
     total = parts.sum(axis=0)
-    known = result.second_moment is not None and result.photons >= 2 * result.batch_size
+    known = result.batches > 1
     error = pixel_standard_error(result, row, column) * per_pulse if known else None
     if error is None:
         weight = typical_weight(total)

@@ -37,5 +37,5 @@ def scene(tmp_path_factory):
 def done(scene):
     """The directory of a finished run."""
     out = scene.parent / "run"
-    run("simulate", scene, "--out", out, "--quiet", "--uncertainty", "--device", "cpu")
+    run("simulate", scene, "--out", out, "--quiet", "--device", "cpu")
     return out

@@ -42,7 +42,7 @@ def test_a_resumed_run_is_the_long_run(scene, tmp_path):
     "parts",
     [
         [("--photons", 10_000), ("--photons", 10_000, "--first-photon", 10_000)],
-        [("--shard", f"{number}/3", "--uncertainty") for number in (1, 2, 3)],
+        [("--shard", f"{number}/3") for number in (1, 2, 3)],
     ],
     ids=["runs", "shards"],
 )
@@ -53,9 +53,10 @@ def test_parts_are_merged_to_one_run(parts, scene, tmp_path):
     both = tmp_path / "both"
     printed = run("merge", *folders[:-1], folders[-1] / "result.h5", "--out", both, "--json", both / "a.json", *DEVICE)
     merged = spadwarp.load_result(both / "result.h5")
-    whole = spadwarp.simulate(scene, device="cpu", uncertainty="--uncertainty" in parts[0])
+    whole = spadwarp.simulate(scene, device="cpu")
     assert_same(merged, whole)
-    assert np.array_equal(merged.second_moment, whole.second_moment)
+    assert np.array_equal(merged.half, whole.half) == (len(parts) == 3)  # batches of fewer photons have other numbers
+    assert np.array_equal(merged.second_moment, whole.second_moment) == (len(parts) == 3)
     assert tables(both / "a.json")["photon_ranges"] == [[0, whole.photons]]
     words, last = " ".join(printed.stdout.split()), f"{whole.photons - 1:,}".replace(",", " ")
     assert f"photon ids 0 to {last}" in words and "energy balance exact" in words and (both / "depth.exr").is_file()

@@ -135,7 +135,7 @@ def test_a_bound_that_is_noise_is_refused_with_the_photons_that_it_needs():
     )
 
     def run(photons, seed):
-        return spadwarp.simulate(murky, photons=photons, seed=seed, uncertainty=True, device="cpu")
+        return spadwarp.simulate(murky, photons=photons, seed=seed, device="cpu")
 
     truth = np.median(spadwarp.crlb(run(1_000_000, 0), device="cpu"))
     given, refused = [], 0

@@ -249,7 +249,7 @@ WEAK = Laser(pulse_energy=1e-15)  # far from pile-up
 def test_frames_of_two_runs_differ_by_what_is_said(whole):
     """Pixel by pixel, the mean over frames is off by the standard error, in units of the shot noise of a frame; that
     noise grows with the square root of the pulses, the standard error with their number."""
-    result = whole[True]
+    result = whole
     pulses = 100_000
     fewer, noise = (monte_carlo_noise(result, pulses=number, laser=WEAK) for number in (1000, pulses))
     part = 10  # runs of a tenth of the photons, whose spread is larger by its root
@@ -267,7 +267,7 @@ def test_frames_of_two_runs_differ_by_what_is_said(whole):
 def test_a_warning_with_numbers_or_a_note_that_nobody_knows(whole):
     keywords = {"laser": WEAK, "seed": 1, "device": "cpu"}
     with pytest.warns(SpadwarpWarning, match=r"Monte Carlo noise.* of the pixels, and .* photons instead of") as caught:
-        frames = spadwarp.detect(whole[True], pulses=10**8, **keywords)
+        frames = spadwarp.detect(whole, pulses=10**8, **keywords)
     assert len(caught) == 1 and frames.notes == ()
     with warnings.catch_warnings(action="error"):
         quiet, unknown = (spadwarp.detect(whole[known], pulses=1000, **keywords) for known in (True, False))

@@ -155,7 +155,7 @@ def make_corpus(folder: Path) -> None:
     Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(folder / "target.png")
     # HDF5 of every kind, and a dataset.
     scene = spadwarp.load_scene(folder / "scene.toml")
-    result = spadwarp.simulate(scene, photons=2000, seed=3, device="cpu", uncertainty=True)
+    result = spadwarp.simulate(scene, photons=2000, seed=3, device="cpu")
     result.save(folder / "result.h5")
     record_frames(result, folder / "frames.h5", pulses=300, frames=2, seed=1, tags=True, device="cpu")
     spadwarp.simulate_analytic(scene, frames=2, seed=1, device="cpu").save(folder / "analytic.h5")

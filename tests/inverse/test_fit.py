@@ -160,7 +160,7 @@ def test_commands_say_what_python_says(light, tmp_path):
 
 def test_noise_that_simulated_counts_inherit_is_said():
     scene = plate()
-    few = spadwarp.simulate(scene, photons=30_000, seed=2, uncertainty=True, device="cpu")
+    few = spadwarp.simulate(scene, photons=30_000, seed=2, device="cpu")
     frames = spadwarp.detect(few, pulses=500_000, frames=4, seed=3, device="cpu")
     assert read_exposure(frames, scene).monte_carlo_noise == pytest.approx(2 * frames.monte_carlo_noise)
     found = fit(frames, scene, UNKNOWN, photons=30_000)

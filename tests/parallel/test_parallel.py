@@ -106,21 +106,21 @@ class Killer:
 
 def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, whole, tmp_path):
     killer, kept = Killer(2, seed=2), tmp_path / "checkpoint.h5"
-    options = {"uncertainty": True, "run": RunOptions(checkpoint=kept, checkpoint_every=0.0)}
+    options = {"run": RunOptions(checkpoint=kept, checkpoint_every=0.0)}
     run = simulate(scene(), **RUN, engine=Ray(workers=2), progress=killer, **options)
-    same(run, whole[True])
+    same(run, whole)
     assert killer.lost == 2
     assert 3 <= len(run.provenance["workers"]) <= 4 and run.provenance["device"] == "2 Ray workers"
     # The checkpoint is consistent, whatever was lost, and can be resumed.
     kept = spadwarp.load_result(kept)
     assert kept.partial and 0 < kept.photons < PHOTONS and kept.energy_report()["exact"]
-    same(simulate(scene(), device="cpu", run=RunOptions(resume=kept)), whole[True])
+    same(simulate(scene(), device="cpu", run=RunOptions(resume=kept)), whole)
 
 
 def test_a_run_can_be_resumed_over_ray(cluster, whole):
-    parts = [simulate(scene(), **RUN, device="cpu", uncertainty=True, run=RunOptions(shard=(n, 5))) for n in (5, 1)]
+    parts = [simulate(scene(), **RUN, device="cpu", run=RunOptions(shard=(n, 5))) for n in (5, 1)]
     gaps = spadwarp.merge(parts)
-    same(simulate(scene(), engine=Ray(workers=1), run=RunOptions(resume=gaps)), whole[True])
+    same(simulate(scene(), engine=Ray(workers=1), run=RunOptions(resume=gaps)), whole)
     assert gaps.photons < PHOTONS / 2  # untouched
 
 

@@ -182,7 +182,7 @@ def test_figure_of_a_capture_finds_its_own_model(tmp_path, monkeypatch):
 def test_formats_page_names_everything_in_the_files(tmp_path):
     """Every dataset and attribute of a result with errors, of frames with tags, of analytic frames and of records."""
     scene = make_scene(transport={"photons": 2000, "seed": 1})
-    result = spadwarp.simulate(scene, device="cpu", uncertainty=True)
+    result = spadwarp.simulate(scene, device="cpu")
     record_frames(result, tmp_path / "frames.h5", pulses=100, frames=1, seed=1, tags=True, device="cpu")
     save_records(spadwarp.transport.trace(scene, photons=10, device="cpu"), tmp_path / "records.h5", scene=scene)
     paths = [result.save(tmp_path / "result.h5"), tmp_path / "frames.h5", tmp_path / "records.h5"]

@@ -35,7 +35,7 @@ def polarised(camera="analyser", **fields):
 
 @pytest.fixture(scope="module")
 def analysed():
-    return spadwarp.simulate(polarised(), seed=5, device="cpu", uncertainty=True)
+    return spadwarp.simulate(polarised(), seed=5, device="cpu")
 
 
 @pytest.fixture(scope="module")

@@ -135,7 +135,7 @@ def test_rate_of_a_pixel():
 def seen():
     """A result 5 m below the surface, and the same at night."""
     scene = lit(detector__filter_fwhm_nm=3.0)
-    result = spadwarp.simulate(scene, photons=40_000, seed=1, device="cpu", uncertainty=True)
+    result = spadwarp.simulate(scene, photons=40_000, seed=1, device="cpu")
     return result, replace(result, scene=result.scene.with_overrides({"daylight.cloud_factor": 0.0}))
 
 

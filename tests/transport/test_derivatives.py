@@ -197,7 +197,7 @@ def test_behind_a_port_the_path_is_that_in_water_and_lambertian_bounces_are_coun
 
 
 def test_errors_between_batches_are_those_between_seeds(device):
-    runs = [simulated(layered(), device, ALL, 32_768, seed=seed, uncertainty=True) for seed in range(24)]
+    runs = [simulated(layered(), device, ALL, 32_768, seed=seed) for seed in range(24)]
     for name in ALL:
         spread = np.std([run.derivatives[name].sum(axis=0) for run in runs], axis=0, ddof=1)
         stated = np.sqrt(np.mean([run.derivative_errors[name] ** 2 for run in runs], axis=0))
@@ -207,7 +207,7 @@ def test_errors_between_batches_are_those_between_seeds(device):
 
 def test_runs_with_other_derivatives_are_not_added():
     targets = [{**PLATE, "size": [1.0, 1.0], "translation": [x, 0.0, 2.2]} for x in (-0.6, 0.6)]
-    one, half = layered(targets=targets), {"photons": 4096, "uncertainty": True}
+    one, half = layered(targets=targets), {"photons": 4096}
     first, other = (
         simulated(one, "cpu", [*ALL[:3], f"targets[{k}].reflectance"], **half, run=RunOptions(shard=(k + 1, 2)))
         for k in (0, 1)

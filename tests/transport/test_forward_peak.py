@@ -66,7 +66,7 @@ def test_check_and_the_run_say_what_is_not_seen(device):
     (message,) = [found for found in check(one) if "forward peak" in found.text]
     assert message.level == "warning" and message.field == "transport.estimator"
     with pytest.warns(spadwarp.SpadwarpWarning, match="next_event: up to 31 % of the scattered light"):
-        result = spadwarp.simulate(one, device=device, uncertainty=True)
+        result = spadwarp.simulate(one, device=device)
     share = result.summary()["unseen_share"]
     assert share == result.unseen_share == one.unseen_peak(result.photons, 2.2)[1]
     assert share == pytest.approx(message.values["unseen"], rel=0.02)

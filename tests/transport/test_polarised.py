@@ -151,7 +151,7 @@ ON_A_CPU = (2, 5, 10, 11, 12, 14, 17, 19)  # of each table two, one of them near
 def off_the_tables(table, row, photons, device):
     """I, Q and U of a row less those of the table, and their standard errors, both over the table's I."""
     _face, mu, phi, *expected = row
-    result = simulate(atmosphere(table, mu, phi), photons=photons, device=device, uncertainty=True)
+    result = simulate(atmosphere(table, mu, phi), photons=photons, device=device)
     # The lens has the part A µ/R² sr of the radiant intensity µ L/(π µ0) of the slab, for a flux of π.
     per_radiance = math.pi * (APERTURE / 2.0) ** 2 * (mu / FAR) ** 2 / (math.pi * table.mu0)
     rows = [[float(one[name].sum()) for name in "IQU"] for one in (result.channels, result.channel_errors)]
@@ -271,8 +271,8 @@ def test_an_analyser_splits_the_stokes_vector(device):
     analyser = {"polarisation": "analyser", "analyser_angle_deg": 30.0, "analyser_extinction_ratio": 50.0}
     split = polarised(camera=analyser)
     one = polarised(medium={"layers": ELSEWHERE})
-    whole = simulate(split, photons=8192, device=device, uncertainty=True)
-    stokes = simulate(one, photons=8192, device=device, uncertainty=True)
+    whole = simulate(split, photons=8192, device=device)
+    stokes = simulate(one, photons=8192, device=device)
     leak, (i, q, u, _v) = 1.0 / 50.0, stokes.channels.values()
     along = q * math.cos(math.radians(60.0)) + u * math.sin(math.radians(60.0))
     for name, sign in (("co", 1.0), ("cross", -1.0)):

@@ -17,7 +17,7 @@ SCENE = make_scene(gate={"start_ns": 0.0, "bin_width_ps": 400.0, "bins": 64})
 
 @pytest.fixture(scope="module")
 def result():
-    return spadwarp.simulate(SCENE, photons=20_000, device="cpu", uncertainty=True)
+    return spadwarp.simulate(SCENE, photons=20_000, device="cpu")
 
 
 @pytest.fixture(scope="module")

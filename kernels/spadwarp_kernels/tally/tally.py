@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_kind
+from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_kind, check_number
 from spadwarp_kernels.base.kernels import launch_pixels
 
 __all__ = ["COMPONENTS", "Batches", "add_tallies", "has_overflowed", "tally_rates"]
@@ -191,15 +191,18 @@ def close_batch_kernel(
     component_count: int,
     least: wp.int64,
     run: int,
+    weight: wp.float64,
     batch: wp.array[wp.int64],
     # Out:
     total: wp.array[wp.int64],
+    half: wp.array[wp.int64],
     squares_low: wp.array[wp.uint64],
     squares_high: wp.array[wp.uint64],
     sums: wp.array[wp.int64],
     overflow: wp.array[int],
 ):
-    """Adds a batch to the total and the square of its sum over components to a 128-bit sum, and empties it.
+    """Adds a batch to the total, to `half` if that is as long, and the square of its sum over components, times
+    `weight`, to a 128-bit sum, and empties it.
 
     `sums` takes its components, over voxels; `overflow` is set where a total leaves [least, 2^62).
 
@@ -224,12 +227,16 @@ def close_batch_kernel(
                 atomic_add_int64(sums, component * _SLOTS + voxel % _SLOTS, value)
                 new = total[index] + value
                 total[index] = new
+                if half.shape[0] == total.shape[0]:
+                    half[index] = half[index] + value
                 batch[index] = wp.int64(0)
                 if new < least or new >= VOXEL_LIMIT:
                     overflow[0] = 1
         if t != wp.int64(0):
             # Derivatives have signs. t^2 = high^2 2^64 + 2 low high 2^32 + low^2, with |t| < 2^63.
             t = wp.abs(t)
+            if weight != wp.float64(1.0):
+                t = wp.int64(wp.rint(wp.float64(t) * weight))
             low = wp.uint64(t) & _LOW32
             high = wp.uint64(t) >> wp.uint64(32)
             middle = wp.uint64(2) * low * high
@@ -252,18 +259,26 @@ def add_squares_kernel(
 class Batches:
     """Totals and squares on the device of a tally; `total` may be the caller's own array of zeros.
 
-    `signed`: whether values may be negative, as those of derivatives.
+    `signed`: whether values may be negative, as those of derivatives; `halved`: whether the total of one half of the
+    batches is wanted.
 
     Raises `ArgumentError` for arrays that do not fit each other.
 
     Attributes:
         total: int64, as the tally.
+        half: int64, as the tally, the total of the batches of one half; None if not wanted.
         second_moment: Low and high halves of the sums of squares over batches, uint64 [voxels of one component] each.
         count: Batches closed.
     """
 
     def __init__(
-        self, tally: wp.array, component_count: int, *, total: wp.array | None = None, signed: bool = False
+        self,
+        tally: wp.array,
+        component_count: int,
+        *,
+        total: wp.array | None = None,
+        signed: bool = False,
+        halved: bool = False,
     ) -> None:
         check_array("tally", tally, wp.int64, (None,), contiguous=True)
         self._component_count = check_integer("component_count", component_count, 1, max(tally.size, 1))
@@ -278,15 +293,21 @@ class Batches:
             self._sums = wp.zeros(component_count * _SLOTS, dtype=wp.int64)
             self._overflow = wp.zeros(1, dtype=int)
             self.total = wp.zeros(tally.size, dtype=wp.int64) if total is None else total
+            self.half = wp.zeros(tally.size, dtype=wp.int64) if halved else None
+            self._no_half = wp.zeros(0, dtype=wp.int64)
             self.second_moment = tuple(wp.zeros(tally.size // component_count, dtype=wp.uint64) for _ in range(2))
         self.count = 0
 
-    def close(self, tally: wp.array, *, threads: int = 1) -> None:
-        """Takes the tally over as one batch and sets it to zero; on a CPU with so many threads."""
+    def close(self, tally: wp.array, *, in_half: bool = False, part: float = 1.0, threads: int = 1) -> None:
+        """Takes the tally over as one batch, or a part of one in (0, 1], and sets it to zero; on a CPU with so many
+        threads. The square of a part is divided by it, so that parts and batches add up to one estimate of the
+        variance. `in_half`: whether it belongs to the half."""
         check_array("tally", tally, wp.int64, tuple(self.total.shape), self.total.device, contiguous=True)
         threads = 1 if tally.device.is_cuda else check_integer("threads", threads, 1, 4096)
         run = 1 if tally.device.is_cuda else _RUN
-        inputs = [self._component_count, self._least, run, tally, self.total, *self.second_moment]
+        half = self.half if in_half and self.half is not None else self._no_half
+        weight = wp.float64(1.0 / math.sqrt(check_number("part", part, "(0, 1]")))
+        inputs = [self._component_count, self._least, run, weight, tally, self.total, half, *self.second_moment]
         inputs += [self._sums, self._overflow]
         runs = -(-self.second_moment[0].size // run)
         launch_pixels(close_batch_kernel, runs, inputs, device=tally.device, threads=threads)
@@ -302,6 +323,8 @@ class Batches:
             raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
         device = self.total.device
         add_tallies(self.total, other.total)
+        if self.half is not None and other.half is not None:
+            add_tallies(self.half, other.half)
         for piece in _pieces(self.second_moment[0].size):
             more = [half[piece].to(device) for half in other.second_moment]
             outputs = [half[piece] for half in self.second_moment]

@@ -1,0 +1,138 @@
+"""Noise of a simulation against that of the camera: by how much a frame's photons outweigh what too few traced photons
+leave in the expected light."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.result.tallies import standard_error
+from spadwarp.scene.ambient_light import noise_rate
+from spadwarp.values import check_real, percent
+
+if TYPE_CHECKING:
+    from spadwarp.result.result import Result
+    from spadwarp.scene import Scene
+
+__all__ = ["NOISE_GOAL", "PhotonsNeeded", "noise_problem", "photons_needed"]
+
+NOISE_GOAL = 0.1
+"""`Result.target_noise_ratio` up to which a result's noise does not show beside that of a frame's photons: it adds 5 %
+to their standard deviation."""
+
+_FWHM_PER_SIGMA = math.sqrt(8.0 * math.log(2.0))
+_NARROW = 0.2  # standard deviation [bins] of a response that leaves light in its bin
+_PART_VOXELS = 1 << 22
+_SAMPLE = 1024  # pixels whose median stands for the target
+
+Floats = NDArray[np.float64]
+
+
+def noise_ratios(result: Result, second_moment: NDArray[np.uint64], pixels: NDArray[np.intp]) -> Floats:
+    """`Result.noise_ratio` of pixels, by their numbers in the image; `[P]`."""
+    components, _, _, bins = result.tallies.shape
+    tallies, moments = result.tallies.reshape(components, -1, bins), second_moment.reshape(2, -1, bins)
+    size = max(1, _PART_VOXELS // bins)
+    scene, value = result.scene, result.tally_value.reshape(-1)
+    target = np.isfinite(result.truth.depth).reshape(-1)
+    noise = np.broadcast_to(noise_rate(scene, result.truth), (*result.truth.depth.shape, 1)).reshape(-1)
+    ratios = np.full(len(pixels), np.nan)
+    for first in range(0, len(pixels), size):
+        part = pixels[first : first + size]
+        mine = tallies[:, part]
+        scale = (value[part] * (scene.laser.photons_per_pulse * scene.detections_per_photon))[:, None]
+        error = standard_error(mine, moments[:, part], result.batches, result.photons / result.batch_size) * scale
+        light = mine.sum(axis=0) * scale
+        # The return is the light of the target, where there is one.
+        signal = np.where(target[part, None], mine[:2].sum(axis=0) * scale, light)
+        background = noise[part, None] * scene.gate.bin_width
+        ratios[first : first + size] = _ratios(scene, signal, light, background, error)
+    return ratios
+
+
+def _ratios(scene: Scene, signal: Floats, light: Floats, background: Floats, error: Floats) -> Floats:
+    """From detections per pulse `[P, T]`: of the return, of all light, of ambient light and dark counts, and the
+    standard errors of all light.
+
+    The matched filter adds up counts c_k with weights w_k, the return after the instrument's response h. Errors σ_j of
+    the light move it by M² Σ_j σ_j² (Σ_k h_kj w_k S_k)², the photons of M pulses by M (Σ w_k² p_k - (Σ w_k p_k)²) in a
+    first-photon detector, with p_k the probability of a count and S_k that of none until the end of the bin, else by
+    M Σ w_k² λ_k with S_k = 1.
+    """
+    weight, rate = _blurred(scene, signal), _blurred(scene, light) + background
+    if scene.detector.mode == "first_photon":
+        before = np.cumsum(rate, axis=1) - rate
+        counted, none = np.exp(-before) * -np.expm1(-rate), np.exp(-before - rate)
+        variance = (np.square(weight) * counted).sum(axis=1) - np.square((weight * counted).sum(axis=1))
+        moved = weight * none
+    else:
+        variance, moved = (np.square(weight) * rate).sum(axis=1), weight
+    moved = np.square(error * _blurred(scene, moved)).sum(axis=1) * scene.detector.pulses_per_frame
+    return np.divide(moved, variance, out=np.full(len(moved), np.nan), where=variance > 0)
+
+
+def _blurred(scene: Scene, values: Floats) -> Floats:
+    """By a Gaussian response of the width of pulse and jitter, along the bins."""
+    from scipy.ndimage import gaussian_filter1d
+
+    fwhm = math.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps)
+    sigma = fwhm / (_FWHM_PER_SIGMA * scene.gate.bin_width_ps)
+    return values if sigma < _NARROW else gaussian_filter1d(values, sigma, axis=1, mode="constant", truncate=3.0)
+
+
+def target_noise_ratio(result: Result, second_moment: NDArray[np.uint64]) -> float:
+    """`Result.target_noise_ratio`."""
+    target = np.isfinite(result.truth.depth)
+    returned = result.tallies.any(axis=(0, 3)) & (target | ~target.any())
+    pixels = np.flatnonzero(returned)
+    pixels = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), _SAMPLE)).astype(np.intp)]
+    ratios = noise_ratios(result, second_moment, pixels)
+    ratios = ratios[np.isfinite(ratios)]
+    return float(np.median(ratios)) if ratios.size else math.inf
+
+
+class PhotonsNeeded(NamedTuple):
+    """That would bring a result's noise to a goal."""
+
+    photons: float  # in all; infinite where nothing returned yet
+    seconds: float  # that they would take on the devices of the result; NaN where its time is not known
+
+
+def photons_needed(result: Result, noise_ratio: float = NOISE_GOAL) -> PhotonsNeeded:
+    """Photons that would bring `Result.target_noise_ratio` to a goal: it falls as their number.
+
+    `noise_ratio`: the goal, > 0. Where few heavy photons decide, the estimate is too low. Raises `ConfigError` as
+    `Result.noise_ratio` does.
+    """
+    goal = check_real("noise_ratio", noise_ratio, "(0, inf)")
+    photons = result.photons * result.target_noise_ratio / goal
+    seconds = result.timing.get("trace", math.nan)
+    return PhotonsNeeded(photons, photons * seconds / result.photons)
+
+
+def noise_problem(result: Result) -> str:
+    """A sentence for the user where the noise of the simulation shows beside that of the photons; else empty."""
+    if result.batches < 2:
+        return "the noise of the simulation is not known: too few photons were traced to tell"
+    ratio = result.target_noise_ratio
+    if ratio <= NOISE_GOAL:
+        return ""
+    if ratio == math.inf:
+        return f"not enough photons: none of {result.photons:.3g} brought light back"
+    photons, seconds = photons_needed(result)
+    time = f", about {_duration(seconds)} here" if math.isfinite(seconds) else ""
+    return (
+        f"not enough photons: noise of the simulation has {percent(ratio)} % of the variance of a frame's photons in "
+        f"the median pixel, and pictures show it; about {photons:.1e} photons instead of {result.photons:.1e} would "
+        f"make it {percent(NOISE_GOAL)} %{time}"
+    )
+
+
+def _duration(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} s"
