@@ -90,7 +90,9 @@ def _read(scene: Scene, word: Any) -> Unknown:
     if name == "reflectance" and len(own) == 1:
         name = own[0]
     if name == "reflectance" and own:
-        raise ArgumentError(f"unknown: 'reflectance' is that of one target, and the scene has {len(own)}: name {' or '.join(own)}")
+        raise ArgumentError(
+            f"unknown: 'reflectance' is that of one target, and the scene has {len(own)}: name {' or '.join(own)}"
+        )
     if name == "ambient_rate":
         name = BACKGROUND
     field = _FIELD.fullmatch(name)
