@@ -643,7 +643,9 @@ def trace(
         options: dict[str, Any] = {"seed": seed, "device": device, "progress": report, "mesh_cache": cache}
         return simulate(scene, photons=each, run=RunOptions(first_photon=before + number * each), **options)
 
-    runs = [run(number) for number in range(_RUNS)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SpadwarpWarning)  # of few photons: `plan` judges what they tell
+        runs = [run(number) for number in range(_RUNS)]
     return tuple(merge(pair) for pair in zip(earlier, runs, strict=True)) if earlier else tuple(runs)
 
 
