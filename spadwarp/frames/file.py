@@ -416,7 +416,7 @@ def record_frames(
         pulses, frames, seed, tags, window, device: As of `spadwarp.detect`.
         methods: Estimators of depth, see `spadwarp.arrival_time`. They know background and response.
         undo_pile_up: Estimate from Coates' correction of the counts.
-        progress: Called with ("frames", done, frames).
+        progress: Called with ("frames", done, frames), and before it with (step, 0, 0) of each part of them.
 
     Raises `ArgumentError`, and `FileError` where the file cannot be written.
     """
@@ -426,6 +426,12 @@ def record_frames(
     bins = scene.gate.bins if window is None else window[1]
     size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
     options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
+
+    def remark(text: str) -> None:
+        if progress is not None:
+            progress(text, 0, 0)
+
+    remark("Cramér–Rao bound")
     bound = _bound(result, pulses, device)
     notes = () if bound.problem is None else (f"no Cramér–Rao bound: {bound.problem}",)
     errors: dict[Method, FrameErrors] = {}
@@ -433,11 +439,14 @@ def record_frames(
     with write_hdf5(path) as opened:
         writer = _Writer(opened, frames)
         for start in range(0, frames, size):
-            part = detect(result, frames=min(size, frames - start), first_frame=start, **options)
+            number = min(size, frames - start)
+            remark(f"counts of frames {start + 1} to {start + number}")
+            part = detect(result, frames=number, first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
             depth: dict[Method, Map] = {}
             found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}
             for method in methods:
+                remark(f"their depth by {method}")
                 time = part.arrival_time(method, undo_pile_up=undo_pile_up, **found)
                 depth[method] = depth_from_time(time, scene=scene)
             writer.add(part, scene, depth, found["significance"], _still(result, part, frames, bound.sigma))
