@@ -171,7 +171,7 @@ class Survey:
             distance=distance,
             optical_depth=optical_depth,
             irradiance=axis_fluence(scene, distance) * passed * scene.laser.average_power,
-            samples_per_pixel=scene.transport.photons / scene.scan_positions * ballistic,
+            samples_per_pixel=_photons(scene) / scene.scan_positions * ballistic,
             photons_per_pixel=photons,
             signal_per_pulse=photons * scene.detections_per_photon,
         )
@@ -638,10 +638,15 @@ def _check_polarisation(survey: Survey) -> None:
             survey.note(f"{section}.{field}", f"{field} = {value:g} is not used: it goes with {section}.{needed}")
 
 
+def _photons(scene: Scene) -> float:
+    """That will be traced; infinite where their noise decides, and the run itself says whether they were enough."""
+    return math.inf if isinstance(scene.transport.photons, str) else scene.transport.photons
+
+
 def _check_peak(survey: Survey) -> None:
     """A forward peak that is too narrow for the photons to see it."""
-    scene, (estimator, photons) = survey.scene, (survey.scene.transport.estimator, survey.scene.transport.photons)
-    if scene.medium.range.scattering == 0.0:
+    scene, (estimator, photons) = survey.scene, (survey.scene.transport.estimator, _photons(survey.scene))
+    if scene.medium.range.scattering == 0.0 or photons == math.inf:
         return
     middle = 0.5 * (scene.gate.start + scene.gate.stop)
     distance = survey.target_range[0] if survey.target_range else survey.range_of(middle)
@@ -663,7 +668,7 @@ def _check_statistics(survey: Survey) -> None:
         survey.warn("gate.bins", text, bytes=size)
     if axis is None:
         return
-    signal, samples, traced = axis.signal_per_pulse, axis.samples_per_pixel, scene.transport.photons
+    signal, samples, traced = axis.signal_per_pulse, axis.samples_per_pixel, _photons(scene)
     text = (
         f"optical depth to the nearest illuminated point {axis.optical_depth:.3g} one way ({axis.distance:.4g} m); "
         f"a pixel on the beam's axis detects {signal:.3g} unscattered photons a pulse"

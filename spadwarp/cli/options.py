@@ -216,6 +216,10 @@ def numbers(form: str) -> Callable[[str], dict[str, Any]]:
     return parse
 
 
+def _photons(text: str) -> int | Literal["auto"]:
+    return "auto" if text == "auto" else whole_number(text)
+
+
 def _part(text: str) -> tuple[int, int]:
     number, _, parts = text.partition("/")
     if not (number.isdecimal() and parts.isdecimal()):
@@ -247,6 +251,8 @@ def number_or(word: str | None = None) -> Callable[[str], float | str]:
 
 Length = Annotated[float, from_unit("m")]
 Seconds = Annotated[float, from_unit("s")]
+Photons = Annotated[int, _photons]
+"""A whole number, or "auto"."""
 Part = Annotated[tuple[int, int], _part]
 """`3/64`; Python checks the range."""
 
@@ -292,7 +298,7 @@ def read_scene(
     overrides: list[str] | None = None,
     *,
     mesh: Path | None = None,
-    photons: int | None = None,
+    photons: int | Literal["auto"] | None = None,
     seed: int | None = None,
 ) -> Scene:
     """The scene with the options applied: first `--mesh`, then `--set`, then the others."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import spadwarp
 from spadwarp.cli import options as opt
@@ -32,7 +32,8 @@ def simulate(
     devices: str | None = None,
     ray: str | None = None,
     workers: int | None = None,
-    photons: int | None = None,
+    photons: opt.Photons | None = None,
+    time: opt.Seconds | None = None,
     seed: int | None = None,
     overrides: list[str] | None = None,
     threads: int | None = None,
@@ -57,11 +58,15 @@ def simulate(
 
     Args:
         scene (SCENE): Scene file (TOML), or the name of a scene of `spadwarp list scenes`; none with --resume.
+        photons (N|auto): Photons to emit, such as 2e9. auto: until the noise of the simulation is small beside that of
+            a frame's photons in the median pixel of the target, a tenth of its variance, or until --relative-error or
+            --time; the default where the scene gives no number.
+        time (SECONDS): Of auto at most, without loading kernels; by default 60. It asks for auto.
         seed: Key of the random numbers. By default the scene's.
         threads: CPU threads; by default one for each core.
         records: Also write the terminal state of every photon: records.h5.
         relative_error (X): Stop at this relative error of the bins that decide the depth (0.02: 2 %), or after
-            --photons.
+            a number of --photons.
         derivatives (NAME,...): Also the derivatives of the histogram by these parameters, 8 at most:
             medium.absorption, medium.scattering, medium.anisotropy, medium.layers[0].scattering,
             targets[0].reflectance, ...; short, absorption, where one alone can be meant. medium.grid.absorption,
@@ -95,27 +100,28 @@ def simulate(
     else:
         text = "cannot be combined with --trajectory"
         opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
-        opt.refuse(text, "--records", "--relative-error", "--derivatives")
+        opt.refuse(text, "--records", "--relative-error", "--derivatives", "--time")
+    asked: Any = "auto" if photons is None and time is not None else photons
     earlier = None
     if resume is not None:
         text = "cannot be combined with --resume: the run has it"
         opt.refuse(text, "SCENE", "--out", "--mesh", "--seed", "--set", "--records", "--derivatives")
         opt.refuse(text, "--first-photon", "--shard")
         out = resume if resume.is_dir() else resume.parent
-        earlier = _earlier(resume, photons)
+        earlier = _earlier(resume, asked)
         read = earlier.scene
     elif scene is None or out is None:
         hint, text = ("--out", "a directory, --out out/") if scene else ("SCENE", "a scene file, or --resume DIR")
         wrong(f"is missing; give {text}", hint)
     elif trajectory is not None:
-        drawn = {"frame_rate": frame_rate, "photons": photons, "seed": seed, "methods": (method,), "tags": tags}
+        drawn = {"frame_rate": frame_rate, "photons": asked, "seed": seed, "methods": (method,), "tags": tags}
         _simulate_moving(scene, trajectory, out, opt.read_scene(scene, overrides, mesh=mesh), device=devices, **drawn)
         return
     else:
-        read = opt.read_scene(scene, overrides, mesh=mesh, photons=photons, seed=seed)
+        read = opt.read_scene(scene, overrides, mesh=mesh, photons=asked, seed=seed)
     if records and (first_photon or shard):
         wrong("needs all photons from photon 0 on", "--records")
-    if records and read.transport.photons >= 2**31:
+    if records and (read.transport.photons == "auto" or read.transport.photons >= 2**31):
         raise ConfigError(f"--records: photons = {read.transport.photons} is outside [1, {2**31 - 1}]")
     engine = opt.read_engine(ray, workers)
     if engine is None:
@@ -126,7 +132,8 @@ def simulate(
     with _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
             read,
-            photons=None if earlier is None or photons is None else read.transport.photons,
+            photons=None if earlier is None or asked is None else read.transport.photons,
+            time=time,
             device=devices,
             engine=engine,
             progress=report,
@@ -147,17 +154,21 @@ def simulate(
         note("the photons are traced again for their records")
         traced = spadwarp.transport.trace(read, photons=result.photons, device=device, progress=progress())
         files.written.append(spadwarp.transport.save_records(traced, out / "records.h5", scene=read))
+    if problem := spadwarp.result.noise_problem(result):
+        say(problem)
     shown = _brief(result, files)
     error = shown.get("relative_error")
     answer({**result.summary(), "relative_error": error, "files": files.written}, shown=shown)
     if result.partial:
-        done = f"{count(result.photons)} of {count(result.requested[1] - result.requested[0])} photons"
+        wanted = "" if read.transport.photons == "auto" else f" of {count(result.requested[1] - result.requested[0])}"
+        done = f"{count(result.photons)}{wanted} photons"
         without = "; no records were written" if records else ""
         fail(f"interrupted after {done}, which are written and marked partial{without}", INTERRUPTED)
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
-        late = result.photons < read.transport.photons
-        why = "since rare heavy photons arrived late" if late else "after all photons"
+        number = read.transport.photons
+        late = number != "auto" and result.photons < number
+        why = "since rare heavy photons arrived late" if late else f"after {count(result.photons)} photons"
         complain(f"warning: the error {reached} {why}, not {100 * relative_error:.3g} %; --resume {out} adds photons")
 
 
@@ -186,14 +197,14 @@ def _warn(scene: Scene, device: str | None) -> None:
         complain(f"warning: --device: {name} is named more than once: the same bits, no sooner, with more memory")
 
 
-def _earlier(place: Path, photons: int | None) -> Result:
+def _earlier(place: Path, photons: int | Literal["auto"] | None) -> Result:
     """The run to resume, whose scene asks for as many photons as it shall have."""
     from spadwarp.files import load_resumable
 
     earlier, place = load_resumable(place)
     start, stop = earlier.requested
     wanted = stop - start if photons is None else photons
-    if wanted <= earlier.photons:
+    if wanted != "auto" and wanted <= earlier.photons:
         raise ConfigError(f"--photons: {wanted} is no more than the {earlier.photons} that {place} has")
     if photons is None:
         return earlier
@@ -258,7 +269,7 @@ def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
         "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
     }
     if result.batches > 1:
-        found["relative_error"] = result.relative_error
+        found |= {"noise_ratio": result.target_noise_ratio, "relative_error": result.relative_error}
     return {**found, "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"}
 
 
@@ -292,6 +303,8 @@ def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
     check_outputs(out, files.RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
     made = files.write_run(result, out, device=device)
     say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))
+    if problem := spadwarp.result.noise_problem(result):
+        say(problem)
     summary = {**result.summary(), "photon_ranges": result.photon_ranges, "files": made.written}
     answer(summary, shown=_brief(result, made))
 

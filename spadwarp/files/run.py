@@ -173,7 +173,7 @@ def bytes_needed(scene: Scene, *, records: bool = False, checkpoint: bool = Fals
     signed = derivatives + len(scene.camera.tallied_channels)
     # Tallies and squares by bin, and of light the tallies of one half of the photons.
     tallies = (8 + 5 * signed) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
-    photons = scene.transport.photons if records else 0
+    photons = scene.transport.photons if records and scene.transport.photons != "auto" else 0
     return (2 if checkpoint else 1) * tallies + _OTHER_BYTES + _RECORD_BYTES * photons
 
 

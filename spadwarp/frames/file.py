@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -513,7 +513,7 @@ def simulate_sequence(
     path: str | Path,
     *,
     frame_rate: float | None = None,
-    photons: int | None = None,
+    photons: int | Literal["auto"] | None = None,
     pulses: int | None = None,
     seed: int | None = None,
     methods: Sequence[Method] = ("matched",),
@@ -531,7 +531,7 @@ def simulate_sequence(
         trajectory: From `spadwarp.scene.load_trajectory`, or the path of its .csv file.
         path: The file, whole or not at all.
         frame_rate: Frames a second, at even times between the rows; None: a frame at each row.
-        photons: Traced for each frame; default: the scene's.
+        photons: Traced for each frame, as of `simulate`; default: the scene's. With "auto" the first frame decides.
         pulses, methods, tags, progress: As of `record_frames`.
         seed: 64 bits; default: the scene's.
         device: "cpu", "cuda:0", ...; by default the first GPU, else the CPU.
@@ -552,7 +552,7 @@ def simulate_sequence(
         raise ConfigError([f"{wrong[0]} cannot change from frame to frame"], source=moves.source)
     seed = base.transport.seed if seed is None else check_integer("seed", seed, SEED)
     pulses = base.detector.pulses_per_frame if pulses is None else pulses
-    photons = base.transport.photons if photons is None else photons
+    asked = base.transport.photons if photons is None else photons
     # One device for all but the photons.
     first = None if device is None else "cuda:0" if device == "cuda:all" else device.split(",")[0]
     kept: dict[str, Any] = {}
@@ -563,21 +563,22 @@ def simulate_sequence(
             with warnings.catch_warnings():
                 if number:  # said of the first frame
                     warnings.simplefilter("ignore", SpadwarpWarning)
-                result = simulate(at, photons=photons, seed=frame_seed, device=device, mesh_cache=kept)
+                result = simulate(at, photons=asked, seed=frame_seed, device=device, mesh_cache=kept)
+                asked = result.photons  # all frames have those of the first
                 part = detect(result, first_frame=number, pulses=pulses, seed=seed, tags=tags, device=first)
             found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": first}
             times = {method: part.arrival_time(method, **found) for method in methods}
             depth = {method: depth_from_time(time, scene=at) for method, time in times.items()}
-            writer.add(part, base, depth, found["significance"], _moving(result, part, moves, number, photons))
+            writer.add(part, base, depth, found["significance"], _moving(result, part, moves, number))
             if progress is not None:
                 progress("frames", number + 1, len(scenes))
     return SequenceFile.load(path)
 
 
-def _moving(result: Result, part: Frames, moves: Trajectory, row: int, photons: int) -> _Layout:
+def _moving(result: Result, part: Frames, moves: Trajectory, row: int) -> _Layout:
     """What the file of a scene that moves holds of a frame beside its counts: see `_Layout`."""
     fields = list(moves.fields)
-    attributes = {"format": SequenceFile.FORMAT, "photons": photons, "fields": fields}
+    attributes = {"format": SequenceFile.FORMAT, "photons": result.photons, "fields": fields}
     coordinates = {"camera_axis": (["x", "y", "z"], "1", "of the camera"), "field": (fields, "1", "of the scene")}
     camera: Any = camera_attributes(result.scene.camera, result.focus_distance)
     position, rotation = camera["camera_position"], camera["camera_rotation"].reshape(3, 3)

@@ -268,7 +268,7 @@ def merge(results: Iterable[ResultLike]) -> Result:
 
     `results` are results or their paths.
 
-    Standard errors are those of the batches that the parts had. The ids may leave gaps, which `simulate(resume=)` fills.
+    Standard errors are from the batches that the parts had. The ids may leave gaps, which `simulate(resume=)` fills.
     Each part's provenance is in `provenance["parts"]`, with its ids.
 
     Raises `ArgumentError`: no list of results; `ConfigError`: different scenes (photons and output aside), seeds or

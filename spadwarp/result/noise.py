@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from spadwarp.result.tallies import standard_error
 from spadwarp.scene.ambient_light import noise_rate
-from spadwarp.values import check_real, percent
+from spadwarp.values import check_real
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
@@ -123,11 +123,11 @@ def noise_problem(result: Result) -> str:
     if ratio == math.inf:
         return f"not enough photons: none of {result.photons:.3g} brought light back"
     photons, seconds = photons_needed(result)
-    time = f", about {_duration(seconds)} here" if math.isfinite(seconds) else ""
+    time = f", {_duration(seconds)} here" if math.isfinite(seconds) else ""
     return (
-        f"not enough photons: noise of the simulation has {percent(ratio)} % of the variance of a frame's photons in "
-        f"the median pixel, and pictures show it; about {photons:.1e} photons instead of {result.photons:.1e} would "
-        f"make it {percent(NOISE_GOAL)} %{time}"
+        f"not enough photons: the picture is noise of the simulation, {ratio:.2g} times the variance of a frame's "
+        f"photons in the median pixel; about {photons:.1e} photons instead of {result.photons:.1e} would make it "
+        f"{NOISE_GOAL:g} times{time}"
     )
 
 

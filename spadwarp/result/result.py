@@ -342,8 +342,8 @@ class Result(Shown, ResultHead, Tallies):
             )
         return unseen + tuple(
             f"{name}: one of {self.batches} batches has {100 * share:.0f} % of the variance of its light (relative "
-            f"standard error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; what "
-            f"helps: {', '.join(ways)}"
+            f"standard error {percent(error)} %): few heavy photons decide it, and errors may be larger than they seem; "
+            f"what helps: {', '.join(ways)}"
             for name, (error, share) in component_errors(self).items()
             if error > _SMALL_ERROR and share > _threshold(self.batches)
         )

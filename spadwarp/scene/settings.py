@@ -239,7 +239,9 @@ class Scan(Section):
 class Transport(Section):
     """How photons are traced."""
 
-    photons: Whole = field(1_000_000, "photons to emit", "[1, 1000000000000]")
+    photons: Annotated[Whole, Field(ge=1, le=10**12)] | Literal["auto"] = "auto"
+    """photons to emit; "auto": until the noise of the simulation is small beside that of a frame's photons, or its time
+    is over"""
     seed: Whole = field(0, "key of the random numbers; one seed gives the same bits", SEED)
     estimator: Literal["analog", "next_event", "guided"] = "guided"
     """what scores: the photon itself, every event, or guided flights; `none` of the kernel library is not offered here;

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,10 @@ _BATCHES, _STOPPING_BATCHES = (8, 32), (128, 1024)
 
 # Photons of a batch at most: some seconds of a GPU, so that several can share the work.
 _LARGEST_BATCH = 1 << 30
+
+# Where the error decides about the number of photons: of a batch at least, and voxels read for each.
+_AUTO_BATCH = {"cpu": 1 << 15, "cuda": 1 << 24}
+_AUTO_VOXELS_PER_PHOTON = {"cpu": 128, "cuda": 16}
 
 # Bins of all pixels, at most, whose errors are kept: in memory they take 88 bytes each, without errors 24.
 MOST_BINS_WITH_ERRORS = 1 << 27
@@ -93,6 +97,7 @@ class Plan(ResultHead):
     mesh: TriangleMesh | None
     derivatives: tuple[str, ...] = ()
     launch_size: int | None = None
+    is_auto: bool = False  # whether the error decides how many of the `photons` are traced
 
     @property
     def scale(self) -> float:
@@ -104,20 +109,22 @@ def make_plan(
     scene: Scene,
     run: RunOptions,
     *,
-    photons: int | None,
+    photons: int | Literal["auto"] | None,
     seed: int | None,
     batches: bool = True,
+    kind: Literal["cpu", "cuda"] = "cpu",
     relative_error: float | None = None,
     resume: Result | None = None,
     derivatives: Iterable[str] | None = None,
     blocks: Sequence[int] | None = None,
 ) -> Plan:
     """The plan for the arguments of `simulate`; `resume` is that of the run, read. `batches`: whether errors are kept,
-    for which a run whose light alone is wanted has no use.
+    for which a run whose light alone is wanted has no use; `kind` of the devices.
 
     Raises `ArgumentError` for those that are out of range, `ConfigError` for those that cannot be combined.
     """
-    photons = None if photons is None else check_integer("photons", photons, _PHOTONS)
+    if photons is not None and photons != "auto":
+        photons = check_integer("photons", photons, _PHOTONS)
     seed = None if seed is None else check_integer("seed", seed, SEED)
     first_photon, shard, batch_size = run.first_photon, run.shard, 0
     if relative_error is not None:
@@ -129,19 +136,27 @@ def make_plan(
         _check_resumed(resume, run, seed)
         seed, first_photon, batches = resume.seed, resume.requested[0], resume.batch_size > 0
         photons = count([resume.requested]) if photons is None else photons
-        if photons <= resume.photons:
-            raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
         had = tuple(resume.derivatives)
         if derivatives is not None and names != had:
             text = f"the run to resume has {', '.join(had) or 'none'}, not {', '.join(names)}"
             raise ConfigError(f"derivatives: {text}")
         names = had
     photons = scene.transport.photons if photons is None else photons
-    if batches:
-        least = 0 if resume is None else resume.batch_size
-        batch_size = max(least, _batch_size(scene, photons, relative_error, shard))
     mesh = build_mesh(scene)
     scale, capacity = scale_and_capacity(scene, mesh)
+    most = min(capacity, int(_PHOTONS.high))
+    # A run by its error is interrupted with all the photons that there can be still asked for.
+    is_auto = photons == "auto" or (resume is not None and photons == most)
+    photons = most if photons == "auto" else photons
+    if resume is not None and photons <= resume.photons:
+        raise ConfigError(f"photons = {photons} is outside [{resume.photons + 1}, {10**12}]")
+    if is_auto and shard is not None:
+        raise ConfigError("photons = 'auto' cannot be combined with shard: no part knows the error of the whole")
+    if batches:
+        wanted = _auto_batch_size(scene, kind) if is_auto else _batch_size(scene, photons, relative_error, shard)
+        batch_size = max(0 if resume is None else resume.batch_size, wanted)
+    if is_auto and not batch_size:
+        raise ConfigError("photons = 'auto' needs errors, which a histogram this large does not keep; give a number")
     if photons > capacity:
         raise ConfigError(
             f"photons = {photons} is outside [1, {capacity}]: the unit of this scene's histogram is fine enough for "
@@ -164,6 +179,7 @@ def make_plan(
         mesh=mesh,
         derivatives=names,
         launch_size=run.launch_size,
+        is_auto=is_auto,
     )
     if resume is not None and (problem := difference(resume, plan)):
         raise ConfigError(f"resume: {problem}")
@@ -180,6 +196,15 @@ def _batch_size(scene: Scene, photons: int, relative_error: float | None, shard:
     least = least if shard is None else max(least, shard[1])
     positions = scene.scan_positions
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
+
+
+def _auto_batch_size(scene: Scene, kind: str) -> int:
+    """As `_batch_size`, for a number of photons that is not known: some hundredths of a second."""
+    bins = scene.camera.width * scene.camera.height * scene.gate.bins
+    if bins > MOST_BINS_WITH_ERRORS:
+        return 0
+    least = max(_AUTO_BATCH[kind], len(COMPONENTS) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
+    return scene.scan_positions << max(0, (least // scene.scan_positions - 1).bit_length())
 
 
 def _check_resumed(resume: Result, run: RunOptions, seed: int | None) -> None:

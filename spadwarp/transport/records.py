@@ -97,7 +97,8 @@ def trace(
     Args and raises: as `simulate`.
     """
     scene = as_scene(scene)
-    photons = check_integer("photons", scene.transport.photons if photons is None else photons, "[1, 2147483647]")
+    asked: Any = scene.transport.photons if photons is None else photons
+    photons = check_integer("photons", asked, "[1, 2147483647]")
     seed = check_integer("seed", scene.transport.seed if seed is None else seed, SEED)
     mesh = build_mesh(scene)
     names = resolve_derivatives(scene, derivatives)

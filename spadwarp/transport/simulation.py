@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import fields, replace
 from functools import partial
 from itertools import accumulate
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,22 @@ from spadwarp.device import pick_device, pick_devices, processor_name
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.parallel.worker import Event
 from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
+from spadwarp.result.noise import NOISE_GOAL
 from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
 from spadwarp.scene import SceneLike, as_scene
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
 from spadwarp.transport.workers import ClusterWorkers, LocalWorkers, trace_block
-from spadwarp.values import ArgumentError, ConfigError, DeviceError, FileError, SpadwarpWarning, percent, shown
+from spadwarp.values import (
+    ArgumentError,
+    ConfigError,
+    DeviceError,
+    FileError,
+    SpadwarpWarning,
+    check_real,
+    percent,
+    shown,
+)
 
 __all__ = ["Progress", "provenance", "simulate"]
 
@@ -44,6 +54,9 @@ _BLOCK_SECONDS = 5.0
 # Checkpoints take at most this share of the time.
 _LARGEST_SHARE = 0.02
 
+# Seconds of a run whose error decides its photons, and the least part of these for which it goes on.
+_SECONDS, _LEAST_PART = 60.0, 0.05
+
 FIRST_LOOK = 32
 """Batches after which a run whose goal is a relative error first looks at it."""
 
@@ -59,7 +72,8 @@ _GOING_ON = 4.0
 def simulate(
     scene: SceneLike,
     *,
-    photons: int | None = None,
+    photons: int | Literal["auto"] | None = None,
+    time: float | None = None,
     seed: int | None = None,
     device: str | None = None,
     engine: Ray | None = None,
@@ -78,14 +92,16 @@ def simulate(
     Args:
         scene: From `spadwarp.load_scene`, or the path of its file.
         photons: Emitted photons in all, > 0; by default `scene.transport.photons`, or what the run to resume was asked
-            for.
+            for. "auto": as many as bring `Result.target_noise_ratio` to 0.1, or `Result.relative_error` to
+            `relative_error`, by the rule of the latter; fewer where the time is over before.
+        time: Seconds that "auto" takes at most, > 0, without loading kernels; by default 60.
         seed: 0 ... 2^64 - 1; by default `scene.transport.seed`, or that of the run to resume.
         device: "cpu", "cuda:0", "cuda:0,cuda:2", or "cuda:all" for the GPUs of this host; by default the first GPU,
             else the CPU.
         engine: `spadwarp.Ray(...)` to run on its workers; `device` is then "cpu" or "cuda".
         progress: Called from the caller's thread with ("compile", 0, 0) before kernels are compiled or loaded, then
             with ("trace", photons done, photons asked for); any other first word is a remark for the user.
-        relative_error: Stop when `Result.relative_error` is about this; `photons` is the most that are traced. The
+        relative_error: Stop when `Result.relative_error` is about this; a number of `photons` is the most. The
             error is looked at after 32 batches of 1/128 to 1/1024 of the photons, and then where it says that the goal
             will be reached, whatever the device. There the run goes on by a part of its photons that is then fixed, so
             that it does not end because rare heavy photons have not arrived yet; if they do then, the error is larger
@@ -122,28 +138,32 @@ def simulate(
     if tallies is not None and (run.resume is not None or engine is not None):
         raise ConfigError("tallies cannot be combined with resume and engine: they hold one run of one device")
     resume = None if run.resume is None else as_result(run.resume, "resume")
+    devices = pick_devices(device) if engine is None else ()
     plan = make_plan(
         as_scene(scene),
         run,
         photons=photons,
         seed=seed,
+        kind="cuda" if any(item.is_cuda for item in devices) or (engine and device == "cuda") else "cpu",
         relative_error=relative_error,
         resume=resume,
         derivatives=derivatives,
         blocks=blocks,
     )
+    if time is not None and not plan.is_auto:
+        raise ConfigError(f"time = {shown(time)} goes with photons = 'auto'")
+    seconds = _SECONDS if time is None else check_real("time", time, "(0, 1e9]")
     with ExitStack() as stack:
         stopped = stack.enter_context(interruptible())
         if progress is not None:
             progress("compile", 0, 0)
         workers: LocalWorkers | ClusterWorkers
         if engine is None:
-            devices = pick_devices(device)
             workers = LocalWorkers(plan, devices, threads=run.threads, tallies=tallies, mesh_cache=mesh_cache)
         else:
             note = None if progress is None else lambda text: progress(text, 0, 0)
             workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))
-        result = _Run(plan, workers, resume, progress, run, stopped).result(relative_error)
+        result = _Run(plan, workers, resume, progress, run, stopped).result(relative_error, seconds)
     _warn_of_rounding(result)
     for text in result.warnings:
         warnings.warn(text, SpadwarpWarning, stacklevel=2)
@@ -198,14 +218,15 @@ class _Run:
         self._progress: dict[Any, int] = {}  # photons of a running block that are done
         self._speed: dict[Any, float] = {}
         self._collecting: set[Any] | None = None  # workers that have yet to hand over, while a checkpoint is due
+        self._photons = plan.photons  # that will be traced, as far as is known
         self._place, self._every = options.checkpoint, options.checkpoint_every
         self._written, self._cost, self._saved = time.monotonic(), 0.0, 0  # time, seconds and photons of the checkpoint
 
-    def result(self, relative_error: float | None) -> Result:
-        """Of all photons, of those that reach a relative error, or of those done when the run was stopped."""
+    def result(self, relative_error: float | None, seconds: float) -> Result:
+        """Of all photons, of those that reach a goal, or of those done when the run was stopped."""
         try:
-            if relative_error is not None:
-                return self._known_result(relative_error)
+            if relative_error is not None or self._plan.is_auto:
+                return self._known_result(Goal.of(relative_error), seconds if self._plan.is_auto else math.inf)
             self._trace(self._plan.requested)
             if not self._done:
                 raise KeyboardInterrupt
@@ -216,27 +237,42 @@ class _Run:
             saved = f"{self._place}: the {self._saved} photons that were done are here; resume it"
             raise DeviceError(f"{error}\n{saved}") from error
 
-    def _known_result(self, relative_error: float) -> Result:
-        """Traces until the error is known to be small enough, looking at it where it may be."""
-        size, rule, (start, stop) = self._plan.batch_size, StoppingRule(relative_error), self._plan.requested
-        goal = min(start + max(FIRST_LOOK * size, count(self._earlier)), stop)
+    def _known_result(self, goal: Goal, seconds: float) -> Result:
+        """Traces until the error is known to be small enough, looking at it where it may be, or for so many seconds."""
+        size, (start, stop), began = self._plan.batch_size, self._plan.requested, time.monotonic()
+        earlier, spent, rule = count(self._earlier), 0.0, StoppingRule(goal.error)
+        if limited := seconds < math.inf:  # and it first finds out how fast it is
+            self._photons = earlier + FIRST_LOOK * size
+            end = min(start + earlier + 2 * len(self._workers.workers) * size, stop)
+        else:
+            end = min(start + max(FIRST_LOOK * size, earlier), stop)
         while True:
-            self._trace((start, goal))
+            launched = time.monotonic()
+            self._trace((start, end))
+            spent += time.monotonic() - launched
             if not self._done and self._stopped.is_set():
                 raise KeyboardInterrupt
             result = self._collect()
-            if self._stopped.is_set() and without((start, goal), joined(result.photon_ranges)):
+            if self._stopped.is_set() and without((start, end), joined(result.photon_ranges)):
                 return result
-            batches = result.photons // size
-            error = result.relative_error if batches > 1 else math.inf
-            wanted = rule.next_look(batches, error, partial(largest_share, result))
-            remark = f"error {100 * error:.3g} % after {batches} batches"
-            if relative_error < error < math.inf:
-                remark += f"; about {result.photons * (error / relative_error) ** 2:.2g} photons are needed"
-            self._report(remark, result.photons, self._plan.photons)
-            if wanted is None or goal == stop:
-                return replace(result, requested=(start, goal), partial=False)
-            goal = min(goal + (wanted - batches) * size, stop)
+            batches, left, needed = result.photons // size, stop - end, math.inf
+            wanted: int | None = max(FIRST_LOOK, 2 * batches)
+            if not limited or batches >= FIRST_LOOK:
+                error = goal.error_of(result)
+                wanted = rule.next_look(batches, error, partial(largest_share, result))
+                self._report(goal.remark(result, error), result.photons, self._photons)
+                needed = result.photons * (error / goal.error) ** 2
+                left = 0 if wanted is None else left
+            if limited:
+                rate = (result.photons - earlier) / spent
+                left = min(left, int(rate * (seconds - (time.monotonic() - began))))
+                self._photons = int(min(result.photons + max(left, 0), max(needed, end - start)))
+                left = left if left >= _LEAST_PART * result.photons else 0
+            if left < 1:
+                return replace(result, requested=(start, end), partial=False)
+            assert wanted is not None
+            more = wanted - batches
+            end += min(more * size, max(left // size, 1) * size if limited else left)
 
     def _trace(self, span: Range) -> None:
         """Traces the ids of a span that are not done; fewer where the run is stopped."""
@@ -257,7 +293,7 @@ class _Run:
                 for event in self._workers.wait():
                     self._take(event)
                 photons = sum(map(count, (self._earlier, self._done, *self._held.values())))
-                self._report("trace", photons + sum(self._progress.values()), self._plan.photons)
+                self._report("trace", photons + sum(self._progress.values()), self._photons)
                 if self._collecting is not None and not self._collecting:
                     self._collecting = None
                     if self._done and not self._stopped.is_set() and self._unfinished():
@@ -352,6 +388,30 @@ class _Run:
             warnings.warn(f"no checkpoint, the run continues: {error}", RuntimeWarning, stacklevel=2)
         self._written = time.monotonic()
         self._cost = self._written - began
+
+
+class Goal(NamedTuple):
+    """The error that ends a run, which falls as the root of its photons; relative, or the root of the noise ratio."""
+
+    error: float
+    is_relative: bool
+
+    @classmethod
+    def of(cls, relative_error: float | None) -> Goal:
+        return cls(math.sqrt(NOISE_GOAL), False) if relative_error is None else cls(relative_error, True)
+
+    def error_of(self, result: Result) -> float:
+        """Infinite: not known."""
+        if result.batches < 2:
+            return math.inf
+        return result.relative_error if self.is_relative else math.sqrt(result.target_noise_ratio)
+
+    def remark(self, result: Result, error: float) -> str:
+        text = f"error {100 * error:.3g} %" if self.is_relative else f"noise ratio {error * error:.3g}"
+        text += f" after {result.batches} batches"
+        if self.error < error < math.inf:
+            text += f"; about {result.photons * (error / self.error) ** 2:.2g} photons are needed"
+        return text
 
 
 class StoppingRule:
