@@ -17,7 +17,7 @@ _PACKAGES = {
     "water": (),
     "mesh": (),
     "checks": ("check",),
-    "transport": ("RunOptions", "simulate", "truth_maps"),
+    "transport": ("RunOptions", "reconstruct", "simulate", "truth_maps"),
     "parallel": ("Ray",),
     "result": ("Result", "load_result", "merge"),
     "frames": ("Frames", "arrival_time", "crlb", "detect"),
@@ -57,7 +57,8 @@ if TYPE_CHECKING:
     from spadwarp.parallel import Ray as Ray
     from spadwarp.result import Result as Result, load_result as load_result, merge as merge
     from spadwarp.scene import Scene as Scene, load_scene as load_scene
-    from spadwarp.transport import RunOptions as RunOptions, simulate as simulate, truth_maps as truth_maps
+    from spadwarp.transport import RunOptions as RunOptions, reconstruct as reconstruct, simulate as simulate
+    from spadwarp.transport import truth_maps as truth_maps
 else:
     __all__ = ["__version__", *_HOMES]
 

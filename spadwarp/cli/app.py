@@ -46,7 +46,7 @@ Value = TypeVar("Value")
 STAGES = {
     "Begin": ("init", "list", "doctor"),
     "Plan": ("check", "plan", "sweep", "water"),
-    "Simulate": ("simulate", "merge", "analytic"),
+    "Simulate": ("simulate", "merge", "reconstruct", "analytic"),
     "Counts and depth": ("detect", "depth", "fit", "denoise"),
     "Look at results": ("info", "view", "export"),
     "Datasets and training": ("dataset", "train", "evaluate"),

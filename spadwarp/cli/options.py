@@ -109,7 +109,8 @@ def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name:
     if one.kind is not inspect.Parameter.KEYWORD_ONLY:
         about: Any = typer.Argument(**extra)
     else:
-        names = [f"{name}/--no-{name[2:]}"] if one.default is True else [name]
+        pair = one.default is True or (inner is bool and one.default is None)
+        names = [f"{name}/--no-{name[2:]}"] if pair else [name]
         about = typer.Option(*names, *(["-q"] if one.name == "quiet" else []), **extra)
     annotation = Annotated[list[item] if repeated else item, about]  # type: ignore[valid-type]
     return one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=annotation)

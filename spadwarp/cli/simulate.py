@@ -40,6 +40,7 @@ def simulate(
     records: bool = False,
     relative_error: float | None = None,
     derivatives: str | None = None,
+    reconstruct: bool | None = None,
     resume: Path | None = None,
     checkpoint: float = 60.0,
     first_photon: int = 0,
@@ -72,6 +73,8 @@ def simulate(
             targets[0].reflectance, ...; short, absorption, where one alone can be meant. medium.grid.absorption,
             .scattering, .extinction: by block of cells; with :NX:NY:NZ by so many blocks along its edges,
             divisors of the numbers of cells, else by one. Memory grows with their product.
+        reconstruct: Also the light without most of its noise, smoothed by what is known of the scene exactly; it stands
+            in result.h5 beside what was traced. `spadwarp reconstruct` does it later.
         resume (DIR): Resume the finished, interrupted or killed run in DIR until it has --photons in total (by default
             those it was started with), and write the result there.
         checkpoint (SECONDS): Time between checkpoints in --out, for --resume after a crash; longer where writing takes
@@ -100,7 +103,7 @@ def simulate(
     else:
         text = "cannot be combined with --trajectory"
         opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
-        opt.refuse(text, "--records", "--relative-error", "--derivatives", "--time")
+        opt.refuse(text, "--records", "--relative-error", "--derivatives", "--time", "--reconstruct")
     asked: Any = "auto" if photons is None and time is not None else photons
     earlier = None
     if resume is not None:
@@ -149,6 +152,9 @@ def simulate(
             ),
         )
     device = opt.one_device(devices, engine)
+    if reconstruct and result.batches > 1:
+        note("the light is reconstructed")
+        result = spadwarp.reconstruct(result, device=device)
     files = spadwarp.files.write_run(result, out, device=device, keep=() if earlier is None else ("records.h5",))
     if records and not result.partial:
         note("the photons are traced again for their records")
@@ -307,6 +313,31 @@ def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
         say(problem)
     summary = {**result.summary(), "photon_ranges": result.photon_ranges, "files": made.written}
     answer(summary, shown=_brief(result, made))
+
+
+@command()
+def reconstruct(run: Path, *, out: Path | None = None, device: str | None = None) -> None:
+    """Smooth the light of a run by what is known of its scene exactly: truth depth, shadows, the laser's footprint.
+
+    The traced light stays in result.h5; `depth`, `detect` and pictures take the reconstructed light, whose error is
+    estimated from two halves of the photons. Writes the same files as `spadwarp simulate`.
+
+    Args:
+        run (RUN): A result, or its directory.
+        out: Directory; by default that of the run.
+
+    \b
+    Example:
+      spadwarp reconstruct out/
+    """
+    files, result = spadwarp.files, opt.load_run(run)
+    place = out or (run if run.is_dir() else run.parent)
+    inputs = () if out is None else (run, *result.scene.files)
+    needed = files.bytes_needed(result.scene, derivatives=len(result.derivatives))
+    check_outputs(place, files.RUN_FILES, resume=out is None, inputs=inputs, needed=needed)
+    result = spadwarp.reconstruct(result, device=device)
+    made = files.write_run(result, place, device=device, keep=("records.h5",) if out is None else ())
+    answer({**result.summary(), "files": made.written}, shown=_brief(result, made))
 
 
 # Of --rendered: arguments of `spadwarp.result.load_truth_exr`.

@@ -18,6 +18,7 @@ from spadwarp.io.paths import file_within
 from spadwarp.result.result import (
     ARRAYS,
     COMPONENTS,
+    Reconstruction,
     Result,
     ResultHead,
     Truth,
@@ -140,6 +141,8 @@ def load_result(path: str | Path) -> Result:
         tallies = array("tallies")
         if tallies.min() < 0:
             file.refuse("tallies", "are negative in some bins")
+        kept = Reconstruction.__dataclass_fields__ if "reconstruction" in file else ()
+        light = {name: array(f"reconstruction/{name}") for name in kept}
         maps = {name: array(f"truth/{name}") for name in Truth.__dataclass_fields__}
         for name, values in maps.items():
             if np.isinf(values).any():
@@ -159,6 +162,7 @@ def load_result(path: str | Path) -> Result:
             half_photons=file.integer("half_photons", default=0),
             second_moment=moment("second_moment"),
             truth=Truth(**maps),
+            reconstruction=Reconstruction(**light) if light else None,
             energy_balance=file.integers("energy_balance"),
             counters=file.integers("counters"),
             batch_moments=moments,
@@ -292,6 +296,7 @@ def merge(results: Iterable[ResultLike]) -> Result:
     return replace(
         first,
         **vars(total),
+        reconstruction=None,
         batch_size=size,
         photons=sum(part.photons for part in parts),
         timing=added(*(part.timing for part in parts)),

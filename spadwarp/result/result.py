@@ -23,7 +23,7 @@ from spadwarp.values import ArgumentError, ConfigError, Shown, check_choice, per
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "Half", "Result", "Truth"]
+__all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "Half", "Reconstruction", "Result", "Truth"]
 __all__ += ["analyser_channel", "component_errors", "degree_of_polarisation"]
 
 Component = Literal["ballistic", "forward_scattered", "backscatter"]
@@ -56,6 +56,8 @@ ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
     "tallies": (np.int64, ("component", *_VOXELS), "1", "times unit over photons: fraction of the emitted photons"),
     "half": (np.int64, ("component", *_VOXELS), "1", "tallies of the batches with an even number"),
     "second_moment": (np.uint64, ("word", *_VOXELS), "1", "sum over batches of the squared tally"),
+    "reconstruction/histogram": (np.float32, ("component", *_VOXELS), "1", "fraction of the emitted photons"),
+    "reconstruction/error": (np.float32, _VOXELS, "1", "of the sum over components"),
     "truth/depth": (np.float32, PIXELS, "m", "true planar depth"),
     "truth/range": (np.float32, PIXELS, "m", "true distance along the line of sight"),
     "truth/normal": (np.float32, (*PIXELS, "axis"), "1", "unit normals towards the camera"),
@@ -140,12 +142,21 @@ class Half(NamedTuple):
     tally_value: Floats  # expected fraction of emitted photons per tally unit, float64 `[H, W]`
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Reconstruction:
+    """The light of a result without most of its noise, see `spadwarp.reconstruct`."""
+
+    histogram: NDArray[np.float32]  # float32 `[3, H, W, T]`, fraction of the emitted photons by component
+    error: NDArray[np.float32]  # float32 `[H, W, T]`, of the sum over components: standard deviation and bias
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Result(Shown, ResultHead, Tallies):
     """Expected photon histograms of one scene in fixed point, value = tally · unit / photons, see `tally_value`, and
     all that is needed to interpret them; with the attributes of `Tallies`."""
 
     truth: Truth  # depth, range, normal and reflectance at pixel centres
+    reconstruction: Reconstruction | None = None  # beside the tallies, never instead of them
     timing: Mapping[str, float] = field(default_factory=dict)  # seconds of each stage
     provenance: Mapping[str, Any] = field(default_factory=dict)  # versions, device and date
 
@@ -202,6 +213,22 @@ class Result(Shown, ResultHead, Tallies):
         `"backscatter"`: water alone. Their sum is the histogram (eq 2).
         """
         return self._fraction(self.tallies[COMPONENTS.index(check_choice("component", name, COMPONENTS))])
+
+    def expected(self, name: Component | None = None) -> Floats:
+        """The best estimate of the histogram or of a component, float64 `[H, W, T]`: of `reconstruction`, where there
+        is one, else of the tallies."""
+        if self.reconstruction is None:
+            return self.histogram if name is None else self.component(name)
+        parts = self.reconstruction.histogram
+        if name is None:
+            return parts.sum(axis=0, dtype=np.float64)
+        return parts[COMPONENTS.index(check_choice("component", name, COMPONENTS))].astype(np.float64)
+
+    @property
+    def expected_error(self) -> Floats:
+        """Standard error of `expected()`, float64 `[H, W, T]`; of the reconstruction with its bias. Raises as
+        `standard_error` does."""
+        return self.standard_error if self.reconstruction is None else self.reconstruction.error.astype(np.float64)
 
     @property
     def detections(self) -> Floats:
@@ -487,6 +514,8 @@ def signed_of(result: Result) -> dict[str, SignedTallies]:
 def arrays_of(result: Result) -> dict[str, NDArray[Any]]:
     """The arrays of a result, of those of `ARRAYS`."""
     found: dict[str, Any] = {name: getattr(result, name) for name in ("tallies", "half", "second_moment")}
+    if result.reconstruction is not None:
+        found |= {f"reconstruction/{name}": values for name, values in vars(result.reconstruction).items()}
     for group, signed in signed_of(result).items():
         found |= {f"{group}/tallies": signed.tallies, f"{group}/second_moment": signed.second_moment}
         found[f"{group}/unit"] = np.array(signed.units)
@@ -728,6 +757,7 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
         batch_size=0 if moments is None else result.batch_size,
         batches=0 if moments is None else result.batches,
         batch_moments={},
+        reconstruction=None,
         channel_tallies=None,
         derivative_tallies=None,
         provenance={**result.provenance, "channel": channel},

@@ -503,7 +503,7 @@ def truth_maps(scene: SceneLike, *, device: str | None = None) -> Truth:
 
 def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     """`truth_maps` for a model that is already on its device."""
-    camera, device = scene.camera, model.device
+    camera = scene.camera
     shape = (camera.height, camera.width)
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
@@ -511,15 +511,25 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     nowhere = np.zeros((0, 0, 3))
     origins, directions, lead = nowhere, nowhere if camera.is_plain else pixel_directions(camera), None
     if camera.port is not None:
-        # A ray that does not get through goes where nothing is.
         lines = lines_of_sight(scene)
-        passes, lead = np.isfinite(lines.direction).all(axis=-1, keepdims=True), lines.lead
-        origins = np.where(passes, lines.start, 1e9)
-        directions = np.where(passes, lines.direction, [0.0, 0.0, 1.0])
-    rays: Any = [wp.array(part.astype(np.float32), dtype=wp.vec3, device=device) for part in (origins, directions)]
-    depth, distance, reflectance = (wp.empty(shape, dtype=float, device=device) for _ in range(3))
-    normal = wp.empty(shape, dtype=wp.vec3, device=device)
+        origins, directions, lead = lines.start, lines.direction, lines.lead
+    depth, ranges, normal, reflectance = trace_rays(model, origins, directions, shape)
+    ranges = ranges if lead is None else (ranges + lead).astype(np.float32)
+    return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
+
+
+def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int, int]) -> list[NDArray[np.float32]]:
+    """Depth, distance, normal and reflectance of what rays `[H, W, 3]` hit, NaN for nothing; of the camera's own rays
+    where they are empty."""
+    # A ray that does not get through a port goes where nothing is.
+    if np.size(origins):
+        passes = np.isfinite(origins + directions).all(axis=-1, keepdims=True)
+        origins, directions = np.where(passes, origins, 1e9), np.where(passes, directions, [0.0, 0.0, 1.0])
+    rays: Any = [
+        wp.array(part.astype(np.float32), dtype=wp.vec3, device=model.device) for part in (origins, directions)
+    ]
+    depth, distance, reflectance = (wp.empty(shape, dtype=float, device=model.device) for _ in range(3))
+    normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
     inputs, outputs = [model.camera, model.surfaces, *rays], [depth, distance, normal, reflectance]
-    wp.launch(sk.truth_kernel, dim=shape, inputs=inputs, outputs=outputs, device=device)
-    ranges = distance.numpy() if lead is None else (distance.numpy() + lead).astype(np.float32)
-    return Truth(depth=depth.numpy(), range=ranges, normal=normal.numpy(), reflectance=reflectance.numpy())
+    wp.launch(sk.truth_kernel, dim=shape, inputs=inputs, outputs=outputs, device=model.device)
+    return [array.numpy() for array in (depth, distance, normal, reflectance)]

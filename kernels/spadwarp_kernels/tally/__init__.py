@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from .ledger import *
 from .tally import *
+from .windows import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = ledger.__all__ + tally.__all__
+    __all__ = ledger.__all__ + tally.__all__ + windows.__all__

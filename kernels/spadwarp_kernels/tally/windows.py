@@ -1,0 +1,105 @@
+"""Sums over windows of histogram cubes, and the blend of estimates from several windows by their errors."""
+
+from typing import Any
+
+import warp as wp
+
+__all__ = ["blend_kernel", "combine_kernel", "delay_kernel", "estimate_kernel", "window_sums"]
+
+
+@wp.kernel(enable_backward=False)
+def _window_kernel(values: wp.array3d[wp.vec4], radius: int, sums: wp.array3d[wp.vec4]):
+    """Sums over 2 radius + 1 entries of the middle axis. Launch: (outer, inner)."""
+    i, k = wp.tid()
+    count = values.shape[1]
+    total = wp.vec4d()
+    for j in range(wp.min(radius, count)):
+        total += wp.vec4d(values[i, j, k])
+    for j in range(count):
+        if j + radius < count:
+            total += wp.vec4d(values[i, j + radius, k])
+        if j > radius:
+            total -= wp.vec4d(values[i, j - radius - 1, k])
+        sums[i, j, k] = wp.vec4(total)
+
+
+def window_sums(values: wp.array, radius: tuple[int, int], work: wp.array, sums: wp.array) -> None:
+    """Sums of a cube of vectors `[H, W, T]` over windows of (2 r + 1)² pixels and 2 t + 1 bins, radius = (r, t).
+
+    `work` and `sums`: arrays of the same shape, written.
+    """
+    height, width, bins = values.shape
+    shapes = ((1, height, width * bins), (height, width, bins), (height * width, bins, 1))
+    radii = (radius[0], radius[0], radius[1])
+    for shape, size, source, out in zip(shapes, radii, (values, sums, work), (sums, work, sums), strict=True):
+        inputs: list[Any] = [source.reshape(shape), size, out.reshape(shape)]
+        wp.launch(_window_kernel, dim=(shape[0], shape[2]), inputs=inputs, device=values.device)
+
+
+@wp.kernel(enable_backward=False)
+def delay_kernel(fine: wp.array2d[float], first: int, last: int, per_bin: int, delayed: wp.array2d[float]):
+    """Light `[pixel, fine bin]` that comes later by first to last - 1 fine bins, evenly, in bins. Launch: (pixel)."""
+    pixel = wp.tid()
+    late = wp.float64(0.0)
+    for k in range(delayed.shape[1]):
+        total = wp.float64(0.0)
+        for step in range(per_bin):
+            at = k * per_bin + step
+            if at >= first:
+                late += wp.float64(fine[pixel, at - first])
+            if at >= last:
+                late -= wp.float64(fine[pixel, at - last])
+            total += late
+        delayed[pixel, k] = float(total / wp.float64(last - first))
+
+
+@wp.func
+def _estimates(own: wp.vec4, sums: wp.vec4) -> wp.vec3:
+    """Of both halves, and the variance of their mean."""
+    ratio = own[3] / wp.max(wp.max(sums[3], own[3]), 1.0e-30)
+    return wp.vec3(sums[0] * ratio, sums[1] * ratio, wp.max(sums[2], 0.0) * ratio * ratio)
+
+
+@wp.func
+def _product(own: wp.vec4, first: float, second: float) -> float:
+    """Whose expectation is the squared bias: the halves are independent."""
+    return (first - own[0]) * (second - own[1])
+
+
+@wp.kernel(enable_backward=False)
+def estimate_kernel(values: wp.array3d[wp.vec4], sums: wp.array3d[wp.vec4], risk: wp.array3d[wp.vec4]):
+    """Squared bias, variance and squared prediction of the estimates from a window. Launch: the cube's shape.
+
+    `values`: first half, second half, variance of their mean, prediction; `sums`: these over the window.
+    """
+    i, j, k = wp.tid()
+    own = values[i, j, k]
+    found = _estimates(own, sums[i, j, k])
+    risk[i, j, k] = wp.vec4(_product(own, found[0], found[1]), found[2], own[3] * own[3], 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def blend_kernel(
+    values: wp.array3d[wp.vec4],
+    sums: wp.array3d[wp.vec4],
+    risk: wp.array3d[wp.vec4],
+    blended: wp.array3d[wp.vec4],
+):
+    """Adds a window's estimates by their squared error, `risk` around the voxel. Launch: the cube's shape.
+
+    `blended`: first half, second half, standard deviation of their mean, weights.
+    """
+    i, j, k = wp.tid()
+    found, around = _estimates(values[i, j, k], sums[i, j, k]), risk[i, j, k]
+    error = (wp.max(around[0], 0.0) + around[1]) / wp.max(around[2], 1.0e-30)
+    weight = 1.0 / (error * error + 1.0e-10)
+    blended[i, j, k] += weight * wp.vec4(found[0], found[1], wp.sqrt(found[2]), 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def combine_kernel(values: wp.array3d[wp.vec4], blended: wp.array3d[wp.vec4], risk: wp.array3d[wp.vec4]):
+    """Divides by the weights; squared bias, variance and squared prediction of the blend. Launch: the cube's shape."""
+    i, j, k = wp.tid()
+    own, found = values[i, j, k], blended[i, j, k] / wp.max(blended[i, j, k][3], 1.0e-30)
+    blended[i, j, k] = found
+    risk[i, j, k] = wp.vec4(_product(own, found[0], found[1]), found[2] * found[2], own[3] * own[3], 0.0)

@@ -1,0 +1,236 @@
+"""Reconstruction: the light that few photons left noisy, from what is known of the scene without noise.
+
+1. Truth rays within each pixel, with the laser's footprint, shadows, cosines and attenuation, give the ballistic light
+   up to a factor. Light that scattered forward on its way is this light later and blurred, or lights the surfaces
+   evenly; backscatter ends at the first surface. Non-negative least squares of such terms predict each component.
+2. The ratio of the tallies to the prediction is smooth. It is averaged over windows of pixels and bins, the bins
+   counted from the pixel's own true path, and the windows are blended by their squared errors.
+3. These come from two independent halves of the photons: the product of the halves' residuals has the squared bias as
+   its expectation, and the squares of their differences the variance (dual buffers: Rousselle et al. 2012; regression
+   on noise-free features: Bitterli et al. 2016; kernels in time: Jarabo et al. 2014).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.optimize import nnls
+
+import spadwarp_kernels as sk
+from spadwarp.device import pick_device
+from spadwarp.mesh import build_mesh
+from spadwarp.result import Reconstruction, Result
+from spadwarp.scene import Scene
+from spadwarp.scene.camera import image_tangents
+from spadwarp.scene.sight import lines_of_sight
+from spadwarp.transport.model import build_model, trace_rays
+
+__all__ = ["reconstruct"]
+
+Cube = NDArray[np.float32]
+
+_RAYS = 64  # within a pixel
+_PARTS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))  # of a ray, in its part of the pixel
+_WEIGHT = 1.0 / (_RAYS * len(_PARTS))
+_STEPS = 1.1673039782614187 ** -np.arange(1.0, 5.0)  # Kronecker sequence in four dimensions: powers of a plastic number
+_FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
+# Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
+_DELAYS = ((0, 1), (1, 2), (2, 4), (4, 8), (8, 16), (16, 32), (32, 64), (64, 192))
+_EVEN_DELAYS = ((0, 4), (4, 16), (16, 64), (64, 256))
+_BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
+_BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
+# Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
+_WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (2, 1), (4, 2), (8, 4), (16, 8), (32, 32))
+_AROUND = (4, 1)
+_FLOOR = 1e-3  # of the mean: prediction where none is expected
+
+
+def reconstruct(result: Result, *, device: str | None = None) -> Result:
+    """The result with `Result.reconstruction`: its light without most of the noise; tallies stay as they are.
+
+    Of the histogram by component; derivatives and polarised channels are left as they are. Takes about 100 bytes a bin.
+
+    Args:
+        result: With two halves, `Result.halves`, and a scene whose files are still there.
+        device: "cpu" or "cuda:0"; by default as `simulate` picks it.
+
+    Raises `ConfigError`: fewer than two batches of photons; what `simulate` raises of the scene's files.
+    """
+    halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
+    return replace(result, reconstruction=reconstructed(result, halves, pick_device(device)))
+
+
+def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruction:
+    """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
+    scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
+    direct, even, covered = _known_light(scene, result.focus_distance, device)
+    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
+    ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
+    # Scattered light of a pixel without a target is that of the nearest target.
+    start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
+    nearest = distance_transform_edt(np.isnan(start), return_distances=False, return_indices=True)
+    aligned = np.clip(np.nan_to_num(np.rint(start[tuple(nearest)])), 0, gate.bins).astype(np.int64)
+    mean = halves.mean(axis=0)
+    predictions = ballistic, _forward(fine[0], fine[1], ballistic, mean[1]), _backscatter(covered, mean[2])
+    found = np.zeros_like(mean)
+
+    def smooth(k: int) -> Cube:
+        expected = predictions[k].sum(dtype=np.float64)
+        if not (result.tallies[k].any() and expected > 0.0):
+            found[k] = mean[k]
+            return np.zeros_like(mean[k])
+        predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / expected)
+        light, square = _smoothed(halves[0, k], halves[1, k], predicted, aligned if k == 1 else 0 * aligned, device)
+        raw = (result.tallies[k].sum(axis=-1, dtype=np.float64) * result.tally_value).sum()
+        found[k] = light * (raw / light.sum(dtype=np.float64))
+        return square
+
+    with ThreadPoolExecutor(1 if device.is_cuda else 2) as threads:
+        squares = sum(threads.map(smooth, (1, 0, 2)))
+    return Reconstruction(histogram=found, error=np.sqrt(squares))
+
+
+def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
+    """From truth rays: ballistic light and surfaces in even light, `[H, W, fine bin]`; the part of each pixel whose
+    surface has light of a bin or of an earlier one, `[H, W, T]`."""
+    camera, gate, count = scene.camera, scene.gate, scene.gate.bins * _FINE
+    model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
+    voxels = shape[0] * shape[1] * count
+    found: list[tuple[Any, ...]] = [(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
+    first = np.arange(shape[0] * shape[1]).reshape(shape) * count
+    for place, lens in _places(scene, focus) if model.mesh is not None else ():
+        corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
+        view = np.concatenate([image_tangents(camera, corners + place), np.ones((*shape, 1))], axis=-1)
+        view = view - lens / (focus or math.inf)
+        slant = np.linalg.norm(view, axis=-1, keepdims=True)
+        lines = lines_of_sight(scene, view / slant)
+        _, along, normal, reflectance = trace_rays(model, lines.start + lens, lines.direction, shape)
+        point = lines.start + lens + along[..., None] * lines.direction
+        direction, way, path = lines.light_at(point)
+        path = path + along + lines.delay
+        _, free, _, _ = trace_rays(model, point - direction * way[..., None], direction, shape)
+        lit = ~(free < way * (1.0 - 1e-4) - 1e-3) * _footprint(scene, direction)
+        lit *= np.maximum(-(direction * normal).sum(axis=-1), 0.0) / way**2
+        even = reflectance * np.exp(-scene.medium.extinction * path) / slant[..., 0] ** 4
+        at = (path / scene.medium.pulse_speed - gate.start) / scene.gate.bin_width * _FINE
+        # Each ray stands for the part of the surface around it, whose times differ along both axes of the image.
+        towards = (normal * lines.direction).sum(axis=-1)[..., None]
+        slopes = []
+        for unit in np.eye(3)[:2]:
+            axis = unit * camera.pixel_tangent / (slant * math.sqrt(_RAYS))
+            moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
+            along_sight, along_light = (moved * lines.direction).sum(axis=-1), (moved * direction).sum(axis=-1)
+            slopes.append(along * (along_sight + along_light) * _FINE / (scene.medium.pulse_speed * gate.bin_width))
+        for right, down in _PARTS:
+            moment = at + right * slopes[0] + down * slopes[1]
+            inside = np.isfinite(even + lit + moment) & (moment < count)
+            seen = (moment >= 0.0)[inside] / len(_PARTS)
+            bins = np.maximum(moment[inside], 0.0).astype(np.int64)
+            found.append((first[inside] + bins, (even * lit)[inside] * seen, even[inside] * seen))
+    index = np.concatenate([rays[0] for rays in found])
+    light = [*(np.concatenate([rays[k] for rays in found]) for k in (1, 2)), np.full(len(index), _WEIGHT)]
+    direct, even, hits = (np.bincount(index, one, voxels).astype(np.float32).reshape(*shape, count) for one in light)
+    return direct, even, np.cumsum(hits.reshape(*shape, -1, _FINE).sum(axis=-1), axis=-1)
+
+
+def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Places within a pixel, and points of a lens that is not behind a port [m], evenly by Kronecker sequences."""
+    camera = scene.camera
+    radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
+    for k in range(_RAYS):
+        u = (
+            0.5 + (k + 1) * np.array([0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101])
+        ) % 1
+        r, angle = radius * math.sqrt(u[2]), 2.0 * math.pi * u[3]
+        yield u[:2], np.array([r * math.cos(angle), r * math.sin(angle), 0.0])
+
+
+def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Radiant intensity of the laser towards unit vectors, up to a factor; of beams that are no cones 1."""
+    beam = scene.beam
+    cosine = np.maximum((direction * np.asarray(beam.axis)).sum(axis=-1), 1e-6)
+    if scene.scan.mode != "none" or beam.profile not in ("uniform_cone", "gaussian"):
+        return np.ones(cosine.shape)
+    if beam.profile == "uniform_cone":
+        return (cosine >= math.cos(beam.half_angle)).astype(np.float64)
+    return np.exp(-2.0 * (cosine**-2 - 1.0) / math.tan(beam.half_angle) ** 2) / cosine**3
+
+
+def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
+    """Light `[pixel, fine bin]` by a delay of so many fine bins, in bins."""
+    late = wp.empty((fine.shape[0], fine.shape[1] // per_bin), dtype=float, device=fine.device)
+    wp.launch(sk.delay_kernel, dim=fine.shape[0], inputs=[fine, *delay, per_bin, late], device=fine.device)
+    return late
+
+
+def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
+    """Prediction of forward-scattered light from its tallies."""
+    terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
+    terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
+    for radius in _BLURS:
+        blurred = _window_sums(_window_sums(ballistic, (radius, 0), direct.device), (radius, 0), direct.device)
+        pixels: Any = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
+        terms += [_delayed(pixels, delay, 1).numpy() for delay in _BLURRED_DELAYS]
+    sums = [float(term.sum(dtype=np.float64)) for term in terms]
+    rows = np.stack([term.ravel() / total for term, total in zip(terms, sums, strict=True) if total > 0.0])
+    # Weights: the variance of light is about proportional to it.
+    level = _window_sums(light, (3, 2), direct.device).ravel()
+    root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
+    rows *= root
+    gram = (rows @ rows.T).astype(np.float64)
+    lower = np.linalg.cholesky(gram + 1e-9 * np.trace(gram) / len(gram) * np.eye(len(gram)))
+    factors, _ = nnls(lower.T, np.linalg.solve(lower, rows @ (light.ravel() * root)))
+    return ((factors.astype(np.float32) @ rows) / root).reshape(light.shape)
+
+
+def _backscatter(covered: Cube, light: Cube) -> Cube:
+    """Prediction of backscatter: of each bin the mean of pixels before their surface, and of those behind it."""
+    open_ = 1.0 - np.minimum(covered, 1.0)
+    parts = [(part, (part * light).sum(axis=(0, 1)), part.sum(axis=(0, 1))) for part in (open_, 1.0 - open_)]
+    return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
+
+
+def _window_sums(values: Cube, radius: tuple[int, int], device: wp.Device) -> Cube:
+    """Of numbers `[H, W, T]`."""
+    cubes = [wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(2)]
+    source: Any = wp.array(np.repeat(values[..., None], 4, axis=-1), dtype=wp.vec4, device=device)
+    sk.window_sums(source, radius, *cubes)
+    return cubes[1].numpy()[..., 0]
+
+
+def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp.Device) -> tuple[Cube, Cube]:
+    """Light of a component and its squared error `[H, W, T]`. `start`: bin from which those of a pixel are counted."""
+    bins, shift = first.shape[-1], int(start.max()) - start
+    rows = np.arange(bins) + shift[..., None]
+    cubes = [first, second, 0.25 * (first - second) ** 2, predicted + _FLOOR * predicted.mean()]
+    shape = (*first.shape[:2], bins + int(shift.max()))
+    aligned = np.zeros((*shape, 4), np.float32)
+    for k, cube in enumerate(cubes):
+        np.put_along_axis(aligned[..., k], rows, cube, axis=-1)
+    scale = float(predicted.max())  # float32 holds the squares of what is near 1
+    aligned *= np.array([1.0, 1.0, 1.0 / scale, 1.0], np.float32) / scale
+    values: Any = wp.array(aligned, dtype=wp.vec4, device=device)
+    sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
+
+    def launch(kernel: Any, *arrays: wp.array) -> None:
+        wp.launch(kernel, dim=shape, inputs=[*arrays], device=device)
+
+    for window in _WINDOWS:
+        sk.window_sums(values, window, work, sums)
+        launch(sk.estimate_kernel, values, sums, risk)
+        sk.window_sums(risk, _AROUND, work, around)
+        launch(sk.blend_kernel, values, sums, around, blended)
+    launch(sk.combine_kernel, values, blended, sums)
+    sk.window_sums(sums, _AROUND, work, around)
+    found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
+    bias = np.maximum(near[..., 0], 0.0) / np.maximum(near[..., 2], 1e-30) * own[..., 1]
+    light, square = 0.5 * scale * (found[..., 0] + found[..., 1]), scale**2 * (own[..., 0] + bias)
+    return tuple(np.take_along_axis(cube, rows, axis=-1) for cube in (light, square))  # type: ignore[return-value]
