@@ -617,8 +617,8 @@ def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
         raise ConfigError(
             f"no depth is within reach: of a target at {nearest:.3g} m a pixel detects {most:.2g} photons at most in "
             f"all {pulses:.3g} pulses of {with_prefix(time, 's')}, even if scattering took no light away (absorption "
-            f"alone leaves {passed:.2g}, optical depth {scene.medium.range.extinction * nearest:.3g} one way); what helps: a "
-            "shorter distance, clearer water, more pulse energy, a larger aperture, a longer time",
+            f"alone leaves {passed:.2g}, optical depth {scene.medium.range.extinction * nearest:.3g} one way); what helps: "
+            "a shorter distance, clearer water, more pulse energy, a larger aperture, a longer time",
             source=scene.source,
         )
 

@@ -159,14 +159,14 @@ def bound_of_result(
     """`crlb`, also where too few photons were traced."""
     scene = result.scene
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
-    signal = (result.component("ballistic") + result.component("forward_scattered")) * scale
-    background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
+    signal = (result.expected("ballistic") + result.expected("forward_scattered")) * scale
+    background = result.expected("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     variance = None
     if result.batches > 1:
         # The errors are those of all light: the signal has its part of the variance.
-        light = result.histogram * scale
+        light = result.expected() * scale
         part = np.divide(signal, light, out=np.zeros_like(light), where=light > 0)
-        variance = np.square(result.standard_error * scale) * part
+        variance = np.square(result.expected_error * scale) * part
     axis: dict[str, Any] = {"bin_width": scene.gate.bin_width, "irf": detector_response(scene.detector, scene.laser)}
     options: dict[str, Any] = {**axis, "law": law, "signal_variance": variance, "device": device}
     information, noise = information_from_histogram(signal, background, **options)

@@ -168,6 +168,7 @@ class FramesFile(_StoredFrames):
     scene: Scene  # of the result that the counts were drawn from
     truth_depth: NDArray[np.float32]  # of that result, float32 `[H, W]` [m]
     monte_carlo_noise: float | None = None
+    noise_ratio: NDArray[np.float32] | None = None  # `Result.noise_ratio` of frames of these pulses, `[H, W]`
     channel: str = "I"  # light that was counted: "I", all of it, or "co" or "cross" behind an analyser
     notes: tuple[str, ...] = ()
 
@@ -197,6 +198,7 @@ class FramesFile(_StoredFrames):
             "truth_depth": file.array("truth/depth", np.float32, image),
             "channel": file.text_attribute("channel", "I"),
             "notes": tuple(map(str, np.atleast_1d(file.attribute("notes", ())))),
+            "noise_ratio": file.array("noise_ratio", np.float32, image) if "noise_ratio" in file else None,
             "monte_carlo_noise": None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
             **expectations,
         }
@@ -489,6 +491,10 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
         "truth/depth": (PIXELS, result.truth.depth, "m", "true planar depth"),
         "edges": (("edges",), part.edges, "s", "edges of the bins after the start of the gate"),
     }
+    if result.batches > 1:
+        frame_of = scene.with_overrides(detector={"pulses_per_frame": part.pulses})
+        ratio = replace(result, scene=frame_of).noise_ratio.astype(np.float32)
+        arrays["noise_ratio"] = (PIXELS, ratio, "1", "variance by the simulation over that of a frame's photons")
     coordinates: dict[str, Any] = {"whole_gate": 1}
     if irf.times is not None and irf.values is not None:
         curve = np.array([irf.times, irf.values], np.float64)
