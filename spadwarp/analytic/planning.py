@@ -299,26 +299,26 @@ class _Sample(NamedTuple):
         """
         centre, shrunk = self.centre, 1.0 / math.sqrt(factor)
 
-        def ends(of: Callable[[Pilot], float], *, ratio: bool) -> tuple[float, float]:
-            values = np.array([of(one) for one in (centre, *self.parts)])
+        def ends(found: list[float], *, ratio: bool) -> tuple[float, float]:
+            values = np.array(found)
             if ratio:
                 with np.errstate(divide="ignore"):
                     values = np.log(values)
             if not np.isfinite(values).all():
-                middle = of(centre) if np.isfinite(values[0]) else 1.0
+                middle = found[0] if np.isfinite(values[0]) else 1.0
                 return middle * _UNKNOWN**-shrunk, middle * _UNKNOWN**shrunk
             parts = values[1:]
             half = shrunk * (_SCATTER * float(parts.std(ddof=1)) + abs(float(values[0] - parts.mean())))
             low, high = float(values[0]) - half, float(values[0]) + half
             return (math.exp(low), math.exp(min(high, 700.0))) if ratio else (max(low, 0.0), high)
 
-        best, worst = dict[str, Any](), dict[str, Any]()
-        for name in ("bound", "shot_noise", "level"):
-            best[name], worst[name] = ends(operator.attrgetter(name), ratio=True)
-        worst["peak"], best["peak"] = ends(operator.attrgetter("peak"), ratio=True)
+        every, best, worst = (centre, *self.parts), dict[str, Any](), dict[str, Any]()
+        for name in ("bound", "shot_noise", "level", "peak"):
+            best[name], worst[name] = ends([getattr(one, name) for one in every], ratio=True)
+        worst["peak"], best["peak"] = best["peak"], worst["peak"]
         for name in ("floor", "pile_up"):
-            found = {key: ends(lambda one, n=name, k=key: abs(getattr(one, n)[k]), ratio=False) for key in METHODS}
-            best[name], worst[name] = ({key: pair[i] for key, pair in found.items()} for i in (0, 1))
+            pairs = {key: ends([abs(getattr(one, name)[key]) for one in every], ratio=False) for key in METHODS}
+            best[name], worst[name] = ({key: pair[i] for key, pair in pairs.items()} for i in (0, 1))
         return dataclasses.replace(centre, **best), centre, dataclasses.replace(centre, **worst)
 
 
@@ -617,7 +617,7 @@ def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
         raise ConfigError(
             f"no depth is within reach: of a target at {nearest:.3g} m a pixel detects {most:.2g} photons at most in "
             f"all {pulses:.3g} pulses of {with_prefix(time, 's')}, even if scattering took no light away (absorption "
-            f"alone leaves {passed:.2g}, optical depth {scene.medium.range.extinction * nearest:.3g} one way); what helps: "
+            f"alone leaves {passed:.2g}, optical depth {scene.medium.range.extinction * nearest:.3g}); what helps: "
             "a shorter distance, clearer water, more pulse energy, a larger aperture, a longer time",
             source=scene.source,
         )

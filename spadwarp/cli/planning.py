@@ -132,8 +132,8 @@ def plan(
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
         spadwarp.io.write_text(made + found.scene.to_toml(folder=file.parent), file)
     say(_verdict(found))
-    hidden = ("pilot", "channels", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed")
-    hidden += () if found.judged else ("pulses", "pulses_for", "frame_time", "reached", "pile_up_energy")
+    hidden = ["pilot", "channels", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
+    hidden += [] if found.judged else ["pulses", "pulses_for", "frame_time", "reached", "pile_up_energy"]
     values = {name: value for name, value in found.to_dict().items() if name not in hidden}
     if not found.judged:
         del values["values"]["detector.pulses_per_frame"]
