@@ -313,9 +313,10 @@ class _Sample(NamedTuple):
             return (math.exp(low), math.exp(min(high, 700.0))) if ratio else (max(low, 0.0), high)
 
         every, best, worst = (centre, *self.parts), dict[str, Any](), dict[str, Any]()
-        for name in ("bound", "shot_noise", "level", "peak"):
+        for name in ("bound", "shot_noise", "peak"):
             best[name], worst[name] = ends([getattr(one, name) for one in every], ratio=True)
         worst["peak"], best["peak"] = best["peak"], worst["peak"]
+        best["level"], worst["level"] = ends([one.level for one in every], ratio=False)
         for name in ("floor", "pile_up"):
             pairs = {key: ends([abs(getattr(one, name)[key]) for one in every], ratio=False) for key in METHODS}
             best[name], worst[name] = ({key: pair[i] for key, pair in pairs.items()} for i in (0, 1))

@@ -268,6 +268,8 @@ def sweep(
         table = plain if of_range else [{title: value, **row} for value, row in zip(found.values, plain, strict=True)]
         files = [out / f"{stem}.png", spadwarp.io.write_csv(table, out / f"{stem}.csv")]
     cells = _budget_cells if of == "budget" else _error_cells
+    if of == "budget":
+        say("of unscattered light alone, by the analytic model; `spadwarp plan` has the pulses of all light")
     show_table(
         ({title: name, **cells(row)} for name, row in zip(names, lines, strict=True)), keys=2 if of == "budget" else 1
     )
@@ -312,7 +314,7 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
         "outliers": _in_percent(row.outlier_probability),
-        "pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
+        "unscattered: pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
     }
 
 
