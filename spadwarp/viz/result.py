@@ -118,9 +118,7 @@ def draw_result(
 
 # A result
 
-_NOISY = (
-    "hatched, {} % of the pixels: noise of the simulation exceeds that of the frame's photons, in every frame the same"
-)
+_NOISY = "; hatched, {} % of the pixels: noise of the simulation exceeds that of the frame's photons"
 _HATCHED = (
     "hatched, {} % of the pixels: the brightest bin is not known to a third, what shows is noise of the simulation; "
     "more photons or a reconstruction help"
@@ -383,6 +381,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     counts = np.asarray(shown.counts if shown.summed else shown.counts[index])
     intensity = counts.sum(axis=-1)
     panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=(2.0,))
+    hatched = ""
     if file is None:
         edges = 1e9 * (shown.gate_start + shown.edges)
         fullest = np.where(intensity > 0, (0.5 * (edges[:-1] + edges[1:]))[counts.argmax(axis=-1)], np.nan)
@@ -392,8 +391,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
         depth, truth, bound = file.depth(method, number), file.truth_depth, file.bound_depth()
         if file.noise_ratio is not None:
             panels.unclear = noisy = file.noise_ratio > 1.0
-            if noisy.any():
-                panels.figure.note(_NOISY.format(percent(noisy.mean())))
+            hatched = _NOISY.format(percent(noisy.mean())) if noisy.any() else ""
         panels.show_depth(depth, f"Depth ({method})", style.target_limits(truth, depth))
         panels.show_error(depth - truth, "Depth − truth")
         known = "" if np.isfinite(bound).any() else ": unknown"
@@ -404,7 +402,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     panels.figure.key(axes, 1.7)
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
-    noise = noise_caption(shown.monte_carlo_noise)
+    noise = noise_caption(shown.monte_carlo_noise) + hatched
     panels.figure.caption(f"{which}: {count(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
     return panels.figure
 

@@ -97,7 +97,7 @@ def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
 def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
     first = proposal(depth_error=0.05)
     least = math.hypot(first.terms["forward scattering"], first.terms["pile-up"])
-    worse, better = (proposal(depth_error=factor * least) for factor in (1.2, 1.05))
+    worse, better = (proposal(depth_error=factor * least, photons=1_600_000) for factor in (2.0, 1.5))
     assert worse.pulses < better.pulses and better.pulses_for == "depth error"
     assert better.terms["total"] == pytest.approx(better.depth_error, rel=0.02)
     coarse = proposal(depth_error=0.5)
