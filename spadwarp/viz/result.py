@@ -118,7 +118,7 @@ def draw_result(
 
 # A result
 
-_NOISY = "; hatched, {} % of the pixels: noise of the simulation exceeds that of the frame's photons"
+_NOISY = "; hatched ({} % of the pixels): noise of the simulation, more than the photons have"
 _HATCHED = (
     "hatched, {} % of the pixels: the brightest bin is not known to a third, what shows is noise of the simulation; "
     "more photons or a reconstruction help"
@@ -181,7 +181,7 @@ def _histogram_figure(result: Result, width: float) -> Figure:
     for axis, (name, (row, column)) in zip(axes, pixels.items(), strict=True):
         axis.set(xlabel="time of flight [ns]", xlim=1e9 * result.bin_edges[[0, -1]])
         if intensity.any():
-            noisy = ": its brightest bin is noise of the simulation" if unclear[row, column] else ""
+            noisy = "\nits brightest bin is noise of the simulation" if unclear[row, column] else ""
             axis.set_title(
                 f"{name} pixel {group}: row {row}, column {column}{noisy}", color="firebrick" if noisy else TEXT
             )
@@ -402,7 +402,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     panels.figure.key(axes, 1.7)
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
-    noise = noise_caption(shown.monte_carlo_noise) + hatched
+    noise = hatched or noise_caption(shown.monte_carlo_noise)
     panels.figure.caption(f"{which}: {count(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
     return panels.figure
 
@@ -444,7 +444,7 @@ def _plot_counts(frames: Frames, counts: NDArray[Any], file: FramesFile | None, 
     axis.xaxis.minorticks_on()
     noisy = file is not None and file.noise_ratio is not None and file.noise_ratio[row, column] > 1.0
     text = f"Median pixel: row {row}, column {column}"
-    axis.set_title(text + (": noise of the simulation" if noisy else ""), color="firebrick" if noisy else TEXT)
+    axis.set_title(text + ("\nnoise of the simulation" if noisy else ""), color="firebrick" if noisy else TEXT)
 
 
 def _analytic_figure(result: AnalyticResult, width: float) -> Figure:

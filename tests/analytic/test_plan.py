@@ -176,7 +176,7 @@ def test_wrong_arguments_are_named(options, words):
 def test_daylight_is_noise(found):
     """Counts of daylight in the gate, from a window of the image; the return stays as it is."""
     scene = make(daylight={"sun_elevation_deg": 40.0, "depth": 40.0}, detector={"filter_fwhm_nm": 1.0})
-    lit = proposal(scene, photons=400_000)
+    lit = proposal(scene, photons=1_600_000)
     window = lit.scene.gate.stop - lit.scene.gate.start
     rate = np.median(spadwarp.scene.noise_rate(scene, spadwarp.truth_maps(scene, device="cpu")))
     assert lit.pilot.noise == pytest.approx(rate * window, rel=0.1)
