@@ -33,7 +33,15 @@ from spadwarp.scene.medium import (
 from spadwarp.scene.port import Port
 from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import field_unit
-from spadwarp.scene.sight import beam_planes, points_inside, port_advance, view_planes, within_port
+from spadwarp.scene.sight import (
+    beam_planes,
+    lines_of_sight,
+    points_inside,
+    points_on_rays,
+    port_advance,
+    view_planes,
+    within_port,
+)
 from spadwarp.transport import points_per_flight
 from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
@@ -127,11 +135,22 @@ class Survey:
             if port is None or port.shape == "dome" or np.dot(port.normal, axis) > 0.999:
                 whole.append(planes)
         points = points_inside(triangles, np.concatenate(whole))
+        if has_port and len(triangles):
+            points = np.concatenate([points, points_on_rays(triangles, *self._rays())])
         for planes, port, _, origin in self._sides:
             if port is not None and len(points):
                 ahead = origin + port.connect(points, origin)[0]
                 points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
         return points
+
+    def _rays(self) -> tuple[Points, Points]:
+        """Rays in the water over what the camera sees and the beam, which corners of triangles may all lie beside."""
+        scene, steps = self.scene, np.linspace(0.001, 0.999, 25)
+        left, top, right, bottom = scene.camera.view_box
+        x, y = np.meshgrid(left + (right - left) * steps, top + (bottom - top) * steps)
+        view = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+        seen = lines_of_sight(scene, view / np.linalg.norm(view, axis=1, keepdims=True))
+        return seen.start, seen.direction
 
     def paths(self, points: Points) -> Points:
         """Paths [m] from the laser by points `[N, 3]` to the lens, as lengths in water."""
@@ -676,10 +695,16 @@ def _check_statistics(survey: Survey) -> None:
         photons = signal * traced / scene.scan_positions / emitted
         if photons < 10.0:
             text = f"analog: only about {photons:.2g} of {traced:.3g} photons reach a pixel unscattered"
+            text += _enough(traced, photons)
             survey.warn("transport.estimator", text, photons_per_pixel=photons)
     elif samples < 10.0:
         text = f"only about {samples:.2g} of {traced:.3g} photons reach what a pixel sees unscattered"
+        text += _enough(traced, samples)
         survey.warn("transport.photons", text, samples_per_pixel=samples)
+
+
+def _enough(traced: float, samples: float) -> str:
+    return f"; about {10.0 * traced / samples:.1e} would be enough" if samples > 0.0 else ""
 
 
 # The water: its coefficients, phase function and cells, and what ends a photon's history in it

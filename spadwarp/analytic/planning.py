@@ -2,8 +2,8 @@
 
 A short Monte Carlo run on a window of the image measures counts, background and the error that scattering leaves. The
 window has the pixels of the camera about the target pixel nearest to the optical axis, so that light which is scattered
-from other parts of the target into them is all there. Two runs of equal length are compared: what differs between them
-is noise of the runs.
+from other parts of the target into them is all there. Runs of equal length are compared: what differs between them is
+noise of the runs. Numbers that both ends of their uncertainty judge differently are not judged.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-from collections.abc import Callable
+import time as clock
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,7 @@ from spadwarp.values import (
     SEED,
     ArgumentError,
     ConfigError,
+    SpadwarpWarning,
     check_choice,
     check_integer,
     range_from_time,
@@ -72,6 +75,13 @@ _MANY_PHOTONS = 100.0  # of the return, from which on the width of the response 
 _MOST_PULSES = 2**31 - 1
 _MOST_BINS = 1_000_000
 _LEAST = 1e-6  # beyond a port [m]
+_RUNS = 8  # of a quarter of the photons each two, whose scatter tells the noise of all
+_SCATTER = 1.6  # half-width of an interval over the standard deviation of four parts: 3.2/√4, of Student's t, 95 %
+_LIGHT_NOISE = 0.5  # of the target's light in a pixel, from which on rare heavy photons may be missing in the median
+_SECONDS, _FEWEST, _MOST = 60.0, 400_000, 2**40  # of a run that is as long as it takes; its photons
+_PART = 1.0 / 12.0  # of these seconds for one range of the search
+_UNKNOWN = 1e6  # ratio that stands for what parts of the runs do not know
+_WIDE = 4.0  # ratio of pulses, from which on their number is not known
 _FARTHEST = 200.0  # of the search for the largest range [m]
 _STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
 
@@ -93,10 +103,10 @@ class Pilot:
     bias: dict[str, float]  # estimator → median error, positive if too far [m]
     unscattered_floor: dict[str, float]  # `floor` of unscattered light alone: slopes, edges within a pixel, bins
     pile_up: dict[str, float]  # estimator → change of depth by pile-up, median [m]; 0 in free-running mode
-    run_noise: float  # median |error| of `floor` in a pixel that comes from the shortness of the runs [m]
     peak: float  # detections per pulse of the return within ±3σ of its peak, σ that of the response
     level: float  # of background per σ under it
-    photons: int  # of both runs
+    light_noise: float  # relative standard error of the target's light in a pixel
+    photons: int  # of all runs
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -119,20 +129,30 @@ class Proposal:
     pulses: int  # of a depth frame: for the depth error if it can be reached, else those after which more gain little
     pulses_for: str
     """What sets them: "depth error"; "false peaks", fewer than 1 % of them; "floor", where the depth error is out of
-    reach; "out of reach", where 2³¹ pulses are too few."""
+    reach; "out of reach", where 2³¹ pulses are too few; "not judged"."""
+    pulses_range: tuple[int, int]  # least and most by what the traced photons leave open
     frame_time: float  # for these pulses [s], at all positions of a scan
     reached: bool  # whether the depth error is reached, within the time
     terms: dict[str, float]  # name → part of the depth error at these pulses [m], "total" last; squares add up
-    limit: str  # the largest of them
+    limit: str  # the largest of them; "a or b" where the traced photons leave it open
     advice: str  # what would help
     pilot: Pilot  # what was measured by Monte Carlo
+    photons_needed: float  # photons of it that would judge, or those traced; infinite: more than 10⁴ times as many
+    seconds_needed: float  # that they take here
     channels: dict[str, Pilot] = field(default_factory=dict)
     """The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera without
     one."""
     largest_range: float = math.nan  # of a plane square to the axis, as asked for [m]; NaN: not sought, 0: none
     range_limit: str = ""  # what limits it
 
+    @property
+    def judged(self) -> bool:
+        """Whether the traced photons tell; if not, pulses, terms and limit are those of a run of noise."""
+        return self.pulses_for != "not judged"
+
     def __repr__(self) -> str:
+        if not self.judged:
+            return f"Proposal(not enough photons to judge: {self.pilot.photons:.1e} of {self.photons_needed:.1e})"
         error, pulses = 1e3 * self.terms["total"], self.pulses
         return f"Proposal({error:.3g} mm with {pulses} pulses, {self.frame_time:.3g} s; limit: {self.limit})"
 
@@ -163,7 +183,7 @@ def plan(
     full_power: bool = False,
     eye_distance: float | str | None = None,
     eye_exposure: float | str = 100.0,
-    photons: int = 2_000_000,
+    photons: int | Literal["auto"] = "auto",
     seed: int = 0,
     largest_range: bool = True,
     channel: Channel = "I",
@@ -189,17 +209,19 @@ def plan(
         eye_distance: An eye at this distance from the laser limits the pulse energy [m]; default: reported for 0.1 m,
             and no limit.
         eye_exposure: For which it looks into the beam [s].
-        photons: Of the Monte Carlo run.
+        photons: Of the Monte Carlo run; "auto": until they judge, or for 60 s. Numbers that the photons do not tell are
+            not judged.
         seed: Of it.
         largest_range: Whether to look for the largest range, which takes several shorter runs.
         channel: Light that counts, of a camera with an analyser; see `spadwarp.result.analyser_channel`.
         device: "cpu", "cuda:0"; default: the first GPU, else the CPU.
         progress: Called with ("trace", photons done, photons asked for) and the like.
 
-    Raises `ConfigError`: no target in view, or no light from it; `ArgumentError`: an argument out of range.
+    Raises `ConfigError`: no target in view, or no light from it, or before a photon is traced less than one detection
+    of it in all pulses, even without scattering; `ArgumentError`: an argument out of range.
     """
     scene = as_scene(scene)
-    photons = check_integer("photons", photons, field_range(Transport, "photons"))
+    number = None if photons == "auto" else check_integer("photons", photons, field_range(Transport, "photons"))
     check_choice("method", method, METHODS)
     check_choice("channel", channel, CHANNELS)
     planner = _Planner(
@@ -233,11 +255,72 @@ def plan(
         scene = with_plane(scene, span[1])
     if problem:
         raise ConfigError(problem, source=scene.source)
-    proposal = planner.propose(with_gate(scene, span, planner.margin), span, photons)
-    if not largest_range:
+    proposal = planner.propose(with_gate(scene, span, planner.margin), span, number)
+    if not largest_range or not proposal.judged:
         return proposal
-    largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), max(photons // 8, 1))
+    largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), number and max(number // 8, 1))
     return dataclasses.replace(proposal, largest_range=largest, range_limit=limit)
+
+
+class _NoLight(ConfigError):
+    """No photon of the target has come yet."""
+
+
+class _Outcome(NamedTuple):
+    """Of a pilot: pulses and what they are for, as in `Proposal`, parts of the depth error, the largest, time [s]."""
+
+    pulses: int
+    purpose: str
+    terms: dict[str, float]
+    limit: str
+    time: float
+
+
+_ENOUGH = ("depth error", "false peaks")
+
+
+class _Sample(NamedTuple):
+    """What all runs measure, and what quarters of them do."""
+
+    centre: Pilot
+    parts: list[Pilot]
+
+    @classmethod
+    def of(cls, runs: Sequence[Result], scene: Scene, device: str | None, even: bool, channel: Channel) -> _Sample:
+        """Of an even number of runs, in the order in which they were traced."""
+        pairs = [measure(runs[i : i + 2], scene, device, even=even, channel=channel) for i in range(0, len(runs), 2)]
+        return cls(measure(runs, scene, device, even=even, channel=channel), pairs)
+
+    def ends(self, factor: float) -> tuple[Pilot, Pilot, Pilot]:
+        """The best and the worst pilot, the one measured between them, that `factor` times the photons would leave.
+
+        Four parts scatter about a mean that is off the centre where few photons move it: by as much as the centre is
+        off the truth, if the error falls with the root of the photons.
+        """
+        centre, shrunk = self.centre, 1.0 / math.sqrt(factor)
+
+        def ends(found: list[float], *, ratio: bool) -> tuple[float, float]:
+            values = np.array(found)
+            if ratio:
+                with np.errstate(divide="ignore"):
+                    values = np.log(values)
+            if not np.isfinite(values).all():
+                middle = found[0] if np.isfinite(values[0]) else 1.0
+                return middle * _UNKNOWN**-shrunk, middle * _UNKNOWN**shrunk
+            parts = values[1:]
+            half = shrunk * (_SCATTER * float(parts.std(ddof=1)) + abs(float(values[0] - parts.mean())))
+            low, high = float(values[0]) - half, float(values[0]) + half
+            return (math.exp(low), math.exp(min(high, 700.0))) if ratio else (max(low, 0.0), high)
+
+        every, best, worst = (centre, *self.parts), dict[str, Any](), dict[str, Any]()
+        for name in ("bound", "shot_noise", "peak"):
+            best[name], worst[name] = ends([getattr(one, name) for one in every], ratio=True)
+        worst["peak"], best["peak"] = best["peak"], worst["peak"]
+        best["level"], worst["level"] = ends([one.level for one in every], ratio=False)
+        for name in ("floor", "pile_up"):
+            pairs = {key: ends([abs(getattr(one, name)[key]) for one in every], ratio=False) for key in METHODS}
+            best[name], worst[name] = ({key: pair[i] for key, pair in pairs.items()} for i in (0, 1))
+        return dataclasses.replace(centre, **best), centre, dataclasses.replace(centre, **worst)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,29 +339,41 @@ class _Planner:
     channel: Channel
     progress: Progress | None
 
-    def propose(self, scene: Scene, span: tuple[float, float], photons: int, *, even: bool = False) -> Proposal:
-        """The experiment with a target at these ranges: light, pulse energy, pulses, error; `even` as in `measure`."""
+    def propose(self, scene: Scene, span: tuple[float, float], photons: int | None, *, even: bool = False) -> Proposal:
+        """The experiment with a target at these ranges: light, pulse energy, pulses, error; `even` as in `measure`.
+
+        `photons`: None: as many as judge.
+        """
         rate, largest_rate = scene.laser.repetition_rate, 1.0 / scene.gate.stop
         if scene.detector.wrap and rate > largest_rate:
             rate = _rounded_down(largest_rate)
             scene = scene.with_overrides(laser={"repetition_rate": rate})
-        small = window(scene, self.device)
-        runs = trace(small, photons, self.seed, self.device, None if even else self.progress)
-        pilot = measure(runs, scene, self.device, even=even, channel=self.channel)
-        eye = eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
-        piled = scene.laser.pulse_energy * max(PILE_UP - pilot.noise, 0.0) / pilot.brightest
-        allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": eye.pulse_energy})
-        energy_limit = min(allowed, key=allowed.__getitem__)
-        lowest = allowed[energy_limit]
-        if lowest > 0 and ((self.full_power and not even) or scene.laser.pulse_energy > lowest):
-            scene = scene.with_overrides(laser={"pulse_energy": _rounded_down(lowest)})
-            pilot = measure(runs, scene, self.device, even=even, channel=self.channel)
-        else:
-            energy_limit = ""
-        pulses, purpose = self._pulses(scene, pilot)
-        terms = _terms(pilot, pulses, self.method)
-        frame_time = pulses * scene.scan_positions / rate
-        limit = _limit(scene, pilot, terms, pulses, self.method)
+        _refuse_hopeless(scene, span[0], self.time)
+        small, asked = window(scene, self.device), scene
+        budget, begin = _SECONDS * (_PART if even else 1.0), clock.monotonic()
+        runs: tuple[Result, ...] = ()
+        while True:
+            report = None if even else self.progress
+            runs = trace(
+                small, photons or max(_FEWEST, sum(run.photons for run in runs)), self.seed, self.device, report, runs
+            )
+            traced, elapsed = sum(run.photons for run in runs), clock.monotonic() - begin
+            last = photons is not None or 2.0 * elapsed > budget or traced > _MOST
+            try:
+                scene, energy_limit, piled, eye, found = self._settle(asked, runs, even)
+            except _NoLight:
+                if last:
+                    raise
+                continue
+            factor = self._missing(scene, found)
+            if factor <= 1.0 or last:
+                break
+        low, pilot, high = found.ends(1.0)
+        ends = [self._outcome(scene, one) for one in (low, pilot, high)]
+        pulses, purpose, terms, limit, frame_time = ends[1]
+        limits = list(dict.fromkeys(one.limit for one in (ends[1], ends[0], ends[2])))
+        if factor > 1.0:
+            purpose, pulses, frame_time = "not judged", scene.detector.pulses_per_frame, math.nan
         # Given on its own, the analytic model's number would hold against a later change of the detector's.
         depth_pulses = None if scene.analytic.pulses_per_depth_frame is None else pulses
         scene = scene.with_overrides(
@@ -305,14 +400,48 @@ class _Planner:
             irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate,
             pulses=pulses,
             pulses_for=purpose,
+            pulses_range=(ends[0].pulses, ends[2].pulses),
             frame_time=frame_time,
-            reached=purpose in ("depth error", "false peaks") and frame_time <= self.time,
+            reached=purpose in _ENOUGH and frame_time <= self.time,
             terms=terms,
-            limit=limit,
+            limit=" or ".join(limits),
             advice=self._advice(limit, purpose, frame_time, rate, largest_rate),
             pilot=pilot,
+            photons_needed=traced * factor,
+            seconds_needed=sum(run.timing.get("trace", math.nan) for run in runs) * factor,
             channels={name: measure(runs, scene, self.device, channel=name) for name in compared},
         )
+
+    def _settle(self, scene: Scene, runs: Sequence[Result], even: bool) -> tuple[Scene, str, float, EyeLimit, _Sample]:
+        """The scene with its pulse energy, what sets it, that of pile-up, the limit for the eye; and what was
+        measured."""
+        found = _Sample.of(runs, scene, self.device, even, self.channel)
+        eye = eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
+        piled = scene.laser.pulse_energy * max(PILE_UP - found.centre.noise, 0.0) / found.centre.brightest
+        allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": eye.pulse_energy})
+        energy_limit = min(allowed, key=allowed.__getitem__)
+        lowest = allowed[energy_limit]
+        if not (lowest > 0 and ((self.full_power and not even) or scene.laser.pulse_energy > lowest)):
+            return scene, "", piled, eye, found
+        scene = scene.with_overrides(laser={"pulse_energy": _rounded_down(lowest)})
+        return scene, energy_limit, piled, eye, _Sample.of(runs, scene, self.device, even, self.channel)
+
+    def _outcome(self, scene: Scene, pilot: Pilot) -> _Outcome:
+        pulses, purpose = self._pulses(scene, pilot)
+        terms = _terms(pilot, pulses, self.method)
+        limit = _limit(scene, pilot, terms, pulses, self.method)
+        return _Outcome(pulses, purpose, terms, limit, pulses * scene.scan_positions / scene.laser.repetition_rate)
+
+    def _missing(self, scene: Scene, found: _Sample) -> float:
+        """Times as many photons that would judge; 1 where these do, infinite where 10⁴ times as many do not."""
+        factor = max(1.0, (found.centre.light_noise / _LIGHT_NOISE) ** 2)
+        while factor < 1e4:
+            ends = [self._outcome(scene, pilot) for pilot in found.ends(factor)]
+            kinds = {(one.purpose in _ENOUGH, one.purpose in _ENOUGH and one.time <= self.time) for one in ends}
+            if len(kinds) == 1 and (ends[0].purpose not in _ENOUGH or ends[2].pulses <= _WIDE * ends[0].pulses):
+                return factor
+            factor *= 2.0
+        return math.inf
 
     def _pulses(self, scene: Scene, pilot: Pilot) -> tuple[int, str]:
         """Pulses of a depth frame, and what they are for.
@@ -350,7 +479,7 @@ class _Planner:
             f"repetition rate of {with_prefix(rate, 'Hz')}{faster}; fewer pulses are needed with {advice}"
         )
 
-    def largest_range(self, scene: Scene, start: float, photons: int) -> tuple[float, str]:
+    def largest_range(self, scene: Scene, start: float, photons: int | None) -> tuple[float, str]:
         """The largest range [m] of a plane, to 3 %, and what limits it there; sought from `start` on, 0: there is none.
 
         The repetition rate and the pulse energy are the scene's, the gate follows the plane.
@@ -375,7 +504,7 @@ class _Planner:
                 reason = "no light of the target"
                 return False
             if not proposal.reached:
-                reason = proposal.limit
+                reason = proposal.limit if proposal.judged else f"not enough photons to judge {distance:.3g} m"
             return proposal.reached
 
         low, high = (start, 0.0) if is_reached(start) else (0.0, start)
@@ -467,25 +596,62 @@ def window(scene: Scene, device: str | None = None) -> Scene:
     return scene.with_overrides(camera={"width": width, "height": height, "fx": fx, "fy": fy, **centre})
 
 
+def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
+    """Raises `ConfigError` where a pixel detects less than one photon of the target in all pulses of a time [s], even
+    if scattering took no light away.
+
+    Light of a pixel is ρ/π ∫ E I dA: E is the irradiance of the target, I that which the pixel would cast on it, by
+    reciprocity (Veach 1997). ∫ I dA is at most the étendue of the pixel, less what water absorbs on the shortest way.
+    Scattering spreads a beam: E is at most what it casts through clear water that absorbs, on its axis; in a wide beam
+    light that comes back from the water and the target adds to that, here twice.
+    """
+    camera, laser = scene.camera, scene.laser
+    etendue = camera.aperture_area * camera.pixel_tangent**2
+    passed = math.exp(-2.0 * scene.medium.range.absorption * nearest)
+    reflectance = max((one.reflectance for one in scene.targets if not isinstance(one.reflectance, str)), default=1.0)
+    if any(isinstance(one.reflectance, str) for one in scene.targets):
+        reflectance = 1.0
+    light = 2.0 * reflectance / math.pi * axis_fluence(scene, nearest) * etendue * passed
+    pulses = min(time * laser.repetition_rate / scene.scan_positions, _MOST_PULSES)
+    most = light * laser.photons_per_pulse * scene.detections_per_photon * pulses
+    if most < 1.0:
+        raise ConfigError(
+            f"no depth is within reach: of a target at {nearest:.3g} m a pixel detects {most:.2g} photons at most in "
+            f"all {pulses:.3g} pulses of {with_prefix(time, 's')}, even if scattering took no light away (absorption "
+            f"alone leaves {passed:.2g}, optical depth {scene.medium.range.extinction * nearest:.3g}); what helps: "
+            "a shorter distance, clearer water, more pulse energy, a larger aperture, a longer time",
+            source=scene.source,
+        )
+
+
 def trace(
-    scene: Scene, photons: int, seed: int, device: str | None, progress: Progress | None = None
-) -> tuple[Result, Result]:
-    """Two runs of half the photons each."""
-    half = max(1, photons // 2)
+    scene: Scene,
+    photons: int,
+    seed: int,
+    device: str | None,
+    progress: Progress | None = None,
+    earlier: Sequence[Result] = (),
+) -> tuple[Result, ...]:
+    """Runs of an eighth of the photons each, which go on with earlier ones."""
+    each, before = max(1, photons // _RUNS), sum(run.photons for run in earlier)
+    cache: dict[str, Any] = {}
 
-    def half_run(first: int) -> Result:
+    def run(number: int) -> Result:
         def report(stage: str, done: int, total: int) -> None:
-            if progress is not None and (total or not first):
-                progress(stage, first + done if total else done, 2 * half if total else total)
+            if progress is not None and (total or not (number or earlier)):
+                progress(stage, before + number * each + done if total else done, before + _RUNS * each if total else 0)
 
-        options: dict[str, Any] = {"seed": seed, "device": device, "progress": report}
-        return simulate(scene, photons=half, run=RunOptions(first_photon=first), **options)
+        options: dict[str, Any] = {"seed": seed, "device": device, "progress": report, "mesh_cache": cache}
+        return simulate(scene, photons=each, run=RunOptions(first_photon=before + number * each), **options)
 
-    return half_run(0), half_run(half)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SpadwarpWarning)  # of few photons: `plan` judges what they tell
+        runs = [run(number) for number in range(_RUNS)]
+    return tuple(merge(pair) for pair in zip(earlier, runs, strict=True)) if earlier else tuple(runs)
 
 
 def measure(
-    runs: tuple[Result, Result], scene: Scene, device: str | None = None, *, even: bool = False, channel: Channel = "I"
+    runs: Sequence[Result], scene: Scene, device: str | None = None, *, even: bool = False, channel: Channel = "I"
 ) -> Pilot:
     """Numbers of `scene`, whose laser's energy and detector may differ from those of the runs, in a channel of an
     analyser.
@@ -494,21 +660,21 @@ def measure(
     its modulus.
     """
     # The traced scene with what a detector sees of the wanted one.
-    names = ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")
-    laser = runs[0].scene.laser.model_copy(update={name: getattr(scene.laser, name) for name in names})
-    seen_by = runs[0].scene.model_copy(update={"laser": laser, "detector": scene.detector})
-    first, second = (analyser_channel(dataclasses.replace(run, scene=seen_by), channel) for run in runs)
+    laser = {name: getattr(scene.laser, name) for name in ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")}
+    seen_by = runs[0].scene.with_overrides(laser=laser).model_copy(update={"detector": scene.detector})
+    halves = (merge(runs[0::2]), merge(runs[1::2])) if len(runs) > 2 else runs
+    first, second = (analyser_channel(dataclasses.replace(run, scene=seen_by), channel) for run in halves)
     both = merge([first, second])
     clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
-    frames, clear_frames, *half_frames = (
-        detect(run, pulses=1, seed=0, device=device) for run in (both, clear, first, second)
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SpadwarpWarning)  # the noise of the runs is judged here
+        frames, clear_frames = (detect(run, pulses=1, seed=0, device=device) for run in (both, clear))
     light = frames.expected.astype(np.float64)
     background = np.broadcast_to(frames.background, light.shape).astype(np.float64)
     signal = light - background
     seen = np.isfinite(both.truth.depth) & (signal.sum(axis=-1) > 0)
     if not seen.any():
-        raise ConfigError(
+        raise _NoLight(
             "no light of the target reaches the pixels near the axis: `spadwarp check` says why", source=scene.source
         )
 
@@ -522,7 +688,6 @@ def measure(
         return {method: _depth_error(both, frames, histogram, method, device) for method in METHODS}
 
     error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
-    halves = [_depth_error(both, half, half.expected, "likelihood", device) for half in half_frames]
     bias = {method: median(values) for method, values in error.items()}
     piled: dict[str, float] = {method: 0.0 for method in METHODS}
     if scene.detector.mode == "first_photon":
@@ -532,6 +697,7 @@ def measure(
     peak, level = _return(signal, background, both.scene)
     bound, shot, information_noise = _bounds(both, (first, second), seen, device)
     detected = both.detections.sum(axis=-1)
+    lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
     noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
@@ -547,9 +713,9 @@ def measure(
         bias=bias,
         unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
         pile_up=piled,
-        run_noise=median(0.5 * np.abs(halves[0] - halves[1])),
         peak=median(peak),
         level=median(level),
+        light_noise=math.sqrt(np.mean(np.square(lights[0] - lights[1]))) / max(float(np.mean(sum(lights))), 1e-300),
         photons=both.photons,
     )
 

@@ -68,6 +68,9 @@ def detect(
     scene, methods = result.scene, list(dict.fromkeys(method or get_args(opt.Method)))
     bins = recorded[1] if recorded else scene.gate.bins
     shots = scene.detector.pulses_per_frame if pulses is None else pulses
+    told = result.scene.with_overrides(detector={"pulses_per_frame": shots})
+    if problem := spadwarp.result.noise_problem(dataclasses.replace(result, scene=told)):
+        complain(problem, "note")
     counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
     needed = max(frames, 0) * scene.camera.width * scene.camera.height * (4 * counted + 4 * len(methods) + 8)
     check_outputs(out, ("frames.h5", "frame.png"), inputs=(run,), needed=needed + (16 << 20))

@@ -55,7 +55,6 @@ def check(
     write_json({"scene": scene, **numbers, "messages": [dataclasses.asdict(message) for message in messages]})
 
 
-_MUCH_NOISE = 1.0 / 3.0  # of the information of the run
 _Range = Annotated[tuple[float, float], opt.from_to("m")]
 
 
@@ -71,7 +70,7 @@ def plan(
     full_power: bool = False,
     eye_distance: opt.Length | None = None,
     eye_exposure: opt.Seconds = 100.0,
-    photons: int = 2_000_000,
+    photons: int | None = None,
     seed: int = 0,
     no_range: bool = False,
     channel: opt.Channel = "I",
@@ -95,7 +94,7 @@ def plan(
         full_power: Take the largest pulse energy within the limits.
         eye_distance (LENGTH): Also keep the pulse energy safe for an eye at this distance from the laser [m].
         eye_exposure (TIME): How long the eye looks into the beam [s].
-        photons: Photons of the Monte Carlo run.
+        photons: Photons of the Monte Carlo run. By default as many as judge, or 60 s.
         no_range: Do not look for the largest range.
         write: Scene file to write with the proposed values.
 
@@ -106,9 +105,10 @@ def plan(
     """
     read = opt.read_scene(scene, overrides, mesh=mesh)
     check_outputs(files={"--write": write}, inputs=(scene, *read.files))
-    # What `check` warns of in the targets, before a run that would be in vain; the gate is what is proposed.
-    for message in spadwarp.check(read) if range_ is None else ():
-        if message.level == "warning" and message.field.startswith("targets") and "gate" not in message.text:
+    # What `check` warns of, but for what is proposed or traced otherwise here.
+    for message in spadwarp.check(read):
+        ours = message.field.startswith("transport") or "outside the gate" in message.text
+        if message.level == "warning" and not ours and not (range_ and message.field.startswith("targets")):
             complain(str(message))
     found = spadwarp.plan(
         read,
@@ -120,7 +120,7 @@ def plan(
         full_power=full_power,
         eye_distance=eye_distance,
         eye_exposure=eye_exposure,
-        photons=photons,
+        photons="auto" if photons is None else photons,
         seed=seed,
         largest_range=not no_range,
         channel=channel,
@@ -131,21 +131,20 @@ def plan(
     for file in files:
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
         spadwarp.io.write_text(made + found.scene.to_toml(folder=file.parent), file)
-    hidden = ("pilot", "channels", "terms", "advice", "limit")
-    say(readable({name: value for name, value in found.to_dict().items() if name not in hidden}))
+    say(_verdict(found))
+    hidden = ["pilot", "channels", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
+    hidden += [] if found.judged else ["pulses", "pulses_for", "frame_time", "reached", "pile_up_energy"]
+    values = {name: value for name, value in found.to_dict().items() if name not in hidden}
+    if not found.judged:
+        del values["values"]["detector.pulses_per_frame"]
+    say(readable(values))
     if found.largest_range == found.largest_range:
         say(f"largest range, for a plane square to the optical axis: {found.largest_range:.3g} m; {found.range_limit}")
-    say(rows(_terms(found)))
-    for name in ("co", "cross") if found.channels else ():
-        say(_reception(found, name))
-    say(f"{_verdict(found)}\nWhat would help: {found.advice}.")
-    if found.pilot.run_noise > 0.5 * found.terms["forward scattering"]:
-        say("The Monte Carlo run is too short to know the floor: it may be smaller; --photons takes more.")
-    if found.pilot.information_noise > _MUCH_NOISE:
-        say(
-            f"The Monte Carlo run is short for the bound: {100 * found.pilot.information_noise:.0f} % of what its "
-            "histograms say of the depth was noise, and is left out; --photons takes more."
-        )
+    if found.judged:
+        say(rows(_terms(found)))
+        for name in ("co", "cross") if found.channels else ():
+            say(_reception(found, name))
+        say(f"What would help: {found.advice}.")
     for file in files:
         say(f"written: {file}")
     write_json({"scene": scene, **found.to_dict(), "files": files})
@@ -154,7 +153,17 @@ def plan(
 def _verdict(found: Proposal) -> str:
     """One sentence."""
     asked, total = with_prefix(found.depth_error, "m"), with_prefix(found.terms["total"], "m")
-    pulses = f"{count(found.pulses)} pulses, {with_prefix(found.frame_time, 's')}"
+    if not found.judged:
+        traced, needed = found.pilot.photons, found.photons_needed
+        would = f"about {needed:.1e} would do, {with_prefix(found.seconds_needed, 's')} here"
+        if not math.isfinite(needed):
+            would = f"more than {1e4 * traced:.0e} would be needed: the answer lies between two"
+        return f"A depth error of {asked}: not enough photons to judge, {traced:.1e} were traced; {would}."
+    if found.pulses_for == "out of reach":
+        return f"A depth error of {asked} is out of reach: 2^31 pulses are too few; limit: {found.limit}."
+    least, most = found.pulses_range
+    between = f" ({count(least)} to {count(most)})" if most > 1.3 * least else ""
+    pulses = f"{count(found.pulses)} pulses{between}, {with_prefix(found.frame_time, 's')}"
     if found.pulses_for == "false peaks":
         pulses += ", for fewer than 1 % false peaks"
     if found.reached:
@@ -162,8 +171,7 @@ def _verdict(found: Proposal) -> str:
     if found.pulses_for in ("depth error", "false peaks"):
         longest = with_prefix(found.time, "s")
         return f"A depth error of {asked} takes {pulses}, more than {longest}; limit: {found.limit}."
-    least = f"{total} with {pulses}" if math.isfinite(found.terms["total"]) else f"no depth with {pulses}"
-    return f"A depth error of {asked} is out of reach: {least}; limit: {found.limit}."
+    return f"A depth error of {asked} is out of reach: {total} with {pulses}; limit: {found.limit}."
 
 
 def _reception(found: Proposal, name: str) -> str:
@@ -192,7 +200,7 @@ def _terms(found: Proposal) -> dict[str, str]:
         "background": "backscatter, dark counts, ambient light; falls likewise",
         "Cramér–Rao bound": "both together: the least error of an unbiased estimator",
         "forward scattering": f"{found.method}; does not fall with the pulses; {floors}; from {count(pilot.photons)} "
-        f"traced photons, ±{1000 * pilot.run_noise:.2g} a pixel; {unscattered}",
+        f"traced photons; {unscattered}",
         "pile-up": "change of the median depth",
         "total": "root of the sum of squares",
     }
@@ -260,6 +268,8 @@ def sweep(
         table = plain if of_range else [{title: value, **row} for value, row in zip(found.values, plain, strict=True)]
         files = [out / f"{stem}.png", spadwarp.io.write_csv(table, out / f"{stem}.csv")]
     cells = _budget_cells if of == "budget" else _error_cells
+    if of == "budget":
+        say("of unscattered light alone, by the analytic model; `spadwarp plan` has the pulses of all light")
     show_table(
         ({title: name, **cells(row)} for name, row in zip(names, lines, strict=True)), keys=2 if of == "budget" else 1
     )
@@ -304,7 +314,7 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
         "outliers": _in_percent(row.outlier_probability),
-        "pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
+        "unscattered: pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
     }
 
 

@@ -48,7 +48,10 @@ def info(path: Path, *, verify: bool = False) -> None:
         say(readable({"kind": "dataset", "bytes": size, **manifest, "files": len(manifest["files"])}))
         write_json({"kind": "dataset", **manifest})
     else:
-        summary = spadwarp.files.summary(spadwarp.load(path))
+        loaded = spadwarp.load(path)
+        if isinstance(loaded, spadwarp.Result) and (problem := spadwarp.result.noise_problem(loaded)):
+            say(problem)
+        summary = spadwarp.files.summary(loaded)
         shown = dict(summary)
         if (balance := shown.pop("energy_balance", None)) is not None:  # where the emitted light went
             verdict = "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"

@@ -256,7 +256,7 @@ def depth_frame(
     """
     check_choice("quantity", quantity, ("depth", "range"))
     scene, gate = result.scene, result.scene.gate
-    time = arrival_time(result.histogram, gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
+    time = arrival_time(result.expected(), gate_start=gate.start, bin_width=gate.bin_width, method=method, **options)
     lines = lines_of_sight(scene)
     distance = lines.range_from_path(time * result.pulse_speed)
     return lines.depth_from_range(distance) if quantity == "depth" else distance

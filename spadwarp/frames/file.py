@@ -168,6 +168,7 @@ class FramesFile(_StoredFrames):
     scene: Scene  # of the result that the counts were drawn from
     truth_depth: NDArray[np.float32]  # of that result, float32 `[H, W]` [m]
     monte_carlo_noise: float | None = None
+    noise_ratio: NDArray[np.float32] | None = None  # `Result.noise_ratio` of frames of these pulses, `[H, W]`
     channel: str = "I"  # light that was counted: "I", all of it, or "co" or "cross" behind an analyser
     notes: tuple[str, ...] = ()
 
@@ -197,6 +198,7 @@ class FramesFile(_StoredFrames):
             "truth_depth": file.array("truth/depth", np.float32, image),
             "channel": file.text_attribute("channel", "I"),
             "notes": tuple(map(str, np.atleast_1d(file.attribute("notes", ())))),
+            "noise_ratio": file.array("noise_ratio", np.float32, image) if "noise_ratio" in file else None,
             "monte_carlo_noise": None if noise is None else file.real("monte_carlo_noise", "[0, inf)"),
             **expectations,
         }
@@ -416,7 +418,7 @@ def record_frames(
         pulses, frames, seed, tags, window, device: As of `spadwarp.detect`.
         methods: Estimators of depth, see `spadwarp.arrival_time`. They know background and response.
         undo_pile_up: Estimate from Coates' correction of the counts.
-        progress: Called with ("frames", done, frames).
+        progress: Called with ("frames", done, frames), and before it with (step, 0, 0) of each part of them.
 
     Raises `ArgumentError`, and `FileError` where the file cannot be written.
     """
@@ -426,6 +428,12 @@ def record_frames(
     bins = scene.gate.bins if window is None else window[1]
     size = max(1, _PART_BYTES // (4 * scene.camera.width * scene.camera.height * bins))
     options: dict[str, Any] = {"pulses": pulses, "seed": seed, "tags": tags, "window": window, "device": device}
+
+    def remark(text: str) -> None:
+        if progress is not None:
+            progress(text, 0, 0)
+
+    remark("Cramér–Rao bound")
     bound = _bound(result, pulses, device)
     notes = () if bound.problem is None else (f"no Cramér–Rao bound: {bound.problem}",)
     errors: dict[Method, FrameErrors] = {}
@@ -433,11 +441,14 @@ def record_frames(
     with write_hdf5(path) as opened:
         writer = _Writer(opened, frames)
         for start in range(0, frames, size):
-            part = detect(result, frames=min(size, frames - start), first_frame=start, **options)
+            number = min(size, frames - start)
+            remark(f"counts of frames {start + 1} to {start + number}")
+            part = detect(result, frames=number, first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
             depth: dict[Method, Map] = {}
             found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}
             for method in methods:
+                remark(f"their depth by {method}")
                 time = part.arrival_time(method, undo_pile_up=undo_pile_up, **found)
                 depth[method] = depth_from_time(time, scene=scene)
             writer.add(part, scene, depth, found["significance"], _still(result, part, frames, bound.sigma))
@@ -480,6 +491,10 @@ def _still(result: Result, part: Frames, frames: int, bound: Map) -> _Layout:
         "truth/depth": (PIXELS, result.truth.depth, "m", "true planar depth"),
         "edges": (("edges",), part.edges, "s", "edges of the bins after the start of the gate"),
     }
+    if result.batches > 1:
+        frame_of = scene.with_overrides(detector={"pulses_per_frame": part.pulses})
+        ratio = replace(result, scene=frame_of).noise_ratio.astype(np.float32)
+        arrays["noise_ratio"] = (PIXELS, ratio, "1", "variance by the simulation over that of a frame's photons")
     coordinates: dict[str, Any] = {"whole_gate": 1}
     if irf.times is not None and irf.values is not None:
         curve = np.array([irf.times, irf.values], np.float64)

@@ -25,7 +25,7 @@ from spadwarp.io.arrays import read_npy
 from spadwarp.io.hdf5 import hdf5_format, open_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
 from spadwarp.io.paths import existing_file
-from spadwarp.result import Channel, analyser_channel
+from spadwarp.result import Channel, analyser_channel, noise_problem
 from spadwarp.result.file import load_result
 from spadwarp.values import ArgumentError, FileError, SpadwarpError, SpadwarpWarning, check_real, shown
 
@@ -161,10 +161,11 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
     result = analyser_channel(load_result(path), channel)
     scene = result.scene
     return Histograms(
-        values=result.histogram,
+        values=result.expected(),
+        notes=tuple(filter(None, [noise_problem(result)])),
         bin_width=scene.gate.bin_width,
         gate_start=scene.gate.start,
-        background=result.component("backscatter").astype(np.float32),
+        background=result.expected("backscatter").astype(np.float32),
         response=detector_response(scene.detector, scene.laser),
         scene=scene,
     )

@@ -501,7 +501,7 @@ def monte_carlo_noise(
     detector, laser = detector or scene.detector, laser or scene.laser
     scale = laser.photons_per_pulse * detection_efficiency(laser, detector)
     # Bins are nearly independent: a history adds to few of those of one pixel.
-    error = np.sqrt(np.square(result.standard_error).sum(axis=2)) * scale
+    error = np.sqrt(np.square(result.expected_error).sum(axis=2)) * scale
     noise = noise_rate(scene.model_copy(update={"detector": detector, "laser": laser}), result.truth)
     noise = noise[..., 0] if np.ndim(noise) else noise
     expected = result.intensity * scale + noise * (scene.gate.stop - scene.gate.start)
@@ -590,12 +590,13 @@ def detect(
         gate_start, bin_width = scene.gate.start, scene.gate.bin_width
         detections_per_photon = laser.photons_per_pulse * detection_efficiency(laser, detector)
         if background is None:
-            background = source.component("backscatter") * detections_per_photon
+            expected = getattr(source, "expected", source.component)  # a TorchResult has no other light
+            background = expected("backscatter") * detections_per_photon
         if ambient is None and scene.daylight is not None:
             lit = scene.model_copy(update={"detector": detector, "laser": laser})
             truth = Truth(**{name: on_host(getattr(source.truth, name)) for name in Truth.__dataclass_fields__})
             ambient = noise_rate(lit, truth)[..., 0] - detector.noise_rate
-        source = source.histogram * detections_per_photon
+        source = (source.expected() if isinstance(source, Result) else source.histogram) * detections_per_photon
     detector = detector or Detector()
     pulses = detector.pulses_per_frame if pulses is None else pulses
     arguments = {"pulses": pulses, "frames": frames, "first_frame": first_frame, "seed": seed}

@@ -86,13 +86,18 @@ def _read(scene: Scene, word: Any) -> Unknown:
     if spread not in ("", "pixel"):
         raise ArgumentError(f"unknown: {shown(word)} ends neither with a name nor with ':pixel'")
     name = _SHORT.get(name, name)
-    if name == "reflectance" and len(scene.targets) == 1:
-        name = "targets[0].reflectance"
+    own = [f"targets[{k}].reflectance" for k in range(len(scene.targets))]
+    if name == "reflectance" and len(own) == 1:
+        name = own[0]
+    if name == "reflectance" and own:
+        raise ArgumentError(
+            f"unknown: 'reflectance' is that of one target, and the scene has {len(own)}: name {' or '.join(own)}"
+        )
     if name == "ambient_rate":
         name = BACKGROUND
     field = _FIELD.fullmatch(name)
     if field is None and name not in (DEPTH, BACKGROUND):
-        known = [*_SHORT, *_SHORT.values(), "reflectance", "targets[0].reflectance", DEPTH]
+        known = [*_SHORT, *_SHORT.values(), *own, DEPTH]
         raise ArgumentError(f"unknown: {shown(name)} is not one of {', '.join(known)}{suggestion(name, known)}")
     if spread and name.startswith("medium."):
         raise ArgumentError(f"unknown: {name} is one of the whole water, not of a pixel")

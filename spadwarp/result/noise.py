@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from spadwarp.result.result import Result
     from spadwarp.scene import Scene
 
-__all__ = ["NOISE_GOAL", "PhotonsNeeded", "noise_problem", "photons_needed"]
+__all__ = ["NOISE_GOAL", "PhotonsNeeded", "noise_problem", "photons_needed", "unclear_pixels"]
 
 NOISE_GOAL = 0.1
 """`Result.target_noise_ratio` up to which a result's noise does not show beside that of a frame's photons: it adds 5 %
@@ -26,6 +26,7 @@ to their standard deviation."""
 _FWHM_PER_SIGMA = math.sqrt(8.0 * math.log(2.0))
 _NARROW = 0.2  # standard deviation [bins] of a response that leaves light in its bin
 _PART_VOXELS = 1 << 22
+_KNOWN = 1.0 / 3.0  # relative standard error of a bin that means something
 _SAMPLE = 1024  # pixels whose median stands for the target
 
 Floats = NDArray[np.float64]
@@ -36,7 +37,7 @@ def noise_ratios(result: Result, second_moment: NDArray[np.uint64], pixels: NDAr
     components, _, _, bins = result.tallies.shape
     tallies, moments = result.tallies.reshape(components, -1, bins), second_moment.reshape(2, -1, bins)
     size = max(1, _PART_VOXELS // bins)
-    scene, value = result.scene, result.tally_value.reshape(-1)
+    scene, value, better = result.scene, result.tally_value.reshape(-1), result.reconstruction
     target = np.isfinite(result.truth.depth).reshape(-1)
     noise = np.broadcast_to(noise_rate(scene, result.truth), (*result.truth.depth.shape, 1)).reshape(-1)
     ratios = np.full(len(pixels), np.nan)
@@ -44,7 +45,12 @@ def noise_ratios(result: Result, second_moment: NDArray[np.uint64], pixels: NDAr
         part = pixels[first : first + size]
         mine = tallies[:, part]
         scale = (value[part] * (scene.laser.photons_per_pulse * scene.detections_per_photon))[:, None]
-        error = standard_error(mine, moments[:, part], result.batches, result.photons / result.batch_size) * scale
+        if better is None:
+            error = standard_error(mine, moments[:, part], result.batches, result.photons / result.batch_size) * scale
+        else:
+            scale = np.full((1, 1), scene.laser.photons_per_pulse * scene.detections_per_photon)
+            mine = better.histogram.reshape(components, -1, bins)[:, part].astype(np.float64)
+            error = better.error.reshape(-1, bins)[part] * scale
         light = mine.sum(axis=0) * scale
         # The return is the light of the target, where there is one.
         signal = np.where(target[part, None], mine[:2].sum(axis=0) * scale, light)
@@ -81,6 +87,17 @@ def _blurred(scene: Scene, values: Floats) -> Floats:
     fwhm = math.hypot(scene.laser.pulse_fwhm_ps, scene.detector.jitter_fwhm_ps)
     sigma = fwhm / (_FWHM_PER_SIGMA * scene.gate.bin_width_ps)
     return values if sigma < _NARROW else gaussian_filter1d(values, sigma, axis=1, mode="constant", truncate=3.0)
+
+
+def unclear_pixels(result: Result) -> NDArray[np.bool_]:
+    """Pixels with light whose brightest bin is not known to a third: pictures of them show noise of the simulation.
+    bool `[H, W]`; none where the result has no errors."""
+    if result.batches < 2:
+        return np.zeros(result.truth.depth.shape, bool)
+    light = result.expected()
+    peak = light.argmax(axis=2)[..., None]
+    value, error = (np.take_along_axis(cube, peak, axis=2)[..., 0] for cube in (light, result.expected_error))
+    return (value > 0) & (error > _KNOWN * value)
 
 
 def target_noise_ratio(result: Result, second_moment: NDArray[np.uint64]) -> float:

@@ -165,6 +165,8 @@ class Result(Shown, ResultHead, Tallies):
             object.__setattr__(self, "photon_ranges", ((0, self.photons),))
         if self.requested == (0, 0):
             object.__setattr__(self, "requested", (self.photon_ranges[0][0], self.photon_ranges[-1][1]))
+        if self.second_moment is None:
+            object.__setattr__(self, "batches", 0)
         ids = self.photon_ranges
         if self.photons <= 0 or count(ids) != self.photons:
             text = f"the {count(ids)} ids of photon_ranges, more than 0, are needed"

@@ -17,7 +17,7 @@ from spadwarp.analytic import AnalyticResult
 from spadwarp.frames import Frames, FramesFile, Method, first_photon_probabilities
 from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
-from spadwarp.result import COMPONENTS, Channel, Result, degree_of_polarisation
+from spadwarp.result import COMPONENTS, Channel, Result, degree_of_polarisation, unclear_pixels
 from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
@@ -118,19 +118,30 @@ def draw_result(
 
 # A result
 
+_NOISY = "; hatched ({} % of the pixels): noise of the simulation, more than the photons have"
+_HATCHED = (
+    "hatched, {} % of the pixels: the brightest bin is not known to a third, what shows is noise of the simulation; "
+    "more photons or a reconstruction help"
+)
+
 
 def _result_figure(result: Result, kind: str, depth: NDArray[Any] | None, method: str, width: float) -> Figure:
     if kind == "histogram":
         return _histogram_figure(result, width)
-    truth = result.truth
+    truth, unclear = result.truth, unclear_pixels(result)
     panels = Panels(truth.depth.shape, 2 if kind == "intensity" and not result.channels else 3, width=width)
     panels.figure.caption(_caption(result))
+    if unclear.any() and kind != "truth":
+        panels.figure.note(_HATCHED.format(percent(unclear.mean())))
     if kind == "intensity":
+        panels.unclear = unclear
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
         ballistic = result.tallies[COMPONENTS.index("ballistic")].sum(axis=-1) * result.tally_value
         panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
+        panels.unclear = None
         panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
         if result.channels:
+            panels.unclear = unclear
             part = degree_of_polarisation(result, gated=True)
             low = -1.0 if (part < 0.0).any() else 0.0
             panels.show(part, "Degree of polarisation", "of all light in the gate", "viridis", (low, 1.0))
@@ -145,8 +156,11 @@ def _result_figure(result: Result, kind: str, depth: NDArray[Any] | None, method
     else:
         measured = np.asarray(depth, dtype=np.float64)
         limits = style.target_limits(truth.depth, measured)
+        panels.unclear = unclear
         panels.show_depth(measured, f"Measured ({method})", limits)
+        panels.unclear = None
         panels.show_depth(truth.depth, "Truth", limits)
+        panels.unclear = unclear
         panels.show_error(measured - truth.depth, "Measured − truth")
     return panels.figure
 
@@ -161,12 +175,16 @@ def _histogram_figure(result: Result, width: float) -> Figure:
     intensity = ballistic if on_target else result.intensity
     brightest = divmod(int(intensity.argmax()), intensity.shape[1])
     pixels = {"Brightest": brightest, "Median": style.median_pixel(intensity, intensity > 0)}
+    unclear = unclear_pixels(result)
     group = "on the target" if on_target else "of those with a return"
     axes = figure.subplots(2, 1)
     for axis, (name, (row, column)) in zip(axes, pixels.items(), strict=True):
         axis.set(xlabel="time of flight [ns]", xlim=1e9 * result.bin_edges[[0, -1]])
         if intensity.any():
-            axis.set_title(f"{name} pixel {group}: row {row}, column {column}")
+            noisy = "\nits brightest bin is noise of the simulation" if unclear[row, column] else ""
+            axis.set_title(
+                f"{name} pixel {group}: row {row}, column {column}{noisy}", color="firebrick" if noisy else TEXT
+            )
             _plot_pixel(result, axis, row, column)
         else:
             style.middle_text(axis, "nothing returned in the gate")
@@ -191,11 +209,17 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     Where light is sparse, bins are added up until their sum is known to a third; see `merged_edges`.
     """
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
-    parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
+    better = result.reconstruction
+    if better is None:
+        parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
+    else:
+        parts = better.histogram[:, row, column].astype(np.float64) * per_pulse
     time = 1e9 * result.bin_edges
     total = parts.sum(axis=0)
     known = result.batches > 1
     error = pixel_standard_error(result, row, column) * per_pulse if known else None
+    if better is not None:
+        error = better.error[row, column].astype(np.float64) * per_pulse
     if error is None:
         weight = typical_weight(total)
     else:
@@ -357,6 +381,7 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     counts = np.asarray(shown.counts if shown.summed else shown.counts[index])
     intensity = counts.sum(axis=-1)
     panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=(2.0,))
+    hatched = ""
     if file is None:
         edges = 1e9 * (shown.gate_start + shown.edges)
         fullest = np.where(intensity > 0, (0.5 * (edges[:-1] + edges[1:]))[counts.argmax(axis=-1)], np.nan)
@@ -364,6 +389,9 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     else:
         method: Any = file.best_method
         depth, truth, bound = file.depth(method, number), file.truth_depth, file.bound_depth()
+        if file.noise_ratio is not None:
+            panels.unclear = noisy = file.noise_ratio > 1.0
+            hatched = _NOISY.format(percent(noisy.mean())) if noisy.any() else ""
         panels.show_depth(depth, f"Depth ({method})", style.target_limits(truth, depth))
         panels.show_error(depth - truth, "Depth − truth")
         known = "" if np.isfinite(bound).any() else ": unknown"
@@ -374,17 +402,18 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     panels.figure.key(axes, 1.7)
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
-    noise = noise_caption(shown.monte_carlo_noise)
+    noise = hatched or noise_caption(shown.monte_carlo_noise)
     panels.figure.caption(f"{which}: {count(shown.pulses)} pulses{mode}; seed {shown.seed}{noise}")
     return panels.figure
 
 
 def _plot_counts(frames: Frames, counts: NDArray[Any], file: FramesFile | None, axis: Axes) -> None:
-    """Counts of the pixel with most light of a target, their mean, the true arrival."""
+    """Counts of the pixel with the median light of a target, their mean, the true arrival."""
     signal = np.asarray(frames.expected - frames.background).sum(axis=-1)
     if file is not None and np.isfinite(file.truth_depth).any():
         signal = np.where(np.isfinite(file.truth_depth), signal, -1.0)
-    row, column = divmod(int(np.argmax(signal if (signal > 0).any() else counts.sum(axis=-1))), signal.shape[1])
+    signal = signal if (signal > 0).any() else counts.sum(axis=-1)
+    row, column = style.median_pixel(signal, signal > 0)  # the brightest may have one photon of a large weight
     # Means without dead time and afterpulsing.
     detector = None if file is None else file.scene.detector
     hazard = np.asarray(frames.expected[row, column]).astype(np.float64)
@@ -413,7 +442,9 @@ def _plot_counts(frames: Frames, counts: NDArray[Any], file: FramesFile | None, 
         axis.yaxis.set_minor_locator(SymmetricalLogLocator(base=10, linthresh=1.0, subs=range(2, 10)))
     axis.set(xlim=edges[[0, -1]], ylim=(0, 1.3 * top), xlabel="time of flight [ns]", ylabel=scale)
     axis.xaxis.minorticks_on()
-    axis.set_title(f"Pixel in row {row}, column {column}")
+    noisy = file is not None and file.noise_ratio is not None and file.noise_ratio[row, column] > 1.0
+    text = f"Median pixel: row {row}, column {column}"
+    axis.set_title(text + ("\nnoise of the simulation" if noisy else ""), color="firebrick" if noisy else TEXT)
 
 
 def _analytic_figure(result: AnalyticResult, width: float) -> Figure:

@@ -250,11 +250,25 @@ def mark_pixels(axis: Axes, missed: NDArray[np.bool_], invented: NDArray[np.bool
     axis.imshow(marks)
 
 
+def hatch(axis: Axes, pixels: NDArray[np.bool_]) -> None:
+    """Veils and hatches pixels that mean nothing."""
+    if pixels.any():
+        padded = np.pad(pixels, 1).repeat(2, axis=0).repeat(2, axis=1)[1:-1, 1:-1].astype(np.float64)
+        height, width = pixels.shape  # corners of the pixels, so that one alone is a square
+        x, y = (np.repeat(np.arange(n + 1) - 0.5, 2) + np.tile([-1e-3, 1e-3], n + 1) for n in (width, height))
+        limits = axis.get_xlim(), axis.get_ylim()
+        marks = axis.contourf(x, y, padded, levels=[0.5, 1.5], colors=[(1.0, 1.0, 1.0, 0.55)], hatches=["//////"])
+        marks.set(edgecolor="0.35", linewidth=0.0)
+        axis.set(xlim=limits[0], ylim=limits[1])
+
+
 class Panels:
     """A figure of `count` images of `shape` (height, width), as many in a line as fit, each with its colour bar below.
 
     `width`: of the figure [inch]. `below`: heights of more axes over the whole width, `self.below()` [inch].
     """
+
+    unclear: NDArray[np.bool_] | None = None  # pixels to hatch in the images that follow, see `unclear_pixels`
 
     def __init__(
         self, shape: tuple[int, ...], count: int, *, width: float = PAGE, below: tuple[float, ...] = ()
@@ -301,6 +315,8 @@ class Panels:
         if max(height, width) > 5 * min(height, width):  # there is space for two numbers along the short side
             (axis.yaxis if height < width else axis.xaxis).set_major_locator(MaxNLocator(nbins=1, integer=True))
         shown = axis.imshow(image, cmap=colour_map(colours), norm=scale, clim=limits)
+        if self.unclear is not None:
+            hatch(axis, self.unclear)
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)

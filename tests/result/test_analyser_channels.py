@@ -123,7 +123,7 @@ def test_channels_on_the_command_line(analysed, light, tmp_path, monkeypatch):
 def test_plan_compares_the_channels(tmp_path):
     file, summary = tmp_path / "scene.toml", tmp_path / "plan.json"
     file.write_text(polarised().to_toml())
-    options = ("--photons", 20_000, "--no-range", "--json", summary, *DEVICE)
+    options = ("--photons", 800_000, "--depth-error", "30cm", "--no-range", "--json", summary, *DEVICE)
     printed = run("plan", file, *options).stdout
     assert "Cross-polarised reception keeps 50" in printed and "times the pulses" in printed
     channels, limit = tables(summary)["channels"], tables(summary)["pile_up_energy"]

@@ -34,6 +34,7 @@ RESPONSE_FLOOR = 1e-6
 """Smallest response, relative to its peak, that the logarithm sees: one stray count must not exclude every delay."""
 
 _NEWTON_STEPS = wp.constant(6)
+_CONVERGED = wp.constant(1e-4)  # growth of the signal, near whose maximum the likelihood is flat
 
 
 @wp.func
@@ -158,7 +159,9 @@ def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
             return -1.0
         # 1 / (sum n h / (B + S h)) is concave in S (a harmonic mean): Newton from S = 0 rises to the root, not past it.
         signal = float(0.0)
-        for _ in range(_NEWTON_STEPS):
+        step = int(0)
+        grown = float(1.0)
+        while step < _NEWTON_STEPS and grown > _CONVERGED * signal:
             slope = float(0.0)
             curvature = float(0.0)
             for tap in range(low, high):
@@ -168,7 +171,9 @@ def _make_score(dtype: Any, likelihood: bool) -> wp.Function:
                     ratio = h / (wp.max(_level(search, pixel, base + tap), least) + signal * h)
                     slope += n * ratio
                     curvature += n * ratio * ratio
-            signal = wp.max(signal + (slope / seen - 1.0) * slope / curvature, signal)
+            grown = wp.max((slope / seen - 1.0) * slope / curvature, 0.0)
+            signal += grown
+            step += 1
         value = -signal * seen
         for tap in range(low, high):
             n = float(histogram[pixel, base + tap])
@@ -206,8 +211,19 @@ def _search_kernel(dtype: Any, likelihood: bool) -> wp.Kernel:
             arrival[pixel] = wp.nan
             return
         middle = int(0.5 * (best[1] + wp.min(best[2], best[1] + float(coarse_step))))
+        # Near its maximum the score has one peak: halves of the step lead to it, to where a plateau may begin.
+        top_score = score_of(histogram, search, pixel, middle, least, 0.0)
+        reach = coarse_step / 2
+        while reach > 2:
+            centre = middle
+            for side in range(-1, 2, 2):
+                score = score_of(histogram, search, pixel, centre + side * reach, least, top_score)
+                if score > top_score:
+                    top_score = score
+                    middle = centre + side * reach
+            reach = reach / 2
         fine = wp.vec3(-1.0, 0.0, 0.0)
-        for phases in range(middle - coarse_step, middle + coarse_step + 1):
+        for phases in range(middle - 4, middle + 5):
             score = score_of(histogram, search, pixel, phases, least, 0.0)
             fine = _offer(float(phases), score, fine)
         top = 0.5 * (fine[1] + fine[2])

@@ -1,0 +1,54 @@
+"""Verdicts of `spadwarp.plan`: of few photons none, of hopeless water one before a photon is traced."""
+
+import math
+
+import pytest
+
+import spadwarp
+from spadwarp.analytic import planning
+from spadwarp.scene import Scene
+
+SCENE = {
+    "medium": {"extinction": 0.4, "albedo": 0.7, "group_index": 1.36},
+    "laser": {"position": [-0.1, 0, 0], "half_angle_deg": 10.0, "repetition_rate": 1e5, "pulse_energy": 1e-9},
+    "camera": {"width": 32, "height": 24, "horizontal_fov_deg": 12.0, "aperture_diameter": 0.02},
+    "gate": {"start_ns": 0.0, "bin_width_ps": 50.0, "bins": 10},
+    "targets": [{"builtin": "plane", "size": [8, 8], "translation": [0, 0, 6.0], "rotation_deg": [0, 10, 0]}],
+}
+
+
+def plan(photons, extinction=0.4, **options):
+    scene = Scene.from_dict(SCENE).with_overrides({"medium.extinction": extinction})
+    return spadwarp.plan(scene, photons=photons, device="cpu", largest_range=False, **options)
+
+
+@pytest.mark.parametrize("depth_error", [0.002, 0.3])
+def test_few_photons_say_that_they_do_not_judge_or_judge_as_many_do(depth_error):
+    many = plan(800_000, depth_error=depth_error, seed=9)
+    assert many.judged
+    for seed in range(2):
+        for photons in (1_000, 30_000):
+            few = plan(photons, depth_error=depth_error, seed=seed)
+            assert not few.judged or few.reached == many.reached
+            if not few.judged:
+                assert few.photons_needed > few.pilot.photons and "not enough photons to judge" in repr(few)
+
+
+def test_hopeless_water_is_named_before_a_photon_is_traced(monkeypatch):
+    monkeypatch.setattr(planning, "simulate", None)
+    with pytest.raises(
+        spadwarp.ConfigError, match=r"at 5\.9.* m a pixel detects .* photons at most in all 1e\+05 pulses"
+    ):
+        plan("auto", extinction=6.0)
+
+
+def test_the_bound_before_tracing_is_above_what_is_traced():
+    """Light of the target that is traced, of all scatterings, against the bound's 1 in all pulses: it names no water
+    in which a pixel detects more."""
+    found = plan(400_000, extinction=1.2)
+    hopeful = found.pilot.target * 1e5
+    for time in (1.0 / hopeful, 3.0 / hopeful):
+        planning._refuse_hopeless(found.scene, found.target_range[0], time)  # these pulses bring a photon or more
+    with pytest.raises(spadwarp.ConfigError):
+        planning._refuse_hopeless(found.scene, found.target_range[0], 1e-9 * time)
+    assert math.isfinite(found.pilot.light_noise)
