@@ -186,7 +186,7 @@ def test_a_camera_and_a_laser_outside_the_water_are_both_named():
 
 def test_expected_signal_of_a_plate_that_fills_a_pixel():
     """Lidar equation: E0 λ/(hc) PDE · pixel solid angle / cone solid angle · exp(−2cR) · Γ A / (π R²)."""
-    numbers = summary(BASE, plate(5.0))
+    numbers = summary(BASE.with_overrides(transport={"photons": 1_000_000}), plate(5.0))
     pixel = (2 * math.tan(math.radians(10)) / 32) ** 2
     cone = 2 * math.pi * (1 - math.cos(math.radians(15)))
     signal = pixel / cone * math.exp(-3.0) * 0.4 * 0.01**2 / 25.0 * numbers["photons_per_pulse"] * numbers["pde"]

@@ -19,7 +19,7 @@ def test_frames_are_those_of_detect(done, tmp_path, monkeypatch):
     out = tmp_path / "out"
     options = ("--pulses", "2e3", "--frames", 3, "--seed", 5, "--tags", *DEVICE)
     printed = run("detect", done, "--out", out, *options, "--json", tmp_path / "printed.json")
-    result = spadwarp.load_result(done / "result.h5")
+    result = spadwarp.load(done / "result.h5")
     twin = spadwarp.detect(result, pulses=2000, frames=3, seed=5, tags=True, device="cpu")
     with h5py.File(out / "frames.h5") as file:
         assert np.array_equal(file["counts"], twin.counts)
@@ -64,7 +64,7 @@ def test_the_detector_can_be_another(done, tmp_path):
 def test_depth_of_a_result_is_that_of_python(done, tmp_path):
     out, points = tmp_path / "out", tmp_path / "points.ply"
     run("depth", done, "--out", out, "--background", 0, "--ply", points, "--quiet", *DEVICE)
-    depth = spadwarp.load_result(done / "result.h5").depth(device="cpu")
+    depth = spadwarp.load(done / "result.h5").depth(device="cpu")
     assert np.array_equal(np.load(out / "depth.npy"), depth.astype(np.float32), equal_nan=True)
     assert np.array_equal(read_exr(out / "depth.exr")[0]["Z"], depth.astype(np.float32), equal_nan=True)
     assert (out / "depth.png").is_file()

@@ -75,7 +75,7 @@ def test_info_tells_what_the_result_holds(done, tmp_path):
     assert run("info", done).stdout == printed  # the directory stands for the result in it
     assert "20 480" in printed and "100.000000 %" in printed
     assert re.search(r"energy balance\n +verdict +exact", printed)
-    result = spadwarp.load_result(done / "result.h5")
+    result = spadwarp.load(done / "result.h5")
     assert tables(summary) == json.loads(json.dumps({"kind": "result", **result.summary()}))
     # One that says little about its origin is shown too.
     dataclasses.replace(result, provenance={}, timing={}, counters={}).save(tmp_path / "result.h5")

@@ -27,7 +27,7 @@ def test_analytic_frames_are_those_of_python(scene, tmp_path):
 
 
 def test_analytic_takes_truth_and_profile_from_files(scene, done, tmp_path):
-    result = spadwarp.load_result(done / "result.h5")
+    result = spadwarp.load(done / "result.h5")
     exported = save_truth_maps(result, tmp_path / "truth.exr")
     rendered = ("--rendered", f"depth={exported},depth_channel=Z,depth_scale=1,albedo=0.7")
     monte_carlo = ("--set", "analytic.backscatter=monte_carlo", "--profile", done)

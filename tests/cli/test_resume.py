@@ -26,13 +26,13 @@ def test_a_resumed_run_is_the_long_run(scene, tmp_path):
     out = tmp_path / "out"
     options = ("--relative-error", 0.3, "--photons", 200_000, "--quiet", *DEVICE)
     run("simulate", scene, "--out", out, *options, "--json", tmp_path / "first.json")
-    first = spadwarp.load_result(out / "result.h5")
+    first = spadwarp.load(out / "result.h5")
     assert 0 < tables(tmp_path / "first.json")["relative_error"] == first.relative_error <= 0.3
     assert first.photons < 200_000 and not first.partial
 
     total = 2 * first.photons
     printed = run("simulate", "--resume", out, "--photons", total, *DEVICE)
-    result = spadwarp.load_result(out / "result.h5")
+    result = spadwarp.load(out / "result.h5")
     assert_same(result, spadwarp.simulate(scene, photons=total, device="cpu"))
     assert result.photons == spadwarp.load_scene(out / "scene.toml").transport.photons
     assert f"relative error {result.relative_error:.4g}" in " ".join(printed.stdout.split())
@@ -52,7 +52,7 @@ def test_parts_are_merged_to_one_run(parts, scene, tmp_path):
         run("simulate", scene, "--out", out, *options, "--quiet", *DEVICE)
     both = tmp_path / "both"
     printed = run("merge", *folders[:-1], folders[-1] / "result.h5", "--out", both, "--json", both / "a.json", *DEVICE)
-    merged = spadwarp.load_result(both / "result.h5")
+    merged = spadwarp.load(both / "result.h5")
     whole = spadwarp.simulate(scene, device="cpu")
     assert_same(merged, whole)
     if len(parts) == 3:  # shards are cut between batches
@@ -91,7 +91,7 @@ def test_the_number_of_photons_decides_what_is_resumed(scene, tmp_path):
 
     put("checkpoint.h5", 30_000, age=2)
     run("simulate", "--resume", out, "--quiet", *DEVICE)
-    assert_same(spadwarp.load_result(out / "result.h5"), spadwarp.simulate(scene, photons=40_000, device="cpu"))
+    assert_same(spadwarp.load(out / "result.h5"), spadwarp.simulate(scene, photons=40_000, device="cpu"))
     assert not (out / "checkpoint.h5").exists()
 
 
@@ -111,7 +111,7 @@ def test_interrupt_writes_what_is_done(scene, tmp_path, number, pictures):
     assert process.returncode == 130, complaints
     assert "marked partial" in complaints
 
-    result = spadwarp.load_result(out / "result.h5")
+    result = spadwarp.load(out / "result.h5")
     assert result.partial and 0 < result.photons < 10**11
     assert result.energy_report()["exact"]
     assert {path.name for path in out.iterdir()} == FILES | pictures
@@ -129,18 +129,18 @@ def test_a_killed_run_resumes_from_its_checkpoint(scene, tmp_path):
         time.sleep(0.02)
     process.kill()
     process.communicate()
-    before = spadwarp.load_result(kept)
+    before = spadwarp.load(kept)
     assert before.partial and before.energy_report()["exact"] and before.requested == (0, 10**11)
     assert not (out / "result.h5").exists()
     assert f"--resume {out} resumes it" in run("simulate", scene, "--out", out, code=2).stderr.replace("\n", " ")
 
     with interrupt_at_checkpoint(kept):
         run("simulate", "--resume", out, *DEVICE, "--checkpoint", 0.1, code=130)
-    after = spadwarp.load_result(out / "result.h5")
+    after = spadwarp.load(out / "result.h5")
     assert after.partial and after.photons > before.photons
     total = after.photons + 50_000
     run("simulate", "--resume", out, *DEVICE, "--photons", total)
-    assert_same(spadwarp.load_result(out / "result.h5"), spadwarp.simulate(scene, photons=total, device="cpu"))
+    assert_same(spadwarp.load(out / "result.h5"), spadwarp.simulate(scene, photons=total, device="cpu"))
     assert "photon ranges" in run("info", out).stdout and {path.name for path in out.iterdir()} == FILES
 
 
@@ -153,7 +153,7 @@ def test_a_run_whose_directory_is_removed_is_written_all_the_same(scene, tmp_pat
 
     with interrupt_at_checkpoint(out / "checkpoint.h5", first=remove):
         run("simulate", scene, "--out", out, *DEVICE, "--photons", "1e11", "--checkpoint", 0.1, code=130)
-    result = spadwarp.load_result(out / "result.h5")
+    result = spadwarp.load(out / "result.h5")
     assert result.partial and result.energy_report()["exact"]
     again = spadwarp.simulate(scene, photons=min(result.photons, 50_000), device="cpu")
     assert again.tallies.sum() <= result.tallies.sum()

@@ -25,7 +25,7 @@ def test_simulate_writes_what_python_computes(scene, tmp_path):
     printed = run("simulate", scene, "--out", out, *DEVICE, *(f"--set={one}" for one in changes), "--json", summary)
 
     twin = spadwarp.simulate(spadwarp.load_scene(scene, changes), device="cpu")
-    result = spadwarp.load_result(out / "result.h5")
+    result = spadwarp.load(out / "result.h5")
     assert np.array_equal(result.tallies, twin.tallies)
     assert result.energy_balance == twin.energy_balance
     assert result.scene == twin.scene == spadwarp.load_scene(out / "scene.toml")
@@ -44,7 +44,7 @@ def test_options_lie_over_the_scene_and_output_follows_it(scene, tmp_path):
     out = tmp_path / "out"
     options = ("--photons", "1e4", "--seed", 2**64 - 1, "--threads", 1, "--quiet", "--set", "output.exr=false")
     assert run("simulate", scene, "--out", out, *options, *DEVICE).output == ""
-    result = spadwarp.load_result(out / "result.h5")
+    result = spadwarp.load(out / "result.h5")
     assert (result.photons, result.seed) == (10_000, 2**64 - 1)
     assert spadwarp.load_scene(out / "scene.toml").transport.photons == 10_000
     assert {path.name for path in out.iterdir()} == {"result.h5", "scene.toml"}
@@ -100,7 +100,7 @@ def test_mesh_takes_the_place_of_the_first_target(scene, tmp_path):
 
     out = tmp_path / "out"
     run("simulate", scene, "--out", out, "--mesh", mesh, *scale, "--quiet", *DEVICE)
-    (target,) = spadwarp.load_result(out / "result.h5").scene.targets
+    (target,) = spadwarp.load(out / "result.h5").scene.targets
     assert (target.mesh, target.builtin, target.translation[2]) == (str(mesh), None, 2.2)
     assert 'mesh = "../square.obj"' in (out / "scene.toml").read_text()
     assert spadwarp.load_scene(out / "scene.toml").targets == (target,)
@@ -136,7 +136,7 @@ def test_a_result_survives_pictures_and_a_folder_that_cannot_be_written(scene, t
         patch.setattr("spadwarp.viz.result.save", full)
         outcome = run("simulate", scene, "--out", out, *DEVICE, "--set", "output.png=true", code=1)
     assert "No space left" in outcome.stderr
-    assert spadwarp.load_result(out / "result.h5").photons == 20_000
+    assert spadwarp.load(out / "result.h5").photons == 20_000
 
     monkeypatch.setattr(
         spadwarp.Result, "save", lambda result, path: full() if Path(path).parent == out else save(result, path)
@@ -146,7 +146,7 @@ def test_a_result_survives_pictures_and_a_folder_that_cannot_be_written(scene, t
     outcome = run("simulate", scene, "--out", out, "--overwrite", *DEVICE, code=1)
     (saved,) = refuge.iterdir()
     assert saved.name in outcome.stderr
-    assert spadwarp.load_result(saved).photons == 20_000
+    assert spadwarp.load(saved).photons == 20_000
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="pictures are not drawn by processes of their own")

@@ -37,7 +37,7 @@ def read_dataset(path):
 
 
 READERS = {
-    "result.h5": spadwarp.load_result,
+    "result.h5": spadwarp.load,
     "frames.h5": read_frames,
     "analytic.h5": lambda path: open_source(path).frame(0),
     "records.h5": load_records,

@@ -72,7 +72,7 @@ def test_a_result_knows_its_focus_and_is_added_to_its_like_alone(tmp_path):
     assert (far.focus_distance, near.focus_distance, point.focus_distance) == (pytest.approx(2.2), 1.0, None)
     for result, attribute in ((far, 2.2), (point, math.nan)):
         path = result.save(tmp_path / "one.h5")
-        assert spadwarp.load_result(path).focus_distance == result.focus_distance
+        assert spadwarp.load(path).focus_distance == result.focus_distance
         with h5py.File(path) as file:
             assert file.attrs["camera_focus_distance"] == pytest.approx(attribute, nan_ok=True)
     # A target that was moved after the run, or a run of a version with another lens.

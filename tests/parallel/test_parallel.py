@@ -112,7 +112,7 @@ def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, who
     assert killer.lost == 2
     assert 3 <= len(run.provenance["workers"]) <= 4 and run.provenance["device"] == "2 Ray workers"
     # The checkpoint is consistent, whatever was lost, and can be resumed.
-    kept = spadwarp.load_result(kept)
+    kept = spadwarp.load(kept)
     assert kept.partial and 0 < kept.photons < PHOTONS and kept.energy_report()["exact"]
     same(simulate(scene(), device="cpu", run=RunOptions(resume=kept)), whole)
 

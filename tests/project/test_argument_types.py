@@ -10,7 +10,7 @@ from spadwarp.scene import Medium, Scene
 from spadwarp.values import ArgumentError, ConfigError
 
 CALLS = {
-    "path = 2147483648": lambda: spadwarp.load_result(2**31),
+    "path = 2147483648": lambda: spadwarp.load(2**31),
     "path =": lambda: spadwarp.load_scene(3),
     "recipe": lambda: spadwarp.dataset.make_dataset(3, "out"),
     "tables": lambda: Scene.from_dict(3),

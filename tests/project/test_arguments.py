@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize("name", [*OF_SCENES, *OF_RESULTS])
 def test_a_scene_or_a_result_may_be_its_path(name, folder):
     function, file = (OF_SCENES | OF_RESULTS)[name], folder / ("scene.toml" if name in OF_SCENES else "result.h5")
-    expected = function((spadwarp.load_scene if name in OF_SCENES else spadwarp.load_result)(file))
+    expected = function((spadwarp.load_scene if name in OF_SCENES else spadwarp.load)(file))
     for one in (file, str(file), *([] if name in OF_SCENES else [folder])):
         np.testing.assert_array_equal(function(one), expected)
     words = "a Scene nor the path of a scene file" if name in OF_SCENES else "a Result nor the path of one"

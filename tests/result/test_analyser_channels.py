@@ -75,11 +75,11 @@ def test_stokes_cubes_hold_what_an_analyser_passes(analysed, light, tmp_path):
     for name in ("co", "cross"):
         expected = light[name].histogram
         np.testing.assert_allclose(analyser_channel(stokes, name).histogram, expected, atol=1e-6 * expected.max())
-    across = spadwarp.load_result(stokes.save(tmp_path / "result.h5"))
+    across = spadwarp.load(stokes.save(tmp_path / "result.h5"))
     scene = across.scene.with_overrides({"camera.analyser_angle_deg": -60.0})
     turned, cross = analyser_channel(dataclasses.replace(across, scene=scene), "co"), analyser_channel(stokes, "cross")
     np.testing.assert_allclose(turned.histogram, cross.histogram, atol=1e-6 * stokes.histogram.max())
-    again = spadwarp.load_result(turned.save(tmp_path / "co.h5"))
+    again = spadwarp.load(turned.save(tmp_path / "co.h5"))
     assert np.array_equal(again.tallies, turned.tallies) and again.provenance["channel"] == "co"
     linear = degree_of_polarisation(stokes)
     assert np.nanmax(linear) <= 1.0 and np.nanmin(linear) >= 0.0

@@ -61,7 +61,7 @@ def test_a_changed_file_is_named_by_resume_and_merge(tmp_path, case):
     whole = scene(**sections)
     first = spadwarp.simulate(whole, photons=2000, device="cpu")
     first.save(tmp_path / "result.h5")
-    kept = spadwarp.load_result(tmp_path / "result.h5")
+    kept = spadwarp.load(tmp_path / "result.h5")
     assert kept.file_hashes == first.file_hashes and len(kept.file_hashes) == len(whole.files) == 1
     longer = spadwarp.simulate(whole, photons=4000, device="cpu", run=spadwarp.RunOptions(resume=kept))
     assert longer.photons == 4000

@@ -45,7 +45,7 @@ def test_brightest_bins_have_a_quarter_of_the_squared_error(runs: tuple[Result, 
 
 def test_file_keeps_the_reconstruction_and_a_sum_has_none(runs: tuple[Result, Result], tmp_path) -> None:
     result, _ = runs
-    again = spadwarp.load_result(result.save(tmp_path / "result.h5"))
+    again = spadwarp.load(result.save(tmp_path / "result.h5"))
     assert again.reconstruction is not None and result.reconstruction is not None
     for name, values in vars(result.reconstruction).items():
         assert np.array_equal(values, getattr(again.reconstruction, name))

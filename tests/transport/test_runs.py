@@ -145,7 +145,7 @@ def test_derivatives_and_channels_survive_files_merging_and_resuming(kind, tmp_p
     halves = [simulate(one, **options, run=RunOptions(shard=(k, 2))) for k in (1, 2)]
     short = simulate(one, **{**options, "photons": 4096})
     resumed = [simulate(one, photons=8192, device="cpu", run=RunOptions(resume=part)) for part in (halves[0], short)]
-    loaded = spadwarp.load_result(whole.save(tmp_path / "result.h5"))
+    loaded = spadwarp.load(whole.save(tmp_path / "result.h5"))
     signed = "channel_tallies" if kind == "channels" else "derivative_tallies"
     for other in (loaded, merge(halves), *resumed):
         found, expected = getattr(other, signed), getattr(whole, signed)
@@ -229,7 +229,7 @@ def test_a_device_that_disappears_costs_what_was_not_in_a_checkpoint(device, who
     with pytest.raises(DeviceError) as caught:
         simulate(scene(), **RUN, device=device, run=often)
     monkeypatch.undo()
-    saved = spadwarp.load_result(place)
+    saved = spadwarp.load(place)
     assert saved.partial and 0 < saved.photons <= 120_000 and saved.energy_report()["exact"]
     assert "cpu failed: CUDA error 719" in str(caught.value)
     assert f"{place}: the {saved.photons} photons that were done" in str(caught.value)
@@ -263,7 +263,7 @@ def test_a_full_disk_costs_no_photons(whole, tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     same(result, whole)
-    saved = spadwarp.load_result(place)
+    saved = spadwarp.load(place)
     assert saved.photons == 1000 and [path.name for path in tmp_path.iterdir()] == ["checkpoint.h5"]
     longer = here(photons=PHOTONS, run=RunOptions(resume=saved))
     assert longer.tallies.tobytes() == whole.tallies.tobytes()
@@ -373,7 +373,7 @@ def test_a_heavy_batch_is_named(tmp_path):
     tallies = plain.tallies.copy()
     tallies[2, 0, 0, 0] += spike
     spiked = dataclasses.replace(plain, tallies=tallies, batch_moments=heavy)
-    for one in (spiked, spadwarp.load_result(spiked.save(tmp_path / "heavy.h5"))):
+    for one in (spiked, spadwarp.load(spiked.save(tmp_path / "heavy.h5"))):
         (text,) = one.warnings
         assert text.startswith("backscatter: one of 32 batches has 100 %") and "more photons" in text
         assert one.summary()["warnings"] == [text]

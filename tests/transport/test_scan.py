@@ -112,7 +112,7 @@ def test_the_standard_error_of_a_scan_is_the_spread_between_seeds():
 def test_a_scan_survives_its_file_and_gives_depth(tmp_path):
     one = scene(**CONFOCAL, gate={"bin_width_ps": 100.0, "bins": 200})
     result = simulate(one, photons=16 * 4000, seed=1, device="cpu")
-    loaded = spadwarp.load_result(result.save(tmp_path / "scan.h5"))
+    loaded = spadwarp.load(result.save(tmp_path / "scan.h5"))
     assert loaded.scene == one
     np.testing.assert_array_equal(loaded.histogram, result.histogram)
     np.testing.assert_allclose(result.depth(method="peak"), 2.2, atol=0.05)
