@@ -122,7 +122,8 @@ def blend_kernel(
     """
     i, j, k = wp.tid()
     found, around = _estimates(values[i, j, k], sums[i, j, k]), risk[i, j, k]
-    error = (wp.max(around[0], 0.0) + around[1]) / wp.max(around[2], 1.0e-30)
+    own = values[i, j, k][3]
+    error = (wp.max(around[0], 0.0) + around[1]) / wp.max(wp.max(around[2], own * own), 1.0e-30)
     weight = 1.0 / (error * error + 1.0e-10)
     blended[i, j, k] += weight * wp.vec4(found[0], found[1], wp.sqrt(found[2]), 1.0)
 
