@@ -131,8 +131,8 @@ def test_pulse_energy_keeps_the_limits():
 
 @pytest.mark.slow
 def test_largest_range_falls_with_the_extinction():
-    options = {"largest_range": True, "depth_error": 0.02, "photons": 20_000}
-    clear, turbid = (proposal(make(medium={"extinction": c}), **options) for c in (0.2, 0.8))
+    options = {"largest_range": True, "depth_error": 0.1, "photons": 60_000}
+    clear, turbid = (proposal(make(medium={"extinction": c}), **options) for c in (0.1, 0.3))
     assert 0 < turbid.largest_range < clear.largest_range
     assert turbid.range_limit
 

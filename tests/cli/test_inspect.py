@@ -73,7 +73,7 @@ def test_info_tells_what_the_result_holds(done, tmp_path):
     summary = tmp_path / "summary.json"
     printed = run("info", done / "result.h5", "--json", summary).stdout
     assert run("info", done).stdout == printed  # the directory stands for the result in it
-    assert "20 480" in printed and "100.000000 %" in printed
+    assert "20 000" in printed and "100.000000 %" in printed
     assert re.search(r"energy balance\n +verdict +exact", printed)
     result = spadwarp.load(done / "result.h5")
     assert tables(summary) == json.loads(json.dumps({"kind": "result", **result.summary()}))

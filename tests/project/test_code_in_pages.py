@@ -42,7 +42,7 @@ SMALLER = {
     r"--device cuda:\w+": "--device cpu",
 }
 
-SMALLER_PYTHON = {r"photons=[12]00_000, (frame|seed)": r"photons=20_000, \1", r"range\(60\)": "range(3)"}
+SMALLER_PYTHON = {r"photons=[12]00_000, (frame|seed)": r"photons=60_000, \1", r"range\(60\)": "range(3)"}
 
 # What does not run here, and why.
 LEFT_OUT = {
