@@ -46,8 +46,8 @@ _BATCHES, _STOPPING_BATCHES = (8, 32), (128, 1024)
 # A GPU stands still for 2 ms between batches (H200), 3 % of the time of so many photons.
 _GPU_BATCH = 1 << 26
 
-# Photons of a batch at most: some seconds of a GPU, so that several can share the work.
-_LARGEST_BATCH = 1 << 30
+# Photons of a batch at most: a second or some, so that checkpoints can stand between them and devices share the work.
+_LARGEST_BATCH = {"cpu": 1 << 20, "cuda": 1 << 30}
 
 # Where the error decides about the number of photons: of a batch at least, and voxels read for each.
 _AUTO_BATCH = {"cpu": 1 << 15, "cuda": 1 << 25}
@@ -201,7 +201,7 @@ def _batch_size(
     least = min(max(photons * _VOXELS_PER_PHOTON // (len(COMPONENTS) * bins), fewest), most)
     least = least if shard is None else max(least, shard[1])
     positions = scene.scan_positions
-    return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH)
+    return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH[kind])
 
 
 def _auto_batch_size(scene: Scene, kind: str) -> int:
