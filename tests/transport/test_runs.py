@@ -401,17 +401,17 @@ def test_guided_warns_of_no_heavy_photons_where_next_event_does():
 
 def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
     one = scene(transport={"estimator": "guided"})
-    found = simulate(one, photons=2**22, seed=1, device=device, relative_error=0.05)
-    assert found.relative_error <= 0.05 and not found.partial
+    found = simulate(one, photons=2**22, seed=1, device=device, relative_error=0.015)
+    assert found.relative_error <= 0.015 and not found.partial
     assert found.photons < 2**22
     # Where the error so far said that the goal would be reached, not at the next power of two, and a part on.
-    assert found.relative_error > 0.6 * 0.05
+    assert found.relative_error > 0.6 * 0.015
     never = simulate(one, photons=2**14, seed=1, device=device, relative_error=1e-6)
     assert never.photons == 2**14 and not never.partial and never.relative_error > 1e-6
 
 
 def test_the_stopping_rule_does_not_see_how_many_devices_there_are():
-    options, seen = {"photons": 2**20, "seed": 1, "relative_error": 0.1}, []
+    options, seen = {"photons": 2**20, "seed": 1, "relative_error": 0.05}, []
     one = here(**options, progress=lambda *report: seen.append(report[0]))
     same(simulate(scene(), **options, device="cpu,cpu"), one)
     errors = [remark for remark in seen if remark.startswith("error")]
@@ -424,7 +424,8 @@ def test_a_resumed_run_counts_all_batches_for_its_stopping_rule(whole):
     photons, seen = 64 * whole.batch_size, []
     options = {"photons": photons, "relative_error": 1e-6, "run": RunOptions(resume=whole)}
     assert here(**options, progress=lambda *report: seen.append(report[0])).photons == photons
-    assert [remark for remark in seen if remark.startswith("error")][-1].split(" after ")[1].startswith("64 batches; ")
+    last = [remark for remark in seen if remark.startswith("error")][-1]
+    assert last.split(" after ")[1].startswith(("64 batches; ", "65 batches; "))  # the first run ended within one
 
 
 # Light that stays on its device
