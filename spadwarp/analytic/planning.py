@@ -608,9 +608,8 @@ def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
     camera, laser = scene.camera, scene.laser
     etendue = camera.aperture_area * camera.pixel_tangent**2
     passed = math.exp(-2.0 * scene.medium.range.absorption * nearest)
-    reflectance = max((one.reflectance for one in scene.targets if not isinstance(one.reflectance, str)), default=1.0)
-    if any(isinstance(one.reflectance, str) for one in scene.targets):
-        reflectance = 1.0
+    known = (1.0 if isinstance(one.reflectance, str) else one.reflectance for one in scene.targets)
+    reflectance = max(known, default=1.0)
     light = 2.0 * reflectance / math.pi * axis_fluence(scene, nearest) * etendue * passed
     pulses = min(time * laser.repetition_rate / scene.scan_positions, _MOST_PULSES)
     most = light * laser.photons_per_pulse * scene.detections_per_photon * pulses

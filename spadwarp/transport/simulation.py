@@ -165,7 +165,7 @@ def simulate(
             workers = stack.enter_context(ClusterWorkers(plan, engine, device, note=note))
         result = _Run(plan, workers, resume, progress, run, stopped).result(relative_error, seconds)
     _warn_of_rounding(result)
-    # What shakes the errors counts where they decide.
+    # Where the errors decide how many photons are traced, reasons to mistrust them are said.
     by_error = relative_error is not None or plan.is_auto
     for text in result.warnings if by_error else unseen_warnings(result):
         warnings.warn(text, SpadwarpWarning, stacklevel=2)

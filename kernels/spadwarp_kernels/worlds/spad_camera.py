@@ -242,6 +242,14 @@ def _expected(sensor: Sensor, light: PixelLight, k: int, water: float) -> float:
     return light.dark + water * _below(-0.5 * (low + high)) + wp.max(surface, 0.0)
 
 
+@wp.func
+def _pulses(sensor: Sensor, world: int) -> int:
+    """Of a frame in a world."""
+    if world >= 0 and world < sensor.values.pulses.shape[0]:
+        return sensor.values.pulses[world]
+    return sensor.pulses
+
+
 _FRAME_BLOCK = 128
 
 
@@ -280,9 +288,7 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
         if sensor.due[v] == 0:
             return
         world = sensor.world[v]
-        pulses = sensor.pulses
-        if world >= 0 and world < sensor.values.pulses.shape[0]:
-            pulses = sensor.values.pulses[world]
+        pulses = _pulses(sensor, world)
         light = PixelLight()
         if wp.static(traced):
             light.dark = sensor.dark
@@ -359,9 +365,7 @@ def _depth_kernel(
             distance[i] = z / ray[2]
             depth[i] = wp.where(sensor.scans, z * u[2], z)
             status[i] = TARGET
-    pulses = float(sensor.pulses)
-    if world >= 0 and world < sensor.values.pulses.shape[0]:
-        pulses = float(sensor.values.pulses[world])
+    pulses = float(_pulses(sensor, world))
     if pulses > 0.0 and float(counts[i]) >= _SATURATION * pulses:
         status[i] = SATURATED
     elif status[i] == NO_RETURN and true_distance[i] > 0.0:
