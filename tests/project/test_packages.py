@@ -100,7 +100,7 @@ def test_one_line_methods_have_one_line():
 # lines deletes as many, or brings its own with a reason.
 LINES = {
     "spadwarp": (750, 1436),
-    "analytic": (2000, 2276),
+    "analytic": (2000, 2275),
     "benchmark": (500, 508),
     "checks": (800, 859),
     "cli": (2900, 2984),
@@ -130,7 +130,7 @@ LINES = {
     "kernels/tally": (450, 636),
     "kernels/transport": (1450, 1646),
     "kernels/water": (1350, 1537),
-    "kernels/worlds": (1600, 2287),
+    "kernels/worlds": (1600, 2291),
 }
 
 
