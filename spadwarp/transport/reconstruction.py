@@ -245,5 +245,6 @@ def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp
     found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
     # A window holds its own voxel: what is less is left over by differences of float32.
     bias = np.maximum(near[..., 0], 0.0) / np.maximum(np.maximum(near[..., 2], own[..., 1]), 1e-30) * own[..., 1]
-    light, square = 0.5 * scale * (found[..., 0] + found[..., 1]), scale**2 * (own[..., 0] + bias)
+    light = 0.5 * scale * np.maximum(found[..., 0] + found[..., 1], 0.0)  # differences of float32 end below 0
+    square = scale**2 * (own[..., 0] + bias)
     return tuple(np.take_along_axis(cube, rows, axis=-1) for cube in (light, square))  # type: ignore[return-value]

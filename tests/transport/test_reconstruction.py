@@ -28,6 +28,18 @@ def test_energy_of_each_component_is_that_of_the_tallies(runs: tuple[Result, Res
         assert result.expected(name).sum() == pytest.approx(result.component(name).sum(), rel=1e-6)
 
 
+def test_no_light_is_negative_so_that_counts_can_be_drawn(runs: tuple[Result, Result]) -> None:
+    """Of bright light beside empty bins, where sums in float32 end below 0."""
+    near = {"camera.width": 16, "camera.height": 12, "targets[0].translation": [0.0, 0.0, 3.0]}
+    bright = spadwarp.load_scene("configs/scenes/plane_5m.toml").with_overrides(near)
+    for result in (
+        runs[0],
+        spadwarp.reconstruct(spadwarp.simulate(bright, photons=200_000, seed=0, device="cpu"), device="cpu"),
+    ):
+        assert result.reconstruction is not None and (result.reconstruction.histogram >= 0.0).all()
+        spadwarp.crlb(result, pulses=2000, device="cpu")
+
+
 def test_brightest_bins_have_a_quarter_of_the_squared_error(runs: tuple[Result, Result]) -> None:
     """As 4 times the photons; the other run has 1/16 of the variance, and its error is in both sums."""
     result, other = runs
