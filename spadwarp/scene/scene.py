@@ -72,14 +72,16 @@ class Scene(Shown, Document):
             yield f"medium.layers: {len(medium.layers)} given; daylight takes one water"
         if self.daylight is not None and medium.grid is not None:
             yield f"medium.grid {goes} daylight, which takes one water: leave one of them out"
-        near_axis = transport.axis_threshold < 1.0
-        if self.polarised and (near_axis or (medium.scattering_matrix == "none" and medium.range.scattering > 0.0)):
+        words = f"laser.polarisation = {self.laser.polarisation!r}, camera.polarisation = {self.camera.polarisation!r}"
+        if self.polarised and transport.axis_threshold < 1.0:
             yield (
-                f"transport.axis_threshold = {transport.axis_threshold} with medium.scattering_matrix = "
-                f"{medium.scattering_matrix!r} {goes} polarised light, which needs axis_threshold = 1, for directions "
-                "without the near-axis rule, and in water that scatters a matrix: 'rayleigh', 'scaled_rayleigh', "
-                f"'voss_fry' or 'tabulated'; laser.polarisation ({self.laser.polarisation!r} here) = 'linear' emits "
-                f"it, camera.polarisation ({self.camera.polarisation!r} here) = 'analyser' or 'stokes' records it"
+                f"transport.axis_threshold = {transport.axis_threshold} {goes} polarised light ({words}): set it to 1, "
+                "for directions without the near-axis rule"
+            )
+        if self.polarised and medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
+            yield (
+                f"medium.scattering_matrix = 'none' {goes} polarised light ({words}) in water that scatters: choose "
+                "'rayleigh', 'scaled_rayleigh', 'voss_fry' or 'tabulated'"
             )
         for k, target in enumerate(self.targets if self.polarised else ()):
             if target.specular > 0.0 and abs(target.specular_index / medium.phase_index - 1.0) < 1e-3:
