@@ -121,7 +121,7 @@ def test_few_photons_beside_an_edge_are_answered_better_with_the_wide_view(tmp_p
     for seed in range(10, 16):
         counts = counts_of(place, 2.0, 10.0, seed=seed)
         both = (bins_of(found_in(counts, 10.0, weights=one).depth) for one in (tmp_path / "without", None))
-        errors.append([np.mean((found - place) ** 2) for found in both])
+        errors.append([np.nanmean((found - place) ** 2) for found in both])  # two of 24 576 pixels have no detection
     without, whole = np.mean(errors, axis=0)
     assert whole < 0.9 * without
 

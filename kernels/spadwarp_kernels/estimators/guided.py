@@ -101,7 +101,7 @@ def make_choose_meeting(spec: TransportSpec) -> wp.Function:
             chance = wp.min(0.5 * root * (1.0 - root), 1.0 - s.weight.value / (LARGEST_WEIGHT_RATIO * s.analog_weight))
             steps = wp.floor(256.0 * wp.max(chance, 0.0))
             # A single step is coarse, and over so many attenuation lengths its light would be less than a tally's unit.
-            steps = wp.where(steps < 2.0, 0.0, steps)
+            steps = wp.where(root < 0.5 and steps < 2.0, 0.0, steps)
             chance = steps / 256.0
             end.meets = end.meets or float(s.flight.sample_block[3] & wp.uint32(0xFF)) < steps
             reached = root * root / wp.max(root * root * (1.0 - chance) + chance, 1.0e-30)
