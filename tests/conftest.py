@@ -20,7 +20,8 @@ from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES
 
 # Warp's inlining makes kernels a seventh faster, which small runs never earn back: they compile in 60 % of the time.
-wp.config.cpu_compiler_flags = "-march=native"
+wp.config.cpu_compiler_flags = "-march=native -mllvm=-inline-threshold=50"
+wp.config.optimization_level = 1
 
 settings.register_profile("spadwarp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("spadwarp")

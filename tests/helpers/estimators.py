@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-import spadwarp
+from helpers.runs import of_seeds
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene.pose import rotation_matrix
 
@@ -16,19 +16,15 @@ def cells(one, device, photons, seeds=SEEDS, pixels=False):
     """Fractions of emitted photons `[seeds, cells]`: each component's bins over all pixels; with `pixels` also each
     pixel over all bins."""
     rows = []
-    for seed in range(seeds):
-        result = spadwarp.simulate(one, photons=photons, seed=seed, device=device)
-        assert result.counters["invalid"] == 0 and result.counters["clipped"] == 0
-        assert result.energy_report()["exact"]
-        parts = [result.tallies.sum(axis=(1, 2)), result.tallies.sum(axis=(0, 3))][: 2 if pixels else 1]
-        rows.append(np.concatenate([part.ravel() for part in parts]) * (result.unit / photons))
+    for run in of_seeds(one, device, photons, range(seeds)):
+        parts = [run.light.sum(axis=(1, 2)), run.light.sum(axis=(0, 3))][: 2 if pixels else 1]
+        rows.append(np.concatenate([part.ravel() for part in parts]))
     return np.array(rows)
 
 
 def means(one, device, photons, seeds):
     """Fractions of emitted photons in all pixels: mean and standard error by bin, then of all bins together."""
-    runs = [spadwarp.simulate(one, photons=photons, seed=seed, device=device) for seed in range(seeds)]
-    rows = np.array([run.tallies.sum(axis=(0, 1, 2)) * (run.unit / photons) for run in runs])
+    rows = np.array([run.light.sum(axis=(0, 1, 2)) for run in of_seeds(one, device, photons, range(seeds))])
     totals = rows.sum(axis=1)
     error, total_error = (part.std(axis=0, ddof=1) / math.sqrt(seeds) for part in (rows, totals))
     return rows.mean(axis=0), error, totals.mean(), total_error

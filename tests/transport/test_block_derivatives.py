@@ -9,6 +9,7 @@ from scipy import stats
 from scipy.integrate import quad
 
 import spadwarp
+from helpers.runs import of_seeds
 from helpers.scenes import BEYOND, ELSEWHERE, PENCIL, scattered_once, scene
 from spadwarp import simulate
 from spadwarp.transport import derivative_names, resolve_derivatives, trace
@@ -129,15 +130,18 @@ def test_central_differences_in_a_plume(tmp_path, device):
         return scene(medium={"grid": grid}, targets=BEYOND)
 
     seeds, photons, bins = 10, 20_000, slice(1, 5)  # 1 to 5 m of path, before and behind the box too
-    slope_runs = [simulated(one(), device, (2, 2, 2), photons, seed) for seed in range(seeds)]
+    base = one()
+    names = resolve_derivatives(base, WITH_TARGET, (2, 2, 2))
+    slope_runs = list(of_seeds(base, device, photons, range(seeds), names))
     p_values = []
     for number, (kind, step) in enumerate({"absorption": 0.1, "scattering": 0.2}.items()):
-        slopes = [r.derivatives[f"medium.grid.{kind}"][1, 0, 1].sum(axis=(0, 1, 2))[bins] for r in slope_runs]
+        block = names.index(f"medium.grid.{kind}[1,0,1]")
+        slopes = [run.signed[block].sum(axis=(0, 1, 2))[bins] for run in slope_runs]
         both = []
         for sign in (1, -1):
             changed, first = one(**{kind: sign * step}), 1000 * (2 * number + 3 + sign)
-            runs = (simulate(changed, photons=photons, seed=first + k, device=device) for k in range(seeds))
-            both.append([run.histogram.sum(axis=(0, 1)) for run in runs])
+            runs = of_seeds(changed, device, photons, range(first, first + seeds))
+            both.append([run.light.sum(axis=(0, 1, 2)) for run in runs])
         differences = (np.array(both[0]) - both[1])[:, bins] / (2.0 * step)
         p_values += list(stats.ttest_ind(slopes, differences, equal_var=False).pvalue)
     assert min(p_values) * len(p_values) > 1e-3, p_values

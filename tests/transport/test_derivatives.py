@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import spadwarp
+from helpers.runs import of_seeds
 from helpers.scenes import ELSEWHERE, PLATE, scene, single_scatter_case
 from helpers.statistics_of_samples import equal_means_p
 from reference.single_scatter import Lidar, single_scatter
@@ -80,8 +81,8 @@ def test_estimators_agree(device):
 
     def cells(one, estimator, photons):
         one = one.with_overrides({"transport.estimator": estimator})
-        runs = [simulated(one, device, ALL, photons, seed=seed) for seed in range(16)]
-        return np.array([np.stack([*run.derivatives.values()]).sum(axis=(2, 3)).ravel() for run in runs])
+        runs = of_seeds(one, device, photons, range(16), ALL)
+        return np.array([run.signed.sum(axis=(2, 3)).ravel() for run in runs])
 
     for threshold in (1.0, 0.97):
         one = layered(transport={"axis_threshold": threshold})

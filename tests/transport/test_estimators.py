@@ -8,6 +8,7 @@ import pytest
 
 import spadwarp_kernels as sk
 from helpers.estimators import PHOTONS, SEEDS, agreeing_cells, cells
+from helpers.runs import of_seeds
 from helpers.scenes import ELSEWHERE, LAYERS, PENCIL, PLATE, PLUME, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp import simulate
@@ -179,9 +180,11 @@ def test_estimators_share_one_ledger(end, device):
         transport={"max_collisions": 8, "weight_cutoff": 0.2, **end},
     )
 
-    def ledger(estimator, photons=20_000, seed=0):
-        run = one.with_overrides({"transport.estimator": estimator})
-        result = simulate(run, photons=photons, seed=seed, device=device)
+    def with_estimator(name):
+        return one.with_overrides({"transport.estimator": name})
+
+    def ledger(estimator):
+        result = simulate(with_estimator(estimator), photons=20_000, seed=0, device=device)
         assert result.energy_report()["exact"]
         counts = {name: result.counters[name] for name in ("water_collisions", "surface_events")}
         return {**result.energy_balance, **counts}
@@ -189,8 +192,11 @@ def test_estimators_share_one_ledger(end, device):
     entry, found = next(iter(end)), ledger("next_event")
     assert "termination" in end or found == ledger("analog")
     assert all(found[name] > 0 for name in (entry, "exit_y_low", "absorbed_surface"))
-    means = [[ledger(name, 4000, seed)[entry] for seed in range(SEEDS)] for name in ("next_event", "guided")]
-    assert equal_means_p(*(np.array(values, float)[:, None] for values in means)) > 1e-3
+    means = [
+        [[float(run.energy_balance[entry])] for run in of_seeds(with_estimator(name), device, 4000, range(SEEDS))]
+        for name in ("next_event", "guided")
+    ]
+    assert equal_means_p(*means) > 1e-3
 
 
 def test_records_of_a_capped_walk_have_no_more_events_than_allowed(device):

@@ -6,6 +6,7 @@ import pytest
 import spadwarp
 import spadwarp_kernels as sk
 from helpers.estimators import cells
+from helpers.runs import of_seeds
 from helpers.scenes import BEYOND, ELSEWHERE, scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
 from spadwarp import simulate
@@ -50,7 +51,7 @@ def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
 
     def variance(points):
         one = with_points(scene(**sections, medium=ONE_WATER if points == 3 else {}), points)
-        light = [simulate(one, photons=20_000, seed=seed, device=device).histogram for seed in range(24)]
+        light = [run.light.sum(axis=0) for run in of_seeds(one, device, 20_000, range(24))]
         return np.var(light, axis=0).sum(axis=(0, 1))[2:8]
 
     single, triple = (variance(points) for points in (1, 3))

@@ -8,6 +8,7 @@ from scipy import stats
 
 import spadwarp
 from helpers.estimators import SEEDS, clear_at_the_lens
+from helpers.runs import of_seeds
 from helpers.scenes import ELSEWHERE, PLATE, TREE, scene, single_scatter_case
 from helpers.statistics_of_samples import equal_means_p
 from reference.polarised_lidar import linear, stokes_factor
@@ -186,7 +187,7 @@ def agree(one, device):
     found = []
     for name, photons in (("analog", 20_000), ("guided", 10_000)):
         run = clear_at_the_lens(one).with_overrides({"transport.estimator": name})
-        rows = [totals(simulate(run, photons=photons, seed=seed, device=device)).ravel() for seed in range(SEEDS)]
+        rows = [found.signed.sum(axis=(2, 3)).ravel() for found in of_seeds(run, device, photons, range(SEEDS))]
         found.append(np.array(rows))
     assert np.abs(found[1]).reshape(SEEDS, 4, -1)[:, 0].sum() > 0.0
     assert equal_means_p(*found, 0.2) > 1e-3

@@ -12,6 +12,7 @@ import pytest
 from scipy.optimize import brentq
 
 from helpers.estimators import PHOTONS, agreeing_cells, means
+from helpers.runs import of_seeds
 from helpers.scenes import BEYOND, ELSEWHERE, WATER, scene
 from reference import refraction
 from spadwarp import simulate
@@ -83,10 +84,10 @@ def test_equal_indices_are_a_camera_in_the_water(device, monkeypatch):
 
     def light(estimator, port, seeds, photons, laser=NO_WINDOW, **sections):
         one = ported(port, laser, medium=medium, transport={"estimator": estimator}, **sections)
-        results = [simulate(one, photons=photons, seed=seed + 3, device=device) for seed in range(seeds)]
-        balances = [result.energy_balance for result in results]
+        runs = list(of_seeds(one, device, photons, range(3, 3 + seeds)))
+        balances = [run.energy_balance for run in runs]
         assert all(balance.get("laser_port", 0) < 1e-6 * sum(balance.values()) for balance in balances)
-        return np.array([result.tallies.sum(axis=(1, 2)) * (result.unit / photons) for result in results])
+        return np.array([run.light.sum(axis=(1, 2)) for run in runs])
 
     bare, flat, tilted = (
         light("analog", port, 1, 80_000).sum(axis=2)[0] for port in (None, window, window | {"normal": [0.1, 0.0, 1.0]})
@@ -282,9 +283,8 @@ def test_laser_and_camera_may_change_places_in_turbid_water(name, device):
     read = []
     for swapped in (False, True):
         one, rows = exchanged(port, other, swapped), []
-        for seed in range(seeds):
-            result = simulate(one, photons=photons, seed=seed + 100 * swapped, device=device)
-            parts = np.einsum("cijt,ij->ct", result.tallies * (result.unit / photons), weights)
+        for run in of_seeds(one, device, photons, range(100 * swapped, 100 * swapped + seeds)):
+            parts = np.einsum("cijt,ij->ct", run.light, weights)
             rows.append(np.concatenate([parts.sum(axis=0), parts.sum(axis=1)]))
         read.append(np.array(rows))
     mean, error = np.mean(read, axis=1), np.std(read, axis=1, ddof=1) / math.sqrt(seeds)

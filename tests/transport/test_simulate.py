@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import spadwarp
+from helpers.runs import of_seeds
 from helpers.scenes import ELSEWHERE, scene
 from spadwarp import simulate
 from spadwarp.scene.pose import rotation_matrix
@@ -53,7 +54,7 @@ def test_the_ledger_closes_exactly(estimator, termination, **values):
 def test_signed_entries_of_the_ledger_have_expectation_zero(device):
     """Guided directions and roulette move weight between photons and create none, on the mean over 20 seeds."""
     one = scene(domain=WIDE, transport={"termination": "roulette", "weight_cutoff": 0.2})
-    rows = [simulate(one, photons=20_000, seed=seed, device=device).energy_balance for seed in range(20)]
+    rows = [run.energy_balance for run in of_seeds(one, device, 20_000, range(20))]
     for name in ("importance_sampling_residual", "roulette"):
         values = np.array([row[name] for row in rows], np.float64)
         assert values.std() > 0
@@ -71,8 +72,8 @@ def test_roulette_leaves_the_expectation_alone_and_the_cutoff_does_not(device):
     }.items():
         domain = WIDE if "termination" in transport else {}
         one = scene(domain=domain, transport={"max_collisions": 40, **transport})
-        runs = (simulate(one, photons=20_000, seed=seed, device=device) for seed in range(20))
-        values[name] = np.array([run.component("backscatter").sum() for run in runs])
+        runs = of_seeds(one, device, 20_000, range(20))
+        values[name] = np.array([run.light[2].sum() for run in runs])  # backscatter
     error = {name: v.std(ddof=1) / np.sqrt(20) for name, v in values.items()}
     mean = {name: v.mean() for name, v in values.items()}
     assert abs(mean["roulette"] - mean["exact"]) < 4 * np.hypot(error["roulette"], error["exact"])
