@@ -63,7 +63,7 @@ def launch_pixels(
     device = wp.get_device(device)
     if count == 0:
         return
-    if device.is_cuda or device.is_capturing:
+    if device.is_cuda or device.is_capturing or threads == 1:
         wp.launch(kernel, count, [0, *inputs], device=device, block_dim=block_dim)
         return
     wp.load_module(kernel.module, device=device)  # compiled once, before the threads

@@ -311,7 +311,8 @@ class Batches:
         inputs = [self._component_count, self._least, run, weight, tally, self.total, half, *self.second_moment]
         inputs += [self._sums, self._overflow]
         runs = -(-self.second_moment[0].size // run)
-        launch_pixels(close_batch_kernel, runs, inputs, device=tally.device, threads=threads)
+        # A thread costs as much as some hundred runs.
+        launch_pixels(close_batch_kernel, runs, inputs, device=tally.device, threads=min(threads, 1 + runs // 256))
         self.count += 1
 
     def add(self, other: "Batches") -> None:
