@@ -390,7 +390,7 @@ def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array,
     return packed, rows, order, levels
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique")  # not compiled where nothing moves
 def _refit_kernel(
     mesh: wp.uint64, padding: float, level: int, depth: wp.array[int], order: wp.array[int], nodes: wp.array[wp.vec4]
 ):

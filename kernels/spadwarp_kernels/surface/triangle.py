@@ -94,7 +94,7 @@ def middle_planes(p: wp.vec3, e1: wp.vec3, e2: wp.vec3, triangle: float):
     return a_plane, 2.0 * _plane(b, -wp.dot(b, middle)), _plane(n, wp.dot(n, middle)), 0.5 / steepest
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique")  # not compiled for a CPU
 def _rows_kernel(mesh: wp.uint64, order: wp.array[int], corners: wp.array[int], faces: wp.array[wp.vec4]):
     """Faces as CUDA takes them, or the parallelograms that they are halves of. Launch: slots."""
     slot = wp.tid()
