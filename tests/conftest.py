@@ -11,17 +11,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")  # BM3D's, which sets that of torch too
 
 import pytest
-import warp as wp
 from hypothesis import HealthCheck, settings
 
 import spadwarp
+from helpers.quick import sitecustomize
 from helpers.runs import RUN
 from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES
-
-# Warp's inlining makes kernels a seventh faster, which small runs never earn back: they compile in 60 % of the time.
-wp.config.cpu_compiler_flags = "-march=native -mllvm=-inline-threshold=50"
-wp.config.optimization_level = 1
 
 settings.register_profile("spadwarp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("spadwarp")
@@ -57,7 +53,7 @@ def cluster():
     here, started = psutil.Process(), set()
     before = set(here.children())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+        patch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(sitecustomize.__file__), *sys.path]))
         try:
             try:
                 ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)

@@ -20,8 +20,6 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_name] = "1"  # threads do not survive a fork
 sys.path[:0] = [str(Path(__file__).parents[1])]
 
-import warp as wp
-
 from fuzz import api_calls, kernel_calls
 from fuzz.cases import CATEGORIES, draw
 from fuzz.command_lines import program
@@ -29,9 +27,9 @@ from fuzz.corpus import SPECIAL, Corpus, make_corpus
 from fuzz.executed import run_case
 from helpers.cli import run as run_command
 from helpers.coarse_pictures import coarse_pictures
+from helpers.quick import sitecustomize  # noqa: F401
 
 FINE = ("done", "refused")
-wp.config.cpu_compiler_flags = "-march=native"  # as in the other tests, which have compiled many of the kernels
 
 
 def warm_up(corpus: Path) -> None:

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 from spadwarp.cli import app
 
 ROOT = Path(__file__).parents[2]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "kernels")))}
+QUICK = Path(__file__).with_name("quick")
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (QUICK, ROOT, ROOT / "kernels")))}
 FILES = {"result.h5", "scene.toml", "depth.exr", "truth.exr"}  # of a run without pictures
 PICTURES = {"depth.png", "intensity.png", "histogram.png", "truth.png"}
 DEVICE = ("--device", "cpu")

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 
 import spadwarp
-from helpers.cli import ENVIRONMENT, run
+from helpers.cli import ENVIRONMENT, QUICK, run
 from helpers.coarse_pictures import coarse_pictures
 from helpers.pages import PAGES, README, ROOT, blocks, by_name, commands, lines, text_of
 
@@ -58,9 +57,6 @@ LEFT_OUT = {
     r"bm3d": "takes minutes; tests/denoise has it on a small frame",
 }
 
-
-# In processes of their own too, kernels are those of the tests, see tests/conftest.py.
-QUICK = f"import warp; warp.config.cpu_compiler_flags = {wp.config.cpu_compiler_flags!r}"
 
 WITH_PYTHON = [page for page in (README, *PAGES) if page != TUTORIAL and blocks(page, "python")]
 WITH_COMMANDS = [page for page in (README, *PAGES) if page != TUTORIAL and commands(page)]
@@ -115,8 +111,8 @@ def test_python_in_the_text_runs(page, checkout, tmp_path):
 @pytest.mark.slow
 def test_python_of_the_kernels_runs_without_spadwarp_in_reach(tmp_path):
     program = program_of(ROOT / "kernels" / "README.md", tmp_path)
-    command = [sys.executable, "-c", f"{QUICK}; import runpy; runpy.run_path({program!r})"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "kernels")}
+    command = [sys.executable, "-c", f"import runpy; runpy.run_path({program!r})"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (QUICK, ROOT / "kernels")))}
     process = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert "reach the plate without a collision" in process.stdout, process.stderr
 
@@ -166,11 +162,9 @@ def execute(path, folder):
         photons = re.sub(r"\b\d00_000\b", "20_000", cell.source)
         photons = re.sub(r"\b\d_000_000\b", "100_000", photons)
         cell.source = photons.replace("optimiser.steps=50", "optimiser.steps=2")
-    notebook.cells.insert(0, nbformat.v4.new_code_cell(QUICK))
     client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
     environment = {name: value for name, value in ENVIRONMENT.items() if name != "MPLBACKEND"}
     client.execute(env=environment)
-    del notebook.cells[0]
     return notebook
 
 
