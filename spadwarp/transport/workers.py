@@ -200,7 +200,7 @@ class DeviceWorker:
             while not (stopped.is_set() or failures):
                 with lock:
                     # Fewer towards the end so that all threads end at about the same time.
-                    share = waiting.left // (2 * threads) if threads > 1 else waiting.left
+                    share = waiting.left // (2 * self._threads) if self._threads > 1 else waiting.left
                     span = waiting.take(min(self._launch_size, max(share, self._launch_size // 16, 1)))
                 if span is None:
                     return
@@ -215,9 +215,7 @@ class DeviceWorker:
             except BaseException as error:
                 failures.append(error)
 
-        # Few photons are done by one thread before another has begun.
-        threads = 1 if waiting.left <= self._launch_size // 16 else self._threads
-        helpers = [threading.Thread(target=work, daemon=True) for _ in range(threads - 1)]
+        helpers = [threading.Thread(target=work, daemon=True) for _ in range(self._threads - 1)]
         for thread in helpers:
             thread.start()
         work()

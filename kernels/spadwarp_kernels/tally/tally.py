@@ -310,8 +310,7 @@ class Batches:
         weight = wp.float64(1.0 / math.sqrt(check_number("part", part, "(0, 1]")))
         inputs = [self._component_count, self._least, run, weight, tally, self.total, half, *self.second_moment]
         inputs += [self._sums, self._overflow]
-        runs = -(-self.second_moment[0].size // run)
-        # A thread costs as much as some hundred runs.
+        runs = -(-self.second_moment[0].size // run)  # a thread costs as much as some hundred
         launch_pixels(close_batch_kernel, runs, inputs, device=tally.device, threads=min(threads, 1 + runs // 256))
         self.count += 1
 
