@@ -30,8 +30,8 @@ def everywhere(tmp_path_factory):
     return {"file": str(path), "translation": [0.31, 0.2, 1.1], "rotation_deg": [10.0, 20.0, 30.0]}
 
 
-def simulated(one, device, blocks, photons=20_000, seed=1):
-    return simulate(one, photons=photons, seed=seed, device=device, derivatives=WITH_TARGET, blocks=blocks)
+def simulated(one, device, blocks):
+    return simulate(one, photons=20_000, seed=1, device=device, derivatives=WITH_TARGET, blocks=blocks)
 
 
 @pytest.mark.parametrize(("estimator", "tracking"), [("analog", "regular"), ("guided", "regular")])
@@ -99,11 +99,15 @@ def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp
         per_event = {"absorption": 0.0, "scattering": 1.0 / b[here], "extinction": 1.0 / c[here]}[kind]
         return light * ((per_event if here == block else 0.0) - lengths[block])
 
-    runs = [simulated(one, device, (1, 1, 2), 100_000, seed) for seed in range(8)]
+    names = resolve_derivatives(one, WITH_TARGET, (1, 1, 2))
+    runs = list(of_seeds(one, device, 100_000, range(8), names))
     ends = (edges**2 - 0.01) / (2.0 * edges)
     for kind, block in (("light", 0), *itertools.product(KINDS, (0, 1))):
-        cubes = [r.histogram if kind == "light" else r.derivatives[f"medium.grid.{kind}"][0, 0, block, 2] for r in runs]
-        rows = [cube.sum(axis=(0, 1)) for cube in cubes]
+        if kind == "light":
+            rows = [run.light.sum(axis=(0, 1, 2)) for run in runs]
+        else:
+            place = names.index(f"medium.grid.{kind}[0,0,{block}]")
+            rows = [run.signed[place, 2].sum(axis=(0, 1)) for run in runs]
         mean, error = np.mean(rows, axis=0), np.std(rows, axis=0, ddof=1) / math.sqrt(len(rows))
         expected = [
             quad(slope, low, high, args=(kind, block), points=[step], epsabs=1e-15)[0]
