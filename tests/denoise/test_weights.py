@@ -239,7 +239,7 @@ REFUSED = {
     "cuda:77": {"device": "cuda:77"},
     "counts are float64": HISTOGRAMS | {"counts": np.zeros((16, 16))},
     "background has shape": HISTOGRAMS | {"background": np.zeros(5)},
-    "needs counts, background and response": HISTOGRAMS | {"background": None},
+    "needs counts and response": HISTOGRAMS | {"response": None},
     "response has shape": HISTOGRAMS | {"response": np.ones(4)},
     r"depth has shape \(16, 16\); \(20, 16\) is needed": HISTOGRAMS | {"counts": np.zeros((20, 16, 8))},
     r"counts = -1.0 … -1.0 are outside \[0, inf\)": HISTOGRAMS | {"counts": -np.ones((16, 16, 8))},

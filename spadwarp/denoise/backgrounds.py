@@ -1,0 +1,187 @@
+"""Background of measured counts, estimated from the frame itself.
+
+Ambient light and dark counts are constant over the gate; backscatter decays, as exp(−2 c z) / z² or by several laws at
+once. All of these are sums of decaying exponentials with weights >= 0 (completely monotone functions, Bernstein 1929),
+and of a constant. The weights are those of the highest Poisson likelihood of the counts outside the returns of targets.
+Returns are found where the counts of a block of pixels exceed the background within the time of the response; whatever
+all blocks share at the same time and does not fit into a decay counts as a return, too.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp.values import ArgumentError, check_choice, percent
+
+__all__ = ["Background", "BackgroundLaw", "estimate_background"]
+
+BackgroundLaw = Literal["decay", "flat", "none"]
+"""What is assumed of a background that is not known: decays and a constant, a constant, or that there is none."""
+
+_BLOCK = 4  # side of the blocks in which returns are looked for [pixels]
+_RATES = np.concatenate([[0.0], np.geomspace(0.5, 200.0, 28)])  # of the decays [1 / gate]
+_TOLERANCES = (0.5, 0.3, 0.2, 0.1)  # excess over the fit that is no return yet, as the fit gets better
+_STEPS, _LAST_STEPS = 300, 4000  # of a fit, and of the last one
+_FALSE = 4.0  # log of the reciprocal rate of returns by chance, beside that for the number of bins
+_CLIPPED = 2.0  # deviations above a fit, beyond which a bin of the first one counts no more
+_PARTS, _COUNTS_OF_PART = 16, 10.0  # parts of the gate that a block's scale is the median of, and their least counts
+_DECAYS = 12.0  # twice the log-likelihood that decays gain where they are there; one in 400 frames does by chance
+_WIDER = (1, 4)  # windows of the search for returns, in widths of the response
+
+
+class Background(NamedTuple):
+    """Background counts of a pixel in each bin, and how well they are known."""
+
+    per_bin: NDArray[np.float32]  # `[T]`
+    relative_error: float  # standard error of its sum over the gate, relative; of the fit alone
+    interpolated: float  # part of the bins in which returns leave less than a tenth of the pixels
+    decays: bool
+
+    @property
+    def summary(self) -> str:
+        """One sentence for the user."""
+        law = "decays and a constant" if self.decays else "a constant"
+        text = f"background estimated from the frame: {law}, {self.per_bin.sum():.3g} counts in a pixel"
+        text += f" ± {percent(self.relative_error)} %"
+        return text + (f", {percent(self.interpolated)} % of the bins interpolated" if self.interpolated else "")
+
+
+def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "decay") -> Background:
+    """Background of counts `[H, W, T]` or `[N, H, W, T]`, one for all pixels and frames.
+
+    Args:
+        counts: Whole numbers or rates >= 0.
+        response: Instrument response per bin, centred on its time zero, `[2 r + 1]`.
+        law: One of `BackgroundLaw`. "decay": decays and a constant, or the constant alone where decays do not make the
+            counts clearly more likely; "flat": a constant; "none": nothing.
+
+    Raises `ArgumentError`.
+    """
+    check_choice("background", law, get_args(BackgroundLaw))
+    cube, taps = np.asarray(counts), np.asarray(response, np.float64)
+    if cube.ndim not in (3, 4) or cube.size == 0:
+        raise ArgumentError(f"counts have shape {cube.shape}; [H, W, T] or [N, H, W, T] is needed")
+    bins = cube.shape[-1]
+    if law == "none":
+        return Background(np.zeros(bins, np.float32), 0.0, 0.0, False)
+    blocks, pixels = _blocks(cube.reshape(-1, *cube.shape[-3:]))
+    rates = _RATES[:1] if law == "flat" else _RATES
+    width = _width(taps)
+    level = _first_fit(blocks.sum(axis=0), pixels.sum(), rates)
+    free = np.ones(blocks.shape, bool)
+    for tolerance in _TOLERANCES:
+        scaled = pixels * _scales(blocks, pixels, level, free)
+        free = ~_returns(blocks, (1.0 + tolerance) * scaled, level, width)
+        seen, exposure = (blocks * free).sum(axis=0), scaled @ free
+        level, gain = _fit(seen, exposure, rates)
+    decays = gain > _DECAYS
+    level, _ = _fit(seen, exposure, rates if decays else _RATES[:1], _LAST_STEPS)
+    expected = exposure * level
+    used = expected > 0
+    misfit = float(((seen - expected)[used] ** 2 / expected[used]).sum()) / max(1, used.sum() - 2)
+    error = float(np.sqrt(max(1.0, misfit) / max(seen.sum(), 1.0)))
+    hidden = float(np.mean(exposure < 0.1 * pixels.sum()))
+    return Background(level.astype(np.float32), error, hidden, bool(decays))
+
+
+def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Counts of blocks of pixels `[blocks, T]`, and how many pixels each has."""
+    height, width = frames.shape[1:3]
+    rows, columns = np.arange(0, height, _BLOCK), np.arange(0, width, _BLOCK)
+    sums = np.add.reduceat(frames, rows, axis=1, dtype=np.float64)
+    sums = np.add.reduceat(sums, columns, axis=2)
+    sizes = np.outer(np.diff([*rows, height]), np.diff([*columns, width])).ravel()
+    return sums.reshape(-1, frames.shape[-1]), np.tile(sizes, len(frames)).astype(np.float64)
+
+
+def _width(taps: NDArray[np.float64]) -> int:
+    """Bins that hold nearly all of a return: ± 2 deviations of the response."""
+    place = np.arange(taps.size) - taps.size // 2
+    total = taps.sum()
+    mean = (taps * place).sum() / total
+    return 2 * int(np.ceil(2.0 * np.sqrt(max(0.0, (taps * (place - mean) ** 2).sum() / total)))) + 1
+
+
+def _first_fit(total: NDArray[np.float64], pixels: float, rates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A fit to the counts of all pixels, in which what rises above it counts no more, `[T]`."""
+    exposure, seen = np.full(total.size, pixels), total
+    for _ in range(12):
+        level, _ = _fit(seen, exposure, rates)
+        most = level * exposure + _CLIPPED * np.sqrt(level * exposure)
+        seen = np.minimum(total, most)
+    return level
+
+
+def _fit(
+    seen: NDArray[np.float64], exposure: NDArray[np.float64], rates: NDArray[np.float64], steps: int = _STEPS
+) -> tuple[NDArray[np.float64], float]:
+    """Sum of decays with the highest likelihood `[T]`, and twice the log-likelihood that it gains over a constant.
+
+    By expectation maximisation: counts are shared among the decays as these are expected there.
+    """
+    place = (np.arange(seen.size) + 0.5) / seen.size
+    laws = np.exp(-rates[:, None] * place)
+    reach = laws @ exposure
+    laws, reach = laws[reach > 0], reach[reach > 0]
+    if not seen.sum() > 0 or not len(laws):
+        return np.full(seen.size, 1e-9), 0.0
+    constant = seen.sum() / exposure.sum()
+    weight = seen.sum() / reach / len(laws)
+    for _ in range(steps if len(laws) > 1 else 1):
+        level = weight @ laws
+        weight *= (laws @ (seen / np.maximum(level, 1e-300))) / reach
+    level = np.maximum(weight @ laws, 1e-9)
+    return level, 2.0 * float((seen * np.log(level / constant)).sum() - ((level - constant) * exposure).sum())
+
+
+def _scales(
+    blocks: NDArray[np.float64], pixels: NDArray[np.float64], level: NDArray[np.float64], free: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Background of each block over that of all, `[blocks]`, mean 1: ambient light follows the reflectance.
+
+    The median over parts of the gate that have as much background each, of which a return takes one or two; shrunk to 1
+    as far as the scales differ no more than by chance.
+    """
+    total = float(level.sum() * pixels.mean())
+    parts = int(min(_PARTS, total / _COUNTS_OF_PART))
+    if parts < 5:
+        return np.ones(len(blocks))
+    start = np.searchsorted(level.cumsum() / level.sum(), np.arange(parts) / parts)
+    start = np.unique(start)
+    expected = np.add.reduceat(np.where(free, level, 0.0), start, axis=1) * pixels[:, None]
+    seen = np.add.reduceat(np.where(free, blocks, 0.0), start, axis=1)
+    ratio = np.where(expected > 0.3 * _COUNTS_OF_PART, seen / np.maximum(expected, 1e-9), np.nan)
+    some = np.isfinite(ratio).any(axis=1)
+    scale = np.ones(len(blocks))
+    scale[some] = np.nanmedian(ratio[some], axis=1)
+    chance = 0.5 * np.pi / np.maximum(expected.sum(axis=1), _COUNTS_OF_PART)  # variance of a median
+    scale /= max(np.average(scale, weights=pixels), 1e-9)
+    real = max(0.0, float(scale.var() - chance.mean()))
+    scale = np.maximum(1.0 + (scale - 1.0) * real / (real + chance), 0.02)
+    return scale / np.average(scale, weights=pixels)
+
+
+def _returns(
+    blocks: NDArray[np.float64], pixels: NDArray[np.float64], level: NDArray[np.float64], width: int
+) -> NDArray[np.bool_]:
+    """Bins of blocks `[blocks, T]` that may hold light of a target.
+
+    Where a window of the width of the response, or of some times as much, has an excess over the background that chance
+    does not explain: log-likelihood ratio of Poisson counts.
+    """
+    from scipy.ndimage import maximum_filter1d, uniform_filter1d
+
+    found = np.zeros(blocks.shape, bool)
+    least = np.log(level.size) + _FALSE
+    for times in _WIDER:
+        side = min(width * times, level.size) | 1
+        rest = np.where(found, pixels[:, None] * level, blocks)  # without what a narrower window found
+        counts = side * uniform_filter1d(rest, side, axis=1, mode="constant")
+        expected = pixels[:, None] * (side * uniform_filter1d(level, side, mode="constant")) + 1e-9
+        ratio = counts * np.log(np.maximum(counts, 1e-9) / expected) - (counts - expected)
+        excess = (counts > expected) & (ratio > least)
+        found |= maximum_filter1d(excess, side + (width - 1) * (times == 1), axis=1, mode="constant")
+    return found
