@@ -28,6 +28,7 @@ _STEPS, _LAST_STEPS = 300, 4000  # of a fit, and of the last one
 _FALSE = 4.0  # log of the reciprocal rate of returns by chance, beside that for the number of bins
 _CLIPPED = 2.0  # deviations above a fit, beyond which a bin of the first one counts no more
 _PARTS, _COUNTS_OF_PART = 16, 10.0  # parts of the gate that a block's scale is the median of, and their least counts
+_DIFFERENT = 5.0  # standard errors of their variance beyond that of chance, from which on scales differ
 _DECAYS = 12.0  # twice the log-likelihood that decays gain where they are there; one in 400 frames does by chance
 _WIDER = (1, 4)  # windows of the search for returns, in widths of the response
 
@@ -35,10 +36,16 @@ _WIDER = (1, 4)  # windows of the search for returns, in widths of the response
 class Background(NamedTuple):
     """Background counts of a pixel in each bin, and how well they are known."""
 
-    per_bin: NDArray[np.float32]  # `[T]`
+    per_bin: NDArray[np.float32]  # mean over the pixels, `[T]`
+    scale: NDArray[np.float32] | None  # of each pixel, mean about 1, `[H, W]`; None where they differ by chance alone
     relative_error: float  # standard error of its sum over the gate, relative; of the fit alone
     interpolated: float  # part of the bins in which returns leave less than a tenth of the pixels
     decays: bool
+
+    @property
+    def counts(self) -> NDArray[np.float32]:
+        """Background of every pixel, `[T]` or `[H, W, T]`."""
+        return self.per_bin if self.scale is None else self.scale[..., None] * self.per_bin
 
     @property
     def summary(self) -> str:
@@ -46,11 +53,19 @@ class Background(NamedTuple):
         law = "decays and a constant" if self.decays else "a constant"
         text = f"background estimated from the frame: {law}, {self.per_bin.sum():.3g} counts in a pixel"
         text += f" ± {percent(self.relative_error)} %"
+        text += (
+            ""
+            if self.scale is None
+            else f", {self.scale.min():.2g} to {self.scale.max():.2g} times that in blocks of 4 x 4"
+        )
         return text + (f", {percent(self.interpolated)} % of the bins interpolated" if self.interpolated else "")
 
 
 def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "decay") -> Background:
-    """Background of counts `[H, W, T]` or `[N, H, W, T]`, one for all pixels and frames.
+    """Background of counts `[H, W, T]` or `[N, H, W, T]`: one course over time for all pixels and frames.
+
+    Of one frame, blocks of 4 × 4 pixels have scales of their own where these differ by more than chance: ambient light
+    follows the reflectance, backscatter the beam.
 
     Args:
         counts: Whole numbers or rates >= 0.
@@ -66,15 +81,16 @@ def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "d
         raise ArgumentError(f"counts have shape {cube.shape}; [H, W, T] or [N, H, W, T] is needed")
     bins = cube.shape[-1]
     if law == "none":
-        return Background(np.zeros(bins, np.float32), 0.0, 0.0, False)
+        return Background(np.zeros(bins, np.float32), None, 0.0, 0.0, False)
     blocks, pixels = _blocks(cube.reshape(-1, *cube.shape[-3:]))
     rates = _RATES[:1] if law == "flat" else _RATES
     width = _width(taps)
     level = _first_fit(blocks.sum(axis=0), pixels.sum(), rates)
     free = np.ones(blocks.shape, bool)
     for tolerance in _TOLERANCES:
-        scaled = pixels * _scales(blocks, pixels, level, free)
-        free = ~_returns(blocks, (1.0 + tolerance) * scaled, level, width)
+        scale = _scales(blocks, pixels, level, free)
+        scaled = pixels * scale
+        free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * level, width)
         seen, exposure = (blocks * free).sum(axis=0), scaled @ free
         level, gain = _fit(seen, exposure, rates)
     decays = gain > _DECAYS
@@ -84,7 +100,12 @@ def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "d
     misfit = float(((seen - expected)[used] ** 2 / expected[used]).sum()) / max(1, used.sum() - 2)
     error = float(np.sqrt(max(1.0, misfit) / max(seen.sum(), 1.0)))
     hidden = float(np.mean(exposure < 0.1 * pixels.sum()))
-    return Background(level.astype(np.float32), error, hidden, bool(decays))
+    image = None
+    if cube[..., 0].size == cube.shape[-3] * cube.shape[-2] and np.ptp(scale) > 0:
+        rows, columns = (-(-side // _BLOCK) for side in cube.shape[-3:-1])
+        image = np.kron(scale.reshape(rows, columns), np.ones((_BLOCK, _BLOCK))).astype(np.float32)
+        image = image[: cube.shape[-3], : cube.shape[-2]]
+    return Background(level.astype(np.float32), image, error, hidden, bool(decays))
 
 
 def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -143,7 +164,7 @@ def _scales(
     """Background of each block over that of all, `[blocks]`, mean 1: ambient light follows the reflectance.
 
     The median over parts of the gate that have as much background each, of which a return takes one or two; shrunk to 1
-    as far as the scales differ no more than by chance.
+    as far as they may differ by chance; 1 where they do not differ clearly.
     """
     total = float(level.sum() * pixels.mean())
     parts = int(min(_PARTS, total / _COUNTS_OF_PART))
@@ -159,13 +180,15 @@ def _scales(
     scale[some] = np.nanmedian(ratio[some], axis=1)
     chance = 0.5 * np.pi / np.maximum(expected.sum(axis=1), _COUNTS_OF_PART)  # variance of a median
     scale /= max(np.average(scale, weights=pixels), 1e-9)
-    real = max(0.0, float(scale.var() - chance.mean()))
+    real = float(scale.var() - chance.mean())
+    if real < _DIFFERENT * chance.mean() * np.sqrt(2.0 / len(scale)):
+        return np.ones(len(blocks))
     scale = np.maximum(1.0 + (scale - 1.0) * real / (real + chance), 0.02)
     return scale / np.average(scale, weights=pixels)
 
 
 def _returns(
-    blocks: NDArray[np.float64], pixels: NDArray[np.float64], level: NDArray[np.float64], width: int
+    blocks: NDArray[np.float64], expected: NDArray[np.float64], width: int, wider: tuple[int, ...] = _WIDER
 ) -> NDArray[np.bool_]:
     """Bins of blocks `[blocks, T]` that may hold light of a target.
 
@@ -175,13 +198,78 @@ def _returns(
     from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
     found = np.zeros(blocks.shape, bool)
-    least = np.log(level.size) + _FALSE
-    for times in _WIDER:
-        side = min(width * times, level.size) | 1
-        rest = np.where(found, pixels[:, None] * level, blocks)  # without what a narrower window found
-        counts = side * uniform_filter1d(rest, side, axis=1, mode="constant")
-        expected = pixels[:, None] * (side * uniform_filter1d(level, side, mode="constant")) + 1e-9
-        ratio = counts * np.log(np.maximum(counts, 1e-9) / expected) - (counts - expected)
-        excess = (counts > expected) & (ratio > least)
+    bins = blocks.shape[1]
+    for times in wider:
+        side = min(width * times, bins) | 1
+        rest = np.where(found, expected, blocks)  # without what a narrower window found
+        counts, level = (side * uniform_filter1d(one, side, axis=1, mode="constant") for one in (rest, expected))
+        level += 1e-9
+        ratio = counts * np.log(np.maximum(counts, 1e-9) / level) - (counts - level)
+        excess = (counts > level) & (ratio > np.log(bins) + _FALSE)
         found |= maximum_filter1d(excess, side + (width - 1) * (times == 1), axis=1, mode="constant")
     return found
+
+
+# The bins that hold the targets: a network is more accurate in a gate that is not much wider than that.
+
+_KEPT = 0.7  # a gate is narrowed only to less than this part of its width
+_DEVIATIONS = 5.0  # of the counts of all pixels together, from which on they hold a return
+
+
+def bins_of_target(
+    counts: NDArray[Any], background: NDArray[np.float32], response: NDArray[np.float32]
+) -> tuple[int, int]:
+    """(first, stop) of the bins that hold all returns, with a margin; (0, T) where there are none, or little is gained.
+
+    Returns are where two blocks of pixels beside each other have an excess at the same time, where all pixels together
+    have one, and where a pixel alone has one that chance gives in no pixel of the frame. So no surface that reaches
+    over two blocks and can be told from the background is left out, and no pixel with a clear return of its own gets a
+    depth from elsewhere. Arguments are those of `spadwarp.denoise.estimate`.
+    """
+    from scipy.ndimage import maximum_filter, uniform_filter1d
+
+    frames = counts.reshape(-1, *counts.shape[-3:])
+    bins = frames.shape[-1]
+    each = background if background.ndim == 3 else background[None, None]
+    mean = each.reshape(-1, bins).mean(axis=0, dtype=np.float64)
+    blocks, pixels = _blocks(frames)
+    scale = _scales(blocks, pixels, mean, np.ones(blocks.shape, bool))[:, None]
+    if background.ndim == 3:
+        expected = np.tile(_blocks(each[None])[0], (len(frames), 1))
+    else:
+        expected = scale * pixels[:, None] * mean
+    width = _width(np.asarray(response, np.float64))
+    tolerated = (1.0 + _TOLERANCES[-1]) * expected
+    shape = (len(frames), *(-(-side // _BLOCK) for side in frames.shape[1:3]), bins)
+    alone = _returns(blocks, tolerated, width, (1,)).reshape(shape)
+    around = np.ones((1, 3, 3, 1), bool)
+    around[0, 1, 1] = False
+    kept = (alone & maximum_filter(alone, footprint=around, mode="constant")).any(axis=(0, 1, 2))
+    total, level = blocks.sum(axis=0), expected.sum(axis=0)
+    side = max(width, bins // 64) | 1
+    above = uniform_filter1d(total - level, side, mode="constant")
+    together = above > _DEVIATIONS * np.sqrt(uniform_filter1d(np.maximum(level, 1.0), side, mode="constant") / side)
+    if not together.any():  # too few counts to tell which blocks see all of the target
+        return 0, bins
+    kept |= together | _clear_returns(frames, mean * max(1.0, float(scale.max())), width)
+    found = np.flatnonzero(kept)
+    first, stop = int(found[0]), int(found[-1]) + 1
+    outside = float((total - level)[:first].sum() + (total - level)[stop:].sum())
+    if outside > 0.02 * (total - level)[first:stop].sum() + 3.0 * np.sqrt(level.sum()):
+        return 0, bins  # light spread too thin to be found, or a background that is not right
+    margin = width + (stop - first) // 8
+    first, stop = max(0, first - margin), min(bins, stop + margin)
+    return (first, stop) if stop - first < _KEPT * bins else (0, bins)
+
+
+def _clear_returns(frames: NDArray[Any], level: NDArray[np.float64], width: int) -> NDArray[np.bool_]:
+    """Bins `[T]` in which a pixel alone has more counts within a return's width than chance gives in any pixel."""
+    from scipy.ndimage import uniform_filter1d
+    from scipy.special import pdtrc
+
+    expected = width * uniform_filter1d(level, width, mode="constant")
+    most, rare = np.zeros(level.size), 0.01 / frames.size
+    for row in frames.reshape(-1, *frames.shape[2:]):
+        sums = uniform_filter1d(row.astype(np.float32), width, axis=-1, mode="constant").max(axis=0)
+        most = np.maximum(most, width * sums)
+    return np.asarray(pdtrc(np.rint(most) - 1.0, expected) < rare)

@@ -152,7 +152,7 @@ def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) 
     if given is None or isinstance(given, str):
         found = estimate_background(held.values, response, law=given or "decay")
         notes = (*held.notes, found.summary) if given is None or given in ("decay", "flat") else held.notes
-        return dataclasses.replace(held, background=found.per_bin, level_known=False, notes=notes)
+        return dataclasses.replace(held, background=found.counts, level_known=False, notes=notes)
     _, levels, _ = checked_histograms(held.values, given, response)
     return dataclasses.replace(held, background=levels, level_known=True)
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
-from spadwarp.denoise.backgrounds import BackgroundLaw, estimate_background
-from spadwarp.denoise.frames import POOLED, SIDES, bins_of_target
+from spadwarp.denoise.backgrounds import BackgroundLaw, bins_of_target, estimate_background
+from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.frames.measured import Histograms
 from spadwarp.values import ArgumentError, percent
@@ -79,7 +79,7 @@ def checked_histograms(
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
         raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
     if isinstance(background, str):
-        return cubes, estimate_background(cubes, taps, law=background).per_bin, taps
+        return cubes, estimate_background(cubes, taps, law=background).counts, taps
     levels, one, each = real_array("background", background), cubes.shape[-1:], cubes.shape[-3:]
     if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
         raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")

@@ -8,6 +8,7 @@ from scipy.stats import norm
 
 from spadwarp import ArgumentError
 from spadwarp.denoise import denoise_file, estimate, estimate_background, read_depth
+from spadwarp.denoise.backgrounds import bins_of_target
 from spadwarp.denoise.evaluation_scenes import evaluation_scene
 from spadwarp.frames import InstrumentResponse
 
@@ -55,6 +56,9 @@ def test_ambient_light_may_follow_the_reflectance():
     counts = counts_of(np.where(np.arange(SIZE[1]) % 20 < 10, 14.5, 15.0) + np.zeros(SIZE), level, 3.0, scale=scale)
     found = estimate_background(counts, TAPS)
     assert not found.decays and found.per_bin.sum() == pytest.approx(60.0, rel=0.03)
+    assert np.abs(found.scale - scale).mean() < 0.06 and np.allclose(
+        found.counts, found.scale[..., None] * found.per_bin
+    )
 
 
 def test_the_standard_error_is_that_of_many_frames():
@@ -71,7 +75,7 @@ def test_laws():
     level = backscatter(30.0)
     counts = counts_of(np.full((24, 24), np.nan), level, 0.0)
     flat = estimate_background(counts, TAPS, law="flat")
-    assert np.ptp(flat.per_bin) == 0 and not flat.decays
+    assert np.ptp(flat.per_bin) == 0 and not flat.decays and flat.scale is None
     assert not estimate_background(counts, TAPS, law="none").per_bin.any()
     assert np.isfinite(estimate_background(0 * counts, TAPS).per_bin).all()
     two = estimate_background(np.stack([counts, counts]), TAPS).per_bin
@@ -121,3 +125,16 @@ def test_a_file_may_have_its_background_given(tmp_path):
     np.save(tmp_path / "depth.npy", np.full((16, 16), 14.6))
     with pytest.raises(ArgumentError, match="holds depth: background are of histograms"):
         read_depth(tmp_path / "depth.npy", background="flat")
+
+
+def test_no_surface_is_left_out_that_can_be_told_from_the_background():
+    """A wall; a plate of a fortieth of its light, that all pixels together hardly show; one pixel with a return."""
+    rate = np.full((64, 64, 512), 0.1)
+    rate[..., 200:205] += 0.6
+    rate[20:30, 20:30, 200:205] -= 0.6
+    rate[20:30, 20:30, 330:335] += 0.6
+    counts, level = np.random.default_rng(1).poisson(rate), np.full(512, 0.1, np.float32)
+    first, stop = bins_of_target(counts, level, np.ones(5))
+    assert 130 < first < 200 and 335 <= stop < 400
+    counts[5, 5, 440] += 30
+    assert bins_of_target(counts, level, np.ones(5))[1] > 441

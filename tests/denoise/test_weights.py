@@ -10,8 +10,9 @@ import torch
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
 from spadwarp.denoise import baselines, estimate, evaluate_histograms, inference, weights_metadata
+from spadwarp.denoise.backgrounds import bins_of_target
 from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth, water_profile
-from spadwarp.denoise.frames import bins_of_target, depth_frames, gates_of_target
+from spadwarp.denoise.frames import depth_frames, gates_of_target
 from spadwarp.denoise.inference import corrected_target
 from spadwarp.denoise.network_files import MODELS, WEIGHTS
 from spadwarp.io.arrays import read_exr
