@@ -24,7 +24,7 @@ BackgroundLaw = Literal["decay", "flat", "none"]
 _BLOCK = 4  # side of the blocks in which returns are looked for [pixels]
 _RATES = np.concatenate([[0.0], np.geomspace(0.5, 200.0, 28)])  # of the decays [1 / gate]
 _TOLERANCES = (0.5, 0.3, 0.2, 0.1)  # excess over the fit that is no return yet, as the fit gets better
-_STEPS, _LAST_STEPS = 300, 4000  # of a fit, and of the last one
+_STEPS, _LAST_STEPS = 60, 1000  # of a fit, and of the last one; each begins with the one before
 _FALSE = 4.0  # log of the reciprocal rate of returns by chance, beside that for the number of bins
 _CLIPPED = 2.0  # deviations above a fit, beyond which a bin of the first one counts no more
 _PARTS, _COUNTS_OF_PART = 16, 10.0  # parts of the gate that a block's scale is the median of, and their least counts
@@ -83,28 +83,39 @@ def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "d
     if law == "none":
         return Background(np.zeros(bins, np.float32), None, 0.0, 0.0, False)
     blocks, pixels = _blocks(cube.reshape(-1, *cube.shape[-3:]))
-    rates = _RATES[:1] if law == "flat" else _RATES
-    width = _width(taps)
-    level = _first_fit(blocks.sum(axis=0), pixels.sum(), rates)
+    return _estimated(blocks, pixels, _width(taps), _RATES[:1] if law == "flat" else _RATES, cube.shape)
+
+
+def _estimated(
+    blocks: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    width: int,
+    rates: NDArray[np.float64],
+    shape: tuple[int, ...] | None,
+) -> Background:
+    """The background of blocks of counts of this shape; `width`: of a return [bins]."""
+    level, weight = _first_fit(blocks.sum(axis=0), pixels.sum(), rates)
     free = np.ones(blocks.shape, bool)
     for tolerance in _TOLERANCES:
         scale = _scales(blocks, pixels, level, free)
         scaled = pixels * scale
         free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * level, width)
         seen, exposure = (blocks * free).sum(axis=0), scaled @ free
-        level, gain = _fit(seen, exposure, rates)
+        level, weight, gain = _fit(seen, exposure, rates, weight)
+    level, _, gain = _fit(seen, exposure, rates, weight, _LAST_STEPS)
     decays = gain > _DECAYS
-    level, _ = _fit(seen, exposure, rates if decays else _RATES[:1], _LAST_STEPS)
+    if not decays:
+        level, *_ = _fit(seen, exposure, _RATES[:1])
     expected = exposure * level
     used = expected > 0
     misfit = float(((seen - expected)[used] ** 2 / expected[used]).sum()) / max(1, used.sum() - 2)
     error = float(np.sqrt(max(1.0, misfit) / max(seen.sum(), 1.0)))
     hidden = float(np.mean(exposure < 0.1 * pixels.sum()))
     image = None
-    if cube[..., 0].size == cube.shape[-3] * cube.shape[-2] and np.ptp(scale) > 0:
-        rows, columns = (-(-side // _BLOCK) for side in cube.shape[-3:-1])
+    if shape is not None and np.prod(shape[:-3]) == 1 and np.ptp(scale) > 0:
+        rows, columns = (-(-side // _BLOCK) for side in shape[-3:-1])
         image = np.kron(scale.reshape(rows, columns), np.ones((_BLOCK, _BLOCK))).astype(np.float32)
-        image = image[: cube.shape[-3], : cube.shape[-2]]
+        image = image[: shape[-3], : shape[-2]]
     return Background(level.astype(np.float32), image, error, hidden, bool(decays))
 
 
@@ -126,36 +137,43 @@ def _width(taps: NDArray[np.float64]) -> int:
     return 2 * int(np.ceil(2.0 * np.sqrt(max(0.0, (taps * (place - mean) ** 2).sum() / total)))) + 1
 
 
-def _first_fit(total: NDArray[np.float64], pixels: float, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A fit to the counts of all pixels, in which what rises above it counts no more, `[T]`."""
-    exposure, seen = np.full(total.size, pixels), total
+def _first_fit(
+    total: NDArray[np.float64], pixels: float, rates: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A fit to the counts of all pixels, in which what rises above it counts no more, `[T]`, and its weights."""
+    exposure, seen, weight = np.full(total.size, pixels), total, None
     for _ in range(12):
-        level, _ = _fit(seen, exposure, rates)
+        level, weight, _ = _fit(seen, exposure, rates, weight)
         most = level * exposure + _CLIPPED * np.sqrt(level * exposure)
         seen = np.minimum(total, most)
-    return level
+    assert weight is not None
+    return level, weight
 
 
 def _fit(
-    seen: NDArray[np.float64], exposure: NDArray[np.float64], rates: NDArray[np.float64], steps: int = _STEPS
-) -> tuple[NDArray[np.float64], float]:
-    """Sum of decays with the highest likelihood `[T]`, and twice the log-likelihood that it gains over a constant.
+    seen: NDArray[np.float64],
+    exposure: NDArray[np.float64],
+    rates: NDArray[np.float64],
+    weight: NDArray[np.float64] | None = None,
+    steps: int = _STEPS,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Sum of decays with the highest likelihood `[T]`, weights, and twice the log-likelihood gained over a constant.
 
-    By expectation maximisation: counts are shared among the decays as these are expected there.
+    By expectation maximisation from `weight`: counts are shared among the decays as these are expected there.
     """
     place = (np.arange(seen.size) + 0.5) / seen.size
     laws = np.exp(-rates[:, None] * place)
-    reach = laws @ exposure
-    laws, reach = laws[reach > 0], reach[reach > 0]
-    if not seen.sum() > 0 or not len(laws):
-        return np.full(seen.size, 1e-9), 0.0
+    reach = np.maximum(laws @ exposure, 1e-300)
+    if not (seen.sum() > 0 and exposure.sum() > 0):
+        return np.full(seen.size, 1e-9), np.zeros(len(laws)), 0.0
     constant = seen.sum() / exposure.sum()
-    weight = seen.sum() / reach / len(laws)
+    share = seen.sum() / reach / len(laws)
+    weight = share if weight is None or not weight.any() else weight + 1e-6 * share  # none is lost for good
     for _ in range(steps if len(laws) > 1 else 1):
-        level = weight @ laws
-        weight *= (laws @ (seen / np.maximum(level, 1e-300))) / reach
+        weight = weight * (laws @ (seen / np.maximum(weight @ laws, 1e-300))) / reach
     level = np.maximum(weight @ laws, 1e-9)
-    return level, 2.0 * float((seen * np.log(level / constant)).sum() - ((level - constant) * exposure).sum())
+    gain = float((seen * np.log(level / constant)).sum() - ((level - constant) * exposure).sum())
+    return level, weight, 2.0 * gain
 
 
 def _scales(
@@ -208,6 +226,34 @@ def _returns(
         excess = (counts > level) & (ratio > np.log(bins) + _FALSE)
         found |= maximum_filter1d(excess, side + (width - 1) * (times == 1), axis=1, mode="constant")
     return found
+
+
+_PROFILE_BINS, _PROFILE_BLOCKS = 64, 1024  # over the gate; evenly chosen of all frames, so many tell the profile
+
+
+def profile_of_depth(depth: NDArray[np.float32], gate: tuple[float, float]) -> NDArray[np.float64] | None:
+    """Backscatter over the gate, `[bins]`, by which the depths `[N, H, W]` [m] beside those of targets decay.
+
+    None where they do not clearly decay. Depths are counts of one photon in a pixel; a return is a bin in which depths
+    of a block of pixels agree.
+    """
+    if depth.ndim < 2 or depth.size == 0:
+        return None
+    some = depth.reshape(-1, *depth.shape[-2:])
+    rows, columns = (-(-side // _BLOCK) for side in some.shape[1:])
+    some = some[:: max(1, len(some) * rows * columns // _PROFILE_BLOCKS // 4)]
+    with np.errstate(invalid="ignore"):
+        place = np.floor((some - gate[0]) / (gate[1] - gate[0]) * _PROFILE_BINS)
+        reported = (some > 0) & (place >= 0) & (place < _PROFILE_BINS)
+    frame, row, column = np.nonzero(reported)
+    block = (frame * rows + row // _BLOCK) * columns + column // _BLOCK
+    count = len(some) * rows * columns
+    index = block * _PROFILE_BINS + place[reported].astype(np.int64)
+    blocks = np.bincount(index, minlength=count * _PROFILE_BINS).reshape(count, -1).astype(np.float64)
+    pixels = _blocks(np.ones((*some.shape, 1)))[0][:, 0]
+    chosen = slice(None, None, -(-count // _PROFILE_BLOCKS))
+    found = _estimated(blocks[chosen], pixels[chosen], 1, _RATES, None)
+    return found.per_bin.astype(np.float64) if found.decays else None
 
 
 # The bins that hold the targets: a network is more accurate in a gate that is not much wider than that.

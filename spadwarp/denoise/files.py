@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
-from spadwarp.denoise.backgrounds import BackgroundLaw, estimate_background
+from spadwarp.denoise.backgrounds import BackgroundLaw, estimate_background, profile_of_depth
 from spadwarp.denoise.baselines import CLASSICAL
 from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
 from spadwarp.denoise.histograms import checked_histograms, dim_pixels, second_return, target_bins
@@ -303,7 +303,7 @@ def denoise_file(
         min_significance: Of counts, pixels below it become NaN, see `Estimate`; default: that of the scene's detector,
             4 of measured histograms.
         gate: (start, stop) in depth [m]; of counts only the bins within it are used. Default: the file's, else all.
-        profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
+        profile: Backscatter over the gate `[bins]`; default: the file's, else as `estimate` does.
         reading: The other arguments of `read_depth`.
 
     Raises:
@@ -339,7 +339,10 @@ def denoise_file(
             found, second = _from_counts(read, counts, profile, model, weights, index, device)
         else:
             second = None
-            frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile)
+            profile = read.profile if profile is None else profile
+            if profile is None and model in ("pyramid", "gating"):
+                profile = profile_of_depth(read.depth, gate)
+            frames = depth_frames(read.depth, gate=gate, profile=profile)
             found = estimate_frames(frames, model=model, weights=weights, device=device, precision=precision)
         if (held := read.histograms) is not None and held.response is not None and held.background is not None:
             if min_significance is None:

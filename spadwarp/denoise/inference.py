@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.backgrounds import BackgroundLaw
+from spadwarp.denoise.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
 from spadwarp.denoise.frames import (
     MARGIN,
+    SMALLEST_SIDE,
     DepthFrames,
     checked_gate,
     checked_profile,
@@ -113,8 +114,8 @@ def estimate(
         model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d". With counts, "pyramid" means
             "histograms", the variant of PyramidNet that uses them; "likelihood", "pooled", "semi-global",
             "total-variation" and "belief-propagation" are classical estimates from counts.
-        profile: The water's backscatter over the gate in equal bins, `[bins]`, in any unit; taken as flat if not
-            given. PyramidNet and gating use it.
+        profile: The water's backscatter over the gate in equal bins, `[bins]`, in any unit; default: estimated
+            from depths that clearly decay beside those of targets, else flat. PyramidNet and gating use it.
         counts: Histograms that `depth` was estimated from, over the gate in equal bins, `[H, W, T]` or `[N, H, W, T]`.
             PyramidNet uses them, with `response`: where photons are few, neighbouring pixels together show more than
             each alone.
@@ -142,6 +143,8 @@ def estimate(
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
     if model not in ("histograms", *CLASSICAL):
+        if profile is None and model in ("pyramid", "gating"):
+            profile = profile_of_depth(depth, gate)
         frames = depth_frames(depth, gate=gate, profile=profile)
         found = estimate_frames(
             frames, model=model, weights=weights, device=device, precision=precision, progress=progress
@@ -224,6 +227,10 @@ def estimate_histograms(
     device: str | None,
 ) -> Estimate:
     """`estimate` for the methods that use counts, in the bins that hold the target; `gate` and `profile` are theirs."""
+    height, width = counts.shape[-3:-1]
+    if model not in CLASSICAL and min(height, width) < SMALLEST_SIDE:
+        least = f"at least {SMALLEST_SIDE} x {SMALLEST_SIDE} are needed"
+        raise ArgumentError(f"counts are of {height} x {width} pixels; by {model!r} {least}")
     some = counts[..., bins]
     given: dict[str, Any] = {"background": background[..., bins], "response": response, "device": device}
     if model in CLASSICAL:
