@@ -359,6 +359,7 @@ def denoise(
     model: str = "pyramid",
     gate: str | None = None,
     profile: Path | None = None,
+    background: str | None = None,
     weights: Path | None = None,
     inputs: _DenoiseInputs | None = None,
     mask: float | None = None,
@@ -388,6 +389,9 @@ def denoise(
         gate (FROM:TO): Gate in depth, such as 13.5:16 [m]; also in time, such as 90ns:110ns, with --input group_index.
             By default that of the file, or the range of its depths.
         profile: .npy with the water's backscatter over the gate in equal bins.
+        background (FILE|flat|decay|none): Of measured counts: .npy with the expected background of a pixel in each bin,
+            [bins] or [height, width, bins]; or the law by which it is estimated from the counts. By default that of the
+            file, else decay (decays and a constant).
         weights: Weights of spadwarp train. By default the package's.
         mask (P): Leave out pixels that see a target with less than this probability: 0.08 for PyramidNet of depth, 0.5
             for histograms.
@@ -402,7 +406,7 @@ def denoise(
     """
     import numpy as np
 
-    from spadwarp.denoise import denoise_file, depth_files
+    from spadwarp.denoise import BackgroundLaw, denoise_file, depth_files
 
     facts, files = opt.read_measured(inputs)
     depths = None if gate is None else _gate(gate, facts.get("group_index"))
@@ -412,9 +416,12 @@ def denoise(
         raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
     needed = sum(one.stat().st_size for one in paths if one.is_file())
     names = [stem + ending for stem in stems for ending in _ENDINGS]
-    check_outputs(out, names, inputs=(*paths, profile, weights, *files), needed=needed)
+    is_law = background is None or background in get_args(BackgroundLaw)
+    level = None if background is None or is_law else Path(background)
+    check_outputs(out, names, inputs=(*paths, profile, level, weights, *files), needed=needed)
     settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
     settings["min_significance"] = min_significance
+    settings["background"] = spadwarp.io.read_npy(level, largest=1 << 29) if level else background
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
     summary: list[dict[str, Any]] = []

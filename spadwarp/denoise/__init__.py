@@ -5,6 +5,7 @@ torch and the other packages of the extra are loaded when a function needs them:
 
 from typing import TYPE_CHECKING
 
+from spadwarp.denoise.backgrounds import *
 from spadwarp.denoise.evaluation import *
 from spadwarp.denoise.evaluation_scenes import *
 from spadwarp.denoise.files import *
@@ -18,6 +19,7 @@ from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (
+        backgrounds,
         evaluation,
         evaluation_scenes,
         files,

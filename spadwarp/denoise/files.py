@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
+from spadwarp.denoise.backgrounds import BackgroundLaw, estimate_background, profile_of_depth
 from spadwarp.denoise.baselines import CLASSICAL
 from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
-from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins
+from spadwarp.denoise.histograms import checked_histograms, dim_pixels, second_return, target_bins
 from spadwarp.denoise.inference import Estimate, detected, estimate_frames, estimate_histograms, target_threshold
 from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
@@ -67,6 +68,7 @@ def read_depth(
     channel: str | None = None,
     scale: float = 1.0,
     method: Method | None = None,
+    background: ArrayLike | BackgroundLaw | None = None,
     gate: tuple[float, float] | None = None,
     group_index: float | None = None,
     device: str | None = None,
@@ -87,6 +89,8 @@ def read_depth(
         scale: Metres per unit of stored depth; 0.01 for engines that write centimetres.
         method: Estimator for histograms; default: `"likelihood"` for counts, `"matched"` for rates, and `"centroid"`
             where the response is not known.
+        background: Of counts whose response is known, as `spadwarp.denoise.estimate` takes it, replacing the file's;
+            default: the file's, else "decay".
         gate: (start, stop) in depth [m]; of counts whose response is known, only the bins within it are used.
         group_index: Of measured histograms, see `depth_of`.
         device: Warp device of the estimator.
@@ -118,7 +122,8 @@ def read_depth(
         stored, chosen = found
         if stored.dtype.kind not in "iuf":
             raise FileError(f"{place}: {stored.dtype} {stored.shape}; depth is real numbers")
-        if given := [name.replace("_", " ") for name in measured if name != "dataset"]:
+        others = ["background"] * (background is not None)
+        if given := [*(name.replace("_", " ") for name in measured if name != "dataset"), *others]:
             raise ArgumentError(f"{place} holds depth: {', '.join(given)} are of histograms")
         depth = stored.astype(np.float32)
         below = np.count_nonzero(depth < 0)
@@ -129,15 +134,27 @@ def read_depth(
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
     histograms = read_histograms(place, **measured, **of_result)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
-    if counted and histograms.background is None:  # a flat one
-        bins = histograms.values.shape[-1]
-        # At the median bin of all pixels and frames together: that of sparse counts would be 0.
-        total = histograms.values.reshape(-1, bins).sum(axis=0, dtype=np.float64)
-        level = np.median(total) * bins / histograms.values.size
-        histograms = dataclasses.replace(histograms, background=np.full(bins, level, np.float32), level_known=False)
+    if counted:
+        histograms = _with_background(histograms, background)
+    elif background is not None:
+        raise ArgumentError(f"{place}: background is of counts whose instrument response (irf) is known")
     if counted and gate is not None:
         histograms = _within(histograms, gate, float(group_index or 1.0))
     return dataclasses.replace(_estimate_depth(histograms, counted, method, group_index, device), truth=truth)
+
+
+def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:
+    """Counts with the background that is given, or with that of the file, or with an estimate."""
+    if given is None and held.background is not None:
+        return held
+    assert held.response is not None
+    response = held.response.per_bin(float(held.bin_width or 0.0))
+    if given is None or isinstance(given, str):
+        found = estimate_background(held.values, response, law=given or "decay")
+        notes = (*held.notes, found.summary) if given is None or given in ("decay", "flat") else held.notes
+        return dataclasses.replace(held, background=found.counts, level_known=False, notes=notes)
+    _, levels, _ = checked_histograms(held.values, given, response)
+    return dataclasses.replace(held, background=levels, level_known=True)
 
 
 def _unused(held: Held) -> str:
@@ -286,7 +303,7 @@ def denoise_file(
         min_significance: Of counts, pixels below it become NaN, see `Estimate`; default: that of the scene's detector,
             4 of measured histograms.
         gate: (start, stop) in depth [m]; of counts only the bins within it are used. Default: the file's, else all.
-        profile: Backscatter over the gate `[bins]`; default: the file's, else flat.
+        profile: Backscatter over the gate `[bins]`; default: the file's, else as `estimate` does.
         reading: The other arguments of `read_depth`.
 
     Raises:
@@ -322,7 +339,10 @@ def denoise_file(
             found, second = _from_counts(read, counts, profile, model, weights, index, device)
         else:
             second = None
-            frames = depth_frames(read.depth, gate=gate, profile=read.profile if profile is None else profile)
+            profile = read.profile if profile is None else profile
+            if profile is None and model in ("pyramid", "gating"):
+                profile = profile_of_depth(read.depth, gate)
+            frames = depth_frames(read.depth, gate=gate, profile=profile)
             found = estimate_frames(frames, model=model, weights=weights, device=device, precision=precision)
         if (held := read.histograms) is not None and held.response is not None and held.background is not None:
             if min_significance is None:

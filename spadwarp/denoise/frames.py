@@ -304,30 +304,3 @@ def _sums(values: Tensor, place: Tensor) -> Tensor:
     sums = values.new_zeros(frames, _BINS + 1, columns)
     sums.scatter_add_(1, place, values.expand(frames, rows, columns))
     return sums[:, :_BINS].sum(dim=2).double()
-
-
-def bins_of_target(
-    counts: NDArray[np.float32], background: NDArray[np.float32], response: NDArray[np.float32]
-) -> tuple[int, int]:
-    """(first, stop) of the bins that hold the excess of all pixels together over the background, with a margin.
-
-    (0, T) where little would be gained, or where the excess is not significant. Arguments are those of
-    `spadwarp.denoise.estimate`.
-    """
-    bins = counts.shape[-1]
-    total = counts.reshape(-1, bins).sum(axis=0, dtype=np.float64)
-    pixels = counts.size // bins
-    level = np.asarray(background, np.float64).reshape(-1, bins).mean(axis=0) * pixels
-    window = np.ones(max(len(response), bins // 64) | 1)
-    above = total - level
-    excess = np.convolve(above, window, mode="same")
-    spread = np.sqrt(np.convolve(np.maximum(level, 1.0), window, mode="same"))
-    significant = np.flatnonzero(excess > 5.0 * spread)
-    if len(significant) == 0:
-        return 0, bins
-    first, stop = int(significant[0]), int(significant[-1]) + 1
-    if above[:first].sum() + above[stop:].sum() > 0.02 * above[first:stop].sum() + 3.0 * np.sqrt(level.sum()):
-        return 0, bins
-    margin = len(window) + (stop - first) // 8
-    first, stop = max(0, first - margin), min(bins, stop + margin)
-    return (first, stop) if stop - first < _KEPT * bins else (0, bins)

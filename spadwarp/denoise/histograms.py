@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
-from spadwarp.denoise.frames import POOLED, SIDES, bins_of_target
+from spadwarp.denoise.backgrounds import BackgroundLaw, bins_of_target, estimate_background
+from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.frames.measured import Histograms
 from spadwarp.values import ArgumentError, percent
@@ -65,21 +66,23 @@ def histogram_tensors(
 
 
 def checked_histograms(
-    counts: ArrayLike, background: ArrayLike, response: ArrayLike
+    counts: ArrayLike, background: ArrayLike | BackgroundLaw, response: ArrayLike
 ) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32]]:
-    """Counts, background and response as arrays. Raises `ArgumentError`."""
+    """Counts, background and response as arrays; of a law, the background estimated by it. Raises `ArgumentError`."""
     cubes = np.asarray(on_host(counts))
     if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
         raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
     low, high = cubes.min(), cubes.max()
     if not (low >= 0 and high < np.inf):
         raise ArgumentError(f"counts = {low} … {high} are outside [0, inf)")
-    levels, taps = real_array("background", background), real_array("response", response)
-    one, each = cubes.shape[-1:], cubes.shape[-3:]
-    if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
-        raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
+    taps = real_array("response", response)
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
         raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
+    if isinstance(background, str):
+        return cubes, estimate_background(cubes, taps, law=background).counts, taps
+    levels, one, each = real_array("background", background), cubes.shape[-1:], cubes.shape[-3:]
+    if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
+        raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
     return cubes, levels, taps
 
 

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.denoise.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
 from spadwarp.denoise.frames import (
     MARGIN,
+    SMALLEST_SIDE,
     DepthFrames,
     checked_gate,
     checked_profile,
@@ -97,7 +99,7 @@ def estimate(
     model: str = "pyramid",
     profile: ArrayLike | None = None,
     counts: ArrayLike | None = None,
-    background: ArrayLike | None = None,
+    background: ArrayLike | BackgroundLaw = "decay",
     response: ArrayLike | None = None,
     min_significance: float = 4.0,
     weights: str | Path | None = None,
@@ -112,12 +114,13 @@ def estimate(
         model: "pyramid", "dncnn" or "usdn"; or a baseline: "median", "gating", "bm3d". With counts, "pyramid" means
             "histograms", the variant of PyramidNet that uses them; "likelihood", "pooled", "semi-global",
             "total-variation" and "belief-propagation" are classical estimates from counts.
-        profile: The water's backscatter over the gate in equal bins, `[bins]`, in any unit; taken as flat if not
-            given. PyramidNet and gating use it.
+        profile: The water's backscatter over the gate in equal bins, `[bins]`, in any unit; default: estimated
+            from depths that clearly decay beside those of targets, else flat. PyramidNet and gating use it.
         counts: Histograms that `depth` was estimated from, over the gate in equal bins, `[H, W, T]` or `[N, H, W, T]`.
-            PyramidNet uses them, with `background` and `response`: where photons are few, neighbouring pixels together
-            show more than each alone.
-        background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`.
+            PyramidNet uses them, with `response`: where photons are few, neighbouring pixels together show more than
+            each alone.
+        background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`; or the law
+            by which `spadwarp.denoise.estimate_background` estimates them from the counts: "decay", "flat" or "none".
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`, as
             `spadwarp.frames.InstrumentResponse.per_bin` gives it.
         min_significance: Of counts, pixels below this significance have no depth; 0: every pixel has one.
@@ -140,13 +143,15 @@ def estimate(
     if precision is not None:
         check_choice("precision", precision, get_args(Precision))
     if model not in ("histograms", *CLASSICAL):
+        if profile is None and model in ("pyramid", "gating"):
+            profile = profile_of_depth(depth, gate)
         frames = depth_frames(depth, gate=gate, profile=profile)
         found = estimate_frames(
             frames, model=model, weights=weights, device=device, precision=precision, progress=progress
         )
     else:
-        if counts is None or background is None or response is None:
-            raise ArgumentError(f"model = {model!r} needs counts, background and response, of which some are missing")
+        if counts is None or response is None:
+            raise ArgumentError(f"model = {model!r} needs counts and response, of which some are missing")
         cubes, levels, taps = checked_histograms(counts, background, response)
         if depth.shape != cubes.shape[:-1]:
             raise ArgumentError(f"depth has shape {depth.shape}; {cubes.shape[:-1]} is needed, that of counts")
@@ -167,7 +172,8 @@ def estimate(
             depth, cubes, levels, taps, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
             profile=profile, weights=weights, device=device,
         )  # fmt: skip
-        found = detected(found, cubes, levels, taps, model=model, min_significance=min_significance)
+        given: dict[str, Any] = {"min_significance": min_significance, "level_known": not isinstance(background, str)}
+        found = detected(found, cubes, levels, taps, model=model, **given)
     shaped: Any = (None if values is None else values.reshape(np.shape(depth)) for values in found)
     return Estimate(*shaped)
 
@@ -221,6 +227,10 @@ def estimate_histograms(
     device: str | None,
 ) -> Estimate:
     """`estimate` for the methods that use counts, in the bins that hold the target; `gate` and `profile` are theirs."""
+    height, width = counts.shape[-3:-1]
+    if model not in CLASSICAL and min(height, width) < SMALLEST_SIDE:
+        least = f"at least {SMALLEST_SIDE} x {SMALLEST_SIDE} are needed"
+        raise ArgumentError(f"counts are of {height} x {width} pixels; by {model!r} {least}")
     some = counts[..., bins]
     given: dict[str, Any] = {"background": background[..., bins], "response": response, "device": device}
     if model in CLASSICAL:

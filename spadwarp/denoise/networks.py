@@ -416,9 +416,17 @@ def _seen(found: Tensor, logits: Tensor, features: Tensor) -> tuple[Tensor, Tens
 
 
 def _filled_up(image: Tensor, stride: int) -> Tensor:
-    """With rows and columns that repeat the last, up to multiples of `stride`."""
-    bottom, right = (-length % stride for length in image.shape[-2:])
-    return F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
+    """With rows and columns that mirror those before the last, up to multiples of `stride`.
+
+    Copies of the last one would agree in depth, as those of a target do.
+    """
+    for axis in (-2, -1):
+        length = image.shape[axis]
+        if length % stride:
+            period = max(1, 2 * length - 2)
+            place = torch.arange(length + -length % stride, device=image.device) % period
+            image = image.index_select(axis, torch.minimum(place, period - place))
+    return image
 
 
 LONGEST_DELAY = 0.2

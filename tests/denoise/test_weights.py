@@ -10,8 +10,9 @@ import torch
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
 from spadwarp.denoise import baselines, estimate, evaluate_histograms, inference, weights_metadata
+from spadwarp.denoise.backgrounds import bins_of_target, profile_of_depth
 from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth, water_profile
-from spadwarp.denoise.frames import bins_of_target, depth_frames, gates_of_target
+from spadwarp.denoise.frames import depth_frames, gates_of_target
 from spadwarp.denoise.inference import corrected_target
 from spadwarp.denoise.network_files import MODELS, WEIGHTS
 from spadwarp.io.arrays import read_exr
@@ -65,6 +66,15 @@ def test_a_large_frame():
     assert found.shape == (400, 512) and abs(np.nanmedian(found) - 15.0) < 0.01
 
 
+@pytest.mark.parametrize("size", [(97, 129), (49, 113)])
+def test_sides_that_are_not_multiples_of_16_invent_no_target(size):
+    """Of a target in open water, where copies of the last row and column would agree as pixels of a target do."""
+    target = evaluation_scene("vase", "open water", size=size)
+    noisy = noisy_depth(target, water="uniform", level=0.1, seed=3)
+    seen = found_by_pyramid(depth_frames(noisy, gate=GATE))[1][0]
+    assert seen[~np.isfinite(target.clean)].mean() < 0.015
+
+
 @pytest.mark.parametrize("missing", [0.5, 0.9])
 @of_depth
 def test_frames_with_few_reports(model, missing):
@@ -90,6 +100,18 @@ def test_backscatter_alone_is_no_target(share, decay):
     depth = GATE[0] + (GATE[1] - GATE[0]) * place / 64
     depth[generator.random(depth.shape) >= share] = np.nan
     assert np.isfinite(denoised(depth, profile=profile, mask=0.5)).mean() < 0.01
+
+
+def test_the_profile_of_backscatter_is_seen_in_the_depths():
+    """Near-range backscatter alone, whose depths agree more often than those of uniform backscatter."""
+    noisy = noisy_depth(evaluation_scene("nothing", "open water"), water="near-range", level=0.13, seed=3)
+    found = inference.estimate(noisy, gate=GATE, device="cpu")
+    assert (found.target_probability >= 0.08).mean() < 0.01
+    profile = profile_of_depth(noisy, GATE)
+    truth = water_profile("near-range", profile.size)
+    assert np.abs(profile / profile.mean() - truth).mean() < 0.1
+    uniform = noisy_depth(evaluation_scene("vase", "wall"), water="uniform", level=0.13, seed=3)
+    assert profile_of_depth(uniform, GATE) is None
 
 
 @pytest.mark.parametrize("water", ["near-range", "uniform"])
@@ -225,6 +247,7 @@ def test_depth_outside_the_gate_is_left_out_with_a_warning():
 HISTOGRAMS = {"counts": np.zeros((16, 16, 8)), "background": np.ones(8), "response": np.ones(3)}
 REFUSED = {
     r"depth has shape \(5,\)": {"depth": np.zeros(5)},
+    "counts are of 1 x 1 pixels": HISTOGRAMS | {"counts": np.zeros((1, 1, 8)), "depth": np.full((1, 1), 15.0)},
     "depth is <U1": {"depth": np.full((16, 16), "a")},
     "4 x 40 pixels": {"depth": np.ones((4, 40))},
     "outside": {"depth": -np.ones((16, 16))},
@@ -239,7 +262,7 @@ REFUSED = {
     "cuda:77": {"device": "cuda:77"},
     "counts are float64": HISTOGRAMS | {"counts": np.zeros((16, 16))},
     "background has shape": HISTOGRAMS | {"background": np.zeros(5)},
-    "needs counts, background and response": HISTOGRAMS | {"background": None},
+    "needs counts and response": HISTOGRAMS | {"response": None},
     "response has shape": HISTOGRAMS | {"response": np.ones(4)},
     r"depth has shape \(16, 16\); \(20, 16\) is needed": HISTOGRAMS | {"counts": np.zeros((20, 16, 8))},
     r"counts = -1.0 … -1.0 are outside \[0, inf\)": HISTOGRAMS | {"counts": -np.ones((16, 16, 8))},

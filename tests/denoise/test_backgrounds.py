@@ -1,0 +1,140 @@
+"""Backgrounds estimated from counts, against those that the counts were drawn with."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from spadwarp import ArgumentError
+from spadwarp.denoise import denoise_file, estimate, estimate_background, read_depth
+from spadwarp.denoise.backgrounds import bins_of_target
+from spadwarp.denoise.evaluation_scenes import evaluation_scene
+from spadwarp.frames import InstrumentResponse
+
+BINS, SIGMA, SIZE = 128, 1.5, (48, 64)
+TAPS = norm.pdf(np.arange(-6, 7), scale=SIGMA)
+TAPS /= TAPS.sum()
+PLACE = (np.arange(BINS) + 0.5) / BINS
+BACKSCATTER = np.exp(-3.0 * PLACE) / (0.4 + PLACE) ** 2  # of water from behind the start of the gate
+
+
+def counts_of(clean, background, photons, *, gate=(13.5, 16.0), scale=1.0, seed=1):
+    """Counts of targets at depth `clean` [m], NaN for water, before a background per bin."""
+    seen = np.isfinite(clean)
+    place = (np.where(seen, clean, gate[0]) - gate[0]) / (gate[1] - gate[0]) * BINS
+    signal = np.diff(norm.cdf(np.arange(BINS + 1) - place[..., None], scale=SIGMA), axis=-1)
+    rate = photons * seen[..., None] * signal + background * np.broadcast_to(scale, clean.shape)[..., None]
+    return np.random.default_rng(seed).poisson(rate).astype(np.int32)
+
+
+def backscatter(counts):
+    return counts * (0.8 * BACKSCATTER / BACKSCATTER.sum() + 0.2 / BINS)
+
+
+@pytest.mark.parametrize("setting", ["wall", "floor", "open water"])
+def test_a_decaying_background_is_found_between_the_returns(setting):
+    """Mean deviation over the gate, weighted with the background, of a few per cent."""
+    clean = evaluation_scene("stairs", setting, size=SIZE).clean
+    level = backscatter(30.0)
+    found = estimate_background(counts_of(clean, level, 20.0), TAPS)
+    assert found.decays and np.abs(found.per_bin - level).sum() < 0.04 * level.sum()
+    assert "decays and a constant" in found.summary
+
+
+def test_a_return_that_all_pixels_share_is_no_background():
+    clean = np.full(SIZE, 14.6)
+    level = backscatter(30.0)
+    found = estimate_background(counts_of(clean, level, 20.0), TAPS)
+    assert np.abs(found.per_bin - level).sum() < 0.05 * level.sum() and 0.05 < found.interpolated < 0.3
+
+
+def test_ambient_light_may_follow_the_reflectance():
+    """Neighbours on both sides of an edge have a background that differs four times; the mean is that of all pixels."""
+    scale = np.where(np.arange(SIZE[1]) < 32, 0.4, 1.6)
+    level = np.full(BINS, 60.0 / BINS)
+    counts = counts_of(np.where(np.arange(SIZE[1]) % 20 < 10, 14.5, 15.0) + np.zeros(SIZE), level, 3.0, scale=scale)
+    found = estimate_background(counts, TAPS)
+    assert not found.decays and found.per_bin.sum() == pytest.approx(60.0, rel=0.03)
+    assert np.abs(found.scale - scale).mean() < 0.06 and np.allclose(
+        found.counts, found.scale[..., None] * found.per_bin
+    )
+
+
+def test_the_standard_error_is_that_of_many_frames():
+    level = np.full(BINS, 0.05)
+    found = [
+        estimate_background(counts_of(np.full((24, 24), np.nan), level, 0.0, seed=seed), TAPS) for seed in range(40)
+    ]
+    z = [(one.per_bin.sum() / level.sum() - 1.0) / one.relative_error for one in found]
+    assert 0.6 < np.std(z) < 1.4 and abs(np.mean(z)) < 0.6
+    assert sum(one.decays for one in found) <= 2
+
+
+def test_laws():
+    level = backscatter(30.0)
+    counts = counts_of(np.full((24, 24), np.nan), level, 0.0)
+    flat = estimate_background(counts, TAPS, law="flat")
+    assert np.ptp(flat.per_bin) == 0 and not flat.decays and flat.scale is None
+    assert not estimate_background(counts, TAPS, law="none").per_bin.any()
+    assert np.isfinite(estimate_background(0 * counts, TAPS).per_bin).all()
+    two = estimate_background(np.stack([counts, counts]), TAPS).per_bin
+    assert np.allclose(two, estimate_background(counts, TAPS).per_bin, rtol=0.02)
+    with pytest.raises(ArgumentError, match="background = 'linear' is not one of"):
+        estimate_background(counts, TAPS, law="linear")
+    with pytest.raises(ArgumentError, match="counts have shape"):
+        estimate_background(counts[0], TAPS)
+
+
+def test_depth_is_as_good_as_with_the_true_background(tmp_path):
+    """From Python and from a file; in water a flat background takes backscatter for a target."""
+    clean, gate = evaluation_scene("vase", "open water", size=SIZE).clean, (13.5, 16.0)
+    common = {"gate": gate, "response": TAPS, "device": "cpu", "min_significance": 0}
+    level, seen = backscatter(50.0), np.isfinite(clean)
+    counts = counts_of(clean, level, 15.0)
+    depth = gate[0] + (gate[1] - gate[0]) * (counts.argmax(axis=-1) + 0.5) / BINS
+    rmse, invented = {}, {}
+    for name, given in {"true": level, "estimated": "decay", "flat": "flat"}.items():
+        found = estimate(depth, counts=counts, background=given, **common)
+        rmse[name] = np.sqrt(np.mean((found.depth - clean)[seen] ** 2))
+        invented[name] = np.mean(found.target_probability[~seen] > 0.5)
+    assert rmse["estimated"] < 1.3 * rmse["true"] < 0.02
+    assert invented["estimated"] < 0.02 < invented["flat"]
+    np.save(tmp_path / "counts.npy", counts)
+    time = {"bin_width": 2.0 * (gate[1] - gate[0]) / 299792458.0 / BINS, "gate_start": 2.0 * gate[0] / 299792458.0}
+    options = time | {"irf": InstrumentResponse(sigma=SIGMA * time["bin_width"]), "group_index": 1.0, "axes": "yxt"}
+    done = denoise_file(tmp_path / "counts.npy", tmp_path / "out", device="cpu", **options)
+    assert any(note.count("background estimated from the frame: decays") for note in done.notes)
+    assert np.sqrt(np.mean((done.depth[0] - clean)[seen] ** 2)) < 1.5 * rmse["true"]
+
+
+def test_a_file_may_have_its_background_given(tmp_path):
+    counts = counts_of(np.full((16, 16), 14.6), np.full(BINS, 0.05), 5.0)
+    np.save(tmp_path / "counts.npy", counts)
+    options = {"bin_width": 130e-12, "gate_start": 0.0, "irf": InstrumentResponse(sigma=170e-12)}
+    read = read_depth(tmp_path / "counts.npy", background=np.full(BINS, 0.05), group_index=1.0, **options)
+    assert read.histograms.level_known and np.allclose(read.histograms.background, 0.05)
+    assert not read_depth(
+        tmp_path / "counts.npy", background="none", group_index=1.0, **options
+    ).histograms.background.any()
+    with pytest.raises(ArgumentError, match=r"background has shape \(5,\)"):
+        read_depth(tmp_path / "counts.npy", background=np.ones(5), group_index=1.0, **options)
+    with pytest.raises(ArgumentError, match="background is of counts"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        read_depth(tmp_path / "counts.npy", background="flat", group_index=1.0, bin_width=130e-12, gate_start=0.0)
+    np.save(tmp_path / "depth.npy", np.full((16, 16), 14.6))
+    with pytest.raises(ArgumentError, match="holds depth: background are of histograms"):
+        read_depth(tmp_path / "depth.npy", background="flat")
+
+
+def test_no_surface_is_left_out_that_can_be_told_from_the_background():
+    """A wall; a plate of a fortieth of its light, that all pixels together hardly show; one pixel with a return."""
+    rate = np.full((64, 64, 512), 0.1)
+    rate[..., 200:205] += 0.6
+    rate[20:30, 20:30, 200:205] -= 0.6
+    rate[20:30, 20:30, 330:335] += 0.6
+    counts, level = np.random.default_rng(1).poisson(rate), np.full(512, 0.1, np.float32)
+    first, stop = bins_of_target(counts, level, np.ones(5))
+    assert 130 < first < 200 and 335 <= stop < 400
+    counts[5, 5, 440] += 30
+    assert bins_of_target(counts, level, np.ones(5))[1] > 441
