@@ -636,6 +636,9 @@ def _check_polarisation(survey: Survey) -> None:
     """Polarised light that no channel records, and fields without their choice; reads the matrix's table."""
     scene, medium, laser = survey.scene, survey.scene.medium, survey.scene.laser
     scattering_matrix(medium)
+    if scene.polarised:
+        text = f"light is polarised: scattering_matrix = {medium.scattering_matrix!r}, without the near-axis rule"
+        survey.note("medium.scattering_matrix", text)
     measured, cameras = scene.camera.polarisation != "none", "polarisation = 'analyser' or 'stokes'"
     if scene.polarised and not measured:
         text = "light is polarised, but the result will have no channels: 'analyser' or 'stokes' records them"
