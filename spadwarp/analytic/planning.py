@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.analytic.budgets import OUTLIERS, axis_line, central_pixel, face_reflectance
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
 from spadwarp.analytic.model import false_peaks
-from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from spadwarp.analytic.sweeps import OUTLIERS, TOLERANCE, BudgetRow, Sweep
+from spadwarp.analytic.budgets import OUTLIERS, TOLERANCE, BudgetRow
+from spadwarp.analytic.sweeps import Sweep
 from spadwarp.scene import Scene
 from spadwarp.scene.sections import field_unit, locate, parse_key
 from spadwarp.viz import style
@@ -28,11 +29,11 @@ _COLUMNS: dict[str, tuple[str, float, tuple[float, float]]] = {
     "sigma_depth": ("depth error, Cramér–Rao [mm]", 1e3, (1e-3, 1e4)),
     "signal_to_backscatter": ("signal to backscatter", 1.0, (1e-6, 1e6)),
     "pulses_for_1cm": ("pulses for 1 cm", 1.0, (1.0, 1e12)),
-    "outlier_probability": ("outlier probability", 1.0, (0.0, 1.0)),
-    "estimate_fraction": ("pixels with an estimate", 1.0, (0.0, 1.0)),
+    "pulses": ("pulses for the depth error", 1.0, (1.0, 1e12)),
+    "largest_range": ("largest range [m]", 1.0, (0.0, 1e3)),
 }
 _OF_BUDGETS = ("signal", "sigma_depth", "signal_to_backscatter", "pulses_for_1cm")
-_OF_ERRORS = ("sigma_depth", "outlier_probability", "estimate_fraction", "signal_to_backscatter")
+_OF_PLANS = ("pulses", "sigma_depth", "largest_range")
 
 
 @paper()
@@ -75,36 +76,55 @@ def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, wi
 
 @paper()
 def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = PAGE) -> Figure:
-    """Four panels over the values of the swept field, see `spadwarp.sweep`: those of `draw_budget`, or errors.
+    """Panels over the values of the first field, a line for each combination of the others, see `spadwarp.sweep`.
 
-    Linear axes begin at 0, and a curve that varies by less than a tenth has its span written into the panel. Returns
-    the matplotlib figure of this width [inch], and writes it where `path` is given.
+    Of budgets those of `draw_budget`; of plans pulses for the depth error, bound, largest range. Linear axes begin
+    at 0, and a curve that varies by less than a tenth has its span written into the panel. A cross at the top: out
+    of reach. Returns the matplotlib figure of this width [inch], and writes it where `path` is given.
     """
-    budgets = isinstance(curves.rows[0], BudgetRow)
-    names = _OF_BUDGETS if budgets else _OF_ERRORS
+    names = list(_OF_BUDGETS)
+    if not isinstance(curves.rows[0], BudgetRow):
+        names = [name for name in _OF_PLANS if not np.isnan(curves.column(name)).all()]
     figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.3)
-    numeric = all(isinstance(value, (int, float)) for value in curves.values)
-    x: Any = np.array(curves.values, np.float64) if numeric else np.arange(len(curves.values))
-    for number, (axis, name) in enumerate(zip(axes, names, strict=True)):
-        label, scale, (_, most) = _COLUMNS[name]
-        y, colour = curves.column(name) * scale, SERIES[number % 5]
-        axis.plot(x, np.where(np.isfinite(y), y, np.nan), "o-", color=colour, label="median")
-        if name == "sigma_depth" and not budgets:
-            p90 = scale * curves.column("sigma_depth_p90")
-            axis.plot(x, p90, "--", color=colour, linewidth=0.8, label="90 % of the pixels below")
-            axis.legend()
-        axis.set(xlabel=curves.field + _unit(curves.field), ylabel=_broken(label))
-        _value_axis(axis, y, probability=most == 1.0)
+    at, others = [value[0] for value in curves.values], [value[1:] for value in curves.values]
+    ticks = list(dict.fromkeys(map(str, at)))
+    numeric = all(isinstance(value, (int, float)) for value in at)
+    x = np.array(at, np.float64) if numeric else np.array([ticks.index(str(value)) for value in at], np.float64)
+    groups = list(dict.fromkeys(map(repr, others)))
+    for axis, name in zip(axes, names, strict=True):
+        label, scale, _ = _COLUMNS[name]
+        y = curves.column(name) * scale
+        for number, group in enumerate(groups):
+            own = np.array([repr(other) == group for other in others])
+            place = x[own] + (0.0 if numeric else 0.12 * (number - 0.5 * (len(groups) - 1)))
+            words = ", ".join(_value_text(value) for value in others[int(own.argmax())])
+            style_of: dict[str, Any] = {"color": SERIES[number % len(SERIES)], "label": words or None}
+            spread = None
+            if name == "pulses":
+                ends = np.array([curves.column("pulses_least")[own], curves.column("pulses_most")[own]])
+                spread = np.where(np.isfinite(ends), np.abs(ends - np.where(np.isfinite(y[own]), y[own], 0.0)), 0.0)
+            shown = np.where(np.isfinite(y[own]), y[own], np.nan)
+            axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, **style_of)
+            beyond, top = place[np.isinf(y[own])], axis.get_xaxis_transform()
+            axis.plot(beyond, np.full(len(beyond), 0.97), "x", transform=top, color=style_of["color"])
+        axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=_broken(label))
+        _value_axis(axis, y)
         if not numeric:
-            axis.set_xticks(x, map(str, curves.values), rotation=20, ha="right", rotation_mode="anchor")
-            axis.set_xlim(-0.5, len(x) - 0.5)
+            axis.set_xticks(range(len(ticks)), ticks, rotation=20, ha="right", rotation_mode="anchor")
+            axis.set_xlim(-0.5, len(ticks) - 0.5)
         elif x.min() > 0 and x.max() > 30 * x.min():
             log_axis(axis, "x")
         else:
             axis.xaxis.minorticks_on()
+    if len(groups) > 1:
+        figure.key(axes, 1.8, title=", ".join(curves.fields[1:]))
     if path is not None:
         save(figure, path)
     return figure
+
+
+def _value_text(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def _broken(label: str) -> str:
@@ -119,13 +139,11 @@ def _unit(field: str) -> str:
     return "" if unit in (None, "1") else f" [{unit}]"
 
 
-def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool = False) -> None:
-    """From 0 to 1, or logarithmic over more than a factor of 20, else from 0."""
+def _value_axis(axis: Axes, y: NDArray[np.float64]) -> None:
+    """Logarithmic over more than a factor of 20, else from 0."""
     known = y[np.isfinite(y)]
     positive = known[known > 0]
-    if probability:
-        axis.set_ylim(-0.03, 1.03)
-    elif positive.size and positive.max() > 20 * positive.min():
+    if positive.size and positive.max() > 20 * positive.min():
         log_axis(axis, "y")
         return
     elif known.size:
