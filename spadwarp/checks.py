@@ -43,6 +43,7 @@ from spadwarp.scene.sight import (
     within_port,
 )
 from spadwarp.transport import points_per_flight
+from spadwarp.transport.model import visible_points
 from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
@@ -80,12 +81,12 @@ class OnAxis:
 
 
 class Survey:
-    """A scene's targets as the camera sees them and the beam illuminates them, without occlusion; and the findings."""
+    """A scene's targets as the camera sees them and the beam illuminates them, shadows aside; and the findings."""
 
     def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
         if mesh is None and scene.targets:
             mesh = build_mesh(scene)
-        self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
+        self.scene, self.mesh, self.messages, laser = scene, mesh, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
         # The faces of each target in the camera frame `[F, 3, 3]` [m].
         self.targets = [] if mesh is None else [triangles[mesh.target == i] for i in range(len(scene.targets))]
@@ -111,6 +112,7 @@ class Survey:
             self.warn(*found)
         illuminated = self.illuminated_part(triangles)
         if len(illuminated):
+            illuminated = self.visible(illuminated)
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
             self.target_range = float(ranges.min()), float(ranges.max())
             self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
@@ -142,6 +144,11 @@ class Survey:
                 ahead = origin + port.connect(points, origin)[0]
                 points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
         return points
+
+    def visible(self, points: Points) -> Points:
+        """Those of the points of targets that nothing hides from the lens; all of them where there is none."""
+        seen = visible_points(self.mesh, points) if self.mesh is not None and len(points) else np.zeros(0, bool)
+        return points[seen] if seen.any() else points
 
     def _rays(self) -> tuple[Points, Points]:
         """Rays in the water over what the camera sees and the beam, which corners of triangles may all lie beside."""
@@ -197,7 +204,7 @@ class Survey:
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
-    """Everything worth knowing about a scene, warnings first; occlusion is not considered.
+    """Everything worth knowing about a scene, warnings first; shadows of the beam are not considered.
 
     `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
     for the tables of a phase function and a scattering matrix and the instrument response of the detector;
@@ -373,20 +380,21 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
     if (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
         return survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
     if not len(illuminated):
-        angles = np.degrees(_angles(in_view, laser))
+        angles = np.degrees(_angles(survey.visible(in_view), laser))
         text = (
             f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
             f"off the axis, {_beam_text(scene.laser)}"
         )
         return survey.warn(name, text, nearest_angle_deg=float(angles.min()))
     if laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0:
-        widest = math.degrees(float(_angles(in_view, laser).max()))
+        widest = math.degrees(float(_angles(survey.visible(in_view), laser).max()))
         if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
             text = (
                 f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
                 f"{_beam_text(scene.laser)}"
             )
             survey.note("laser.half_angle_deg", text, widest_angle_deg=widest)
+    illuminated = survey.visible(illuminated)
     _check_gate(survey, name, survey.paths(illuminated))
     side = float(np.abs(illuminated[:, :2]).max())
     if side > scene.transport.lateral_limit:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -516,6 +517,18 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     depth, ranges, normal, reflectance = trace_rays(model, origins, directions, shape)
     ranges = ranges if lead is None else (ranges + lead).astype(np.float32)
     return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
+
+
+def visible_points(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which points `[N, 3]` of the camera frame no face hides from the lens, but for a thousandth of their distance and
+    for what a port bends."""
+    device, lens = wp.get_device("cpu"), sk.Camera()
+    kept, surfaces = _surfaces(mesh, None, device, None)
+    distance = np.linalg.norm(points, axis=1)
+    rays = (points / np.maximum(distance, 1e-30)[:, None])[None]
+    model: Any = SimpleNamespace(device=device, camera=lens, surfaces=surfaces, mesh=kept)
+    hit = trace_rays(model, np.zeros_like(rays), rays, (1, len(points)))[1][0]
+    return hit >= 0.999 * distance
 
 
 def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int, int]) -> list[NDArray[np.float32]]:
