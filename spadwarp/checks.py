@@ -37,13 +37,12 @@ from spadwarp.scene.sight import (
     beam_planes,
     lines_of_sight,
     points_inside,
-    points_on_rays,
     port_advance,
     view_planes,
     within_port,
 )
 from spadwarp.transport import points_per_flight
-from spadwarp.transport.model import visible_points
+from spadwarp.transport.model import first_hits
 from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
@@ -86,7 +85,7 @@ class Survey:
     def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
         if mesh is None and scene.targets:
             mesh = build_mesh(scene)
-        self.scene, self.mesh, self.messages, laser = scene, mesh, list[CheckMessage](), scene.beam
+        self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
         # The faces of each target in the camera frame `[F, 3, 3]` [m].
         self.targets = [] if mesh is None else [triangles[mesh.target == i] for i in range(len(scene.targets))]
@@ -138,7 +137,9 @@ class Survey:
                 whole.append(planes)
         points = points_inside(triangles, np.concatenate(whole))
         if has_port and len(triangles):
-            points = np.concatenate([points, points_on_rays(triangles, *self._rays())])
+            start, direction = self._rays()
+            hits = start + first_hits(triangles, start, direction)[:, None] * direction
+            points = np.concatenate([points, hits[np.isfinite(hits).all(axis=1)]])
         for planes, port, _, origin in self._sides:
             if port is not None and len(points):
                 ahead = origin + port.connect(points, origin)[0]
@@ -147,7 +148,9 @@ class Survey:
 
     def visible(self, points: Points) -> Points:
         """Those of the points of targets that nothing hides from the lens; all of them where there is none."""
-        seen = visible_points(self.mesh, points) if self.mesh is not None and len(points) else np.zeros(0, bool)
+        distance = np.linalg.norm(points, axis=1)
+        rays = points / np.maximum(distance, 1e-30)[:, None]
+        seen = first_hits(np.concatenate(self.targets), np.zeros(3), rays) >= 0.999 * distance
         return points[seen] if seen.any() else points
 
     def _rays(self) -> tuple[Points, Points]:

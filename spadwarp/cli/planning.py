@@ -137,7 +137,7 @@ def plan(
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
         spadwarp.io.write_text(made + found.scene.to_toml(folder=file.parent), file)
     say(_verdict(found))
-    hidden = ["pilot", "channels", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
+    hidden = ["pilot", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
     hidden += [] if found.judged else ["pulses", "pulses_for", "frame_time", "reached", "pile_up_energy"]
     values = {name: value for name, value in found.to_dict().items() if name not in hidden}
     if not found.judged:
@@ -147,8 +147,6 @@ def plan(
         say(f"largest range, for a plane square to the optical axis: {found.largest_range:.3g} m; {found.range_limit}")
     if found.judged:
         say(rows(_terms(found)))
-        for name in ("co", "cross") if found.channels else ():
-            say(_reception(found, name))
         say(f"What would help: {found.advice}.")
     for file in files:
         say(f"written: {file}")
@@ -177,21 +175,6 @@ def _verdict(found: Proposal) -> str:
         longest = with_prefix(found.time, "s")
         return f"A depth error of {asked} takes {pulses}, more than {longest}; limit: {found.limit}."
     return f"A depth error of {asked} is out of reach: {total} with {pulses}; limit: {found.limit}."
-
-
-def _reception(found: Proposal, name: str) -> str:
-    """What a channel of the analyser keeps of all light."""
-    whole, part = found.channels["I"], found.channels[name]
-
-    def share(field: str) -> str:
-        return f"{100 * getattr(part, field) / getattr(whole, field):.3g} %" if getattr(whole, field) else "none"
-
-    text = f"{name.capitalize()}-polarised reception keeps {share('target')} of the target's light"
-    text += f", {share('backscatter')} of the backscatter and {share('noise')} of the noise"
-    if not math.isfinite(part.bound) or not math.isfinite(whole.bound):
-        return text + "."
-    ratio = part.bound / whole.bound
-    return f"{text}; the same Cramér–Rao bound takes {ratio**2:.2g} times the pulses."
 
 
 def _terms(found: Proposal) -> dict[str, str]:
@@ -291,7 +274,10 @@ def sweep(
         files = [out / f"{stem}.png", spadwarp.io.write_csv(table, out / f"{stem}.csv")]
     cells: Callable[[Any], dict[str, Any]] = _budget_cells
     if of == "budget":
-        say("of unscattered light alone, by the analytic model; `spadwarp plan` has the pulses of all light")
+        say(
+            "of unscattered light alone, by the analytic model; `spadwarp plan` has the pulses of all light: 1.3 times "
+            "as much at an optical depth of 0.2 in usual water, 3.6 times at 1"
+        )
     else:
         cells = partial(_plan_cells, pulses=read.pulses_per_depth_frame)
         say(f"of all light, by `spadwarp plan`; pulses for a depth error of {1e3 * depth_error:.3g} mm")
@@ -329,7 +315,7 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
 
     return {
         "range [m]": f"{row.range:.4g}",
-        "c·r": row.optical_depth,
+        "optical depth": row.optical_depth,
         "gate [ns]": f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
         "pulses": pulses(row.pulses),
         "signal": row.signal,
@@ -367,9 +353,6 @@ def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:
     }
 
 
-_SCATTERS = 0.2  # optical depth: from here on scattered light adds more than a quarter to a target's
-
-
 def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
     """Notes below the table of a budget."""
     notes = []
@@ -378,12 +361,6 @@ def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
         notes.append(
             f"* not the scene's gate, {gate.start_ns:.4g}-{gate.stop * 1e9:.4g} ns, which misses the return of one of "
             "the ranges, but one as long around the return"
-        )
-    if any(row.optical_depth > _SCATTERS for row in found):
-        notes.append(
-            "signal: unscattered light alone. In water that scatters, more light comes back from a target: in a view "
-            "of 10° of a plane at 5 m, in water of albedo 0.83 and anisotropy 0.924, 1.3 times as much at c·r = 0.2 "
-            "and 3.6 times at 1; `spadwarp plan` traces all of it"
         )
     own, detector = scene.analytic.pulses_per_depth_frame, scene.detector.pulses_per_frame
     if scene.analytic.count_law == "per_pulse" and own is not None and own != detector:

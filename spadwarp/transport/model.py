@@ -519,16 +519,14 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
 
 
-def visible_points(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points `[N, 3]` of the camera frame no face hides from the lens, but for a thousandth of their distance and
-    for what a port bends."""
-    device, lens = wp.get_device("cpu"), sk.Camera()
-    kept, surfaces = _surfaces(mesh, None, device, None)
-    distance = np.linalg.norm(points, axis=1)
-    rays = (points / np.maximum(distance, 1e-30)[:, None])[None]
-    model: Any = SimpleNamespace(device=device, camera=lens, surfaces=surfaces, mesh=kept)
-    hit = trace_rays(model, np.zeros_like(rays), rays, (1, len(points)))[1][0]
-    return hit >= 0.999 * distance
+def first_hits(triangles: NDArray[np.float64], start: Any, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances [m] along rays `[N, 3]` of the nearest of triangles `[F, 3, 3]`; NaN: none."""
+    device, corners = wp.get_device("cpu"), triangles.reshape(-1, 3)
+    faces = wp.array(np.arange(len(corners)), dtype=int, device=device)
+    mesh = wp.Mesh(wp.array(corners, dtype=wp.vec3, device=device), faces)
+    model: Any = SimpleNamespace(device=device, camera=sk.Camera(), surfaces=sk.make_surfaces(mesh, 0.5), mesh=mesh)
+    origins = np.broadcast_to(np.asarray(start, np.float64), direction.shape)
+    return trace_rays(model, origins[None], direction[None], (1, len(direction)))[1][0].astype(np.float64)
 
 
 def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int, int]) -> list[NDArray[np.float32]]:
