@@ -279,5 +279,5 @@ def _spread(triangles: Floats) -> Floats:
     """Points evenly over each triangle, of many triangles near the corners alone; just inside, where rays meet it."""
     steps = 6 if len(triangles) < 2000 else 1
     weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
-    inside = 1e-4 / 3.0 + (1.0 - 1e-4) * np.array(weights) / steps
+    inside = 1e-5 / 3.0 + (1.0 - 1e-5) * np.array(weights) / steps
     return np.einsum("wc,fcx->fwx", inside, triangles).reshape(-1, 3)
