@@ -103,7 +103,7 @@ def sweep(
     """
     fields, chosen = combinations(scene, vary)
     planned = check_choice("of", of, ("budget", "plan")) == "plan"
-    rows = []
+    rows = list[Any]()
     for number, (values, changed, arguments) in enumerate(chosen):
         if progress is not None:
             progress(", ".join(map(str, values)), number, len(chosen))

@@ -522,7 +522,7 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
 def first_hits(triangles: NDArray[np.float64], start: Any, direction: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distances [m] along rays `[N, 3]` of the nearest of triangles `[F, 3, 3]`; NaN: none."""
     device, corners = wp.get_device("cpu"), triangles.reshape(-1, 3)
-    faces = wp.array(np.arange(len(corners)), dtype=int, device=device)
+    faces: wp.array = wp.array(np.arange(len(corners)), dtype=int, device=device)
     mesh = wp.Mesh(wp.array(corners, dtype=wp.vec3, device=device), faces)
     model: Any = SimpleNamespace(device=device, camera=sk.Camera(), surfaces=sk.make_surfaces(mesh, 0.5), mesh=mesh)
     origins = np.broadcast_to(np.asarray(start, np.float64), direction.shape)
