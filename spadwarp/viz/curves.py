@@ -78,14 +78,14 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             if name == "pulses":
                 ends = np.array([curves.column("pulses_least")[own], curves.column("pulses_most")[own]])
                 spread = np.where(np.isfinite(ends), np.abs(ends - np.where(np.isfinite(y[own]), y[own], 0.0)), 0.0)
-            shown = np.where(np.isfinite(y[own]), y[own], np.nan)
+            shown, every = np.where(np.isfinite(y[own]), y[own], np.nan), -(-int(own.sum()) // 12)
             if name == "sigma_depth" and missed[own].any():
                 axis.plot(place, shown, "--", color=style_of["color"], linewidth=0.8)
                 shown = np.where(missed[own], np.nan, shown)
-            axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, **style_of)
+            axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, markevery=every, **style_of)
             if name == "sigma_depth" and curves.fields == ("range", "water"):
                 axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
-            beyond, top = place[np.isinf(y[own])], axis.get_xaxis_transform()
+            beyond, top = place[np.isinf(y[own])][::every], axis.get_xaxis_transform()
             axis.plot(beyond, np.full(len(beyond), 0.97), "x", transform=top, color=style_of["color"])
         axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=_broken(label))
         _value_axis(axis, y)
@@ -100,7 +100,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
         label = f"not reached: over {100 * OUTLIERS:g} % false peaks"
         axes[0].plot([], [], color="0.4", linestyle="--", linewidth=0.8, label=label)
     if len(groups) > 1 or missed.any():
-        figure.key(axes, 1.8, title=", ".join(curves.fields[1:]))
+        figure.key(axes, 2.3, title=", ".join(curves.fields[1:]))
     if path is not None:
         save(figure, path)
     return figure
