@@ -226,8 +226,9 @@ def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
     except ModuleNotFoundError as error:
         raise FileError("data frames need pandas: pip install 'spadwarp[xarray]'") from error
     index = None
-    if hasattr(rows, "rows") and hasattr(rows, "values") and hasattr(rows, "field"):
-        rows, index = rows.rows, pandas.Index(rows.values, name=rows.field)
+    if hasattr(rows, "rows") and hasattr(rows, "values") and hasattr(rows, "fields"):
+        rows, index = rows.rows, pandas.MultiIndex.from_tuples(rows.values, names=rows.fields)
+        index = index if len(index.names) > 1 else index.get_level_values(0)
     elif isinstance(rows, Mapping):
         rows = rows.values()
     rows = rows if isinstance(rows, Iterable) else [rows]

@@ -37,12 +37,12 @@ from spadwarp.scene.sight import (
     beam_planes,
     lines_of_sight,
     points_inside,
-    points_on_rays,
     port_advance,
     view_planes,
     within_port,
 )
 from spadwarp.transport import points_per_flight
+from spadwarp.transport.model import first_hits
 from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
 
@@ -80,7 +80,7 @@ class OnAxis:
 
 
 class Survey:
-    """A scene's targets as the camera sees them and the beam illuminates them, without occlusion; and the findings."""
+    """A scene's targets as the camera sees them and the beam illuminates them, shadows aside; and the findings."""
 
     def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
         if mesh is None and scene.targets:
@@ -111,6 +111,7 @@ class Survey:
             self.warn(*found)
         illuminated = self.illuminated_part(triangles)
         if len(illuminated):
+            illuminated = self.visible(illuminated)
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
             self.target_range = float(ranges.min()), float(ranges.max())
             self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
@@ -136,12 +137,21 @@ class Survey:
                 whole.append(planes)
         points = points_inside(triangles, np.concatenate(whole))
         if has_port and len(triangles):
-            points = np.concatenate([points, points_on_rays(triangles, *self._rays())])
+            start, direction = self._rays()
+            hits = start + first_hits(triangles, start, direction)[:, None] * direction
+            points = np.concatenate([points, hits[np.isfinite(hits).all(axis=1)]])
         for planes, port, _, origin in self._sides:
             if port is not None and len(points):
                 ahead = origin + port.connect(points, origin)[0]
                 points = points[(ahead @ planes[:, :3].T + planes[:, 3] >= 0.0).all(axis=1)]
         return points
+
+    def visible(self, points: Points) -> Points:
+        """Those of the points of targets that nothing hides from the lens; all of them where there is none."""
+        distance = np.linalg.norm(points, axis=1)
+        rays = points / np.maximum(distance, 1e-30)[:, None]
+        seen = first_hits(np.concatenate(self.targets), np.zeros(3), rays) >= 0.999 * distance
+        return points[seen] if seen.any() else points
 
     def _rays(self) -> tuple[Points, Points]:
         """Rays in the water over what the camera sees and the beam, which corners of triangles may all lie beside."""
@@ -197,7 +207,7 @@ class Survey:
 
 
 def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
-    """Everything worth knowing about a scene, warnings first; occlusion is not considered.
+    """Everything worth knowing about a scene, warnings first; shadows of the beam are not considered.
 
     `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
     for the tables of a phase function and a scattering matrix and the instrument response of the detector;
@@ -373,20 +383,21 @@ def _check_target(survey: Survey, name: str, triangles: Points) -> None:
     if (nearest := float(np.linalg.norm(in_view, axis=1).min())) <= scene.camera.aperture_radius:
         return survey.warn(name, f"reaches the lens ({where}): translation moves it away", nearest=nearest)
     if not len(illuminated):
-        angles = np.degrees(_angles(in_view, laser))
+        angles = np.degrees(_angles(survey.visible(in_view), laser))
         text = (
             f"the beam misses what the camera sees of it: {where}, that is {angles.min():.3g} to {angles.max():.3g}° "
             f"off the axis, {_beam_text(scene.laser)}"
         )
         return survey.warn(name, text, nearest_angle_deg=float(angles.min()))
     if laser.profile in ("uniform_cone", "gaussian") and scene.scan_positions == 1 and laser.half_angle_deg < 90.0:
-        widest = math.degrees(float(_angles(in_view, laser).max()))
+        widest = math.degrees(float(_angles(survey.visible(in_view), laser).max()))
         if math.tan(math.radians(min(widest, 89.9))) > 2.0 * math.tan(laser.half_angle):
             text = (
                 f"the beam misses most of what the camera sees of it: that reaches {widest:.3g}° off the axis, "
                 f"{_beam_text(scene.laser)}"
             )
             survey.note("laser.half_angle_deg", text, widest_angle_deg=widest)
+    illuminated = survey.visible(illuminated)
     _check_gate(survey, name, survey.paths(illuminated))
     side = float(np.abs(illuminated[:, :2]).max())
     if side > scene.transport.lateral_limit:
@@ -636,6 +647,9 @@ def _check_polarisation(survey: Survey) -> None:
     """Polarised light that no channel records, and fields without their choice; reads the matrix's table."""
     scene, medium, laser = survey.scene, survey.scene.medium, survey.scene.laser
     scattering_matrix(medium)
+    if scene.polarised:
+        text = f"light is polarised: scattering_matrix = {medium.scattering_matrix!r}, without the near-axis rule"
+        survey.note("medium.scattering_matrix", text)
     measured, cameras = scene.camera.polarisation != "none", "polarisation = 'analyser' or 'stokes'"
     if scene.polarised and not measured:
         text = "light is polarised, but the result will have no channels: 'analyser' or 'stokes' records them"

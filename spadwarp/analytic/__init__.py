@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from spadwarp.analytic.budgets import *
 from spadwarp.analytic.eye_safety import *
 from spadwarp.analytic.model import *
 from spadwarp.analytic.planning import *
@@ -10,5 +11,5 @@ from spadwarp.analytic.sweeps import *
 from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _modules = (eye_safety, model, planning, result, sweeps)
+    _modules = (budgets, eye_safety, model, planning, result, sweeps)
     __all__ = guarded(__name__, sorted(name for module in _modules for name in module.__all__))

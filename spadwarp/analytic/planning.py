@@ -14,15 +14,15 @@ import operator
 import time as clock
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.analytic.budgets import OUTLIERS, axis_line, central_pixel, face_reflectance
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
 from spadwarp.analytic.model import false_peaks
-from spadwarp.analytic.sweeps import OUTLIERS, axis_line, central_pixel, face_reflectance
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
@@ -139,9 +139,6 @@ class Proposal:
     pilot: Pilot  # what was measured by Monte Carlo
     photons_needed: float  # photons of it that would judge, or those traced; infinite: more than 10⁴ times as many
     seconds_needed: float  # that they take here
-    channels: dict[str, Pilot] = field(default_factory=dict)
-    """The same without an analyser ("I"), at its angle ("co") and across it ("cross"); empty for a camera without
-    one."""
     largest_range: float = math.nan  # of a plane square to the axis, as asked for [m]; NaN: not sought, 0: none
     range_limit: str = ""  # what limits it
 
@@ -379,7 +376,6 @@ class _Planner:
         scene = scene.with_overrides(
             detector={"pulses_per_frame": pulses}, analytic={"pulses_per_depth_frame": depth_pulses}
         )
-        compared = CHANNELS if small.camera.channels and not even else ()
         line = axis_line(scene)
         optical_depth = scene.optical_depth(line.start[0].tolist(), line.points(span[0])[0].tolist())
         fluence = axis_fluence(scene, span[0]) * math.exp(-optical_depth)
@@ -409,7 +405,6 @@ class _Planner:
             pilot=pilot,
             photons_needed=traced * factor,
             seconds_needed=sum(run.timing.get("trace", math.nan) for run in runs) * factor,
-            channels={name: measure(runs, scene, self.device, channel=name) for name in compared},
         )
 
     def _settle(self, scene: Scene, runs: Sequence[Result], even: bool) -> tuple[Scene, str, float, EyeLimit, _Sample]:

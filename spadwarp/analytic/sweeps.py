@@ -1,333 +1,191 @@
-"""Photon budgets over range and water, and sweeps over any field of a scene: numbers before anything is simulated.
-
-Built on the analytic model (`spadwarp.analytic.model`), whose limits hold here too: light scattered more than once is
-left out, which in turbid water is most of the backscatter.
-"""
+"""Sweeps: the budget, or the plan of an experiment, over any fields of a scene."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, warn_of_model
-from spadwarp.analytic.result import simulate_analytic
+from spadwarp.analytic.budgets import LONGEST, BudgetRow, central_row
+from spadwarp.analytic.planning import plan
 from spadwarp.io.text import parse_toml
-from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene, parse_override
 from spadwarp.scene.sections import field_unit, locate, parse_key, takes_integers
-from spadwarp.scene.sight import LinesOfSight, lines_of_sight, pixel_directions
-from spadwarp.transport import truth_maps
 from spadwarp.values import (
     ArgumentError,
     ConfigError,
     SpadwarpWarning,
     check_choice,
     check_integer,
-    check_real,
     parse_number,
     quantity,
     shown,
 )
 
-__all__ = [
-    "OUTLIERS",
-    "TOLERANCE",
-    "BudgetRow",
-    "DepthErrorRow",
-    "Sweep",
-    "budget",
-    "parse_values",
-    "parse_vary",
-    "sweep",
-]
+__all__ = ["PlanRow", "Sweep", "combinations", "parse_values", "parse_vary", "sweep"]
 
-TOLERANCE = 0.01
-"""Depth error of `pulses_for_1cm` [m]."""
-OUTLIERS = 0.01
-"""Largest probability of a false peak at which a bound counts as reached."""
-
-_RANGES = (1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 50.0)
-_LONGEST = 10_000  # most values of a budget or a sweep
-_FROM_MAPS = ("arrival", "signal", "alpha", "signal_to_backscatter", "sigma_time", "sigma_depth", "outlier_probability")
+_ANALYSER = "camera.analyser"
 
 
 @dataclass(frozen=True, kw_only=True)
-class BudgetRow:
-    """A pixel on the optical axis and a face square to it."""
+class PlanRow:
+    """What `spadwarp.plan` finds for a scene."""
 
-    medium: str  # name of the water
-    extinction: float  # [1/m]
-    range: float  # distance of the face, behind a port the length of the bent ray [m]
-    optical_depth: float  # attenuation lengths of the way in the water, one way
-    gate_start: float  # [s]; the scene's gate where all ranges fall into it, else one as long around the return
-    gate_stop: float  # [s]
-    gate_moved: bool  # whether it is not the scene's
-    pulses: float
-    """Of one depth frame, for which the bound holds: `Scene.pulses_per_depth_frame`, or those of `analytic.frames`
-    detector frames with a count law per frame."""
-    arrival: float  # of the return [s]
-    signal: float  # S, detections of the return per pulse
-    background: float  # detections of backscatter, dark counts and ambient light per pulse within the gate
-    alpha: float  # all detections per pulse within the gate
-    signal_to_backscatter: float  # both per pulse within the gate
-    sigma_time: float  # Cramér–Rao bound of a depth frame [s]; NaN: no estimate
-    sigma_depth: float  # the same in depth [m]
-    outlier_probability: float  # of a false peak
-    pulses_for_1cm: float  # until the bound is 1 cm and less than 1 % of the fits are outliers; infinite beyond 1e18
-
-
-@dataclass(frozen=True, kw_only=True)
-class DepthErrorRow:
-    """Summary of the depth frames of a scene; statistics run over the pixels that have an estimate."""
-
-    sigma_depth: float  # median bound of depth [m]
-    sigma_depth_p90: float  # 90th percentile of the bound [m]
-    outlier_probability: float  # mean over pixels
-    estimate_fraction: float  # pixels with an estimate over pixels with a target
-    signal_to_backscatter: float  # median
+    pulses: float  # of a depth frame for the depth error; infinite: out of reach, NaN: not judged by the traced photons
+    pulses_least: float  # by what the traced photons leave open
+    pulses_most: float
+    frame_time: float  # for these pulses [s]
+    pulse_energy: float  # proposed [J]
+    sigma_depth: float  # Cramér–Rao bound with the pulses of the scene's own depth frame [m]
+    floor: float  # error that no number of pulses removes [m]
+    largest_range: float  # of a plane with the depth error, within the time [m]; NaN: not sought
+    limit: str  # largest part of the depth error
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Curves over one field: `rows[i]` belongs to `values[i]`."""
+    """Rows over the values of fields: `rows[i]` belongs to `values[i]`, which has a value for each of `fields`."""
 
-    field: str
-    values: tuple[Any, ...]
-    rows: tuple[BudgetRow, ...] | tuple[DepthErrorRow, ...]
+    fields: tuple[str, ...]
+    values: tuple[tuple[Any, ...], ...]
+    rows: tuple[BudgetRow, ...] | tuple[PlanRow, ...]
 
     @property
     def is_flat(self) -> bool:
         """Whether different values gave the same numbers throughout."""
         return len({repr(value) for value in self.values}) > 1 and len({repr(row) for row in self.rows}) == 1
 
-    def column(self, name: str) -> NDArray[np.float64]:
-        """One attribute of all rows."""
+    def column(self, name: str) -> NDArray[Any]:
+        """One attribute of all rows, or the values of one field."""
+        if name in self.fields:
+            return np.array([value[self.fields.index(name)] for value in self.values])
         return np.array([getattr(row, name) for row in self.rows], dtype=np.float64)
-
-
-def budget(
-    scene: SceneLike,
-    ranges: Iterable[float] | None = None,
-    media: Iterable[str] | Mapping[str, Mapping[str, Any]] | None = None,
-    *,
-    reflectance: float | None = None,
-    device: str | None = None,
-) -> list[BudgetRow]:
-    """Signal, background, depth error and pulses needed for 1 cm, over water and range.
-
-    Args:
-        scene: Laser, camera, detector, gate and `[analytic]` settings are taken from it; the target's shape is not.
-        ranges: Distances on the optical axis [m], 1e-6 to 1e6; default 1 to 50 m. Behind a port they are lengths of
-            the ray that it bends, and must be beyond it.
-        media: Names of presets, or name → fields of `[medium]`; default: the scene's water alone.
-        reflectance: Of the face, in [0, 1]; default: the number that the scene's first target has, else 0.5.
-        device: Warp device; default: the first GPU, else the CPU.
-
-    Returns a row for each water and range, in this order. A warning says where light is polarised, which the model
-    leaves out. Raises `ConfigError`: a water or scene that the model does not cover; `ArgumentError`: ranges or
-    reflectance out of range.
-    """
-    scene = as_scene(scene)
-    distances = _distances(scene, ranges)
-    reflectance = check_real("reflectance", face_reflectance(scene) if reflectance is None else reflectance, "[0, 1]")
-    if scene.analytic.backscatter == "monte_carlo":
-        raise ConfigError("analytic.backscatter = 'monte_carlo' belongs to one range; a budget takes 'single_scatter'")
-    warn_of_model(scene)
-    scenes: list[tuple[str | None, Scene]] = [(None, scene)]
-    if media is not None:
-        names = [media] if isinstance(media, str) else media
-        waters = media if isinstance(media, Mapping) else {name: {"preset": name} for name in names}
-        scenes = [(name, scene.with_overrides(medium=fields)) for name, fields in waters.items()]
-    return [row for name, water in scenes for row in axis_rows(water, name, distances, reflectance, device)]
 
 
 def sweep(
     scene: SceneLike,
     *,
-    vary: str | tuple[str, Sequence[Any]],
-    of: Literal["budget", "depth-error"] = "budget",
+    vary: str | tuple[str, Sequence[Any]] | Sequence[Any],
+    of: Literal["budget", "plan"] = "budget",
+    depth_error: float | str = 0.01,
+    time: float | str = 1.0,
+    photons: int | Literal["auto"] = "auto",
+    seed: int = 0,
+    largest_range: bool = True,
     device: str | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Sweep:
-    """The budget, or the error of depth frames, over any field of the scene.
+    """The budget, or the plan of the experiment, over any fields of the scene: in all combinations.
 
     Args:
         scene: The scene.
         vary: `"medium.extinction=0.1:2:20"` (from, to, number of values), the same with `:log` at the end for a
-            geometric progression, `"laser.pulse_energy=1 nJ,4 nJ"`, `"targets[0].translation[2]=5:15:11"`, or (field,
-            values).
-        of: `"budget"`: `BudgetRow` at the range of the target pixel nearest to the optical axis. `"depth-error"`:
-            `DepthErrorRow` over all pixels.
+            geometric progression, `"laser.pulse_energy=1 nJ,4 nJ"`, `"camera.port.preset=none,flat-glass"`, or (field,
+            values); or a list of these. A plan also varies `"range"`, that of a plane, and `"camera.analyser"`: "none",
+            "co" or "cross" to the laser's polarisation.
+        of: `"budget"`: `BudgetRow` by the analytic model, at the range of the target pixel nearest to the optical axis.
+            `"plan"`: `PlanRow`, by a Monte Carlo run for each combination.
+        depth_error, time, photons, seed, largest_range: Of a plan, as in `spadwarp.plan`.
         device: Warp device; default: the first GPU, else the CPU.
+        progress: Called with (values of a combination, how many are done, how many there are).
 
-    Where no number depends on the field, or where light is polarised, which the model leaves out, a warning says so.
+    Where no number depends on the fields, or where light is polarised, which the analytic model leaves out, a warning
+    says so.
 
-    Raises `ConfigError`: an unknown field, a value out of its range, a scene that the model does not cover;
-    `ArgumentError`: `vary` or `of` not of the form above.
+    Raises `ConfigError`: an unknown field, a value out of its range, a wavelength that the water does not follow, a
+    scene that the model does not cover; `ArgumentError`: `vary` or `of` not of the form above.
     """
-    scene = as_scene(scene)
-    row: Callable[[Scene, str | None], Any] = _central_row
-    if check_choice("of", of, ("budget", "depth-error")) == "depth-error":
-        row = _depth_error
-    if isinstance(vary, str):
-        field, values = parse_vary(vary)
-    elif isinstance(vary, tuple | list) and len(vary) == 2 and isinstance(vary[1], Iterable):
-        field, values = str(vary[0]), list(vary[1])
-    else:
-        raise ArgumentError(f"vary = {shown(vary)} is neither 'section.field=from:to:count' nor (field, values)")
-    check_integer("number of values to vary", len(values), f"[1, {_LONGEST}]")
-    rows = tuple(row(scene.with_overrides({field: value}), device) for value in values)
-    curves = Sweep(field=field, values=tuple(values), rows=rows)
+    fields, chosen = combinations(scene, vary)
+    planned = check_choice("of", of, ("budget", "plan")) == "plan"
+    rows = list[Any]()
+    for number, (values, changed, arguments) in enumerate(chosen):
+        if progress is not None:
+            progress(", ".join(map(str, values)), number, len(chosen))
+        if not planned:
+            if arguments:
+                raise ConfigError(f"{next(iter(arguments))} is of a plan, not of a budget: of = 'plan'")
+            rows.append(central_row(changed, device))
+            continue
+        options: Any = {"depth_error": depth_error, "time": time, "photons": photons, "seed": seed} | arguments
+        rows.append(_plan_row(changed, {**options, "largest_range": largest_range, "device": device}))
+    curves = Sweep(fields=fields, values=tuple(values for values, *_ in chosen), rows=tuple(rows))
     if curves.is_flat:
         hint = ""
-        if field == "detector.pulses_per_frame":
+        if fields == ("detector.pulses_per_frame",):
             hint = "; analytic.pulses_per_depth_frame or a count law per frame takes its place in this scene"
-        warnings.warn(
-            f"no number depends on {field}: the analytic model does not use it{hint}", SpadwarpWarning, stacklevel=2
-        )
+        text = f"no number depends on {' and '.join(fields)}: the model does not use it{hint}"
+        warnings.warn(text, SpadwarpWarning, stacklevel=2)
     return curves
 
 
-# Rows
-
-
-def axis_line(scene: Scene) -> LinesOfSight:
-    """The line of sight of the optical axis, `[1]`."""
-    return lines_of_sight(scene, np.array([[0.0, 0.0, 1.0]]))
-
-
-def face_reflectance(scene: Scene) -> float:
-    """The number that the scene's first target has as its reflectance, else 0.5."""
-    reflectance = scene.targets[0].reflectance if scene.targets else 0.5
-    return 0.5 if isinstance(reflectance, str) else reflectance
-
-
-def central_pixel(scene: Scene, truth: Truth) -> tuple[Any, ...]:
-    """Row and column of the target pixel nearest to the optical axis. Raises `ConfigError` without any."""
-    hit = ~np.isnan(truth.depth)
-    if not hit.any():
-        raise ConfigError("no target is in view", source=scene.source)
-    off_axis = np.where(hit, -pixel_directions(scene.camera)[..., 2], np.inf)
-    return np.unravel_index(np.argmin(off_axis), off_axis.shape)
-
-
-def axis_rows(
-    scene: Scene, name: str | None, distances: Map, reflectance: float, device: str | None
-) -> list[BudgetRow]:
-    """A row for each distance on the optical axis [m], for the scene's water of that name."""
-    gate = (scene.gate.start, scene.gate.stop)
-    line, length = axis_line(scene), gate[1] - gate[0]
-    arrival = np.array([line.path_from_range(distance)[0] for distance in distances]) / scene.medium.pulse_speed
-    gates = [(gate, distances)]
-    if not (gate[0] <= arrival.min() and arrival.max() <= gate[1]):
-        starts = np.maximum(arrival - 0.5 * length, 0.0)
-        gates = [((start, start + length), distances[i : i + 1]) for i, start in enumerate(starts)]
-    chosen, pulses = scene.analytic, float(scene.pulses_per_depth_frame)
-    if chosen.count_law != "per_pulse":
-        pulses = chosen.frames * chosen.exposure * scene.laser.repetition_rate
-    rows: list[BudgetRow] = []
-    for (start, stop), inside in gates:
-        maps, _ = pixel_maps(
-            scene,
-            view=np.tile([0.0, 0.0, 1.0], (inside.size, 1)),
-            distance=inside,
-            normal=-np.tile(line.direction, (inside.size, 1)),
-            reflectance=np.full(inside.size, reflectance),
-            device=device,
-            gate=(start, stop),
-        )
-        background = maps["backscatter"] + (scene.detector.noise_rate + maps["daylight"]) * (stop - start)
-        needed = _pulses_needed(scene, maps, background, stop - start, device)
-        depths = (inside - line.lead[0]) * scene.medium.extinction
-        if scene.medium.grid is not None:
-            start_point = line.start[0].tolist()
-            depths = np.array([scene.optical_depth(start_point, line.points([x])[0].tolist()) for x in inside])
-        for i, (distance, depth) in enumerate(zip(inside, depths, strict=True)):
-            rows.append(
-                BudgetRow(
-                    medium=name or scene.medium.preset or "scene",
-                    extinction=scene.medium.extinction,
-                    range=float(distance),
-                    optical_depth=float(depth),
-                    gate_start=start,
-                    gate_stop=stop,
-                    gate_moved=(start, stop) != gate,
-                    pulses=pulses,
-                    background=float(background[i]),
-                    pulses_for_1cm=float(needed[i]),
-                    **{field: float(maps[field][i]) for field in _FROM_MAPS},
-                )
-            )
-    return rows
-
-
-def _central_row(scene: Scene, device: str | None) -> BudgetRow:
-    warn_of_model(scene, stacklevel=4)
-    truth = truth_maps(scene)
-    pixel = central_pixel(scene, truth)
-    return axis_rows(scene, None, np.array([float(truth.range[pixel])]), float(truth.reflectance[pixel]), device)[0]
-
-
-def _depth_error(scene: Scene, device: str | None) -> DepthErrorRow:
-    result = simulate_analytic(scene, frames=0, device=device)
-    estimated = result.fisher > 0
-    count, targets = np.count_nonzero(estimated), np.count_nonzero(~np.isnan(result.truth.depth))
-
-    def over_pixels(values: Map, statistic: Callable[[Map], Any]) -> float:
-        return float(statistic(values[estimated])) if count else math.nan
-
-    return DepthErrorRow(
-        sigma_depth=over_pixels(result.sigma_depth, np.median),
-        sigma_depth_p90=over_pixels(result.sigma_depth, lambda values: np.quantile(values, 0.9)),
-        outlier_probability=over_pixels(result.outlier_probability, np.mean),
-        estimate_fraction=float(count / targets),
-        signal_to_backscatter=over_pixels(result.signal_to_backscatter, np.median),
+def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
+    found = plan(scene, **options)
+    known = math.inf if found.pulses_for in ("floor", "out of reach") else 1.0 if found.judged else math.nan
+    least, most = (known * pulses for pulses in found.pulses_range)
+    return PlanRow(
+        pulses=known * found.pulses,
+        pulses_least=least,
+        pulses_most=most,
+        frame_time=known * found.frame_time,
+        pulse_energy=found.scene.laser.pulse_energy,
+        sigma_depth=found.pilot.bound / math.sqrt(scene.pulses_per_depth_frame),
+        floor=math.hypot(found.pilot.floor[found.method], found.pilot.pile_up[found.method]),
+        largest_range=found.largest_range,
+        limit=found.limit if found.judged else "not judged: more photons",
     )
 
 
-def _distances(scene: Scene, ranges: Any) -> Map:
-    lead = float(axis_line(scene).lead[0])
-    if ranges is None:
-        return np.array([x for x in _RANGES if x > lead] or [lead + x for x in _RANGES])
-    if isinstance(ranges, str | bytes) or not isinstance(ranges, Iterable):
-        raise ArgumentError(f"ranges = {shown(ranges)} is not a list of distances [m]")
-    distances = sorted(check_real("ranges: an item", item, "[1e-6, 1e6] m") for item in ranges)
-    check_integer("number of ranges", len(distances), f"[1, {_LONGEST}]")
-    if distances[0] <= lead:
-        raise ArgumentError(f"ranges: {distances[0]:g} m is not beyond the camera's port, which ends at {lead:g} m")
-    return np.array(distances)
-
-
-def _pulses_needed(scene: Scene, maps: Mapping[str, Map], background: Map, gate: float, device: str | None) -> Map:
-    """Pulses until the bound of depth is within `TOLERANCE` and outliers are rarer than `OUTLIERS`; bisects ln N."""
-    chosen, alpha = scene.analytic, maps["alpha"]
-    per_acquisition = 1.0 if chosen.count_law == "per_pulse" else chosen.exposure * scene.laser.repetition_rate
-    if chosen.count_law == "per_frame_lu2024":
-        recorded = -np.expm1(per_acquisition * np.log1p(-np.minimum(alpha, 1 - 1e-16)))
-    else:
-        recorded = -np.expm1(-alpha * per_acquisition)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth_per_time = maps["sigma_depth"] / maps["sigma_time"]
-        enough = (depth_per_time / TOLERANCE) ** 2 / maps["fisher"]  # recorded photons
-        share = np.maximum(alpha - background, 0.0) / alpha
-        level = maps["background_level"] / alpha
-    lengths = np.full_like(alpha, gate / response_sigma(scene))
-    low, high = np.zeros_like(alpha), np.full_like(alpha, math.log(1e18))
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        photons = np.exp(middle) * recorded
-        reached = (photons >= enough) & (false_peaks(photons * share, photons * level, lengths, device) <= OUTLIERS)
-        low, high = np.where(reached, low, middle), np.where(reached, middle, high)
-    pulses = np.exp(high) * per_acquisition
-    return np.where((maps["fisher"] > 0) & (high < math.log(1e18) * (1 - 1e-9)), pulses, np.inf)
-
-
 # Values to vary
+
+
+def combinations(scene: SceneLike, vary: Any) -> tuple[tuple[str, ...], list[tuple[tuple[Any, ...], Scene, dict]]]:
+    """The fields that `sweep` varies; of each combination its values, its scene, and arguments of `plan`."""
+    scene = as_scene(scene)
+    pair = isinstance(vary, tuple | list) and len(vary) == 2 and isinstance(vary[0], str) and "=" not in vary[0]
+    curves = []
+    for one in [vary] if isinstance(vary, str) or pair or not isinstance(vary, tuple | list) else vary:
+        if isinstance(one, str):
+            curves.append(parse_vary(one))
+        elif isinstance(one, tuple | list) and len(one) == 2 and isinstance(one[1], Iterable):
+            curves.append((str(one[0]), list(one[1])))
+        else:
+            raise ArgumentError(f"vary = {shown(one)} is neither 'section.field=from:to:count' nor (field, values)")
+    check_integer("number of values to vary", math.prod(len(values) for _, values in curves), f"[1, {LONGEST}]")
+    fields = tuple(field for field, _ in curves)
+    waves = dict(curves).get("laser.wavelength_nm", ())
+    follows = scene.medium.chlorophyll is not None or any(field.startswith("medium.") for field in fields)
+    if not follows and any(isinstance(wave, float | int) and abs(wave - 532.0) > 10.0 for wave in waves):
+        raise ConfigError(
+            f"laser.wavelength_nm = {', '.join(map(str, waves))}: each has its own water, and the coefficients of the "
+            "medium would stay the same: give medium.chlorophyll [mg/m³] instead (0.05 clear ocean, 5 coast)",
+            source=scene.source,
+        )
+    chosen = []
+    for values in itertools.product(*(values for _, values in curves)):
+        overrides, arguments = dict[str, Any](), dict[str, Any]()
+        for field, value in zip(fields, values, strict=True):
+            if field == "range":
+                arguments["ranges"] = (value, value)
+            elif field == _ANALYSER:
+                arguments["channel"] = "I" if value == "none" else value
+                if value != "none" and not scene.camera.channels:
+                    overrides["camera.polarisation"] = "analyser"
+            elif field.endswith(".preset") and value == "none":
+                overrides[field.removesuffix(".preset")] = None
+            else:
+                overrides[field] = value
+        changed = scene.with_overrides(overrides)
+        if "channel" in arguments and changed.laser.polarisation == "none":
+            text = "is for polarised lasers: laser.polarisation = 'linear'"
+            raise ConfigError(f"{_ANALYSER} = {arguments['channel']!r} {text}", source=scene.source)
+        chosen.append((values, changed, arguments))
+    return fields, chosen
 
 
 def parse_vary(text: str) -> tuple[str, list[Any]]:
@@ -340,7 +198,7 @@ def parse_vary(text: str) -> tuple[str, list[Any]]:
     if not field or not equals or not spec:
         raise ArgumentError(f"vary = {shown(text)} is not of the form section.field=from:to:count")
     info = locate(Scene, parse_key(field))[1]
-    unit = field_unit(info) if info is not None else None
+    unit = "m" if field == "range" else field_unit(info) if info is not None else None
     values = parse_values(spec, unit, name=f"vary: {field}")
     if ":" in spec and info is not None and takes_integers(info):
         values = list(dict.fromkeys(round(value) for value in values))
@@ -375,7 +233,7 @@ def parse_values(text: str, unit: str | None, *, name: str) -> list[Any]:
         ) from None
     whole = int(count) if float(count).is_integer() and abs(count) < 1e15 else count
     fewest = 1 if low == high else 2
-    count = check_integer(f"{name} = {shown(text)}: the number of values", whole, f"[{fewest}, {_LONGEST}]")
+    count = check_integer(f"{name} = {shown(text)}: the number of values", whole, f"[{fewest}, {LONGEST}]")
     return [float(value) for value in (np.geomspace if geometric else np.linspace)(low, high, count)]
 
 

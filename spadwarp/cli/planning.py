@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,14 +13,14 @@ import typer
 
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import complain, say, wrong
+from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, progress, readable, rows, short, show_table, write_json, written
 from spadwarp.values import ArgumentError, count, shown, with_prefix
 
 if TYPE_CHECKING:
     from spadwarp import Scene
-    from spadwarp.analytic import BudgetRow, DepthErrorRow, Proposal
+    from spadwarp.analytic import BudgetRow, PlanRow, Proposal
     from spadwarp.water import ParticleOptics
 
 
@@ -53,6 +54,13 @@ def check(
         spadwarp.viz.draw_water(read, picture, triangles)
         say(f"written: {picture}")
     write_json({"scene": scene, **numbers, "messages": [dataclasses.asdict(message) for message in messages]})
+
+
+def _warnings(scene: Scene, but: str = "") -> list[str]:
+    """What `check` warns of, but for what a plan proposes or traces otherwise, and for fields that begin so."""
+    found = (message for message in spadwarp.check(scene) if message.level == "warning")
+    own = ("transport", *filter(None, [but]))
+    return [str(one) for one in found if not one.field.startswith(own) and "outside the gate" not in one.text]
 
 
 _Range = Annotated[tuple[float, float], opt.from_to("m")]
@@ -105,11 +113,8 @@ def plan(
     """
     read = opt.read_scene(scene, overrides, mesh=mesh)
     check_outputs(files={"--write": write}, inputs=(scene, *read.files))
-    # What `check` warns of, but for what is proposed or traced otherwise here.
-    for message in spadwarp.check(read):
-        ours = message.field.startswith("transport") or "outside the gate" in message.text
-        if message.level == "warning" and not ours and not (range_ and message.field.startswith("targets")):
-            complain(str(message))
+    for text in _warnings(read, but="targets" if range_ else ""):
+        complain(text)
     found = spadwarp.plan(
         read,
         depth_error=depth_error,
@@ -132,7 +137,7 @@ def plan(
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
         spadwarp.io.write_text(made + found.scene.to_toml(folder=file.parent), file)
     say(_verdict(found))
-    hidden = ["pilot", "channels", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
+    hidden = ["pilot", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
     hidden += [] if found.judged else ["pulses", "pulses_for", "frame_time", "reached", "pile_up_energy"]
     values = {name: value for name, value in found.to_dict().items() if name not in hidden}
     if not found.judged:
@@ -142,8 +147,6 @@ def plan(
         say(f"largest range, for a plane square to the optical axis: {found.largest_range:.3g} m; {found.range_limit}")
     if found.judged:
         say(rows(_terms(found)))
-        for name in ("co", "cross") if found.channels else ():
-            say(_reception(found, name))
         say(f"What would help: {found.advice}.")
     for file in files:
         say(f"written: {file}")
@@ -174,21 +177,6 @@ def _verdict(found: Proposal) -> str:
     return f"A depth error of {asked} is out of reach: {total} with {pulses}; limit: {found.limit}."
 
 
-def _reception(found: Proposal, name: str) -> str:
-    """What a channel of the analyser keeps of all light."""
-    whole, part = found.channels["I"], found.channels[name]
-
-    def share(field: str) -> str:
-        return f"{100 * getattr(part, field) / getattr(whole, field):.3g} %" if getattr(whole, field) else "none"
-
-    text = f"{name.capitalize()}-polarised reception keeps {share('target')} of the target's light"
-    text += f", {share('backscatter')} of the backscatter and {share('noise')} of the noise"
-    if not math.isfinite(part.bound) or not math.isfinite(whole.bound):
-        return text + "."
-    ratio = part.bound / whole.bound
-    return f"{text}; the same Cramér–Rao bound takes {ratio**2:.2g} times the pulses."
-
-
 def _terms(found: Proposal) -> dict[str, str]:
     """The parts of the depth error at the proposed pulses."""
     pilot = found.pilot
@@ -212,41 +200,52 @@ def _terms(found: Proposal) -> dict[str, str]:
 def sweep(
     scene: Path,
     *,
-    vary: str | None = None,
+    vary: list[str] | None = None,
     medium: list[str] | None = None,
     reflectance: float | None = None,
-    of: Literal["budget", "depth-error"] = "budget",
+    of: Literal["budget", "plan"] | None = None,
+    depth_error: opt.Length = 0.01,
+    time: opt.Seconds = 1.0,
+    photons: int | None = None,
+    seed: int = 0,
+    no_range: bool = False,
     out: Path | None = None,
     overrides: list[str] | None = None,
     device: str | None = None,
 ) -> None:
-    """Photon budget, or depth error, over range and water, or over any field of the scene.
+    """Photon budget over range and water, or the plan of an experiment over any fields of the scene.
 
-    By the analytic model, per pulse and pixel. Depth errors are those of one depth frame:
-    analytic.pulses_per_depth_frame, else detector.pulses_per_frame. In brackets they are not reached: more than 1 % of
-    the fits would find a false peak. Where a return misses the scene's gate, gates as long follow the returns, marked
-    *.
+    A budget is analytic, of unscattered light, per pulse and pixel. Where a return misses the scene's gate, gates as
+    long follow the returns, marked *. A plan is that of `spadwarp plan` for each combination of values: pulses for the
+    depth error, the bound with the pulses of the scene's own depth frame, the largest range, what limits the error.
 
     Args:
-        vary (FIELD=FROM:TO:N): Field and values, which may have units; with :log a geometric progression; or a,b,c. By
-            default "range", of a surface on the optical axis, 1 to 50 m.
+        vary (FIELD=VALUES): Field, and FROM:TO:N (with :log a geometric progression) or A,B,C, with units or words; may
+            be repeated. By default "range" of a surface on the optical axis, 1 to 50 m. A plan also takes
+            camera.analyser=none,co,cross (to the laser's polarisation), and none for the preset of a port.
         medium: With range: a named water; may be repeated. By default the scene's.
         reflectance: With range: of the surface; by default that of the first target.
-        of: Budget of the central pixel, or depth error of all pixels.
-        out (DIR): Directory for sweep.png and sweep.csv; with range, budget.png and budget.csv.
+        of: By default a budget; a plan where several fields vary.
+        depth_error (LENGTH): Of a plan, asked for [m].
+        time (TIME): Of a plan, the longest for a depth frame [s].
+        photons: Of a plan, for each combination. By default as many as judge, or 60 s.
+        no_range: Of a plan: do not look for the largest range.
+        out (DIR): Directory for sweep.png and sweep.csv; with a budget over range, budget.png and budget.csv.
 
     \b
     Examples:
       spadwarp sweep configs/scenes/harbour_5m.toml --vary range=1:10:10 --medium petzold-nuc-2240 --medium uwoc-clear
-      spadwarp sweep staircase_5m --vary 'targets[0].translation[2]=3:8:11' --of depth-error --out sweep/
+      spadwarp sweep staircase_5m --set medium.chlorophyll=0.5 --set laser.polarisation=linear --no-range \\
+          --vary laser.wavelength_nm=480,532 --vary camera.analyser=none,cross --out sweep/
     """
     read = opt.read_scene(scene, overrides)
-    field, _, values = (vary or "range=").partition("=")
-    of_range = field.strip() == "range"
-    if of_range:
-        opt.refuse("needs --vary with a field of the scene", "--of")
-    else:
-        opt.refuse("is for --vary range=FROM:TO:N", "--medium", "--reflectance")
+    texts = vary or ["range="]
+    of = of or ("budget" if len(texts) == 1 and not texts[0].strip().startswith("camera.analyser") else "plan")
+    of_range = of == "budget" and len(texts) == 1 and texts[0].partition("=")[0].strip() == "range"
+    if not of_range:
+        opt.refuse("is for a budget over range: --vary range=FROM:TO:N", "--medium", "--reflectance")
+    if of == "budget":
+        opt.refuse("is for --of plan", "--depth-error", "--time", "--photons", "--seed", "--no-range")
     stem = "budget" if of_range else "sweep"
     check_outputs(out, (f"{stem}.png", f"{stem}.csv"), inputs=(scene, *read.files))
     summary: dict[str, Any] = {}
@@ -254,24 +253,37 @@ def sweep(
     lines: Any
     draw: Any
     if of_range:
-        lines = found = spadwarp.budget(read, _ranges(values), medium or None, reflectance=reflectance, device=device)
-        title, names, draw = "water", [row.medium for row in found], spadwarp.viz.draw_budget
+        values = _ranges(texts[0].partition("=")[2])
+        lines = found = spadwarp.budget(read, values, medium or None, reflectance=reflectance, device=device)
+        keys, draw = [{"water": row.medium} for row in found], spadwarp.viz.draw_budget
     else:
-        found = spadwarp.sweep(read, vary=str(vary), of=of, device=device)
-        title, lines, draw = found.field, found.rows, spadwarp.viz.draw_sweep
-        names = [f"{value:.5g}" if isinstance(value, float) else str(value) for value in found.values]
-        summary = {"field": found.field, "values": list(found.values), "of": of}
+        _, chosen = spadwarp.analytic.combinations(read, texts)
+        for text in dict.fromkeys(text for _, changed, _ in chosen for text in _warnings(changed)):
+            complain(text)
+        planned: dict[str, Any] = {"depth_error": depth_error, "time": time, "photons": photons or "auto", "seed": seed}
+        show = None if of == "budget" else lambda name, done, all: note(f"{name} ({done + 1} of {all})")
+        planned |= {"largest_range": not no_range, "progress": show}
+        found = spadwarp.sweep(read, vary=texts, of=of, device=device, **planned)
+        lines, draw = found.rows, spadwarp.viz.draw_sweep
+        keys = [dict(zip(found.fields, value, strict=True)) for value in found.values]
+        summary = {"fields": found.fields, "values": found.values, "of": of}
     plain = [dataclasses.asdict(row) for row in lines]
     files = []
     if out is not None:
         draw(found, out / f"{stem}.png")
-        table = plain if of_range else [{title: value, **row} for value, row in zip(found.values, plain, strict=True)]
+        table = plain if of_range else [{**key, **row} for key, row in zip(keys, plain, strict=True)]
         files = [out / f"{stem}.png", spadwarp.io.write_csv(table, out / f"{stem}.csv")]
-    cells = _budget_cells if of == "budget" else _error_cells
+    cells: Callable[[Any], dict[str, Any]] = _budget_cells
     if of == "budget":
-        say("of unscattered light alone, by the analytic model; `spadwarp plan` has the pulses of all light")
+        say(
+            "of unscattered light alone, by the analytic model; `spadwarp plan` has the pulses of all light: 1.3 times "
+            "as much at an optical depth of 0.2 in usual water, 3.6 times at 1"
+        )
+    else:
+        cells = partial(_plan_cells, pulses=read.pulses_per_depth_frame)
+        say(f"of all light, by `spadwarp plan`; pulses for a depth error of {1e3 * depth_error:.3g} mm")
     show_table(
-        ({title: name, **cells(row)} for name, row in zip(names, lines, strict=True)), keys=2 if of == "budget" else 1
+        ({**key, **cells(row)} for key, row in zip(keys, lines, strict=True)), keys=len(keys[0]) + (of == "budget")
     )
     for text in _budget_notes(lines, read) if of == "budget" else ():
         say(text)
@@ -304,7 +316,7 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
 
     return {
         "range [m]": f"{row.range:.4g}",
-        "c·r": row.optical_depth,
+        "optical depth": row.optical_depth,
         "gate [ns]": f"{1e9 * row.gate_start:.4g}-{1e9 * row.gate_stop:.4g}{'*' if row.gate_moved else ' '}",
         "pulses": pulses(row.pulses),
         "signal": row.signal,
@@ -325,17 +337,21 @@ def _in_percent(value: float) -> str:
     return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
 
 
-def _error_cells(row: DepthErrorRow) -> dict[str, Any]:
+def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:
+    def text(value: float) -> str:
+        return "not judged" if math.isnan(value) else "out of reach" if math.isinf(value) else count(value)
+
     return {
-        "σ* median [mm]": 1e3 * row.sigma_depth,
-        "σ* 90 % below [mm]": 1e3 * row.sigma_depth_p90,
-        "outliers": _in_percent(row.outlier_probability),
-        "pixels with an estimate": _in_percent(row.estimate_fraction),
-        "signal/backscatter": row.signal_to_backscatter,
+        "pulses": text(row.pulses),
+        "from": text(row.pulses_least),
+        "to": text(row.pulses_most),
+        "time": with_prefix(row.frame_time, "s") if math.isfinite(row.frame_time) else "-",
+        "pulse energy": with_prefix(row.pulse_energy, "J"),
+        f"bound [mm] of {count(pulses)} pulses": 1e3 * row.sigma_depth,
+        "floor [mm]": 1e3 * row.floor,
+        **({} if math.isnan(row.largest_range) else {"largest range [m]": row.largest_range}),
+        "limit": row.limit,
     }
-
-
-_SCATTERS = 0.2  # optical depth: from here on scattered light adds more than a quarter to a target's
 
 
 def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
@@ -346,12 +362,6 @@ def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
         notes.append(
             f"* not the scene's gate, {gate.start_ns:.4g}-{gate.stop * 1e9:.4g} ns, which misses the return of one of "
             "the ranges, but one as long around the return"
-        )
-    if any(row.optical_depth > _SCATTERS for row in found):
-        notes.append(
-            "signal: unscattered light alone. In water that scatters, more light comes back from a target: in a view "
-            "of 10° of a plane at 5 m, in water of albedo 0.83 and anisotropy 0.924, 1.3 times as much at c·r = 0.2 "
-            "and 3.6 times at 1; `spadwarp plan` traces all of it"
         )
     own, detector = scene.analytic.pulses_per_depth_frame, scene.detector.pulses_per_frame
     if scene.analytic.count_law == "per_pulse" and own is not None and own != detector:

@@ -334,9 +334,4 @@ def load_recipe(path: str | os.PathLike[str]) -> Recipe:
     Raises `FileError` if it cannot be read, `ConfigError` with a line for each problem in it.
     """
     path = example_or_path(path, "datasets")
-    tables = read_toml(path)
-    if {"laser", "camera"} <= set(tables) and "scene" not in tables:
-        raise ConfigError(
-            "a scene, not a recipe; a recipe has such tables in [scene], see `spadwarp list datasets`", source=str(path)
-        )
-    return Recipe.from_dict(tables, source=path)
+    return Recipe.from_dict(read_toml(path), source=path)

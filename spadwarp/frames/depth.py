@@ -317,15 +317,18 @@ def depth_of(
 
     Raises `ArgumentError`: something that is needed is missing, given twice or out of range.
     """
-    if histograms.bin_width is None:
-        raise ArgumentError("bin width is missing (bin_width): the file does not hold it")
-    index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
-    values = histograms.values
+    values, filtered = histograms.values, method in ("matched", "likelihood")
     height, width = values.shape[-3:-1]
-    filtered = method in ("matched", "likelihood")
     response = histograms.response if filtered else histograms.irf
-    if filtered and response is None:
-        raise ArgumentError(f"method = {method!r} needs an instrument response (irf)")
+    missing = {
+        "bin width is missing (bin_width): the file does not hold it": histograms.bin_width,
+        "group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater": histograms.scene
+        or group_index,
+        f"method = {method!r} needs an instrument response (irf)": response if filtered else "",
+    }
+    if any(value is None for value in missing.values()):
+        raise ArgumentError("; ".join(text for text, value in missing.items() if value is None))
+    index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
     known: Any = histograms.background if background is None else background
     level_known = known is not None and (histograms.level_known if background is None else background != "median")
     if background == "median" or (known is None and method == "likelihood"):
@@ -361,8 +364,6 @@ def _geometry(
         if group_index is not None or horizontal_fov_deg is not None:
             raise ArgumentError("group index and field of view are those of the file's scene")
         return scene.medium.group_index, lines_of_sight(scene)
-    if group_index is None:
-        raise ArgumentError("group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater")
     index = check_real("group index", group_index, field_range(Medium, "group_index"))
     if horizontal_fov_deg is None:
         return index, None

@@ -54,22 +54,27 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
 
 
 def similar(path: str | os.PathLike[str]) -> str:
-    """Addition to an error about a missing file, `; did you mean 'planned.toml'?`: one of that ending beside it."""
+    """Addition to an error about a missing file, `; did you mean 'planned.toml'?`: one beside it, of that ending if
+    there are some."""
     place = Path(path)
     try:
-        beside = [name for name in os.listdir(place.parent) if name.endswith(place.suffix)]
+        beside = os.listdir(place.parent)
     except (OSError, ValueError):
         return ""
-    return suggestion(place.name, beside)
+    return suggestion(place.name, [name for name in beside if name.endswith(place.suffix)] or beside)
 
 
 def used(path: str | os.PathLike[str]) -> str:
-    """Addition to an error about a file of another kind: how a scene, a mesh or a result is used."""
+    """Addition to an error about a file of another kind: how a scene, a mesh, a picture, counts or a result is used."""
     ending = Path(path).suffix.lower()
     if ending == ".toml":
         return f"; if it is a scene, `spadwarp simulate {path} --out DIR` makes a result of it"
     if ending in MESH_ENDINGS:
         return f"; a mesh goes into a scene: `spadwarp simulate SCENE --mesh {path} --out DIR`"
+    if ending in (".exr", ".png"):
+        return f"; a picture holds no histograms; give its run, the folder {Path(path).parent}"
+    if ending in (".npy", ".npz", ".mat", ".ptu"):
+        return f"; if it holds counts, `spadwarp depth {path} --out DIR` makes depth of them"
     if ending in (".h5", ".hdf5"):
         return "; HDF5 files hold results, and a scene is a .toml file"
     return ""

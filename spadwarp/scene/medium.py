@@ -187,7 +187,8 @@ class Medium(Water):
     phase_table: Annotated[str | None, FilePath(".csv", tuple(PHASE_TABLES))] = None
     """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
     scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
-    """what scattering does to the polarisation of light, over any phase function; "none": light is not polarised"""
+    """what scattering does to the polarisation of light, over any phase function; "none": light is not polarised; if
+    it is, "voss_fry", or "rayleigh" with that phase function"""
     matrix_table: CsvFile = None
     """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp water` writes one
     """

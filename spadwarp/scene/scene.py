@@ -55,8 +55,19 @@ class Scene(Shown, Document):
             self.__dict__["medium"] = self.medium.at_wavelength(self.laser.wavelength_nm)
         except ValueError as error:
             yield f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold"
+        if self.polarised:
+            self._polarise()
         yield from self._exclusions()
         yield from self._blocked_ports()
+
+    def _polarise(self) -> None:
+        """Sets what polarised light needs where the defaults are without it."""
+        medium, transport = self.medium, self.transport
+        if transport.axis_threshold == Transport().axis_threshold:
+            self.__dict__["transport"] = transport.model_copy(update={"axis_threshold": 1.0})
+        if medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
+            matrix = "rayleigh" if medium.phase_function == "rayleigh" else "voss_fry"
+            self.__dict__["medium"] = medium.model_copy(update={"scattering_matrix": matrix})
 
     def _exclusions(self) -> Iterator[str]:
         """Why sections exclude each other."""
@@ -72,16 +83,10 @@ class Scene(Shown, Document):
             yield f"medium.layers: {len(medium.layers)} given; daylight takes one water"
         if self.daylight is not None and medium.grid is not None:
             yield f"medium.grid {goes} daylight, which takes one water: leave one of them out"
-        words = f"laser.polarisation = {self.laser.polarisation!r}, camera.polarisation = {self.camera.polarisation!r}"
         if self.polarised and transport.axis_threshold < 1.0:
             yield (
-                f"transport.axis_threshold = {transport.axis_threshold} {goes} polarised light ({words}): set it to 1, "
-                "for directions without the near-axis rule"
-            )
-        if self.polarised and medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
-            yield (
-                f"medium.scattering_matrix = 'none' {goes} polarised light ({words}) in water that scatters: choose "
-                "'rayleigh', 'scaled_rayleigh', 'voss_fry' or 'tabulated'"
+                f"transport.axis_threshold = {transport.axis_threshold} {goes} polarised light: leave it out, or set "
+                "it to 1, for directions without the near-axis rule"
             )
         for k, target in enumerate(self.targets if self.polarised else ()):
             if target.specular > 0.0 and abs(target.specular_index / medium.phase_index - 1.0) < 1e-3:
@@ -242,10 +247,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
         raise FileError(f"{path}: a directory, not a scene" + (f"; that of its run is {run}" if run.is_file() else ""))
     if path.suffix.lower() in (*MESH_ENDINGS, ".h5", ".hdf5") and path.is_file():
         raise FileError(f"{path}: not a scene{used(path)}")
-    tables = read_toml(path)
-    if "scene" in tables and "laser" not in tables:
-        raise ConfigError("a recipe of a dataset, for `spadwarp dataset`, not a scene", source=str(path))
-    return Scene.from_dict(tables, overrides=overrides, source=path)
+    return Scene.from_dict(read_toml(path), overrides=overrides, source=path)
 
 
 def template() -> str:

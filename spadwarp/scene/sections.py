@@ -438,6 +438,13 @@ def read_table(field: str, path: str | Path, columns: Mapping[str, str]) -> NDAr
 
 # Documents
 
+# Field that one kind of file has: the kind, and how `spadwarp list` calls its examples.
+_FILES = {
+    "camera": ("a scene", "scenes"),
+    "scene": ("a recipe of a dataset", "datasets"),
+    "model": ("a recipe of a training", "training"),
+}
+
 
 class Document(Section):
     """What a TOML file holds. Documents are equal in every field; where they came from does not matter."""
@@ -456,6 +463,10 @@ class Document(Section):
         """
         file = None if source is None else Path(source)
         folder = None if file is None else file.absolute().parent
+        own, (kind, examples) = next(item for item in _FILES.items() if item[0] in cls.model_fields)
+        for mark, (other, _) in _FILES.items():
+            if mark in tables and own not in tables:
+                raise ConfigError(f"{other}; {kind} is needed, see `spadwarp list {examples}`", source=file)
         here = folder if cls.overrides_beside_file else Path.cwd()
         layer, items = dict[str, Any](), dict[str, Any]()
         try:
@@ -720,13 +731,15 @@ def _is_overridden(key: Key, layer: Any) -> bool:
 def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel], overridden: bool) -> str:
     name = key_text(key)
     name = name if len(name) <= 200 else f"{name[:200]}..."
-    kind, value = problem["type"], problem["input"]
+    kind, value, whole = problem["type"], problem["input"], model
     if kind == "extra_forbidden":
         for part in (part for part in key[:-1] if isinstance(part, str)):
             model = models_of(model.model_fields[part])[0]
         word, siblings = str(key[-1]), list(model.model_fields)
         meant = _SYNONYMS.get(word)
         hint = f"; did you mean {meant!r}?" if meant in siblings else suggestion(word, siblings)
+        homes = [home for home in whole.model_fields if word in getattr(table_of(whole, home), "model_fields", ())]
+        hint = f"; did you mean {' or '.join(f'{home}.{word}' for home in homes[:2])}?" if homes else hint
         hint = hint or f"; known are {', '.join(siblings)}"
         return f"{name} is not a known {'field' if len(key) > 1 else 'section'}{hint}"
     if kind == "missing" and not isinstance(key[-1], int):

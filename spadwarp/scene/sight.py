@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 _LEAST = 1e-9
 _STEPS = 30
 
-_MOST_LONG = 4096  # triangles that rays are held against
+
 _GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
 
 
@@ -245,30 +245,6 @@ def points_inside(triangles: Floats, planes: Floats) -> Floats:
     return np.concatenate([_spread(triangles[whole]), _spread(cut)])
 
 
-def points_on_rays(triangles: Floats, start: Floats, direction: Floats) -> Floats:
-    """Points at which rays meet triangles, behind one another too, `[N, 3]` (Möller & Trumbore 1997).
-
-    Of the triangles that are long against the distance of the rays from one another: points on others are close to
-    corners. `start`, `direction`: `[R, 3]`.
-    """
-    sides = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    nearest = np.linalg.norm(triangles.mean(axis=1), axis=1) - sides
-    long = triangles[sides > 0.02 * np.maximum(nearest, 0.0)][:_MOST_LONG]
-    known = np.isfinite(direction).all(axis=1)
-    start, direction = start[known], direction[known]
-    found = [np.zeros((0, 3))]
-    for corner, first, second in zip(long[:, 0], long[:, 1] - long[:, 0], long[:, 2] - long[:, 0], strict=True):
-        across = np.cross(direction, second)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = 1.0 / (across @ first)
-            away = start - corner
-            u, turned = (away * across).sum(axis=1) * scale, np.cross(away, first)
-            v, distance = (direction * turned).sum(axis=1) * scale, (turned @ second) * scale
-            hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (distance > 0.0)
-        found.append(start[hit] + distance[hit, None] * direction[hit])
-    return np.concatenate(found)
-
-
 def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
     """What is in the housing or the window of the camera's port and is not meant for it, a laser that shines through no
     port, or parts of triangles: the field, and a text about it."""
@@ -300,7 +276,8 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
 
 
 def _spread(triangles: Floats) -> Floats:
-    """Points evenly over each triangle; of many triangles the corners alone."""
+    """Points evenly over each triangle, of many triangles near the corners alone; just inside, where rays meet it."""
     steps = 6 if len(triangles) < 2000 else 1
     weights = [(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]
-    return np.einsum("wc,fcx->fwx", np.array(weights) / steps, triangles).reshape(-1, 3)
+    inside = 1e-5 / 3.0 + (1.0 - 1e-5) * np.array(weights) / steps
+    return np.einsum("wc,fcx->fwx", inside, triangles).reshape(-1, 3)

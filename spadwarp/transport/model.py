@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -516,6 +517,16 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     depth, ranges, normal, reflectance = trace_rays(model, origins, directions, shape)
     ranges = ranges if lead is None else (ranges + lead).astype(np.float32)
     return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
+
+
+def first_hits(triangles: NDArray[np.float64], start: Any, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances [m] along rays `[N, 3]` of the nearest of triangles `[F, 3, 3]`; NaN: none."""
+    device, corners = wp.get_device("cpu"), triangles.reshape(-1, 3)
+    faces: wp.array = wp.array(np.arange(len(corners)), dtype=int, device=device)
+    mesh = wp.Mesh(wp.array(corners, dtype=wp.vec3, device=device), faces)
+    model: Any = SimpleNamespace(device=device, camera=sk.Camera(), surfaces=sk.make_surfaces(mesh, 0.5), mesh=mesh)
+    origins = np.broadcast_to(np.asarray(start, np.float64), direction.shape)
+    return trace_rays(model, origins[None], direction[None], (1, len(direction)))[1][0].astype(np.float64)
 
 
 def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int, int]) -> list[NDArray[np.float32]]:

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from spadwarp.analytic.sweeps import OUTLIERS, TOLERANCE, BudgetRow, Sweep
+from spadwarp.analytic.budgets import OUTLIERS, TOLERANCE, BudgetRow
+from spadwarp.analytic.sweeps import Sweep
 from spadwarp.scene import Scene
 from spadwarp.scene.sections import field_unit, locate, parse_key
 from spadwarp.viz import style
@@ -28,83 +29,85 @@ _COLUMNS: dict[str, tuple[str, float, tuple[float, float]]] = {
     "sigma_depth": ("depth error, Cramér–Rao [mm]", 1e3, (1e-3, 1e4)),
     "signal_to_backscatter": ("signal to backscatter", 1.0, (1e-6, 1e6)),
     "pulses_for_1cm": ("pulses for 1 cm", 1.0, (1.0, 1e12)),
-    "outlier_probability": ("outlier probability", 1.0, (0.0, 1.0)),
-    "estimate_fraction": ("pixels with an estimate", 1.0, (0.0, 1.0)),
+    "pulses": ("pulses for the depth error", 1.0, (1.0, 1e12)),
+    "largest_range": ("largest range [m]", 1.0, (0.0, 1e3)),
 }
 _OF_BUDGETS = ("signal", "sigma_depth", "signal_to_backscatter", "pulses_for_1cm")
-_OF_ERRORS = ("sigma_depth", "outlier_probability", "estimate_fraction", "signal_to_backscatter")
+_OF_PLANS = ("pulses", "sigma_depth", "largest_range")
 
 
-@paper()
 def draw_budget(rows: Sequence[BudgetRow], path: str | Path | None = None, *, width: float = PAGE) -> Figure:
     """Four panels over range, a line for each water: signal, depth error, signal to backscatter, pulses for 1 cm.
 
-    Where more than 1 % of the fits would be outliers, the bound is dashed: it is not reached. Returns the matplotlib
-    figure of this width [inch], and writes it where `path` is given.
+    See `draw_sweep`.
     """
-    figure, axes = panel_grid(len(_OF_BUDGETS), width, least=2.3, height=2.1)
-    low, high = min(row.range for row in rows), max(row.range for row in rows)
-    reached = np.array([row.outlier_probability <= OUTLIERS for row in rows])
-    for axis, field in zip(axes, _OF_BUDGETS, strict=True):
-        label, scale, (least, most) = _COLUMNS[field]
-        values = np.array([getattr(row, field) for row in rows]) * scale
-        values[~((values >= least) & (values <= most))] = np.nan
-        for number, water in enumerate(dict.fromkeys(row.medium for row in rows)):
-            own = [index for index, row in enumerate(rows) if row.medium == water]
-            x, y, colour = [rows[index].range for index in own], values[own], SERIES[number % len(SERIES)]
-            if field == "sigma_depth":
-                axis.plot(x, y, "--", color=colour, linewidth=0.8)
-                y = np.where(reached[own], y, np.nan)
-            label_of = f"{water}, c = {rows[own[0]].extinction:.3g} 1/m"
-            axis.plot(x, y, "o-", color=colour, markevery=-(-len(x) // 12), label=label_of)
-        axis.set(xlabel="range [m]", ylabel=_broken(label))
-        if field == "sigma_depth":
-            axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
-        _value_axis(axis, values)
-        if high > low:
-            axis.set_xlim(low * (low / high) ** 0.05, high * (high / low) ** 0.05)  # also where nothing comes back
-            log_axis(axis, "x")
-    if not reached.all():
-        label = f"not reached: over {100 * OUTLIERS:g} % false peaks"
-        axes[0].plot([], [], color="0.4", linestyle="--", linewidth=0.8, label=label)
-    figure.key(axes, 2.3)
-    if path is not None:
-        save(figure, path)
-    return figure
+    waters = tuple((row.range, f"{row.medium}, c = {row.extinction:.3g} 1/m") for row in rows)
+    return draw_sweep(Sweep(fields=("range", "water"), values=waters, rows=tuple(rows)), path, width=width)
 
 
 @paper()
 def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = PAGE) -> Figure:
-    """Four panels over the values of the swept field, see `spadwarp.sweep`: those of `draw_budget`, or errors.
+    """Panels over the values of the first field, a line for each combination of the others, see `spadwarp.sweep`.
 
-    Linear axes begin at 0, and a curve that varies by less than a tenth has its span written into the panel. Returns
-    the matplotlib figure of this width [inch], and writes it where `path` is given.
+    Of budgets those of `draw_budget`; of plans pulses for the depth error, bound, largest range. Linear axes begin
+    at 0, and a curve that varies by less than a tenth has its span written into the panel. Dashed: a bound that is not
+    reached, since more than 1 % of the fits would be outliers. A cross at the top: out of reach. Returns the figure of
+    this width [inch], and writes it where `path` is given.
     """
-    budgets = isinstance(curves.rows[0], BudgetRow)
-    names = _OF_BUDGETS if budgets else _OF_ERRORS
+    names = list(_OF_BUDGETS)
+    if not isinstance(curves.rows[0], BudgetRow):
+        names = [name for name in _OF_PLANS if not np.isnan(curves.column(name)).all()]
     figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.3)
-    numeric = all(isinstance(value, (int, float)) for value in curves.values)
-    x: Any = np.array(curves.values, np.float64) if numeric else np.arange(len(curves.values))
-    for number, (axis, name) in enumerate(zip(axes, names, strict=True)):
-        label, scale, (_, most) = _COLUMNS[name]
-        y, colour = curves.column(name) * scale, SERIES[number % 5]
-        axis.plot(x, np.where(np.isfinite(y), y, np.nan), "o-", color=colour, label="median")
-        if name == "sigma_depth" and not budgets:
-            p90 = scale * curves.column("sigma_depth_p90")
-            axis.plot(x, p90, "--", color=colour, linewidth=0.8, label="90 % of the pixels below")
-            axis.legend()
-        axis.set(xlabel=curves.field + _unit(curves.field), ylabel=_broken(label))
-        _value_axis(axis, y, probability=most == 1.0)
+    at, others = [value[0] for value in curves.values], [value[1:] for value in curves.values]
+    ticks = list(dict.fromkeys(map(str, at)))
+    numeric = all(isinstance(value, (int, float)) for value in at)
+    x = np.array(at, np.float64) if numeric else np.array([ticks.index(str(value)) for value in at], np.float64)
+    groups = list(dict.fromkeys(map(repr, others)))
+    budgets = isinstance(curves.rows[0], BudgetRow)
+    missed = curves.column("outlier_probability") > OUTLIERS if budgets else np.zeros(len(at), bool)
+    for axis, name in zip(axes, names, strict=True):
+        label, scale, (least, most) = _COLUMNS[name]
+        y = curves.column(name) * scale
+        y[np.isfinite(y) & ~((y >= least) & (y <= most))] = np.nan
+        for number, group in enumerate(groups):
+            own = np.array([repr(other) == group for other in others])
+            place = x[own] + (0.0 if numeric else 0.12 * (number - 0.5 * (len(groups) - 1)))
+            words = ", ".join(_value_text(value) for value in others[int(own.argmax())])
+            style_of: dict[str, Any] = {"color": SERIES[number % len(SERIES)], "label": words or None}
+            spread = None
+            if name == "pulses":
+                ends = np.array([curves.column("pulses_least")[own], curves.column("pulses_most")[own]])
+                spread = np.where(np.isfinite(ends), np.abs(ends - np.where(np.isfinite(y[own]), y[own], 0.0)), 0.0)
+            shown, every = np.where(np.isfinite(y[own]), y[own], np.nan), -(-int(own.sum()) // 12)
+            if name == "sigma_depth" and missed[own].any():
+                axis.plot(place, shown, "--", color=style_of["color"], linewidth=0.8)
+                shown = np.where(missed[own], np.nan, shown)
+            axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, markevery=every, **style_of)
+            if name == "sigma_depth" and curves.fields == ("range", "water"):
+                axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
+            beyond, top = place[np.isinf(y[own])][::every], axis.get_xaxis_transform()
+            axis.plot(beyond, np.full(len(beyond), 0.97), "x", transform=top, color=style_of["color"])
+        axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=_broken(label))
+        _value_axis(axis, y)
         if not numeric:
-            axis.set_xticks(x, map(str, curves.values), rotation=20, ha="right", rotation_mode="anchor")
-            axis.set_xlim(-0.5, len(x) - 0.5)
-        elif x.min() > 0 and x.max() > 30 * x.min():
+            axis.set_xticks(range(len(ticks)), ticks, rotation=20, ha="right", rotation_mode="anchor")
+            axis.set_xlim(-0.5, len(ticks) - 0.5)
+        elif x.min() > 0 and x.max() > (2 if curves.fields[0] == "range" else 30) * x.min():
             log_axis(axis, "x")
         else:
             axis.xaxis.minorticks_on()
+    if missed.any():
+        label = f"not reached: over {100 * OUTLIERS:g} % false peaks"
+        axes[0].plot([], [], color="0.4", linestyle="--", linewidth=0.8, label=label)
+    if len(groups) > 1 or missed.any():
+        figure.key(axes, 2.3, title=", ".join(curves.fields[1:]))
     if path is not None:
         save(figure, path)
     return figure
+
+
+def _value_text(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def _broken(label: str) -> str:
@@ -115,17 +118,15 @@ def _broken(label: str) -> str:
 def _unit(field: str) -> str:
     """` [1/m]` for `medium.extinction`: the unit in the field's description, or nothing."""
     info = locate(Scene, parse_key(field))[1]
-    unit = None if info is None else field_unit(info)
+    unit = "m" if field == "range" else None if info is None else field_unit(info)
     return "" if unit in (None, "1") else f" [{unit}]"
 
 
-def _value_axis(axis: Axes, y: NDArray[np.float64], *, probability: bool = False) -> None:
-    """From 0 to 1, or logarithmic over more than a factor of 20, else from 0."""
+def _value_axis(axis: Axes, y: NDArray[np.float64]) -> None:
+    """Logarithmic over more than a factor of 20, else from 0."""
     known = y[np.isfinite(y)]
     positive = known[known > 0]
-    if probability:
-        axis.set_ylim(-0.03, 1.03)
-    elif positive.size and positive.max() > 20 * positive.min():
+    if positive.size and positive.max() > 20 * positive.min():
         log_axis(axis, "y")
         return
     elif known.size:

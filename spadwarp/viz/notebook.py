@@ -61,7 +61,7 @@ def _display() -> Callable[[float | None, str], None]:
     return show
 
 
-_HIDDEN = ("kind", "timing", "provenance", "counters", "pilot", "channels")
+_HIDDEN = ("kind", "timing", "provenance", "counters", "pilot")
 
 
 def html(shown: Result | Frames | Scene | AnalyticResult | Proposal) -> str:

@@ -17,12 +17,20 @@ from spadwarp.analytic import AnalyticResult
 from spadwarp.frames import Frames, FramesFile, Method, first_photon_probabilities
 from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
-from spadwarp.result import COMPONENTS, Channel, Result, degree_of_polarisation, unclear_pixels
+from spadwarp.result import (
+    CHANNELS,
+    COMPONENTS,
+    Channel,
+    Result,
+    analyser_channel,
+    degree_of_polarisation,
+    unclear_pixels,
+)
 from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import ArgumentError, count, percent, rounded
+from spadwarp.values import ArgumentError, check_integer, count, percent, rounded
 from spadwarp.viz import style
 from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits
 
@@ -39,6 +47,7 @@ def plot(
     *,
     method: Any = "centroid",
     frame: int = 0,
+    pixel: tuple[int, int] | None = None,
     device: Any = None,
     width: float = PAGE,
 ) -> Figure:
@@ -51,6 +60,7 @@ def plot(
         kind: Of a result's figure.
         method: Estimator of a result's depth.
         frame: Number of the frame.
+        pixel: Row and column of one more pixel whose histogram, or counts, are shown.
         device: Warp device.
         width: Of the figure [inch]: 7.2 for a journal's page, 3.5 for its column.
 
@@ -61,7 +71,7 @@ def plot(
         if kind not in (None, *KINDS):
             raise ArgumentError(f"kind = {kind!r} is not one of {', '.join(map(repr, KINDS))}")
         depth = shown.depth(method=method, device=device) if kind in (None, "depth") else None
-        return _result_figure(shown, kind or "depth", depth, method, width)
+        return _result_figure(shown, kind or "depth", depth, method, width, pixel)
     if kind is not None:
         raise ArgumentError(f"kind = {kind!r} needs a result, not a {type(shown).__name__}")
     if isinstance(shown, AnalyticResult):
@@ -69,7 +79,7 @@ def plot(
     if isinstance(shown, Fit):
         return _fit_figure(shown, width)
     if isinstance(shown, Frames | FramesFile):
-        return _frame_figure(shown, frame, width)
+        return _frame_figure(shown, frame, width, pixel)
     truth = truth_maps(shown, device=device)
     panels = Panels(truth.depth.shape, 2, width=width)
     panels.show_depth(truth.depth, "Truth", shown_limits(truth.depth))
@@ -125,11 +135,36 @@ _HATCHED = (
 )
 
 
-def _result_figure(result: Result, kind: str, depth: NDArray[Any] | None, method: str, width: float) -> Figure:
+def _typical_pixels(
+    light: NDArray[Any], depth: NDArray[Any] | None, pixel: tuple[int, int] | None
+) -> dict[str, tuple[int, int]]:
+    """The pixels with the median light of the target and of the water, of those there are, and the one asked for."""
+    target = np.zeros(light.shape, bool) if depth is None else np.isfinite(depth)
+    groups = {"Typical pixel of the target": target & (light > 0), "Typical pixel of the water": ~target & (light > 0)}
+    if depth is None:
+        groups = {"Typical pixel": light > 0}
+    found = {name: style.median_pixel(light, group) for name, group in groups.items() if group.any()}
+    if pixel is not None:
+        for index, name, length in zip(pixel, ("row", "column"), light.shape, strict=True):
+            check_integer(f"pixel: {name}", index, f"[0, {length - 1}]")
+        found["Pixel asked for"] = pixel
+    return found
+
+
+def _result_figure(
+    result: Result,
+    kind: str,
+    depth: NDArray[Any] | None,
+    method: str,
+    width: float,
+    pixel: tuple[int, int] | None = None,
+) -> Figure:
     if kind == "histogram":
-        return _histogram_figure(result, width)
+        return _histogram_figure(result, width, pixel)
     truth, unclear = result.truth, unclear_pixels(result)
-    panels = Panels(truth.depth.shape, 2 if kind == "intensity" and not result.channels else 3, width=width)
+    shown_channels = CHANNELS[1:] if result.channels else ()
+    count_of = 2 + len(shown_channels) + bool(shown_channels) if kind == "intensity" else 3
+    panels = Panels(truth.depth.shape, count_of, width=width)
     panels.figure.caption(_caption(result))
     if unclear.any() and kind != "truth":
         panels.figure.note(_HATCHED.format(percent(unclear.mean())))
@@ -140,7 +175,11 @@ def _result_figure(result: Result, kind: str, depth: NDArray[Any] | None, method
         panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
         panels.unclear = None
         panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
-        if result.channels:
+        for channel in shown_channels:
+            part = analyser_channel(result, channel).intensity * per_pulse
+            name = style.CHANNEL_NAMES[channel].capitalize()
+            panels.show_intensity(part, f"{name} light", "expected detections per pulse")
+        if shown_channels:
             panels.unclear = unclear
             part = degree_of_polarisation(result, gated=True)
             low = -1.0 if (part < 0.0).any() else 0.0
@@ -165,32 +204,27 @@ def _result_figure(result: Result, kind: str, depth: NDArray[Any] | None, method
     return panels.figure
 
 
-def _histogram_figure(result: Result, width: float) -> Figure:
-    figure = style.new_figure(width, 4.6)
-    figure.caption(_caption(result))
-    # Ranked by ballistic light where there is any: in a short run a rare photon of large weight can make any other
-    # pixel the brightest.
+def _histogram_figure(result: Result, width: float, pixel: tuple[int, int] | None) -> Figure:
+    # By ballistic light on the target: in a short run a rare photon of large weight can make any pixel bright.
     ballistic = result.tallies[0].sum(axis=2)
-    on_target = bool(ballistic.any())
-    intensity = ballistic if on_target else result.intensity
-    brightest = divmod(int(intensity.argmax()), intensity.shape[1])
-    pixels = {"Brightest": brightest, "Median": style.median_pixel(intensity, intensity > 0)}
+    on_target = np.isfinite(result.truth.depth) & bool(ballistic.any())
+    pixels = _typical_pixels(np.where(on_target, ballistic, result.intensity), result.truth.depth, pixel)
     unclear = unclear_pixels(result)
-    group = "on the target" if on_target else "of those with a return"
-    axes = figure.subplots(2, 1)
-    for axis, (name, (row, column)) in zip(axes, pixels.items(), strict=True):
+    figure = style.new_figure(width, 2.3 * max(len(pixels), 1))
+    figure.caption(_caption(result))
+    axes = figure.subplots(max(len(pixels), 1), 1, squeeze=False)[:, 0]
+    merged = False
+    for axis, (name, (row, column)) in zip(axes, pixels.items(), strict=False):
         axis.set(xlabel="time of flight [ns]", xlim=1e9 * result.bin_edges[[0, -1]])
-        if intensity.any():
-            noisy = "\nits brightest bin is noise of the simulation" if unclear[row, column] else ""
-            axis.set_title(
-                f"{name} pixel {group}: row {row}, column {column}{noisy}", color="firebrick" if noisy else TEXT
-            )
-            _plot_pixel(result, axis, row, column)
-        else:
-            style.middle_text(axis, "nothing returned in the gate")
-            axis.set_yticks([])
-    if intensity.any():
-        figure.key(axes, 1.35)
+        noisy = "\nits brightest bin is noise of the simulation" if unclear[row, column] else ""
+        axis.set_title(f"{name}: row {row}, column {column}{noisy}", color="firebrick" if noisy else TEXT)
+        merged |= _plot_pixel(result, axis, row, column)
+    if pixels:
+        title = "wide steps: means of bins that are added up, since the light of each is not known to a third"
+        figure.key(axes, 1.35, title=style.wrapped(title, width - 0.3) if merged else "")
+    else:
+        style.middle_text(axes[0], "nothing returned in the gate")
+        axes[0].set_yticks([])
     return figure
 
 
@@ -202,11 +236,11 @@ _CHANNEL_LINES: dict[Channel, dict[str, Any]] = {
 }
 
 
-def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
+def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
     """Components of one pixel over time of flight, and over the range along its line of sight; of polarised light also
     what each channel has of all of them.
 
-    Where light is sparse, bins are added up until their sum is known to a third; see `merged_edges`.
+    Where light is sparse, bins are added up until their sum is known to a third, see `merged_edges`; returns whether.
     """
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
     better = result.reconstruction
@@ -250,6 +284,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
     axis.xaxis.minorticks_on()
     axis.grid(which="major")
     _range_axis(result, axis, row, column)
+    return any(len(own) < len(time) for _, own, _ in curves)
 
 
 def _range_axis(result: Result, axis: Axes, row: int, column: int) -> None:
@@ -368,9 +403,11 @@ def merged_means(values: NDArray[np.float64], edges: NDArray[np.intp]) -> NDArra
 # Depth frames
 
 
-def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Figure:
+def _frame_figure(
+    frames: Frames | FramesFile, number: int, width: float, pixel: tuple[int, int] | None = None
+) -> Figure:
     """One frame: of a file depth by its best estimator, its error, the bound; of counts alone the time of the fullest
-    bin; intensity; the counts of one pixel over time."""
+    bin; intensity; the counts of typical pixels over time."""
     file = frames if isinstance(frames, FramesFile) and frames.best_method is not None else None
     if isinstance(frames, FramesFile):
         shown, index = frames.frame(number), 0
@@ -380,7 +417,9 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
             raise ArgumentError(f"frame = {number} is outside [0, {1 if frames.summed else frames.frames})")
     counts = np.asarray(shown.counts if shown.summed else shown.counts[index])
     intensity = counts.sum(axis=-1)
-    panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=(2.0,))
+    light = np.asarray(shown.expected).sum(axis=-1)  # the brightest may have one photon of a large weight
+    pixels = _typical_pixels(light if light.any() else intensity, None if file is None else file.truth_depth, pixel)
+    panels = Panels(intensity.shape, 2 if file is None else 4, width=width, below=(1.7,) * len(pixels))
     hatched = ""
     if file is None:
         edges = 1e9 * (shown.gate_start + shown.edges)
@@ -398,8 +437,10 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
         panels.show_positive(1e3 * bound, f"Cramér–Rao bound{known}", "standard deviation [mm]")
     panels.show_intensity(intensity, "Intensity", "counts in a frame")
     axes = panels.below()
-    _plot_counts(shown, counts, file, axes[0])
-    panels.figure.key(axes, 1.7)
+    for axis, (name, place) in zip(axes, pixels.items(), strict=True):
+        _plot_counts(shown, counts, file, axis, name, place)
+    if axes:
+        panels.figure.key(axes, 1.7)
     which = "all frames added up" if shown.summed else f"frame {shown.first_frame + index + 1}"
     mode = "" if file is None else f", {file.scene.detector.mode.replace('_', '-')}{channel_text(file.channel)}"
     noise = hatched or noise_caption(shown.monte_carlo_noise)
@@ -407,13 +448,11 @@ def _frame_figure(frames: Frames | FramesFile, number: int, width: float) -> Fig
     return panels.figure
 
 
-def _plot_counts(frames: Frames, counts: NDArray[Any], file: FramesFile | None, axis: Axes) -> None:
-    """Counts of the pixel with the median light of a target, their mean, the true arrival."""
-    signal = np.asarray(frames.expected - frames.background).sum(axis=-1)
-    if file is not None and np.isfinite(file.truth_depth).any():
-        signal = np.where(np.isfinite(file.truth_depth), signal, -1.0)
-    signal = signal if (signal > 0).any() else counts.sum(axis=-1)
-    row, column = style.median_pixel(signal, signal > 0)  # the brightest may have one photon of a large weight
+def _plot_counts(
+    frames: Frames, counts: NDArray[Any], file: FramesFile | None, axis: Axes, name: str, place: tuple[int, int]
+) -> None:
+    """Counts of a pixel, their mean, the true arrival."""
+    row, column = place
     # Means without dead time and afterpulsing.
     detector = None if file is None else file.scene.detector
     hazard = np.asarray(frames.expected[row, column]).astype(np.float64)
@@ -437,21 +476,20 @@ def _plot_counts(frames: Frames, counts: NDArray[Any], file: FramesFile | None, 
     scale = "counts per bin"
     if top > max(10.0, 50 * float(np.median(expected))):
         axis.set_yscale("symlog", linthresh=1.0)
-        scale += " (linear to 1, then log)"
+        scale += "\n(linear to 1, then log)"
         axis.set_yticks([0] + [10**e for e in range(int(np.log10(top)) + 1)])
         axis.yaxis.set_minor_locator(SymmetricalLogLocator(base=10, linthresh=1.0, subs=range(2, 10)))
     axis.set(xlim=edges[[0, -1]], ylim=(0, 1.3 * top), xlabel="time of flight [ns]", ylabel=scale)
     axis.xaxis.minorticks_on()
     noisy = file is not None and file.noise_ratio is not None and file.noise_ratio[row, column] > 1.0
-    text = f"Median pixel: row {row}, column {column}"
+    text = f"{name}: row {row}, column {column}"
     axis.set_title(text + ("\nnoise of the simulation" if noisy else ""), color="firebrick" if noisy else TEXT)
 
 
 def _analytic_figure(result: AnalyticResult, width: float) -> Figure:
     frame, labels = (part[0] for part in ((result.depth, result.labels) if len(result.depth) else result.sample(1)))
     truth, analytic = result.truth.depth, result.scene.analytic
-    seen = result.fisher > 0
-    limits = shown_limits(truth[seen] if seen.any() else truth, margin=0.05)
+    limits = shown_limits(truth, margin=0.05)
     outliers = f", {labels.sum()} outliers" if labels.any() else ""
     ratio, colours = result.signal_to_backscatter, style.PROBABILITY_MAP
     panels = Panels(truth.shape, 6, width=width)
@@ -504,7 +542,7 @@ def draw_denoised(
     """
     known = truth is not None and np.isfinite(truth).any()
     scale = truth if truth is not None and known else denoised if np.isfinite(denoised).any() else noisy
-    low, high = shown_limits(scale, beyond=1.0, margin=0.05 * known)
+    low, high = shown_limits(scale, beyond=0.0 if known else 1.0, margin=0.05 * known)
     limits = max(low, gate[0] - 1.0), min(high, gate[1] + 1.0)
     panels = Panels(noisy.shape, 2 if truth is None else 4, width=width)
     panels.show_depth(noisy, "Input", limits)
@@ -534,8 +572,12 @@ def _fit_figure(fit: Fit, width: float) -> Figure:
     panels.show_intensity(counts, "Counts", "counts in the exposure")
     residual = (counts - expected) / np.sqrt(np.maximum(expected, 1e-12))
     residual[expected <= 0] = np.nan
-    panels.show(residual, "Residual", "(counts − fit) / √fit", style.ERROR_MAP, (-3.0, 3.0))
-    panels.show(fit.goodness.pixels, "Deviance", "(deviance − expected) / σ", style.ERROR_MAP, (-4.0, 4.0))
+    for image, name, label in (
+        (residual, "Residual", "(counts − fit) / √fit"),
+        (fit.goodness.pixels, "Deviance", "(deviance − expected) / σ"),
+    ):
+        reach = max(style.error_limit(image), 1.0)
+        panels.show(image, name, label, style.ERROR_MAP, (-reach, reach))
     if fit.depth is not None:
         panels.show_depth(fit.depth, "Depth", shown_limits(fit.depth))
     top, bottom = panels.below()

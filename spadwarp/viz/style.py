@@ -54,11 +54,11 @@ CHANNEL_NAMES: dict[Channel, str] = {"co": "co-polarised", "cross": "cross-polar
 
 DEPTH_MAP, INTENSITY_MAP = "viridis_r", "cividis"
 BOUND_MAP, PROBABILITY_MAP, LIGHT_MAP = "magma_r", "inferno_r", "inferno"
-# Orange to violet without the dark ends, from which the colours of what is beyond them differ.
+# Orange to violet without the dark ends, which are the colours of what is beyond them.
 ERROR_MAP = LinearSegmentedColormap.from_list(
-    "depth error", matplotlib.colormaps["PuOr"](np.linspace(0.12, 0.88, 65))
-).with_extremes(under=SKY, over="black", bad=MISSING)
-"""Signed errors: light blue below the limits, black above them."""
+    "depth error", matplotlib.colormaps["PuOr"](np.linspace(0.16, 0.84, 65))
+).with_extremes(under="#4a1d00", over="#14002b", bad=MISSING)
+"""Signed errors: dark brown below the limits, dark violet above them."""
 
 
 @contextmanager
@@ -117,7 +117,7 @@ class PaperFigure(Figure):
         for axis in axes:
             entries |= dict(zip(*axis.get_legend_handles_labels()[::-1], strict=True))
         lines, columns = arranged(len(entries), self.get_figwidth(), width)
-        self.grow(0.1 + 0.14 * (lines + bool(title)))
+        self.grow(0.1 + 0.14 * (lines + (title.count("\n") + 1) * bool(title)))
         loc: Any = f"outside {place} center"
         self.legend(entries.values(), entries.keys(), loc=loc, ncols=columns, title=title or None)
 
@@ -372,15 +372,15 @@ class Panels:
 
 
 def error_limit(error: NDArray[Any]) -> float:
-    """Largest error in colours [m]: twice the 68th percentile of the absolute errors, at most the 95th.
+    """Largest error in colours [m]: twice the 68th percentile of the absolute errors, between the 90th and the 95th.
 
     Large errors of some pixels, at steps and where nothing returned, do not hide the millimetres of the others.
     """
     known = np.abs(error[np.isfinite(error)])
     if not known.size:
         return 1.0
-    body, tail = np.percentile(known, (68.0, 95.0))
-    reach = max(min(2.0 * body, tail), 1e-4)
+    body, most, tail = np.percentile(known, (68.0, 90.0, 95.0))
+    reach = max(min(max(2.0 * body, most), tail), 1e-4)
     digit = 10.0 ** math.floor(math.log10(reach))
     return float(math.ceil(reach / digit * 2 - 1e-9) / 2 * digit)  # of two digits: 3.5 mm
 

@@ -456,7 +456,7 @@ def _of_sequence(file: SequenceFile, most: int) -> Iterator[NDArray[np.uint8]]:
     chosen = range(0, file.frames, -(-file.frames // most))
     truth = np.array([file.truth(number).depth for number in chosen])
     counts = np.array([file.counts(number).sum(axis=-1, dtype=np.int64) for number in chosen])
-    near, far = style.shown_limits(truth, beyond=1.0, margin=0.1)
+    near, far = style.shown_limits(truth, margin=0.1)
     depth = Normalize(near - 0.05, far + 0.05)
     light = Normalize(0.0, max(1.0, float(np.percentile(counts, 99.5))))
     shown = [(f"{name} depth", depth, colour_map(style.DEPTH_MAP), "depth z [m]") for name in ("true", "measured")]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.scenes import scene
-from spadwarp.analytic import budget, model_notes, parse_values, parse_vary, simulate_analytic, sweep
+from spadwarp.analytic import budget, combinations, model_notes, parse_values, parse_vary, simulate_analytic, sweep
 from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
 
 SCENE = scene(
@@ -127,15 +127,30 @@ def test_what_cannot_be_varied(match, texts):
 def test_a_sweep_follows_the_lidar_equation():
     """S falls as e^{−2cR} with the extinction and rises with the pulse energy; the field may be any of the scene."""
     curves = sweep(SCENE, vary="medium.extinction=0.1:1.1:3")
-    assert curves.values == pytest.approx((0.1, 0.6, 1.1))
+    assert curves.column("medium.extinction") == pytest.approx((0.1, 0.6, 1.1))
     signal, distance = curves.column("signal"), curves.rows[0].range
     np.testing.assert_allclose(np.log(signal[:-1] / signal[1:]), 2 * 0.5 * distance, rtol=1e-6)
-    curves = sweep(SCENE, vary=("laser.pulse_energy", [1e-9, 3e-9]), of="depth-error")
-    first, second = curves.rows
-    assert second.sigma_depth < first.sigma_depth <= first.sigma_depth_p90
-    assert first.estimate_fraction == 1.0
+    first, second = sweep(SCENE, vary=("laser.pulse_energy", [1e-9, 3e-9])).rows
+    assert second.sigma_depth < first.sigma_depth and second.signal == pytest.approx(3.0 * first.signal)
     far = sweep(SCENE, vary="targets[0].translation[2]=2:4:3").rows
     assert [row.range for row in far] == pytest.approx([2.0, 3.0, 4.0], rel=0.01)
+
+
+def test_choices_of_an_experiment_are_combined():
+    fields, chosen = combinations(
+        SCENE.with_overrides({"medium.chlorophyll": 0.5, "laser.polarisation": "linear"}),
+        [
+            "laser.wavelength_nm=480,532",
+            "camera.analyser=none,cross",
+            "camera.port.preset=none,flat-glass",
+            "range=2 m",
+        ],
+    )
+    assert len(chosen) == 8 and len(fields) == 4
+    assert len({scene.medium.absorption for _, scene, _ in chosen}) == 2  # blue and green water
+    assert {arguments["channel"] for _, _, arguments in chosen} == {"I", "cross"}
+    assert all((one.camera.port is None) == (values[2] == "none") for values, one, _ in chosen)
+    assert all(arguments["ranges"] == (2.0, 2.0) for *_, arguments in chosen)
 
 
 @pytest.mark.parametrize("text", ["1:5", "a,", "", ":", "1 s,2 s", "1:2:0", "1:inf:3", "1,,2"])
@@ -151,6 +166,9 @@ def test_values_that_are_wrong_are_named_by_their_option(text):
         (lambda: sweep(SCENE, vary="medium.anisotropy=0.5:1.5:3"), "outside"),
         (lambda: budget(SCENE, ranges=[2.0, -1.0]), r"ranges: an item = -1.0 is outside \[1e-6, 1e6\] m"),
         (lambda: sweep(SCENE.with_overrides({"targets": []}), vary="medium.extinction=1"), "no target is in view"),
+        (lambda: sweep(SCENE, vary="laser.wavelength_nm=480,532"), r"its own water.* give medium\.chlorophyll"),
+        (lambda: sweep(SCENE, vary="camera.analyser=cross", of="plan"), r"laser\.polarisation = 'linear'"),
+        (lambda: sweep(SCENE, vary=["medium.albedo=0.5", "range=2,3"]), "of = 'plan'"),
     ],
 )
 def test_bad_requests_are_named(ask, match):

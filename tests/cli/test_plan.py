@@ -64,13 +64,17 @@ def test_a_budget_of_polarised_light_says_what_is_left_out(scene, tmp_path):
     assert printed.stderr.count("has no polarisation") == 1 and f"warning: {note}" in printed.stderr
 
 
-@pytest.mark.parametrize("of", ["budget", "depth-error"])
-def test_sweep_is_that_of_python(scene, tmp_path, of):
-    summary, vary = tmp_path / "printed.json", "medium.extinction=0.1:2:3"
-    run("sweep", scene, "--vary", vary, "--of", of, "--out", tmp_path / "out", "--json", summary, *DEVICE)
-    twin = spadwarp.sweep(scene, vary=vary, of=of, device="cpu")
+@pytest.mark.parametrize(
+    "vary", [["medium.extinction=0.1:2:3"], ["laser.pulse_energy=1 nJ,4 nJ", "detector.mode=first_photon,free_running"]]
+)
+def test_sweep_is_that_of_python(scene, tmp_path, vary):
+    summary, few = tmp_path / "printed.json", () if len(vary) == 1 else ("--photons", "4000", "--no-range")
+    words = [word for one in vary for word in ("--vary", one)]
+    run("sweep", scene, *words, *few, "--out", tmp_path / "out", "--json", summary, *DEVICE)
+    planned = {"of": "plan", "photons": 4000, "largest_range": False} if few else {}
+    twin = spadwarp.sweep(scene, vary=vary, device="cpu", **planned)
     found = tables(summary)
-    assert (found["field"], found["values"]) == ("medium.extinction", [0.1, 1.05, 2.0])
+    assert tuple(found["fields"]) == twin.fields and tuple(map(tuple, found["values"])) == twin.values
     assert [row["sigma_depth"] for row in found["rows"]] == [row.sigma_depth for row in twin.rows]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"sweep.png", "sweep.csv"}
 

@@ -29,6 +29,7 @@ SMALLER = {
     r"^(spadwarp simulate (?!.*(--photons|--resume)).*)": r"\1 --photons 5e3",
     r"^(spadwarp fit .*)": r"\1 --set camera.width=16 --set camera.height=12",
     r"^(spadwarp plan .*)": r"\1 --photons 5e3 --no-range",
+    r"^(spadwarp sweep .*analyser.*)": r"\1 --photons 5e3",
     r"--pulses 20000": "--pulses 500",
     r"--steps 24": "--steps 3",
     r"=1:40:40": "=1:40:3",
@@ -123,7 +124,7 @@ def test_commands_in_the_text_run(page, checkout):
     """The commands of a page, one after the other. A mesh, poses, a depth frame and a result are the reader's."""
     trimesh.creation.box().export("bust.stl")
     Path("poses.csv").write_text("time,camera.position[2]\n0.0,0.0\n0.1,0.4\n")
-    if page.name == "denoising.md":
+    if page.name in ("denoising.md", "comparison.md"):
         Path("out").mkdir()
         np.save("out/depth.npy", np.full((24, 32), 15.0))
         spadwarp.simulate("plane_5m", photons=20_000).save("out/result.h5")

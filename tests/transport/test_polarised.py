@@ -291,8 +291,7 @@ def test_an_analyser_splits_the_stokes_vector(device):
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
-        ({"transport": {"axis_threshold": 0.9998}}, "axis_threshold = 0.9998 does not go with polarised light"),
-        ({"medium": {"scattering_matrix": "none"}}, "scattering_matrix = 'none' does not go with polarised light"),
+        ({"transport": {"axis_threshold": 0.999}}, "axis_threshold = 0.999 does not go with polarised light"),
         ({"medium": {"scattering_matrix": "tabulated"}}, "needs matrix_table"),
         ({"medium": {"matrix_table": "a.csv"}}, "goes with scattering_matrix = 'tabulated' only"),
         ({"targets": [{**SHINY, "specular_index": 1.3415}]}, "specular_index = 1.3415 is that of the water"),
@@ -302,3 +301,13 @@ def test_an_analyser_splits_the_stokes_vector(device):
 def test_what_does_not_go_with_polarised_light_is_refused_by_name(sections, message):
     with pytest.raises(ConfigError, match=message):
         polarised().with_overrides(sections)
+
+
+def test_a_polarised_laser_sets_what_its_light_needs():
+    plain = spadwarp.load_scene("staircase_5m")
+    linear = plain.with_overrides({"laser.polarisation": "linear"})
+    assert (linear.medium.scattering_matrix, linear.transport.axis_threshold) == ("voss_fry", 1.0)
+    molecules = plain.with_overrides({"medium.phase_function": "rayleigh", "camera.polarisation": "analyser"})
+    assert (molecules.medium.scattering_matrix, molecules.transport.axis_threshold) == ("rayleigh", 1.0)
+    assert spadwarp.Scene.from_toml(linear.to_toml()) == linear
+    assert (plain.medium.scattering_matrix, plain.transport.axis_threshold) == ("none", 0.9998)

@@ -119,8 +119,9 @@ def draw_budget(path, width, **_):
     spadwarp.viz.draw_budget(found, path, width=width)
 
 
-def draw_sweep(path, width, of="budget", vary="medium.extinction=0.1:0.4:4", **_):
-    spadwarp.viz.draw_sweep(spadwarp.sweep(SCENE, vary=vary, of=of, device="cpu"), path, width=width)
+def draw_sweep(path, width, vary="medium.extinction=0.1:0.4:4", **options):
+    options = {name: value for name, value in options.items() if name in ("of", "photons", "largest_range")}
+    spadwarp.viz.draw_sweep(spadwarp.sweep(SCENE, vary=vary, device="cpu", **options), path, width=width)
 
 
 def draw_video(path, width, request):
@@ -180,6 +181,7 @@ def changed(draw, **options):
     return lambda path, width, request: draw(path, width=width, request=request, **options)
 
 
+CHOICES = ["laser.pulse_energy=1 nJ,4 nJ", "detector.dark_count_rate=0,1e6"]
 WATERS = "medium.preset=uwoc-clear,uwoc-coastal,jerlov-1C-williamson,uwoc-harbour"
 OF_SCENES = (draw_narrow, draw_scene, draw_analytic, draw_budget, draw_sweep, draw_data, draw_targets, draw_mesh)
 OF_NUMBERS = (draw_depth_alone, draw_before_and_after, draw_curves, draw_case, draw_video)
@@ -189,7 +191,7 @@ PICTURES = {
     "frames": plot_of("frames"),
     "stored_frames": plot_of("recording"),
     "denoised_alone": changed(draw_before_and_after, truth=False),
-    "sweep_error": changed(draw_sweep, of="depth-error"),
+    "sweep_plan": changed(draw_sweep, of="plan", vary=CHOICES, photons=4000, largest_range=False),
     "sweep_flat": changed(draw_sweep, vary="laser.wavelength_nm=530:534:3"),
     "sweep_names": changed(draw_sweep, vary=WATERS),
     **{draw.__name__.removeprefix("draw_"): draw for draw in (*AS_WIDE_AS_A_PAGE, *OF_SCENES, *OF_NUMBERS)},
