@@ -21,8 +21,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
-from scipy.optimize import nnls
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
@@ -68,6 +66,8 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
 
 def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruction:
     """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
+    from scipy.ndimage import distance_transform_edt
+
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
     focus = result.focus_distance
     if focus is not None:  # lens points matter where a point is imaged over more than a pixel's half
@@ -185,6 +185,8 @@ def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
 
 def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
+    from scipy.optimize import nnls
+
     terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
     terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
     for radius in _BLURS:
