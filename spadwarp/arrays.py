@@ -97,9 +97,9 @@ def real_array(name: str, values: Any, dtype: DTypeLike = np.float32) -> NDArray
     try:
         given, kind = np.asarray(on_host(values)), np.dtype(dtype)
     except (TypeError, ValueError) as error:  # rows of several lengths, no type
-        raise ArgumentError(f"{name} = {shown(values)} is not an array of real numbers, {dtype!r}: {error}") from error
+        raise ArgumentError(f"{name} = {shown(values)}, dtype = {shown(dtype)}: {error}") from error
     if given.dtype.kind not in "biuf" or kind.kind not in "biuf":
-        raise ArgumentError(f"{name} = {shown(values)} is not an array of real numbers, {kind}")
+        raise ArgumentError(f"{name} = {shown(values)} is not an array of real numbers ({kind})")
     return given.astype(kind)
 
 
