@@ -444,7 +444,10 @@ def record_frames(
         for start in range(0, frames, size):
             number = min(size, frames - start)
             remark(f"counts of frames {start + 1} to {start + number} of {frames}")
-            part = detect(result, frames=number, first_frame=start, **options)
+            with warnings.catch_warnings():
+                if start:  # all parts say the same
+                    warnings.simplefilter("ignore", SpadwarpWarning)
+                part = detect(result, frames=number, first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
             depth: dict[Method, Map] = {}
             found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}

@@ -250,7 +250,7 @@ def progress_report(
         began = began or (now, done)
         seconds, waited = now - began[0], now - shown_at
         often = done - shown_done >= 0.1 * total and waited >= 1.0 if seldom else waited >= 0.1
-        if done > shown_done and (often or waited >= patience) or (done == total and not ended):
+        if (done > shown_done and (often or waited >= patience)) or (done == total and not ended):
             text = f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}"
             if seconds > 0.05 and (rate := (done - began[1]) / seconds):
                 text += f", {rate:.3g} {unit}/s"

@@ -370,9 +370,7 @@ class FirstPhotons:
 
 
 @wp.func
-def draw_bin(
-    draws: FirstPhotons, hazard: float, sparse: wp.float64, seed: wp.uint64, id: wp.uint64
-) -> FirstPhotons:
+def draw_bin(draws: FirstPhotons, hazard: float, sparse: wp.float64, seed: wp.uint64, id: wp.uint64) -> FirstPhotons:
     """The counts of the next bin; `id` names the pixel and frame. Counts come one by one where fewer than `sparse` are
     expected."""
     draws.count = 0

@@ -50,7 +50,7 @@ TARGET, NO_RETURN, SATURATED, OUTSIDE_GATE = (wp.constant(i) for i in range(len(
 # Part of the pulses that count at which a pixel is saturated: three mean photons a pulse.
 _SATURATION = wp.constant(0.95)
 
-# Counts that are expected in a bin below which they are drawn one by one: the lanes of a GPU wait for the one with most.
+# Expected counts of a bin below which they are drawn one by one: the lanes of a GPU wait for the one with most.
 _SPARSE = wp.constant(wp.float64(0.125))
 
 _ROWS = 1 << 18  # pixels that are drawn side by side: enough for a GPU, and 270 MB of counts of 256 bins
