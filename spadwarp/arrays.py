@@ -94,10 +94,13 @@ def on_host(array: Any) -> Any:
 
 def real_array(name: str, values: Any, dtype: DTypeLike = np.float32) -> NDArray[Any]:
     """A copy of an argument as an array of real numbers, also of a tensor. Raises `ArgumentError`."""
-    given = np.asarray(on_host(values))
-    if given.dtype.kind not in "biuf":
-        raise ArgumentError(f"{name} = {shown(values)} is not an array of real numbers")
-    return given.astype(dtype)
+    try:
+        given, kind = np.asarray(on_host(values)), np.dtype(dtype)
+    except (TypeError, ValueError) as error:  # rows of several lengths, no type
+        raise ArgumentError(f"{name} = {shown(values)}, dtype = {shown(dtype)}: {error}") from error
+    if given.dtype.kind not in "biuf" or kind.kind not in "biuf":
+        raise ArgumentError(f"{name} = {shown(values)} is not an array of real numbers ({kind})")
+    return given.astype(kind)
 
 
 def is_torch(array: Any) -> bool:

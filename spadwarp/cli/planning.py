@@ -78,7 +78,7 @@ def plan(
     full_power: bool = False,
     eye_distance: opt.Length | None = None,
     eye_exposure: opt.Seconds = 100.0,
-    photons: int | None = None,
+    photons: opt.Photons | None = None,
     seed: int = 0,
     no_range: bool = False,
     channel: opt.Channel = "I",
@@ -102,7 +102,7 @@ def plan(
         full_power: Take the largest pulse energy within the limits.
         eye_distance (LENGTH): Also keep the pulse energy safe for an eye at this distance from the laser [m].
         eye_exposure (TIME): How long the eye looks into the beam [s].
-        photons: Photons of the Monte Carlo run. By default as many as judge, or 60 s.
+        photons (N|auto): Photons of the Monte Carlo run. By default auto: as many as judge, or 60 s.
         no_range: Do not look for the largest range.
         write: Scene file to write with the proposed values.
 

@@ -41,7 +41,7 @@ FORMAT_VERSION = 1
 
 _PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 _CHUNK_BYTES, _CHUNK_TAGS = 1 << 20, 1 << 16
-_PART_BYTES = 1 << 28  # of counts that are held at a time
+_PART_BYTES = 1 << 26  # of counts that are held at a time
 _IMAGES, _DETECTION = ("frame", *PIXELS), "tags/detection"
 _TAGS: dict[str, Any] = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
 _TRUTH = {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}
@@ -437,21 +437,27 @@ def record_frames(
     bound = _bound(result, pulses, device)
     notes = () if bound.problem is None else (f"no Cramér–Rao bound: {bound.problem}",)
     errors: dict[Method, FrameErrors] = {}
+    still: _Layout | None = None
     detections = 0
     with write_hdf5(path) as opened:
         writer = _Writer(opened, frames)
         for start in range(0, frames, size):
             number = min(size, frames - start)
-            remark(f"counts of frames {start + 1} to {start + number}")
-            part = detect(result, frames=number, first_frame=start, **options)
+            remark(f"counts of frames {start + 1} to {start + number} of {frames}")
+            with warnings.catch_warnings():
+                if start:  # all parts say the same
+                    warnings.simplefilter("ignore", SpadwarpWarning)
+                part = detect(result, frames=number, first_frame=start, **options)
             part = replace(part, notes=(*part.notes, *notes))
             depth: dict[Method, Map] = {}
             found: dict[str, Any] = {"significance": np.zeros(part.counts.shape[:-1], np.float32), "device": device}
             for method in methods:
-                remark(f"their depth by {method}")
+                if not start:
+                    remark(f"their depth by {method}")
                 time = part.arrival_time(method, undo_pile_up=undo_pile_up, **found)
                 depth[method] = depth_from_time(time, scene=scene)
-            writer.add(part, scene, depth, found["significance"], _still(result, part, frames, bound.sigma))
+            still = still or _still(result, part, frames, bound.sigma)
+            writer.add(part, scene, depth, found["significance"], still)
             detections += int(part.intensity.sum())
             errors = errors or {name: FrameErrors.of(values, result.truth.depth) for name, values in depth.items()}
             if progress is not None:

@@ -239,10 +239,10 @@ def progress_report(
     then ever more seldom.
     """
     began: tuple[float, int] | None = None  # the first report: kernels are loaded and truth maps made before it
-    shown_at, shown_done, patience = time.monotonic() if seldom else 0.0, 0, 2.0
+    shown_at, shown_done, ended, patience = time.monotonic() if seldom else 0.0, 0, False, 2.0
 
     def report(stage: str, done: int, total: int) -> None:
-        nonlocal began, shown_at, shown_done, patience
+        nonlocal began, shown_at, shown_done, ended, patience
         now = time.monotonic()
         if not total:
             compiling = "loading kernels; the first run of a kind compiles them, which takes a while"
@@ -250,13 +250,13 @@ def progress_report(
         began = began or (now, done)
         seconds, waited = now - began[0], now - shown_at
         often = done - shown_done >= 0.1 * total and waited >= 1.0 if seldom else waited >= 0.1
-        if done > shown_done and (often or waited >= patience or done == total):
+        if (done > shown_done and (often or waited >= patience)) or (done == total and not ended):
             text = f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}"
             if seconds > 0.05 and (rate := (done - began[1]) / seconds):
                 text += f", {rate:.3g} {unit}/s"
                 text += f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(seconds)}"
             show(done / total, text)
-            shown_at, shown_done, patience = now, done, min(2.0 * patience, 60.0)
+            shown_at, shown_done, ended, patience = now, done, done == total, min(2.0 * patience, 60.0)
 
     return report
 

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
@@ -67,6 +66,8 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
 
 def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruction:
     """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
+    from scipy.ndimage import distance_transform_edt
+
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)

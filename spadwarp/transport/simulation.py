@@ -244,10 +244,10 @@ class _Run:
         size, (start, stop), began = self._plan.batch_size, self._plan.requested, time.monotonic()
         earlier, spent, rule = count(self._earlier), 0.0, StoppingRule(goal.error)
         if limited := seconds < math.inf:  # and it first finds out how fast it is
-            self._photons = earlier + FIRST_LOOK * size
             end = min(start + earlier + 2 * len(self._workers.workers) * size, stop)
         else:
             end = min(start + max(FIRST_LOOK * size, earlier), stop)
+        self._photons = max(earlier + FIRST_LOOK * size, end - start) + size
         while True:
             launched = time.monotonic()
             self._trace((start, end))
@@ -268,13 +268,15 @@ class _Run:
             if limited:
                 rate = (result.photons - earlier) / spent
                 left = min(left, int(rate * (seconds - (time.monotonic() - began))))
-                self._photons = int(min(result.photons + max(left, 0), max(needed, end - start)))
                 left = left if left >= _LEAST_PART * result.photons else 0
             if left < 1:
+                self._report("trace", result.photons, result.photons)
                 return replace(result, requested=(start, end), partial=False)
             assert wanted is not None
             more = wanted - batches
             end += min(more * size, max(left // size, 1) * size if limited else left)
+            # Of the error's own: what is done of the photons that reach the goal, or that the time allows.
+            self._photons = max(int(min(result.photons + left, needed)), end - start + (0 if rule.found else size))
 
     def _trace(self, span: Range) -> None:
         """Traces the ids of a span that are not done; fewer where the run is stopped."""
@@ -426,15 +428,15 @@ class StoppingRule:
     """
 
     def __init__(self, goal: float) -> None:
-        self._goal, self._found = goal, False
+        self._goal, self.found = goal, False
 
     def next_look(self, batches: int, error: float, share: Callable[[], float]) -> int | None:
         """Batches at the next look, None if the run ends; from those so far, the relative error after these (infinite:
         not known) and the part of the variance between batches that one of them has, in [0, 1]."""
-        if self._found:
+        if self.found:
             return None
         if error <= self._goal:
-            self._found = True
+            self.found = True
             return batches + math.ceil(batches * min(1.0, _GOING_ON * share()))
         most, excess = _MOST * batches, error / self._goal
         wanted = math.ceil(_RESERVE * batches * excess**2) if excess < math.inf else most

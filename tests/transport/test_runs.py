@@ -412,12 +412,13 @@ def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
 
 def test_the_stopping_rule_does_not_see_how_many_devices_there_are():
     options, seen = {"photons": 2**20, "seed": 1, "relative_error": 0.05}, []
-    one = here(**options, progress=lambda *report: seen.append(report[0]))
+    one = here(**options, progress=lambda *report: seen.append(report))
     same(simulate(scene(), **options, device="cpu,cpu"), one)
-    errors = [remark for remark in seen if remark.startswith("error")]
+    errors = [remark for remark, *_ in seen if remark.startswith("error")]
     assert "after 32 batches; about " in errors[0] and errors[0].endswith(" photons are needed")
     batches = one.photons // one.batch_size
     assert errors[-1] == f"error {100 * one.relative_error:.3g} % after {batches} batches"
+    assert all(done <= total for _, done, total in seen) and seen[-1] == ("trace", one.photons, one.photons)
 
 
 def test_a_resumed_run_counts_all_batches_for_its_stopping_rule(whole):
