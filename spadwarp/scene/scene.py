@@ -20,6 +20,7 @@ from pydantic import BeforeValidator
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
+from spadwarp.scene.flux import Flux, Sun
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium, phase_function
 from spadwarp.scene.port import Port, PortGeometry
@@ -46,6 +47,8 @@ class Scene(Shown, Document):
     daylight: Daylight | None = None
     targets: Annotated[tuple[Target, ...], BeforeValidator(listed)] = ()
     domain: Domain = Domain()
+    sun: Sun | None = None
+    flux: Annotated[tuple[Flux, ...], BeforeValidator(listed)] = ()
     transport: Transport = Transport()
     output: Output = Output()
     analytic: Analytic = Analytic()
@@ -57,6 +60,7 @@ class Scene(Shown, Document):
             yield f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold"
         yield from self._exclusions()
         yield from self._blocked_ports()
+        yield from self._flux_exclusions()
 
     def _exclusions(self) -> Iterator[str]:
         """Why sections exclude each other."""
@@ -89,6 +93,41 @@ class Scene(Shown, Document):
                     f"targets[{k}].specular_index = {target.specular_index} is that of the water, "
                     f"{medium.phase_index:.4g}: such facets reflect nothing"
                 )
+
+    def _flux_exclusions(self) -> Iterator[str]:
+        """Why flux is not tallied, or not what it seems."""
+        transport, names, sun = self.transport, [section.name for section in self.flux], self.sun
+        estimator = f"transport.estimator = {transport.estimator!r}"
+        if len(set(names)) < len(names):
+            yield f"flux: the names {', '.join(names)} are not all different"
+        if self.flux and transport.estimator in ("analog", "guided"):
+            yield (
+                f"{estimator} does not go with flux, whose balance with absorption holds for light that nothing "
+                "guides: take 'next_event', or 'none' for flux alone"
+            )
+        if self.flux and transport.axis_threshold < 1.0:
+            yield (
+                f"transport.axis_threshold = {transport.axis_threshold} does not go with flux: set it to 1, for exact "
+                "directions"
+            )
+        if self.flux and (self.polarised or isinstance(self.medium.albedo, str)):
+            yield "flux goes neither with polarised light nor with a random albedo"
+        if transport.estimator == "none" and not self.flux:
+            yield f"{estimator} tallies nothing without [[flux]]"
+        if sun is None:
+            return
+        if transport.estimator != "none" or not self.flux or self.scan.mode != "none" or self.polarised:
+            yield f"{estimator}: [sun] is for [[flux]] alone, with 'none', without a scan or polarised light"
+        k, axes = "xyz".index(sun.surface[0]), [0, 1, 2]
+        axes.remove(k)
+        low, high = self.domain.bounds
+        if math.isinf((low, high)[sun.surface.endswith("high")][k]):
+            yield f"sun.surface = {sun.surface!r} is no face of the domain: give it a shape and that bound"
+        if any(math.isfinite(side[j]) for side in (low, high) for j in axes) or self.transport.lateral_limit < math.inf:
+            yield "sun: the domain and transport.lateral_limit bound the water along the surface; take inf there"
+        across = any(abs(self.medium.layer_axis[j]) > 0.0 for j in axes) if self.medium.layers else False
+        if self.medium.grid is not None or across:
+            yield "sun: water that varies along the surface; layers across it are allowed"
 
     def _blocked_ports(self) -> Iterator[str]:
         """Why light cannot pass the ports, or cannot be computed through them."""
@@ -138,7 +177,7 @@ class Scene(Shown, Document):
         Raises what `phase_function` raises.
         """
         directions, estimator = photons / self.scan_positions, self.transport.estimator
-        if estimator == "analog" or (estimator == "guided" and not self.medium.has_phase_table):
+        if estimator in ("analog", "none") or (estimator == "guided" and not self.medium.has_phase_table):
             return 0.0, 0.0
         if estimator == "guided":
             middle = 0.25 * self.medium.pulse_speed * (self.gate.start + self.gate.stop)

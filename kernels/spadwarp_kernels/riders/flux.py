@@ -6,7 +6,7 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import u01
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonRef, SinkRef, WorldRef
-from spadwarp_kernels.tally.flux import add_flux_collision, add_flux_crossings, add_flux_track
+from spadwarp_kernels.tally.flux import Leg, add_flux_collision, add_flux_crossings, add_flux_track
 
 
 @memoised
@@ -21,21 +21,17 @@ def make_flux_score(spec: TransportSpec) -> wp.Function | None:
 
     @wp.func
     def score_flux(s: PhotonRef, world: WorldRef, sink: SinkRef, length: float, collides: bool):
-        weight = s.weight.value
-        rounding_sample = u01(s.flight.block[3])
+        leg = Leg(s.x, s.u, length, s.path, s.weight.value, u01(s.flight.block[3]))
         if wp.static(tracks):
             for k in range(world.flux.tracks.shape[0]):
-                add_flux_track(world.flux.tracks[k], sink.flux, s.x, s.u, length, s.path, weight, rounding_sample)
+                add_flux_track(world.flux.tracks[k], sink.flux, leg)
         if wp.static(planes):
             for k in range(world.flux.planes.shape[0]):
-                section = world.flux.planes[k]
-                add_flux_crossings(section, world.flux.positions, sink.flux, s.x, s.u, length, weight, rounding_sample)
+                add_flux_crossings(world.flux.planes[k], world.flux.positions, sink.flux, leg)
         if wp.static(collisions):
             if collides:
-                x = s.x + length * s.u
-                free = weight / water_at(world.medium, world.layers, x).extinction
+                extinction = water_at(world.medium, world.layers, leg.x + length * leg.u).extinction
                 for k in range(world.flux.collisions.shape[0]):
-                    volume = world.flux.collisions[k]
-                    add_flux_collision(volume, sink.flux, x, s.path + length, free, rounding_sample)
+                    add_flux_collision(world.flux.collisions[k], sink.flux, leg, extinction)
 
     return score_flux

@@ -15,7 +15,7 @@ from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_i
 
 from .tally import atomic_add_int64
 
-__all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "add_flux_collision", "add_flux_crossings"]
+__all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "Leg", "add_flux_collision", "add_flux_crossings"]
 __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume"]
 
 FLUX_KINDS = ("track", "collision", "planes")
@@ -71,6 +71,18 @@ class Flux:
     size: int  # entries of the tally
 
 
+@wp.struct
+class Leg:
+    """A straight way of light."""
+
+    x: wp.vec3  # where it begins [m]
+    u: wp.vec3  # unit direction
+    length: float  # [m]
+    path: float  # by which the light has come there [m]
+    weight: float
+    rounding_sample: float  # uniform in [0, 1)
+
+
 @wp.func
 def _add(tally: wp.array[wp.int64], index: int, units: float, rounding_sample: float):
     whole = wp.int64(units + rounding_sample)
@@ -90,28 +102,16 @@ def _in_voxels(volume: FluxVolume, x: wp.vec3, path: float) -> wp.vec4:
 
 
 @wp.func
-def add_flux_track(
-    volume: FluxVolume,
-    tally: wp.array[wp.int64],
-    x: wp.vec3,
-    u: wp.vec3,
-    length: float,
-    path: float,
-    weight: float,
-    rounding_sample: float,
-):
-    """Adds weight times length to the voxels and gates on the way from x along u, where light has come by `path`.
-
-    Lengths in metres; `rounding_sample`: uniform in [0, 1). Voxel after voxel (Amanatides & Woo 1987), gates as the
-    fourth edge of the box.
-    """
+def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
+    """Adds weight times length to the voxels and gates on a leg, one after the other (Amanatides & Woo 1987), with
+    gates as the fourth edge of the box."""
     size = wp.vec4i(volume.size[0], volume.size[1], volume.size[2], volume.gates)
-    q = _in_voxels(volume, x, path)
-    along = volume.turn * u
+    q = _in_voxels(volume, leg.x, leg.path)
+    along = volume.turn * leg.u
     v = wp.vec4(along[0], along[1], along[2], volume.gates_per_metre)
     inverse = wp.vec4()
     s = float(0.0)
-    end = float(length)
+    end = float(leg.length)
     for i in range(4):
         if wp.abs(v[i]) > 1.0e-20:
             inverse[i] = 1.0 / v[i]
@@ -128,7 +128,7 @@ def add_flux_track(
         ahead[i] = wp.where(inverse[i] != 0.0, (float(k[i] + wp.where(v[i] > 0.0, 1, 0)) - q[i]) * inverse[i], 1.0e30)
     while s < end:
         stop = wp.max(s, wp.min(end, wp.min(wp.min(ahead[0], ahead[1]), wp.min(ahead[2], ahead[3]))))
-        _add(tally, _voxel(volume, k), weight * (stop - s) * volume.scale, rounding_sample)
+        _add(tally, _voxel(volume, k), leg.weight * (stop - s) * volume.scale, leg.rounding_sample)
         s = stop
         for i in range(4):
             if ahead[i] <= stop:
@@ -139,12 +139,10 @@ def add_flux_track(
 
 
 @wp.func
-def add_flux_collision(
-    volume: FluxVolume, tally: wp.array[wp.int64], x: wp.vec3, path: float, length: float, rounding_sample: float
-):
-    """Adds to the voxel and gate of a collision at x, after a path [m], the weight before it over the extinction,
-    `length` [m]: the expectation of `add_flux_track`."""
-    q = _in_voxels(volume, x, path)
+def add_flux_collision(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg, extinction: float):
+    """Adds weight over extinction [1/m] to the voxel and gate of the collision that ends a leg: the expectation of
+    `add_flux_track`."""
+    q = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
     size = wp.vec4i(volume.size[0], volume.size[1], volume.size[2], volume.gates)
     k = wp.vec4i()
     inside = bool(True)
@@ -152,45 +150,36 @@ def add_flux_collision(
         inside = inside and q[i] >= 0.0 and q[i] < float(size[i])
         k[i] = int(q[i])
     if inside:
-        _add(tally, _voxel(volume, k), length * volume.scale, rounding_sample)
+        _add(tally, _voxel(volume, k), leg.weight / extinction * volume.scale, leg.rounding_sample)
 
 
 @wp.func
-def add_flux_crossings(
-    planes: FluxPlanes,
-    positions: wp.array[float],
-    tally: wp.array[wp.int64],
-    x: wp.vec3,
-    u: wp.vec3,
-    length: float,
-    weight: float,
-    rounding_sample: float,
-):
-    """Adds the weight to all planes that are crossed on the way from x along u, of a length [m]."""
-    begin = wp.dot(planes.axis, x)
-    # As of the point where the next way begins, so that none crosses a plane twice.
-    end = wp.dot(planes.axis, x + length * u)
-    mu = wp.dot(planes.axis, u)
-    exact = weight * planes.scale
+def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp.array[wp.int64], leg: Leg):
+    """Adds the weight to all planes that a leg crosses."""
+    begin = wp.dot(planes.axis, leg.x)
+    # As of the point where the next leg begins, so that none crosses a plane twice.
+    end = wp.dot(planes.axis, leg.x + leg.length * leg.u)
+    mu = wp.dot(planes.axis, leg.u)
+    exact = leg.weight * planes.scale
     scalar = exact / wp.where(wp.abs(mu) < _GRAZING, 0.5 * _GRAZING, wp.abs(mu))
     side = wp.where(end > begin, 0, 1)
     width = 4 + planes.polar * planes.azimuth
     for k in range(planes.count):
         p = positions[planes.begin + k]
         if wp.min(begin, end) < p and p <= wp.max(begin, end):
-            away = x + ((p - begin) / (end - begin) * length) * u - planes.centre
+            away = leg.x + ((p - begin) / (end - begin) * leg.length) * leg.u - planes.centre
             across = away - wp.dot(planes.axis, away) * planes.axis
             if planes.radius2 >= 1.0e30 or wp.dot(across, across) <= planes.radius2:
                 entry = planes.first + k * width
-                _add(tally, entry + side, exact, rounding_sample)
-                _add(tally, entry + 2 + side, scalar, rounding_sample)
+                _add(tally, entry + side, exact, leg.rounding_sample)
+                _add(tally, entry + 2 + side, scalar, leg.rounding_sample)
                 if planes.polar > 0:
                     angle = wp.acos(wp.clamp(mu, -1.0, 1.0)) / wp.pi
                     i = wp.min(int(angle * float(planes.polar)), planes.polar - 1)
-                    turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), u), wp.dot(planes.right, u))
+                    turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), leg.u), wp.dot(planes.right, leg.u))
                     turn = wp.where(turn < 0.0, turn / (2.0 * wp.pi) + 1.0, turn / (2.0 * wp.pi))
                     j = wp.min(int(turn * float(planes.azimuth)), planes.azimuth - 1)
-                    _add(tally, entry + 4 + i * planes.azimuth + j, scalar, rounding_sample)
+                    _add(tally, entry + 4 + i * planes.azimuth + j, scalar, leg.rounding_sample)
 
 
 # ---- Sections.

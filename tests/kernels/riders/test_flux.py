@@ -18,7 +18,7 @@ PHOTONS = 20_000
 @wp.kernel
 def _tracks(volume: sk.FluxVolume, x: wp.array[wp.vec3], u: wp.array[wp.vec3], tally: wp.array[wp.int64]):
     i = wp.tid()
-    sk.add_flux_track(volume, tally, x[i], u[i], 3.0, 1.0, 0.5, 0.5)
+    sk.add_flux_track(volume, tally, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, 0.5))
 
 
 @wp.kernel
@@ -30,7 +30,7 @@ def _planes(
     tally: wp.array[wp.int64],
 ):
     i = wp.tid()
-    sk.add_flux_crossings(planes, positions, tally, x[i], u[i], 3.0, 0.5, 0.5)
+    sk.add_flux_crossings(planes, positions, tally, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, 0.5))
 
 
 def directions(rng, count):
