@@ -119,7 +119,7 @@ def test_parts_of_a_run_and_files_keep_the_bits(tmp_path):
     assert errors[1] == pytest.approx(errors[0], rel=0.5) and errors[2] == pytest.approx(errors[0], rel=0.5)
     data = whole.to_xarray()
     assert data["depths_irradiance"].dims == ("depths_position", "depths_kind")
-    assert float(data["sea_fluence"]) == whole.flux["sea"]["fluence"].values.item()
+    assert data["sea_fluence"].item() == whole.flux["sea"]["fluence"].values.item()
 
 
 def test_fluence_of_a_beam_from_a_turned_camera_by_gate():
