@@ -84,14 +84,11 @@ def flux_of(result: Result) -> dict[str, dict[str, FluxValues]]:
 
 def check_flux(scene: Scene, tallies: FluxTallies | None, batches: int) -> None:
     """Refuses tallies that are not those of the scene's sections."""
-    size, held = sum(section.size for section in scene.flux), None if tallies is None else tallies.tallies.shape
-    if held != ((size,) if scene.flux else None):
-        raise ArgumentError(f"flux_tallies have the shape {held}; the scene's sections have {size} entries")
-    moments = None if tallies is None else tallies.second_moment
-    if moments is not None and moments.shape != (2, size):
-        raise ArgumentError(f"flux_tallies: second_moment has the shape {moments.shape}; (2, {size}) is needed")
-    if tallies is not None and (moments is not None) != (batches > 0):
-        raise ArgumentError("flux and tallies: both have a second moment, or none of them")
+    size, moments = sum(section.size for section in scene.flux), None if tallies is None else tallies.second_moment
+    shapes = [None if one is None else one.shape for one in (None if tallies is None else tallies.tallies, moments)]
+    needed = [(size,), (2, size) if batches else None] if scene.flux else [None, None]
+    if shapes != needed:
+        raise ArgumentError(f"flux_tallies and their second moment have the shapes {shapes}; {needed} are needed")
 
 
 # Apparent optical properties
@@ -113,18 +110,13 @@ class Apparent:
     errors: Mapping[str, Floats]  # standard error of each of those above but position and middle, by name
 
 
-def apparent(result: Any, section: str | None = None) -> Apparent:
+def apparent(result: Result, section: str | None = None) -> Apparent:
     """Diffuse attenuation, irradiance reflectance and mean cosines at the planes of a section of `[[flux]]`.
 
-    Args:
-        result: A result, or the path of one.
-        section: Its name; by default that of the first section with planes.
+    `section`: its name; by default that of the first section with planes.
 
     Raises `ConfigError`: the result has no planes, or no errors; `ArgumentError` for another name.
     """
-    from spadwarp.result.file import as_result
-
-    result = as_result(result)
     names = [one.name for one in result.scene.flux if one.positions is not None]
     if not names:
         raise ConfigError("apparent: the result has no [[flux]] with positions of planes", source=result.scene.source)

@@ -96,37 +96,34 @@ class Scene(Shown, Document):
 
     def _flux_exclusions(self) -> Iterator[str]:
         """Why flux is not tallied, or not what it seems."""
-        transport, names, sun = self.transport, [section.name for section in self.flux], self.sun
-        estimator = f"transport.estimator = {transport.estimator!r}"
+        transport, names, sun, medium = self.transport, [section.name for section in self.flux], self.sun, self.medium
+        estimator, threshold = f"transport.estimator = {transport.estimator!r}", transport.axis_threshold
         if len(set(names)) < len(names):
             yield f"flux: the names {', '.join(names)} are not all different"
         if self.flux and transport.estimator in ("analog", "guided"):
             yield (
-                f"{estimator} does not go with flux, whose balance with absorption holds for light that nothing "
-                "guides: take 'next_event', or 'none' for flux alone"
+                f"{estimator} does not go with flux, whose balance with absorption holds for light that nothing guides:"
+                " take 'next_event', or 'none' for flux alone"
             )
-        if self.flux and transport.axis_threshold < 1.0:
-            yield (
-                f"transport.axis_threshold = {transport.axis_threshold} does not go with flux: set it to 1, for exact "
-                "directions"
-            )
-        if self.flux and (self.polarised or isinstance(self.medium.albedo, str)):
+        if self.flux and threshold < 1.0:
+            yield f"transport.axis_threshold = {threshold} does not go with flux: set it to 1, for exact directions"
+        if self.flux and (self.polarised or isinstance(medium.albedo, str)):
             yield "flux goes neither with polarised light nor with a random albedo"
         if transport.estimator == "none" and not self.flux:
             yield f"{estimator} tallies nothing without [[flux]]"
         if sun is None:
             return
-        if transport.estimator != "none" or not self.flux or self.scan.mode != "none" or self.polarised:
-            yield f"{estimator}: [sun] is for [[flux]] alone, with 'none', without a scan or polarised light"
-        k, axes = "xyz".index(sun.surface[0]), [0, 1, 2]
-        axes.remove(k)
-        low, high = self.domain.bounds
+        if transport.estimator != "none" or self.scan.mode != "none":
+            yield f"{estimator}: [sun] is for [[flux]] alone, with 'none', and without a scan"
+        k, (low, high) = "xyz".index(sun.surface[0]), self.domain.bounds
         if math.isinf((low, high)[sun.surface.endswith("high")][k]):
             yield f"sun.surface = {sun.surface!r} is no face of the domain: give it a shape and that bound"
-        if any(math.isfinite(side[j]) for side in (low, high) for j in axes) or self.transport.lateral_limit < math.inf:
+        bounds = [side[j] for side in (low, high) for j in range(3) if j != k]
+        if any(map(math.isfinite, [*bounds, transport.lateral_limit])):
             yield "sun: the domain and transport.lateral_limit bound the water along the surface; take inf there"
-        across = any(abs(self.medium.layer_axis[j]) > 0.0 for j in axes) if self.medium.layers else False
-        if self.medium.grid is not None or across:
+        if medium.grid is not None or (
+            medium.layers and sum(map(bool, medium.layer_axis)) - bool(medium.layer_axis[k])
+        ):
             yield "sun: water that varies along the surface; layers across it are allowed"
 
     def _blocked_ports(self) -> Iterator[str]:

@@ -12,6 +12,7 @@ from spadwarp.values import ConfigError
 from spadwarp.viz import style
 from spadwarp.viz.style import INTENSITY_MAP, SERIES, colour_map, log_axis, plain_axis
 
+_PROPERTIES = {"attenuation": "K_d [1/m]", "reflectance": "R", "mean_cosine": "mean cosine"}
 _LEAST = 1e-5  # of the brightest voxel, that a slice shows
 
 
@@ -51,13 +52,10 @@ def _profiles(result: Result, section: str, left: Axes, right: Axes) -> None:
         style.middle_text(right, "too few batches")
         return
     found = apparent(result, section)
-    shown = {
-        "K_d [1/m]": (found.attenuation, found.middle, found.errors["attenuation"]),
-        "R": (found.reflectance, found.position, found.errors["reflectance"]),
-        "mean cosine": (found.mean_cosine, found.position, found.errors["mean_cosine"]),
-    }
-    for k, (label, (values, places, errors)) in enumerate(shown.items()):
-        right.errorbar(values, places, xerr=errors, fmt=".-", color=SERIES[k], label=label, linewidth=0.9)
+    for k, (name, label) in enumerate(_PROPERTIES.items()):
+        places = found.middle if name == "attenuation" else found.position
+        error = found.errors[name]
+        right.errorbar(getattr(found, name), places, xerr=error, fmt=".-", color=SERIES[k], label=label, linewidth=0.9)
     right.set(xlabel="K_d, R, mean cosine", title="apparent optical properties")
     log_axis(right, "x")
     right.legend(fontsize=6.5)
@@ -76,12 +74,6 @@ def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: 
     if not top > 0.0:
         style.middle_text(axis, "no light")
         return
-    shown = axis.imshow(
-        np.maximum(image, _LEAST * top),
-        norm=LogNorm(_LEAST * top, top),
-        cmap=colour_map(INTENSITY_MAP),
-        extent=(*ends[0], ends[1][1], ends[1][0]),
-        aspect="equal",
-        interpolation="nearest",
-    )
+    look = {"norm": LogNorm(_LEAST * top, top), "cmap": colour_map(INTENSITY_MAP), "interpolation": "nearest"}
+    shown = axis.imshow(np.maximum(image, _LEAST * top), extent=(*ends[0], ends[1][1], ends[1][0]), **look)
     figure.colorbar(shown, ax=axis, label=f"fluence [{light.unit}]", shrink=0.6)

@@ -203,15 +203,10 @@ def make_sun(
     An emitted photon stands for the irradiance on the surface, in the air. All are emitted at one point: in water that
     is the same along the surface a plane anywhere gets from it what a unit of its area gets from a beam without bounds.
 
-    Args:
-        direction: In which the sun's light goes in the air, of any length but 0.
-        normal: Unit vector down into the water.
-        distance: Of the surface from the origin along the normal [m].
-        index: Of the water over that of the air; 1: a surface that does nothing.
-        sky: Part of the irradiance, in [0, 1], that comes from a sky of even radiance.
-
-    Raises:
-        ArgumentError: A number out of range, or a sun below the horizon.
+    `direction`: in which the sun's light goes in the air, of any length; `normal`: unit vector down into the water;
+    `distance` of the surface from the origin along it [m]; `index`: of the water over that of the air, 1: a surface
+    that does nothing; `sky`: part of the irradiance, in [0, 1], of a sky of even radiance. Raises `ArgumentError`, also
+    for a sun below the horizon.
     """
     height = max(_ABOVE, _ABOVE * abs(check_number("distance", distance, "(-inf, inf)")))
     laser = make_laser("collimated", radius=0.0, axis=direction, position=[(distance - height) * x for x in normal])

@@ -21,9 +21,6 @@ __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume
 FLUX_KINDS = ("track", "collision", "planes")
 """How light is tallied: by the lengths of its ways in voxels, by its collisions there, by its crossings of planes."""
 
-IRRADIANCES = ("downward", "upward", "scalar_downward", "scalar_upward")
-"""What a plane has beside its bins of radiance: along its axis and against it, by area, and by area across the ray."""
-
 # Crossings with |mu| below this count in scalar irradiance and radiance as their mean would, 2 / _GRAZING, for radiance
 # that is even there: 1/|mu| has no variance.
 _GRAZING = wp.constant(0.01)
@@ -56,7 +53,9 @@ class FluxPlanes:
     count: int
     polar: int  # bins of radiance in the angle to the axis, 0 ... pi
     azimuth: int  # and about it, 0 ... 2 pi
-    first: int  # its first entry in the tally, of [plane, IRRADIANCES and (polar, azimuth)]; filled by `make_flux`
+    first: int
+    """Its first entry in the tally, of [plane, irradiance downward, upward, scalar downward, scalar upward, radiance
+    (polar, azimuth)]; filled by `make_flux`."""
     scale: float  # tally units
 
 
@@ -198,37 +197,34 @@ def make_flux_volume(
     estimator: str = "track",
     scale: float = 2.0**22,
 ) -> FluxVolume:
-    """A box of voxels and gates.
+    """A box of voxels and gates; `estimator`: "track" or "collision", see FLUX_KINDS; `scale`: units per metre.
 
-    Args:
-        shape: Number of voxels along x, y and z.
-        lower: Corner of the box [m].
-        edge: Of a voxel along x, y and z [m]; infinite: the box has no bounds there, and one voxel.
-        rotation, origin: A point x of the photons lies at rotation x + origin in the frame of the box.
-        gates, gate_start, gate_path: Number of gates, where the first begins and how long each is, in path [m].
-        estimator: "track" or "collision", see FLUX_KINDS.
-        scale: Tally units per metre of weight times length.
-
-    Raises:
-        ArgumentError: A number out of range.
+    The box of `shape` voxels begins at `lower`, in a frame in which a point x of the photons lies at rotation x +
+    origin; where the `edge` of a voxel is infinite it has no bounds, and one voxel. Gates of `gate_path` follow each
+    other from `gate_start` on. Lengths and paths in metres. Raises `ArgumentError`.
     """
-    for name, vector in {"shape": shape, "lower": lower, "origin": origin}.items():
+    for name, vector in {
+        "shape": shape,
+        "lower": lower,
+        "edge": [min(x, 1e30) for x in edge],
+        "origin": origin,
+    }.items():
         check_vector(name, vector)
     if estimator not in FLUX_KINDS[:2]:
         raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
+    volume: Any = FluxVolume()
     rows, shift = [], []
     for k, width in enumerate(edge):
-        check_number(f"edge[{k}]", 1.0 if width == math.inf else width, "(0, inf)")
+        check_number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
         check_integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
-        bounded = width < math.inf
         rows += [x / width for x in rotation[k]]
-        shift.append((origin[k] - lower[k]) / width if bounded else 0.0)
-    volume: Any = FluxVolume()
+        shift.append((origin[k] - lower[k]) / width)
     volume.turn, volume.shift, volume.size = wp.mat33(*rows), wp.vec3(*shift), wp.vec3i(*shape)
     volume.gates = check_integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
     volume.gate_start = check_number("gate_start", gate_start, "(-inf, inf)")
-    volume.gates_per_metre = 1.0 / check_number("gate_path", min(gate_path, 1e30), "(0, inf)") * (gate_path < math.inf)
-    volume.by_collision, volume.scale = int(estimator == "collision"), check_number("scale", scale, "(0, inf)")
+    check_number("gate_path", min(gate_path, 1e30), "(0, inf)")
+    volume.gates_per_metre, volume.by_collision = 1.0 / gate_path, int(estimator == "collision")
+    volume.scale = check_number("scale", scale, "(0, inf)")
     return volume
 
 
@@ -243,37 +239,28 @@ def make_flux_planes(
     azimuth: int = 0,
     scale: float = 2.0**20,
 ) -> FluxPlanes:
-    """So many planes; their positions, in the order of the sections, go to `make_flux`. See `FluxPlanes`.
-
-    Raises:
-        ArgumentError: A number out of range.
-    """
-    check_vector("axis", axis, unit=True)
-    check_vector("right", right, unit=True)
-    check_vector("centre", centre)
+    """So many planes, see `FluxPlanes`; their positions, in the order of the sections, go to `make_flux`. Raises
+    `ArgumentError`."""
     planes: Any = FluxPlanes()
-    planes.axis, planes.right, planes.centre = wp.vec3(*axis), wp.vec3(*right), wp.vec3(*centre)
+    for name, vector in {"axis": axis, "right": right, "centre": centre}.items():
+        check_vector(name, vector, unit=name != "centre")
+        setattr(planes, name, wp.vec3(*vector))
+    for name, number, least in (("count", count, 1), ("polar", polar, 0), ("azimuth", azimuth, 0)):
+        setattr(planes, name, check_integer(name, number, least, 1 << 16))
     planes.radius2 = min(check_number("radius", min(radius, 1e15), "(0, inf)") ** 2, 1e30)
-    planes.count = check_integer("count", count, 1, 1 << 16)
-    planes.polar, planes.azimuth = (
-        check_integer("polar", polar, 0, 1 << 12),
-        check_integer("azimuth", azimuth, 0, 1 << 12),
-    )
     planes.scale = check_number("scale", scale, "(0, inf)")
     return planes
 
 
 def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, device: wp.DeviceLike = None) -> Flux:
-    """The sections, FluxVolume or FluxPlanes, whose entries follow each other in the tally; `positions` along the axis
-    of all their planes [m].
+    """The sections, FluxVolume or FluxPlanes, one after the other in the tally, and the positions of all their planes.
 
-    Raises:
-        ArgumentError: A tally of 2^31 entries or more, or positions that are not those of the planes.
+    Raises `ArgumentError`: a tally of 2^31 entries or more, or positions that are not those of the planes.
     """
-    device, flux = check_device("device", device), Flux()
-    size, begin, kinds = 0, 0, dict[str, list[Any]](tracks=[], collisions=[], planes=[])
+    device, flux, size, begin = check_device("device", device), Flux(), 0, 0
+    kinds: dict[str, list[Any]] = {"tracks": [], "collisions": [], "planes": []}
     for section in sections:
-        section.first = check_integer("entries of the tally of flux", size, 0, 2**31 - 1)
+        section.first = size
         if hasattr(section, "polar"):
             section.begin = begin
             begin += section.count
@@ -282,9 +269,10 @@ def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, devic
         else:
             size += math.prod(section.size) * section.gates
             kinds["collisions" if section.by_collision else "tracks"].append(section)
+        check_integer("entries of the tally of flux", size, 0, 2**31 - 1)
     if len(positions) != begin:
         raise ArgumentError(f"positions: {len(positions)} of {begin} planes")
-    flux.size = check_integer("entries of the tally of flux", size, 0, 2**31 - 1)
+    flux.size = size
     for name, found in kinds.items():
         setattr(flux, name, wp.array(found, dtype=FluxPlanes if name == "planes" else FluxVolume, device=device))
     flux.positions = wp.array(list(positions), dtype=float, device=device)
