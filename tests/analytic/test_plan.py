@@ -242,7 +242,7 @@ def test_the_hazard_distance_is_where_the_limit_is(profile):
 def test_the_safe_distance_in_water_is_that_of_absorption_alone_where_nothing_scatters():
     """Of a beam narrower than the pupil, which `plan` reports as well; on the safe side, by 12 % at most."""
     laser = {"profile": "collimated", "beam_radius": 0.002, "half_angle_deg": None, "pulse_energy": 1e-7}
-    scene = make(laser=laser | {"repetition_rate": 1e6}, medium={"absorption": 0.3, "scattering": 1e-6, "albedo": None})
+    scene = make(laser=laser | {"repetition_rate": 1e6}, medium={"extinction": 0.3, "albedo": 1e-6})
     allowed = eye_limit(scene).pulse_energy / scene.laser.pulse_energy
     expected = -math.log(allowed) / 0.3
     found = safe_distance_in_water(scene, photons=20_000, device="cpu")
