@@ -63,7 +63,7 @@ def scene() -> str:
         "```toml\n" + _EXAMPLE + "```\n"
     ]
     for name, field in Scene.model_fields.items():
-        parts.append(_section(name, _model(field), repeated=name == "targets"))
+        parts.append(_section(name, _model(field), repeated=name in ("targets", "flux")))
     return "\n".join(parts)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.budgets import OUTLIERS, axis_line, central_pixel, face_reflectance
-from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit
+from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, safe_distance_in_water
 from spadwarp.analytic.model import false_peaks
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, Method, arrival_time
@@ -253,6 +253,9 @@ def plan(
     if problem:
         raise ConfigError(problem, source=scene.source)
     proposal = planner.propose(with_gate(scene, span, planner.margin), span, number)
+    if eye_distance is not None and not isinstance(scene.medium.albedo, str):
+        water = safe_distance_in_water(proposal.scene, exposure=planner.eye_exposure, seed=seed, device=device)
+        proposal = dataclasses.replace(proposal, eye=dataclasses.replace(proposal.eye, water_distance=water))
     if not largest_range or not proposal.judged:
         return proposal
     largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), number and max(number // 8, 1))

@@ -37,7 +37,7 @@ __all__ += ["write_depth", "write_fit", "write_run"]
 CHECKPOINT = "checkpoint.h5"
 """Name of the partial result of an unfinished run."""
 
-_KINDS, _ENDINGS = ("depth", "intensity", "histogram", "truth"), ("png", "pdf")
+_KINDS, _ENDINGS = ("depth", "intensity", "histogram", "truth", "flux"), ("png", "pdf")
 _PICTURES = tuple(f"{name}.{ending}" for name in _KINDS for ending in _ENDINGS)
 RUN_FILES = ("result.h5", "records.h5", "scene.toml", "depth.exr", "truth.exr", CHECKPOINT, *_PICTURES)
 """Names of all files that the directory of a run may have."""
@@ -121,7 +121,9 @@ def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[
     output = result.scene.output
     formats = [ending for ending in _ENDINGS if getattr(output, ending)]
     draw = functools.partial(_Pictures.plot, result, folder, depth=depth, method=output.depth_method, formats=formats)
-    return [functools.partial(draw, kinds=(kind,)) for kind in _KINDS] if formats else []
+    kinds = _KINDS[:-1] if result.scene.transport.estimator != "none" else ()
+    kinds += _KINDS[-1:] if result.scene.flux else ()
+    return [functools.partial(draw, kinds=(kind,)) for kind in kinds] if formats else []
 
 
 def _save(result: Result, path: Path) -> Path:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 import numpy as np
 
 from spadwarp.arrays import Variable, is_torch, labelled
+from spadwarp.result.flux import flux_arrays
 from spadwarp.result.result import ARRAYS, COMPONENTS, Component, Result, coordinates_of
 from spadwarp.values import ArgumentError, check_choice
 
@@ -106,7 +107,8 @@ def to_xarray(result: Result) -> xarray.Dataset:
     `histogram` has the dimensions (component, y, x, time); `.sum("component")` is all light, `.sel(component=
     "backscatter")` a part of it. Coordinates: time of flight [s] at the bins' centres, `path` [m] along it, pixels.
     `derivative`, of results that have some, has the dimension parameter before these, and `polarisation` the dimension
-    channel. Attributes: photons, seed, partial and the scene as TOML.
+    channel. Sections of flux are such as `around_fluence`, with dimensions of their own.
+    Attributes: photons, seed, partial and the scene as TOML.
 
     Raises `FileError`: xarray is not installed.
     """
@@ -127,6 +129,14 @@ def to_xarray(result: Result) -> xarray.Dataset:
         channels = np.stack([*result.channels.values()])
         variables["polarisation"] = (("channel", *cube), channels, "1", "fraction of the emitted photons in a channel")
     known = coordinates_of(result)
+    for name, array in flux_arrays(result.scene).items():
+        section, _, kind = name.partition("/")
+        axes = {f"{section}_{axis}": coordinate for axis, coordinate in array.dimensions.items()}
+        light = result.flux[section][kind]
+        variables[f"{section}_{kind}"] = (tuple(axes), light.values, array.unit, array.meaning)
+        if light.errors is not None:
+            variables[f"{section}_{kind}_error"] = (tuple(axes), light.errors, array.unit, "standard error")
+        known |= axes
     known["channel"] = (list(result.channels), *known["channel"][1:])
     used = {dimension for dimensions, *_ in variables.values() for dimension in dimensions}
     coordinates: dict[str, Variable] = {name: ((name,), *known[name]) for name in known if name in used}

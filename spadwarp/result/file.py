@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
 from spadwarp.io.paths import file_within
+from spadwarp.result.flux import flux_arrays, part_of
 from spadwarp.result.result import (
     ARRAYS,
     COMPONENTS,
@@ -29,7 +30,7 @@ from spadwarp.result.result import (
     signed_of,
     water_of,
 )
-from spadwarp.result.tallies import Range, SignedTallies, added, joined, moments_of, rebatched, total_of
+from spadwarp.result.tallies import FluxTallies, Range, SignedTallies, added, joined, moments_of, rebatched, total_of
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, shown
@@ -54,6 +55,7 @@ _READ_ME = (
     "photons of the batch in units of batch_size; half: the tallies of the half of the batches whose number is even. "
     "derivatives/tallies, where they were asked for: [parameter, component, height, width, bin], signed; times "
     "derivatives/unit over photons it is the derivative of the fraction with respect to the parameter. "
+    "flux/SECTION/NAME, of [[flux]]: tallies whose attribute unit, over photons, makes them what long_name says. "
     "channels/tallies, of a camera that records polarisation: the same for each channel, the fraction that it gets. "
     "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
     "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
@@ -107,10 +109,11 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
             else:
                 file.create_dataset(name, data=array, **(options if "y" in dimensions else {}))
         file.create_dataset("bin_edges", data=result.bin_edges)
+        axes, described = _write_flux(file, result, options)
         file.create_dataset("config", data=result.scene.to_toml())
         for name in _RECORDS:
             file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
-        name_dimensions(file, coordinates, _DIMENSIONS)
+        name_dimensions(file, coordinates | axes, _DIMENSIONS | described)
     return Path(path)
 
 
@@ -173,9 +176,42 @@ def load_result(path: str | Path) -> Result:
             batch_moments=moments,
             derivative_tallies=signed("derivatives"),
             channel_tallies=signed("channels"),
+            flux_tallies=_read_flux(file, head) if head.scene.flux else None,
             timing=file.numbers("timing"),
             provenance=made,
         )
+
+
+def _write_flux(file: Any, result: Result, options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Writes the integers of the sections of flux and the sums of their squares; returns coordinates and descriptions
+    for `name_dimensions`."""
+    axes, described, held = dict[str, Any](), dict[str, Any](), result.flux_tallies
+    for name, array in flux_arrays(result.scene).items():
+        assert held is not None
+        section = f"flux/{name.partition('/')[0]}"
+        own = {f"{section}/{axis}": coordinate for axis, coordinate in array.dimensions.items()}
+        axes |= own
+        texts = {f"flux/{name}": (held.tallies, (*own,), f"times unit over photons: {array.meaning} [{array.unit}]")}
+        if held.second_moment is not None:
+            text = "sum over batches of the squared tally"
+            texts[f"flux/{name}_second_moment"] = held.second_moment, ("word", *own), text
+        for place, (entries, dimensions, text) in texts.items():
+            file.create_dataset(place, data=part_of(entries, array), **options).attrs["unit"] = array.value
+            described[place] = dimensions, "1", text
+    return axes, described
+
+
+def _read_flux(file: Hdf5File, head: ResultHead) -> FluxTallies:
+    """The sections' tallies of a file, one after another."""
+    size = sum(section.size for section in head.scene.flux)
+    tallies = np.zeros(size, np.int64)
+    moments = np.zeros((2, size), np.uint64) if head.batch_size else None
+    for name, array in flux_arrays(head.scene).items():
+        part_of(tallies, array)[...] = file.array(f"flux/{name}", np.int64, array.shape)
+        if moments is not None:
+            held = file.array(f"flux/{name}_second_moment", np.uint64, (2, *array.shape))
+            part_of(moments, array)[...] = held
+    return FluxTallies(tallies, moments)
 
 
 ResultLike = Result | str | os.PathLike[str]

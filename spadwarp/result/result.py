@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
+from spadwarp.result.flux import FluxValues, check_flux, flux_arrays, flux_of
 from spadwarp.result.noise import noise_ratios, photons_needed, target_noise_ratio
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.medium import NOTABLE_UNSEEN
@@ -184,6 +185,7 @@ class Result(Shown, ResultHead, Tallies):
         camera, counts["time"] = self.scene.camera, self.scene.gate.bins
         for name, array in arrays_of(self).items():
             _check_array(name, array, shape_of(name, camera.height, camera.width, **counts))
+        check_flux(self.scene, self.flux_tallies, self.batches)
         units = {"unit": self.unit, "energy_balance_unit": self.energy_balance_unit}
         for group, found in signed.items():
             if (found.second_moment is None) != (self.second_moment is None):
@@ -266,6 +268,11 @@ class Result(Shown, ResultHead, Tallies):
         """Channel of the camera, "co" and "cross" of an analyser or "I", "Q", "U" and "V", → what it gets, as
         `derivatives`; the histogram is of light without an analyser."""
         return _SignedValues(self, "channels")
+
+    @cached_property
+    def flux(self) -> Mapping[str, Mapping[str, FluxValues]]:
+        """Section of `[[flux]]` → its arrays, "fluence" of a volume, "irradiance" and "radiance" of planes."""
+        return flux_of(self)
 
     # Errors
 
@@ -471,6 +478,7 @@ class Result(Shown, ResultHead, Tallies):
             **self._noise_summary(),
             **({"derivatives": _short_names(self.derivatives)} if self.derivatives else {}),
             **_polarisation_summary(self),
+            **({"flux": list(flux_arrays(scene))} if scene.flux else {}),
             "timing": dict(self.timing),
             "provenance": dict(self.provenance),
         }

@@ -15,7 +15,7 @@ from spadwarp.values import ConfigError, SpadwarpError
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["SignedTallies", "Tallies"]
+__all__ = ["FluxTallies", "SignedTallies", "Tallies"]
 
 OVERFLOW = (
     "a histogram bin overflowed: the scene is brighter than the tally's unit allows for; run fewer photons at a time "
@@ -35,6 +35,14 @@ class SignedTallies:
     """Fraction of one emitted photon, per unit of the parameter, that a tally unit stands for; powers of two."""
     second_moment: NDArray[np.uint64] | None = None
     """uint64 `[2, P, H, W, T]`, as `Tallies.second_moment`; None without batches."""
+
+
+@dataclass(frozen=True, eq=False)
+class FluxTallies:
+    """Tallies of all sections of flux one after another, see `Flux.arrays`."""
+
+    tallies: NDArray[np.int64]  # int64 `[E]`
+    second_moment: NDArray[np.uint64] | None = None  # uint64 `[2, E]`, as `Tallies.second_moment`; None without batches
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,6 +70,7 @@ class Tallies:
     and over batches of `batch_size` photons `…_smallest` and `…_largest`; empty without batches."""
     derivative_tallies: SignedTallies | None = None  # of the derivatives that were asked for; None if there are none
     channel_tallies: SignedTallies | None = None  # of the camera's channels but "I", the histogram; None: no others
+    flux_tallies: FluxTallies | None = None  # of the scene's sections of flux; None if there are none
 
 
 def total_of(*parts: Tallies) -> Tallies:
@@ -88,6 +97,7 @@ def total_of(*parts: Tallies) -> Tallies:
         batch_moments=joined_moments(*(part.batch_moments for part in parts)),
         derivative_tallies=_signed_total([part.derivative_tallies for part in parts]),
         channel_tallies=_signed_total([part.channel_tallies for part in parts]),
+        flux_tallies=_flux_total([part.flux_tallies for part in parts if part.flux_tallies is not None]),
     )
 
 
@@ -106,7 +116,18 @@ def _signed_total(parts: Sequence[SignedTallies | None]) -> SignedTallies | None
     return replace(first, tallies=tallies, second_moment=second_moment)
 
 
-def _added_arrays(parts: Sequence[Tallies | SignedTallies]) -> tuple[NDArray[np.int64], NDArray[np.uint64] | None]:
+def _flux_total(parts: Sequence[FluxTallies]) -> FluxTallies | None:
+    if not parts:
+        return None
+    tallies, second_moment = _added_arrays(parts)
+    if tallies.min(initial=0) < 0 or tallies.max(initial=0) >= 2**62:
+        raise SpadwarpError("a voxel or plane of flux overflowed; run fewer photons at a time and average the results")
+    return FluxTallies(tallies, second_moment)
+
+
+def _added_arrays(
+    parts: Sequence[Tallies | SignedTallies | FluxTallies],
+) -> tuple[NDArray[np.int64], NDArray[np.uint64] | None]:
     """The sum of the tallies, and of the second moments where all have one: 128-bit integers, low and high halves."""
     total = parts[0].tallies.copy()
     for part in parts[1:]:
@@ -168,12 +189,12 @@ def rebatched(part: Tallies, ratio: int) -> Tallies:
         return part
     shift = np.uint64(ratio.bit_length() - 1)
     moments = {name: value * ratio for name, value in part.batch_moments.items() if name.endswith("_squares")}
-    signed = {}
-    for name in ("derivative_tallies", "channel_tallies"):
+    others = {}
+    for name in ("derivative_tallies", "channel_tallies", "flux_tallies"):
         if (group := getattr(part, name)) is not None:
             assert group.second_moment is not None
-            signed[name] = replace(group, second_moment=_shifted(group.second_moment, shift))
-    return replace(part, batch_moments=moments, second_moment=_shifted(part.second_moment, shift), **signed)
+            others[name] = replace(group, second_moment=_shifted(group.second_moment, shift))
+    return replace(part, batch_moments=moments, second_moment=_shifted(part.second_moment, shift), **others)
 
 
 def _shifted(wide: NDArray[np.uint64], shift: np.uint64) -> NDArray[np.uint64]:

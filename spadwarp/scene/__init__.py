@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from spadwarp.scene.ambient_light import *
 from spadwarp.scene.camera import *
+from spadwarp.scene.flux import *
 from spadwarp.scene.laser import *
 from spadwarp.scene.medium import *
 from spadwarp.scene.pose import *
@@ -17,5 +18,5 @@ from spadwarp.scene.settings import *
 from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _MODULES = (ambient_light, camera, laser, medium, pose, scene, sections, settings)
+    _MODULES = (ambient_light, camera, flux, laser, medium, pose, scene, sections, settings)
     __all__ = guarded(__name__, [name for module in _MODULES for name in module.__all__])

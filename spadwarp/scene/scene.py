@@ -20,6 +20,7 @@ from pydantic import BeforeValidator
 from spadwarp.io.paths import MESH_ENDINGS, example_or_path, used
 from spadwarp.io.text import read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
+from spadwarp.scene.flux import Flux, Sun
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium, phase_function
 from spadwarp.scene.port import Port, PortGeometry
@@ -46,6 +47,8 @@ class Scene(Shown, Document):
     daylight: Daylight | None = None
     targets: Annotated[tuple[Target, ...], BeforeValidator(listed)] = ()
     domain: Domain = Domain()
+    sun: Sun | None = None
+    flux: Annotated[tuple[Flux, ...], BeforeValidator(listed)] = ()
     transport: Transport = Transport()
     output: Output = Output()
     analytic: Analytic = Analytic()
@@ -59,6 +62,7 @@ class Scene(Shown, Document):
             self._polarise()
         yield from self._exclusions()
         yield from self._blocked_ports()
+        yield from self._flux_exclusions()
 
     def _polarise(self) -> None:
         """Sets what polarised light needs where the defaults are without it."""
@@ -94,6 +98,38 @@ class Scene(Shown, Document):
                     f"targets[{k}].specular_index = {target.specular_index} is that of the water, "
                     f"{medium.phase_index:.4g}: such facets reflect nothing"
                 )
+
+    def _flux_exclusions(self) -> Iterator[str]:
+        """Why flux is not tallied, or not what it seems."""
+        transport, names, sun, medium = self.transport, [section.name for section in self.flux], self.sun, self.medium
+        estimator, threshold = f"transport.estimator = {transport.estimator!r}", transport.axis_threshold
+        if len(set(names)) < len(names):
+            yield f"flux: the names {', '.join(names)} are not all different"
+        if self.flux and transport.estimator in ("analog", "guided"):
+            yield (
+                f"{estimator} does not go with flux, whose balance with absorption holds for light that nothing guides:"
+                " take 'next_event', or 'none' for flux alone"
+            )
+        if self.flux and threshold < 1.0:
+            yield f"transport.axis_threshold = {threshold} does not go with flux: set it to 1, for exact directions"
+        if self.flux and (self.polarised or isinstance(medium.albedo, str)):
+            yield "flux goes neither with polarised light nor with a random albedo"
+        if transport.estimator == "none" and not self.flux:
+            yield f"{estimator} tallies nothing without [[flux]]"
+        if sun is None:
+            return
+        if transport.estimator != "none" or self.scan.mode != "none":
+            yield f"{estimator}: [sun] is for [[flux]] alone, with 'none', and without a scan"
+        k, (low, high) = "xyz".index(sun.surface[0]), self.domain.bounds
+        if math.isinf((low, high)[sun.surface.endswith("high")][k]):
+            yield f"sun.surface = {sun.surface!r} is no face of the domain: give it a shape and that bound"
+        bounds = [side[j] for side in (low, high) for j in range(3) if j != k]
+        if any(map(math.isfinite, [*bounds, transport.lateral_limit])):
+            yield "sun: the domain and transport.lateral_limit bound the water along the surface; take inf there"
+        if medium.grid is not None or (
+            medium.layers and sum(map(bool, medium.layer_axis)) - bool(medium.layer_axis[k])
+        ):
+            yield "sun: water that varies along the surface; layers across it are allowed"
 
     def _blocked_ports(self) -> Iterator[str]:
         """Why light cannot pass the ports, or cannot be computed through them."""
@@ -143,7 +179,7 @@ class Scene(Shown, Document):
         Raises what `phase_function` raises.
         """
         directions, estimator = photons / self.scan_positions, self.transport.estimator
-        if estimator == "analog" or (estimator == "guided" and not self.medium.has_phase_table):
+        if estimator in ("analog", "none") or (estimator == "guided" and not self.medium.has_phase_table):
             return 0.0, 0.0
         if estimator == "guided":
             middle = 0.25 * self.medium.pulse_speed * (self.gate.start + self.gate.stop)

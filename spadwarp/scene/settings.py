@@ -243,9 +243,8 @@ class Transport(Section):
     """photons to emit; "auto": until the noise of the simulation is small beside that of a frame's photons, or its time
     is over"""
     seed: Whole = field(0, "key of the random numbers; one seed gives the same bits", SEED)
-    estimator: Literal["analog", "next_event", "guided"] = "guided"
-    """what scores: the photon itself, every event, or guided flights; `none` of the kernel library is not offered here;
-    `spadwarp.transport.trace` uses it"""
+    estimator: Literal["analog", "next_event", "guided", "none"] = "guided"
+    """what scores: the photon itself, every event, or guided flights; none: the camera sees nothing, for flux alone"""
     points_per_flight: Whole = Field(1, ge=1, le=3)
     """points at which `guided` scores a flight; more leave less noise in the bins of a pixel and take longer"""
     termination: Literal["cutoff", "roulette"] = field("cutoff", "drop light photons (biased), or Russian roulette")

@@ -18,6 +18,7 @@ from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import COMPONENTS, Truth
 from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix
 from spadwarp.scene.camera import pixel_views, to_camera, to_world, view_box
+from spadwarp.scene.flux import Sun, azimuth_zero
 from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.port import PortGeometry
@@ -85,6 +86,8 @@ def build_model(
         parts["derivatives"] = make_derivatives(scene, derivatives, mesh, scale, device, grid)
     if scene.polarised:
         parts |= _polarised(scene, mesh, scale, device)
+    if camera and scene.flux:
+        parts["flux"] = _flux(scene, device)
     model = sk.Model(
         device=device,
         medium=_medium(scene, device),
@@ -147,7 +150,8 @@ def _limits(scene: Scene, device: wp.Device, camera: bool) -> Any:
         lower=wp.vec3(*np.maximum(lower, -_UNLIMITED)),
         upper=wp.vec3(*np.minimum(upper, _UNLIMITED)),
         lateral=min(transport.lateral_limit, _UNLIMITED),
-        max_path=scene.path_limit if camera else transport.max_path or _UNLIMITED,
+        # Light that comes after the camera's gate still counts where flux is tallied.
+        max_path=scene.path_limit if camera and not scene.flux else transport.max_path or _UNLIMITED,
         weight_cutoff=transport.weight_cutoff,
         max_collisions=transport.max_collisions,
     )
@@ -260,7 +264,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         confocal=scene.scan.mode == "confocal",
         rotated_domain=_has_rotated_domain(scene),
         port=port_kind(camera_port(scene)),
-        laser_port=port_kind(laser_port(scene)),
+        laser_port=port_kind(laser_port(scene)) if scene.sun is None else sk.FLAT_PORT,
         reflecting=bool(scene.domain.reflecting),
         grid=_grid_tracking(scene),
         derivatives=kinds,
@@ -269,6 +273,8 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         # Those of a scene go with its own estimator.
         points=1 if "estimator" in choices else points_per_flight(scene, kinds, by_block),
         channels=len(scene.camera.tallied_channels),
+        flux=() if "estimator" in choices else tuple(dict.fromkeys(section.kind for section in scene.flux)),
+        sun=scene.sun is not None,
     )
     return spec._replace(**choices)
 
@@ -304,7 +310,47 @@ def points_per_flight(scene: Scene, kinds: Sequence[str] = (), by_block: Sequenc
     return points
 
 
+def _flux(scene: Scene, device: wp.Device) -> Any:
+    """The sections of the tally of flux in the camera's frame."""
+    camera, speed, sections, positions = scene.camera, scene.medium.pulse_speed, list[Any](), list[float]()
+    rotation, absorption = rotation_matrix(camera.rotation_deg), scene.medium.range.absorption
+    for section in scene.flux:
+        scale = section.scale(absorption)
+        if section.voxels is not None:
+            gates = {"gates": section.gates, "gate_start": section.gate_start_ns * 1e-9 * speed}
+            if section.gate_width_ps is not None:
+                gates["gate_path"] = section.gate_width_ps * 1e-12 * speed
+            frame: Any = {"rotation": rotation, "origin": camera.position, "scale": scale, **gates}
+            lower = [low if math.isfinite(low) else 0.0 for low in section.lower]
+            box = {"lower": lower, "edge": section.edges, "estimator": section.estimator}
+            sections.append(sk.make_flux_volume(section.voxels, **box, **frame))
+            continue
+        axis, right = section.normal, azimuth_zero(section.normal)
+        bins = {"polar": section.polar_bins, "azimuth": section.azimuth_bins if section.polar_bins else 0}
+        frame = {"axis": axis @ rotation, "right": right @ rotation, "centre": to_camera(camera, section.centre)}
+        count = len(section.positions or ())
+        sections.append(sk.make_flux_planes(count, radius=section.radius, scale=scale, **bins, **frame))
+        positions += [position - float(axis @ camera.position) for position in section.positions or ()]
+    return sk.make_flux(sections, positions, device=device)
+
+
+def _sun(scene: Scene, sun: Sun) -> Any:
+    """The light of sun and sky in the camera's frame."""
+    rotation, k = rotation_matrix(scene.camera.rotation_deg), "xyz".index(sun.surface[0])
+    level = scene.domain.bounds[sun.surface.endswith("high")][k] - scene.camera.position[k]
+    outside = scene.domain.reflecting.get(sun.surface, scene.medium.phase_index)
+    return sk.make_sun(
+        sun.direction @ rotation,
+        normal=sun.down @ rotation,
+        distance=level * float(sun.down[k]),
+        index=scene.medium.phase_index / outside,
+        sky=sun.sky,
+    )
+
+
 def _laser(scene: Scene, device: wp.Device) -> Any:
+    if scene.sun is not None:
+        return _sun(scene, scene.sun)
     beam = scene.beam
     laser: Any = _filled(sk.Laser(), position=wp.vec3(*beam.position), axis=wp.vec3(*beam.axis))
     if (port := laser_port(scene)) is not None:
@@ -433,7 +479,7 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
         raise ConfigError(": ".join(found), source=scene.source)
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
-    ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)]
+    ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)][scene.sun is not None :]
     if camera:
         radius, origin = 0.0 if lens.pinhole else lens.aperture_radius, (0.0, 0.0, 0.0)
         ends.append(("camera", camera_port(scene), origin, (0.0, 0.0, 1.0), "aperture_diameter", radius))
@@ -481,7 +527,7 @@ def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bo
     if count >= 2**31:
         raise ConfigError(f"camera and gate: {shape} = {size} {outside}", source=scene.source)
     # On the CPU counts on the device, their copy in the result, and the total of the components.
-    needed = (8 if cuda else 16) * size * (1 + signed) * copies / 2**30
+    needed = ((8 if cuda else 16) * size * (1 + signed) + 32 * model.flux.size) * copies / 2**30
     available = model.device.free_memory if cuda else physical_memory()
     if available is not None and needed > available / 2**30:
         raise DeviceError(

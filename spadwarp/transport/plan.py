@@ -188,11 +188,17 @@ def make_plan(
     return plan
 
 
+def _bins(scene: Scene) -> int:
+    """Of the histogram, and entries of flux."""
+    bins = scene.camera.width * scene.camera.height * scene.gate.bins
+    return bins + sum(section.size for section in scene.flux)
+
+
 def _batch_size(
     scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None, kind: str
 ) -> int:
     """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches."""
-    bins = scene.camera.width * scene.camera.height * scene.gate.bins
+    bins = _bins(scene)
     if bins > MOST_BINS_WITH_ERRORS and relative_error is None:
         return 0
     fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
@@ -206,7 +212,7 @@ def _batch_size(
 
 def _auto_batch_size(scene: Scene, kind: str) -> int:
     """As `_batch_size`, for a number of photons that is not known: some hundredths of a second."""
-    bins = scene.camera.width * scene.camera.height * scene.gate.bins
+    bins = _bins(scene)
     if bins > MOST_BINS_WITH_ERRORS:
         return 0
     least = max(_AUTO_BATCH[kind], len(COMPONENTS) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
@@ -254,6 +260,8 @@ def photon_capacity(scene: Scene, mesh: TriangleMesh | None) -> int:
 
 def scale_and_capacity(scene: Scene, mesh: TriangleMesh | None) -> tuple[float, int]:
     """`tally_scale` and `photon_capacity`, which share their work."""
+    if scene.transport.estimator == "none":
+        return 1.0, PHOTON_CAPACITY
     density = _phase_density(scene)
     brightest, faintest = (min(max(bound(scene, mesh, density), 1e-30), 1.0) for bound in (_brightest, _faintest))
     coarsest, finest = (

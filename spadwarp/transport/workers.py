@@ -23,7 +23,7 @@ from spadwarp.device import core_count, pick_device, pick_devices, processor_nam
 from spadwarp.parallel import Ray, Worker
 from spadwarp.parallel.ray import RayWorkers
 from spadwarp.parallel.worker import Event
-from spadwarp.result import COMPONENTS, SignedTallies, Tallies, Truth
+from spadwarp.result import COMPONENTS, FluxTallies, SignedTallies, Tallies, Truth
 from spadwarp.result.tallies import (
     OVERFLOW,
     IdQueue,
@@ -54,11 +54,18 @@ _FIRST_BLOCK = {"cpu": 1 << 14, "cuda": 1 << 24}
 class _Histogram:
     """A tally on the device, `[voxel * parts]`, and its batches, if any; `total` may be the caller's."""
 
-    def __init__(self, array: wp.array, *, signed: bool, batched: bool, total: wp.array | None = None) -> None:
+    def __init__(
+        self,
+        array: wp.array,
+        *,
+        signed: bool,
+        batched: bool,
+        total: wp.array | None = None,
+        components: int = len(COMPONENTS),
+    ) -> None:
         self.array, self._signed = array, signed
-        self.batches = (
-            sk.Batches(array, len(COMPONENTS), total=total, signed=signed, halved=not signed) if batched else None
-        )
+        halved = not signed and components > 1
+        self.batches = sk.Batches(array, components, total=total, signed=signed, halved=halved) if batched else None
         self.total: wp.array = array if self.batches is None else self.batches.total
         self.half: wp.array | None = None if self.batches is None else self.batches.half
 
@@ -141,6 +148,8 @@ class DeviceWorker:
             self._histograms = [_Histogram(self.data.tally, signed=False, batched=batched, total=total)]
             if self.data.gradients is not None:
                 self._histograms.append(_Histogram(self.data.gradients, signed=True, batched=batched))
+            if self.data.flux is not None:
+                self._histograms.append(_Histogram(self.data.flux, signed=False, batched=batched, components=1))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device, model=model, photon_count=most)
@@ -263,6 +272,7 @@ class DeviceWorker:
                 second_moment=histogram.second_moment(self._shape[1:]),
                 derivative_tallies=None if self._spec.channels else signed,
                 channel_tallies=signed if self._spec.channels else None,
+                flux_tallies=self._flux_tallies(),
             )
 
     def _signed_tallies(self) -> SignedTallies | None:
@@ -273,6 +283,12 @@ class DeviceWorker:
         values, moments = histogram.total.numpy().reshape(shape), histogram.second_moment(shape[1:])
         moments = None if moments is None else np.ascontiguousarray(np.moveaxis(moments, -1, 1))
         return SignedTallies(self._signed, np.moveaxis(values, -1, 0), self.signed_units, moments)
+
+    def _flux_tallies(self) -> FluxTallies | None:
+        if self.data.flux is None:
+            return None
+        histogram = self._histograms[-1]
+        return FluxTallies(_on_host(histogram.total), histogram.second_moment(histogram.total.shape))
 
     @property
     def signed_units(self) -> tuple[float, ...]:
@@ -491,6 +507,7 @@ class ClusterWorkers(RayWorkers):
         voxels = camera.width * camera.height * plan.scene.gate.bins
         histograms = 1 + len(plan.derivatives) + len(camera.tallied_channels)
         size = 8 * (len(COMPONENTS) + (2 + len(COMPONENTS) if plan.batch_size else 0)) * histograms * voxels
+        size += 24 * sum(section.size for section in plan.scene.flux)
         super().__init__(engine, device, prepare=functools.partial(_prepare, plan), value_bytes=size, note=note)
         self._total: Tallies | None = None
         self.timing: dict[str, float] = {}

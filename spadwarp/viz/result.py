@@ -32,18 +32,19 @@ from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
 from spadwarp.values import ArgumentError, check_integer, count, percent, rounded
 from spadwarp.viz import style
+from spadwarp.viz.flux import flux_figure
 from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits
 
 __all__ = ["draw", "draw_denoised", "draw_depth", "draw_result", "plot"]
 
-KINDS = ("depth", "intensity", "histogram", "truth")
+KINDS = ("depth", "intensity", "histogram", "truth", "flux")
 """Figures of a result."""
 
 
 @paper()
 def plot(
     shown: Result | Frames | FramesFile | Scene | AnalyticResult | Fit,
-    kind: Literal["depth", "intensity", "histogram", "truth"] | None = None,
+    kind: Literal["depth", "intensity", "histogram", "truth", "flux"] | None = None,
     *,
     method: Any = "centroid",
     frame: int = 0,
@@ -54,9 +55,9 @@ def plot(
     """A figure of a result, of frames or of a scene; notebooks show it, `savefig` writes it.
 
     Args:
-        shown: A result: `kind` is "depth" (default), "intensity", "histogram" or "truth". Frames: one of them, from a
-            file with its depth. An analytic result: its maps and a frame. A fit: its counts and residuals. A scene:
-            true depth and reflectance, by ray casting.
+        shown: A result: `kind` is "depth" (default), "intensity", "histogram", "truth" or "flux". Frames: one of them,
+            from a file with its depth. An analytic result: its maps and a frame. A fit: its counts and residuals. A
+            scene: true depth and reflectance, by ray casting.
         kind: Of a result's figure.
         method: Estimator of a result's depth.
         frame: Number of the frame.
@@ -98,13 +99,13 @@ def draw_result(
     result: Result,
     directory: str | Path,
     *,
-    kinds: Sequence[str] = KINDS,
+    kinds: Sequence[str] = KINDS[:-1],
     depth: NDArray[np.float64] | None = None,
     method: Method = "centroid",
     formats: Sequence[str] = ("png",),
     width: float = PAGE,
 ) -> list[Path]:
-    """Writes pictures of depth, intensity, histograms and truth, such as `depth.png`; returns their paths.
+    """Writes pictures of depth, intensity, histograms, truth and flux, such as `depth.png`; returns their paths.
 
     Args:
         result: What to show; frames without returns give empty pictures, not errors.
@@ -161,6 +162,8 @@ def _result_figure(
 ) -> Figure:
     if kind == "histogram":
         return _histogram_figure(result, width, pixel)
+    if kind == "flux":
+        return flux_figure(result, _caption(result), width)
     truth, unclear = result.truth, unclear_pixels(result)
     shown_channels = CHANNELS[1:] if result.channels else ()
     count_of = 2 + len(shown_channels) + bool(shown_channels) if kind == "intensity" else 3

@@ -8,7 +8,7 @@ import pytest
 
 import spadwarp
 from helpers.planned import SCENE
-from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, planning
+from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_exposure, planning, safe_distance_in_water
 from spadwarp.scene import Laser, Scene
 from spadwarp.values import range_from_time
 
@@ -237,3 +237,14 @@ def test_the_hazard_distance_is_where_the_limit_is(profile):
     assert distance < eye_limit(laser.model_copy(update={"pulse_energy": 1e-6})).hazard_distance
     per_area = permissible_exposure(100.0, 532.0) / (100.0 * laser.repetition_rate)
     assert eye_limit(laser, distance=5.0).pulse_energy == pytest.approx(per_area / axis_fluence(laser, 5.0), rel=1e-4)
+
+
+def test_the_safe_distance_in_water_is_that_of_absorption_alone_where_nothing_scatters():
+    """Of a beam narrower than the pupil, which `plan` reports as well; on the safe side, by 12 % at most."""
+    laser = {"profile": "collimated", "beam_radius": 0.002, "half_angle_deg": None, "pulse_energy": 1e-7}
+    scene = make(laser=laser | {"repetition_rate": 1e6}, medium={"extinction": 0.3, "albedo": 1e-6})
+    allowed = eye_limit(scene).pulse_energy / scene.laser.pulse_energy
+    expected = -math.log(allowed) / 0.3
+    found = safe_distance_in_water(scene, photons=20_000, device="cpu")
+    assert 0.99 * expected <= found <= 1.13 * expected
+    assert safe_distance_in_water(scene.with_overrides({"laser.pulse_energy": 1e-15}), device="cpu") == 0.0

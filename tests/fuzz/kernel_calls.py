@@ -109,6 +109,12 @@ def _valid_calls():
         "make_layers": (sk.make_layers, dict(
             start=[0.0, 1.0], extinction=[1.0, 1.0], albedo=[0.5, 0.5], anisotropy=[0.1, 0.1], axis=(0, 0, 1.0),
             device="cpu")),
+        "make_flux_volume": (sk.make_flux_volume, dict(
+            shape=(2, 3, 4), lower=(0, 0, 0), edge=(1.0, 1.0, 2.0), rotation=np.eye(3), origin=(0, 0, 1.0), gates=2,
+            gate_start=0.0, gate_path=1.0, estimator="track", scale=1.0)),
+        "make_flux_planes": (sk.make_flux_planes, dict(
+            count=2, axis=(0, 0, 1.0), right=(1.0, 0, 0), centre=(0, 0, 0), radius=1.0, polar=3, azimuth=2, scale=1.0)),
+        "make_sun": (sk.make_sun, dict(direction=(0.5, 0, 1.0), normal=(0, 0, 1.0), distance=1.0, index=1.34, sky=0.2)),
         "make_records": (sk.make_records, dict(count=3, device="cpu")),
         "phase_tables": (sk.make_phase_tables, dict(density=np.ones_like, device="cpu")),
         "profile_tables": (sk.profile_tables, dict(image=np.ones((3, 4)))),

@@ -13,9 +13,9 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
 
-from .port import Port, PortKind
+from .port import Port, PortKind, make_flat_port
 
-__all__ = ["LASER_PROFILES", "Laser", "Scan", "emit_photon", "make_laser", "profile_tables"]
+__all__ = ["LASER_PROFILES", "Laser", "Scan", "emit_photon", "make_laser", "make_sun", "profile_tables"]
 
 LASER_PROFILES = ("uniform_cone", "gaussian", "collimated")
 
@@ -27,7 +27,7 @@ class Laser:
     position: wp.vec3  # centre of the exit pupil [m]
     axis: wp.vec3  # unit vector of the beam
     profile: int  # index into LASER_PROFILES
-    spread: float  # 1 - cos of the half angle, in [0, 2] (uniform cone)
+    spread: float  # 1 - cos of the half angle, in [0, 2] (uniform cone); part of the light that the sky has (sun)
     tan2: float  # tan^2 of the half angle at which the irradiance is 1/e^2 of that on the axis (gaussian)
     radius: float  # beam radius at the exit [m] (collimated; 0 is a pencil beam)
     rows: wp.array[float]
@@ -182,6 +182,54 @@ def emit_measured(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
     return laser.position, wp.normalize(axis + (x * laser.extent[0]) * right + (y * laser.extent[1]) * down)
 
 
+# ---- Sun and sky above a calm sea.
+
+
+# Height of the emission above the surface, relative to its distance from the origin, and at least [m]: in single
+# precision it is above.
+_ABOVE = 1e-5
+
+
+def make_sun(
+    direction: Sequence[float],
+    *,
+    normal: Sequence[float],
+    distance: float,
+    index: float = 1.34,
+    sky: float = 0.0,
+) -> Laser:
+    """The light of sun and sky that falls through a calm surface, of a spec with `sun`.
+
+    An emitted photon stands for the irradiance on the surface, in the air. All are emitted at one point: in water that
+    is the same along the surface a plane anywhere gets from it what a unit of its area gets from a beam without bounds.
+
+    `direction`: in which the sun's light goes in the air, of any length; `normal`: unit vector down into the water;
+    `distance` of the surface from the origin along it [m]; `index`: of the water over that of the air, 1: a surface
+    that does nothing; `sky`: part of the irradiance, in [0, 1], of a sky of even radiance. Raises `ArgumentError`, also
+    for a sun below the horizon.
+    """
+    height = max(_ABOVE, _ABOVE * abs(check_number("distance", distance, "(-inf, inf)")))
+    laser = make_laser("collimated", radius=0.0, axis=direction, position=[(distance - height) * x for x in normal])
+    indices = (1.0, 1.0, check_number("index", index, "[1, 1e3]"))
+    laser.port = make_flat_port(
+        distance=distance, normal=normal, index=indices, group_index=indices, origin=laser.position
+    )
+    check_number("cosine of direction to normal", float(wp.dot(laser.axis, laser.port.normal)), "(0, 1.000001]")
+    laser.spread = check_number("sky", sky, "[0, 1]")
+    return laser
+
+
+@wp.func
+def emit_sun(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
+    """Start position [m] and unit direction of photon `id` in the air, by the share of its direction in the
+    irradiance."""
+    block = random_block(seed, id, wp.uint32(0), STREAM_EMISSION)
+    direction = axis
+    if u01(block[2]) < laser.spread:
+        direction = rotate_direction(laser.port.normal, 1.0 - wp.sqrt(u01_open(block[0])), u01(block[1]))
+    return laser.position, direction
+
+
 # ---- A raster that beam and pixel scan together.
 
 
@@ -206,9 +254,9 @@ class Beam(NamedTuple):
 
 
 @memoised
-def make_beam(measured: bool, port: PortKind | None, scans: bool) -> Beam:
+def make_beam(measured: bool, port: PortKind | None, scans: bool, sun: bool = False) -> Beam:
     """The beam of a spec."""
-    emit_from = emit_measured if measured else emit_along
+    emit_from = emit_sun if sun else emit_measured if measured else emit_along
 
     @wp.func
     def axis(laser: Laser, scan: Scan, target: int) -> wp.vec3:

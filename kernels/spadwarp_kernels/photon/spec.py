@@ -9,9 +9,10 @@ from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_i
 from spadwarp_kernels.optics.camera import PLAIN, Lens
 from spadwarp_kernels.optics.laser import Beam, make_beam
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
-from spadwarp_kernels.optics.port import PortKind
+from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
 from spadwarp_kernels.optics.visibility import Sight, make_sight
 from spadwarp_kernels.surface.ray_cast import Faces, make_faces
+from spadwarp_kernels.tally.flux import FLUX_KINDS
 from spadwarp_kernels.water.limits import Domain, make_domain
 from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
@@ -69,6 +70,11 @@ class TransportSpec(NamedTuple):
     points: int = 1
     """At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`, `blocks`
     and DELTA_TRACKING, three with up to 4 derivatives."""
+    flux: tuple[str, ...] = ()
+    """Kinds of the sections of `Model.flux`, each one of FLUX_KINDS; for estimators that neither guide light nor let
+    it fly on after its last event, and without `polarised`."""
+    sun: bool = False
+    """The light is that of sun and sky, see `make_sun`, through a calm surface, FLAT_PORT as `laser_port`."""
     channels: int = 0
     """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, each with a tally of its
     own."""
@@ -109,7 +115,7 @@ class TransportSpec(NamedTuple):
     @property
     def beam(self) -> Beam:
         """Of the laser."""
-        return make_beam(self.measured_beam, self.laser_port, self.confocal)
+        return make_beam(self.measured_beam, self.laser_port, self.confocal, self.sun)
 
     @property
     def tally_index(self) -> wp.Function:
@@ -150,6 +156,7 @@ def check_spec(spec: Any) -> None:
     choices: dict[str, tuple[Iterable[str], int]] = {
         "derivatives": (DERIVATIVES, MOST_DERIVATIVES),
         "blocks": (BLOCK_DERIVATIVES, len(BLOCK_DERIVATIVES)),
+        "flux": (FLUX_KINDS, len(FLUX_KINDS)),
     }
     for name, (allowed, most) in choices.items():
         check_integer(f"length of spec.{name}", len(getattr(spec, name)), 0, most)
@@ -197,6 +204,15 @@ def check_spec(spec: Any) -> None:
         (
             spec.polarised and (spec.derivatives or spec.blocks),
             "polarised cannot be combined with spec.derivatives and spec.blocks",
+        ),
+        (
+            spec.flux and (spec.estimator in ("analog", "guided") or spec.polarised or spec.random_albedo),
+            "flux cannot be combined with spec.estimator = 'analog' or 'guided', spec.polarised and spec.random_albedo",
+        ),
+        (
+            spec.sun and (spec.laser_port != FLAT_PORT or spec.measured_beam or spec.confocal or spec.polarised),
+            "sun needs spec.laser_port = FLAT_PORT, and cannot be combined with spec.measured_beam, spec.confocal and "
+            "spec.polarised",
         ),
     ):
         if wrong:

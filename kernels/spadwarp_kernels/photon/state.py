@@ -14,6 +14,7 @@ from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
 from spadwarp_kernels.tally import ledger
+from spadwarp_kernels.tally.flux import Flux
 from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
 from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64
 from spadwarp_kernels.water.limits import Limits
@@ -40,6 +41,7 @@ class World:
     scan: Scan
     derivatives: Derivatives
     polarisation: Polarisation
+    flux: Flux
     seed: wp.uint64
     keys: RoundKeys
 
@@ -75,6 +77,7 @@ class Sink:
     tally: wp.array[wp.int64]  # histograms [component, pixel, bin], fixed point
     low: wp.array[wp.uint32]  # their low words, where those are apart, see `tally.splitting_pays`
     gradients: wp.array[wp.int64]  # the tallies that have signs [voxel, parameter]
+    flux: wp.array[wp.int64]  # the tally of `World.flux`
     ledger: wp.array[wp.int64]  # the energy balance and counters, see `add_to_ledger`
     records: Records
     scale: float  # tally units per emitted photon

@@ -12,6 +12,7 @@ from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.photon.queue import Request, long_queue_fits, make_queue
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonRef, SinkRef, WorldRef, is_planned, make_deposit
+from spadwarp_kernels.riders.flux import make_flux_score
 from spadwarp_kernels.surface.bvh import segment_meets_box
 
 from .stages import (
@@ -39,7 +40,7 @@ class Stages(NamedTuple):
     trace: wp.Function  # ``(s, world)``, from RAY to EVENT, without other threads
     meet: wp.Function  # ``(s, world, distance) -> bool``, whether the flight ends on the face at that distance [m]
     cross: wp.Function  # ``(s, world, sink)``, what the photon itself brings on its flight
-    collide: wp.Function  # ``(s, world)``, to SCATTER or END
+    collide: wp.Function  # ``(s, world, sink)``, to SCATTER or END
     scatter: wp.Function  # ``(s, world, sink, draws)``, to FLIGHT or END
     finish: wp.Function  # ``(s, sink)``
     flush: wp.Function  # ``(s, sink)``, of a thread
@@ -89,7 +90,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
         trace=make_trace(meet, in_tree),
         meet=meet,
         cross=make_cross(spec, estimator.cross, deposit),
-        collide=make_collide(spec, estimator.meet is not None, flies_on),
+        collide=make_collide(spec, estimator.meet is not None, flies_on, make_flux_score(spec)),
         scatter=make_scatter(spec, estimator.direct, flies_on),
         finish=make_finish(spec.records, len(spec.derivatives)),
         flush=make_flush(not cuda and estimator.scores, spec.reflecting),

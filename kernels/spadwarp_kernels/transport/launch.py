@@ -42,6 +42,7 @@ from spadwarp_kernels.photon.spec import TransportSpec, check_spec
 from spadwarp_kernels.photon.state import Launch, Records, Sink, World, make_records
 from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, surface_choices
 from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
+from spadwarp_kernels.tally.flux import FLUX_KINDS, Flux
 from spadwarp_kernels.tally.ledger import (
     BOUNDARY_COUNTERS,
     COUNTERS,
@@ -94,6 +95,7 @@ class Model:
     """The parameters of a spec with derivatives or channels, from `make_derivatives`."""
     polarisation: Polarisation = field(default_factory=Polarisation)
     """Those of a polarised spec, from `make_polarisation`."""
+    flux: Flux = field(default_factory=Flux)  # sections of a spec with flux, from `make_flux`
     split_accumulators: bool = False
     """Whether large launches on CUDA may take half the tally's memory more where that makes them faster, with the same
     sums."""
@@ -127,6 +129,7 @@ class Data:
     gradients: wp.array | None = None
     """int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None without
     them."""
+    flux: wp.array | None = None  # int64 [model.flux.size], the tally of its sections; None without them
     split_accumulators: wp.array | None = None
     """uint32, as long as the tally, zero between launches; made by the first launch that is large enough, see
     `tally.splitting_pays`, and used by those after it."""
@@ -162,6 +165,7 @@ def make_data(
         offset=wp.zeros(1, dtype=wp.uint64, device=model.device),
         reflecting=any((*model.limits.boundary.low, *model.limits.boundary.high)),
         gradients=zeros(signed, wp.int64, model.device) if histogram and derivatives else None,
+        flux=zeros(model.flux.size, wp.int64, model.device) if model.flux.size else None,
     )
 
 
@@ -304,12 +308,18 @@ def _rider_needs(spec: TransportSpec, model: Model) -> Needs:
         yield "derivatives", {"waters": (model.layers.start.size,)}
     if "reflectance" in spec.derivatives:
         yield "derivatives", {"faces": faces}
+    if (spec.polarised or spec.flux) and model.medium.axis_threshold < 1.0:
+        raise ArgumentError(
+            f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.polarised and spec.flux need 1, "
+            "without the near-axis rule, which has no plane of scattering and is not exact"
+        )
+    for kind, name in zip(
+        FLUX_KINDS if spec.flux or model.flux.size else (), ("tracks", "collisions", "planes"), strict=False
+    ):
+        sections = getattr(model.flux, name)
+        if (kind in spec.flux) != bool(sections.shape and sections.shape[0]):
+            raise ArgumentError(f"spec.flux = {spec.flux!r} is not the kinds of the sections of model.flux")
     if spec.polarised:
-        if model.medium.axis_threshold < 1.0:
-            raise ArgumentError(
-                f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.polarised = True needs 1, without "
-                "the near-axis rule, which has no plane of scattering"
-            )
         yield "polarisation", {"first": (MATRIX_POINTS,), "last": (MATRIX_POINTS,)}
         if spec.specular and spec.mesh:
             yield "polarisation", {"facet_index": faces}
@@ -326,6 +336,8 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, photon_count: int
     signed = spec.signed + len(spec.blocks) * model.derivatives.blocks.count if scores else 0
     if signed or data.gradients is not None:
         check("gradients", wp.int64, check_integer("bins of data.gradients", bins * signed, 1) if signed else None)
+    if spec.flux:
+        check("flux", wp.int64, check_integer("model.flux.size", model.flux.size, 1))
     if data.split_accumulators is not None:
         check("split_accumulators", wp.uint32, data.tally.size)
     check("ledger", wp.int64, LEDGER_SLOTS * LEDGER_WIDTH)
@@ -429,7 +441,7 @@ def launch_transport(
     launch.cursor, launch.offset = data.cursor, data.offset
     sink = Sink()
     sink.tally, sink.ledger, sink.scale, sink.records = data.tally, data.ledger, model.scale, data.records
-    sink.gradients, sink.low = data.gradients, split_accumulators
+    sink.gradients, sink.low, sink.flux = data.gradients, split_accumulators, data.flux
     wp.launch(
         make_transport_kernel(spec, model.device.is_cuda, split_accumulators is not None),
         dim=threads,

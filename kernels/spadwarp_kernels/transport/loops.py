@@ -95,7 +95,7 @@ def _make_loop_alone(stages: Stages, cuda: bool, options: dict) -> wp.Kernel:
                 stages.trace(s, world)
                 stages.ask_flight(s, world, sink, 0)
                 stages.cross(s, world, sink)
-                stages.collide(s, world)
+                stages.collide(s, world, sink)
                 if s.stage == SCATTER:
                     stages.ask_event(s, world, sink, 0)
                     stages.scatter(s, world, sink, draws)
@@ -173,7 +173,7 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
                         stages.fly(s, world, draws, launch.cursor)
                         stages.ask_flight(s, world, sink, memory)
                         stages.cross(s, world, sink)
-                        stages.collide(s, world)
+                        stages.collide(s, world, sink)
                         if s.stage == SCATTER:
                             stages.ask_event(s, world, sink, memory)
                             stages.scatter(s, world, sink, draws)
@@ -182,7 +182,7 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
                         stages.ask_flight(s, world, sink, memory)
                     else:
                         stages.cross(s, world, sink)
-                        stages.collide(s, world)
+                        stages.collide(s, world, sink)
                         if s.stage == SCATTER:
                             stages.ask_event(s, world, sink, memory)
                 round += 1
@@ -312,7 +312,7 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
                                 stages.ask_flight(s, world, sink, memory)
                         if round == 1 and (wp.static(not flights) or not is_planned(s.flight)):
                             stages.cross(s, world, sink)
-                            stages.collide(s, world)
+                            stages.collide(s, world, sink)
                             if s.stage == SCATTER:
                                 stages.ask_event(s, world, sink, memory)
                                 if wp.static(scatter_first):

@@ -275,11 +275,13 @@ class Collision:
     mirror: int  # face of the domain that reflects the photon there; else 0
 
 
-def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, world)``: takes a photon to the end of its flight, and on to SCATTER or to END.
+def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: wp.Function | None) -> wp.Function:
+    """The Warp function ``(s, world, sink)``: takes a photon to the end of its flight, and on to SCATTER or to END.
 
-    `chosen`: an estimator chooses what ends a flight; `flies_on`: see `make_continues`.
+    `chosen`: an estimator chooses what ends a flight; `flies_on`: see `make_continues`; `score_flux`: see
+    `make_flux_score`.
     """
+    tallies_flux = score_flux is not None
     domain, local_albedo = spec.domain, spec.local_albedo
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
     water_at, fly_carried = spec.water.at, make_rider(spec).fly
@@ -319,12 +321,14 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool) -> wp.Functi
         return c
 
     @wp.func
-    def collide(s: PhotonRef, world: WorldRef):
+    def collide(s: PhotonRef, world: WorldRef, sink: SinkRef):
         c = end_of_flight(s, world)
         if wp.static(chosen):
             reweigh(s.weight, s.flight.factor)
             s.directed += s.weight.taken
         fly_carried(s.carried, world, s.x, s.u, c.distance)
+        if wp.static(tallies_flux):
+            score_flux(s, world, sink, c.distance, c.reason < 0 and c.mirror == 0 and s.hit.face < 0)
         s.x = s.x + c.distance * s.u
         s.path += c.distance
         s.reason = c.reason

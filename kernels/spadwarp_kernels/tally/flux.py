@@ -1,0 +1,279 @@
+"""Tallies of flux inside the water: fluence in voxels and gates of time, and light through planes, in fixed point.
+
+Any kernel may call the Warp functions with sections and an array of its own; the transport kernel calls those of the
+kinds in `TransportSpec.flux`. A tally over its section's scale and the photons is, for a volume, the weight times
+length [m] of an emitted photon in a voxel (its fluence over the voxel's volume), for planes the weight that crosses.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_integer, check_number, check_vector
+
+from .tally import atomic_add_int64
+
+__all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "Leg", "add_flux_collision", "add_flux_crossings"]
+__all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume"]
+
+FLUX_KINDS = ("track", "collision", "planes")
+"""How light is tallied: by the lengths of its ways in voxels, by its collisions there, by its crossings of planes."""
+
+# Crossings with |mu| below this count in scalar irradiance and radiance as their mean would, 2 / _GRAZING, for radiance
+# that is even there: 1/|mu| has no variance.
+_GRAZING = wp.constant(0.01)
+
+
+@wp.struct
+class FluxVolume:
+    """A box of voxels and gates, made by `make_flux_volume`."""
+
+    turn: wp.mat33  # a point x [m] lies at turn x + shift in voxels; the box has 0 ... size there, 0 where unbounded
+    shift: wp.vec3  # likewise
+    size: wp.vec3i  # number of voxels along the three edges
+    gate_start: float  # path at which the first gate begins [m]
+    gates_per_metre: float  # of path; 0: one gate of all times
+    gates: int
+    by_collision: int  # 1: of kind "collision", else "track"
+    first: int  # its first entry in the tally, of [gate, x, y, z]; filled by `make_flux`
+    scale: float  # tally units per metre
+
+
+@wp.struct
+class FluxPlanes:
+    """Planes across one axis, made by `make_flux_planes`."""
+
+    axis: wp.vec3  # unit vector, along which light is "downward"
+    right: wp.vec3  # unit vector across it, of azimuth 0
+    centre: wp.vec3  # of the discs, on the axis [m]
+    radius2: float  # squared radius of the discs [m^2]; 1e30: planes without bounds
+    begin: int  # of its `Flux.positions`
+    count: int
+    polar: int  # bins of radiance in the angle to the axis, 0 ... pi
+    azimuth: int  # and about it, 0 ... 2 pi
+    first: int
+    """Its first entry in the tally, of [plane, irradiance downward, upward, scalar downward, scalar upward, radiance
+    (polar, azimuth)]; filled by `make_flux`."""
+    scale: float  # tally units
+
+
+@wp.struct
+class Flux:
+    """The sections of a tally of flux by kind, made by `make_flux`."""
+
+    tracks: wp.array[FluxVolume]
+    collisions: wp.array[FluxVolume]
+    planes: wp.array[FluxPlanes]
+    positions: wp.array[float]  # of planes, x·axis [m]
+    size: int  # entries of the tally
+
+
+@wp.struct
+class Leg:
+    """A straight way of light."""
+
+    x: wp.vec3  # where it begins [m]
+    u: wp.vec3  # unit direction
+    length: float  # [m]
+    path: float  # by which the light has come there [m]
+    weight: float
+    rounding_sample: float  # uniform in [0, 1)
+
+
+@wp.func
+def _add(tally: wp.array[wp.int64], index: int, units: float, rounding_sample: float):
+    whole = wp.int64(units + rounding_sample)
+    if whole != wp.int64(0):
+        atomic_add_int64(tally, index, whole)
+
+
+@wp.func
+def _voxel(volume: FluxVolume, k: wp.vec4i) -> int:
+    return volume.first + ((k[3] * volume.size[0] + k[0]) * volume.size[1] + k[1]) * volume.size[2] + k[2]
+
+
+@wp.func
+def _in_voxels(volume: FluxVolume, x: wp.vec3, path: float) -> wp.vec4:
+    q = volume.turn * x + volume.shift
+    return wp.vec4(q[0], q[1], q[2], volume.gates_per_metre * (path - volume.gate_start))
+
+
+@wp.func
+def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
+    """Adds weight times length to the voxels and gates on a leg, one after the other (Amanatides & Woo 1987), with
+    gates as the fourth edge of the box."""
+    size = wp.vec4i(volume.size[0], volume.size[1], volume.size[2], volume.gates)
+    q = _in_voxels(volume, leg.x, leg.path)
+    along = volume.turn * leg.u
+    v = wp.vec4(along[0], along[1], along[2], volume.gates_per_metre)
+    inverse = wp.vec4()
+    s = float(0.0)
+    end = float(leg.length)
+    for i in range(4):
+        if wp.abs(v[i]) > 1.0e-20:
+            inverse[i] = 1.0 / v[i]
+            near = -q[i] * inverse[i]
+            far = (float(size[i]) - q[i]) * inverse[i]
+            s = wp.max(s, wp.min(near, far))
+            end = wp.min(end, wp.max(near, far))
+        elif q[i] < 0.0 or q[i] >= float(size[i]):
+            end = -1.0
+    k = wp.vec4i()
+    ahead = wp.vec4()  # distance to the next face across each edge
+    for i in range(4):
+        k[i] = wp.clamp(int(wp.floor(q[i] + s * v[i])), 0, size[i] - 1)
+        ahead[i] = wp.where(inverse[i] != 0.0, (float(k[i] + wp.where(v[i] > 0.0, 1, 0)) - q[i]) * inverse[i], 1.0e30)
+    while s < end:
+        stop = wp.max(s, wp.min(end, wp.min(wp.min(ahead[0], ahead[1]), wp.min(ahead[2], ahead[3]))))
+        _add(tally, _voxel(volume, k), leg.weight * (stop - s) * volume.scale, leg.rounding_sample)
+        s = stop
+        for i in range(4):
+            if ahead[i] <= stop:
+                k[i] += wp.where(v[i] > 0.0, 1, -1)
+                ahead[i] = (float(k[i] + wp.where(v[i] > 0.0, 1, 0)) - q[i]) * inverse[i]
+                if k[i] < 0 or k[i] >= size[i]:
+                    end = -1.0
+
+
+@wp.func
+def add_flux_collision(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg, extinction: float):
+    """Adds weight over extinction [1/m] to the voxel and gate of the collision that ends a leg: the expectation of
+    `add_flux_track`."""
+    q = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
+    size = wp.vec4i(volume.size[0], volume.size[1], volume.size[2], volume.gates)
+    k = wp.vec4i()
+    inside = bool(True)
+    for i in range(4):
+        inside = inside and q[i] >= 0.0 and q[i] < float(size[i])
+        k[i] = int(q[i])
+    if inside:
+        _add(tally, _voxel(volume, k), leg.weight / extinction * volume.scale, leg.rounding_sample)
+
+
+@wp.func
+def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp.array[wp.int64], leg: Leg):
+    """Adds the weight to all planes that a leg crosses."""
+    begin = wp.dot(planes.axis, leg.x)
+    # As of the point where the next leg begins, so that none crosses a plane twice.
+    end = wp.dot(planes.axis, leg.x + leg.length * leg.u)
+    mu = wp.dot(planes.axis, leg.u)
+    exact = leg.weight * planes.scale
+    scalar = exact / wp.where(wp.abs(mu) < _GRAZING, 0.5 * _GRAZING, wp.abs(mu))
+    side = wp.where(end > begin, 0, 1)
+    width = 4 + planes.polar * planes.azimuth
+    for k in range(planes.count):
+        p = positions[planes.begin + k]
+        if wp.min(begin, end) < p and p <= wp.max(begin, end):
+            away = leg.x + ((p - begin) / (end - begin) * leg.length) * leg.u - planes.centre
+            across = away - wp.dot(planes.axis, away) * planes.axis
+            if planes.radius2 >= 1.0e30 or wp.dot(across, across) <= planes.radius2:
+                entry = planes.first + k * width
+                _add(tally, entry + side, exact, leg.rounding_sample)
+                _add(tally, entry + 2 + side, scalar, leg.rounding_sample)
+                if planes.polar > 0:
+                    angle = wp.acos(wp.clamp(mu, -1.0, 1.0)) / wp.pi
+                    i = wp.min(int(angle * float(planes.polar)), planes.polar - 1)
+                    turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), leg.u), wp.dot(planes.right, leg.u))
+                    turn = wp.where(turn < 0.0, turn / (2.0 * wp.pi) + 1.0, turn / (2.0 * wp.pi))
+                    j = wp.min(int(turn * float(planes.azimuth)), planes.azimuth - 1)
+                    _add(tally, entry + 4 + i * planes.azimuth + j, scalar, leg.rounding_sample)
+
+
+# ---- Sections.
+
+
+def make_flux_volume(
+    shape: Sequence[int],
+    *,
+    lower: Sequence[float],
+    edge: Sequence[float],
+    rotation: Sequence[Sequence[float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    gates: int = 1,
+    gate_start: float = 0.0,
+    gate_path: float = math.inf,
+    estimator: str = "track",
+    scale: float = 2.0**22,
+) -> FluxVolume:
+    """A box of voxels and gates; `estimator`: "track" or "collision", see FLUX_KINDS; `scale`: units per metre.
+
+    The box of `shape` voxels begins at `lower`, in a frame in which a point x of the photons lies at rotation x +
+    origin; where the `edge` of a voxel is infinite it has no bounds, and one voxel. Gates of `gate_path` follow each
+    other from `gate_start` on. Lengths and paths in metres. Raises `ArgumentError`.
+    """
+    for name, vector in {
+        "shape": shape,
+        "lower": lower,
+        "edge": [min(x, 1e30) for x in edge],
+        "origin": origin,
+    }.items():
+        check_vector(name, vector)
+    if estimator not in FLUX_KINDS[:2]:
+        raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
+    volume: Any = FluxVolume()
+    rows, shift = [], []
+    for k, width in enumerate(edge):
+        check_number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
+        check_integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
+        rows += [x / width for x in rotation[k]]
+        shift.append((origin[k] - lower[k]) / width)
+    volume.turn, volume.shift, volume.size = wp.mat33(*rows), wp.vec3(*shift), wp.vec3i(*shape)
+    volume.gates = check_integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
+    volume.gate_start = check_number("gate_start", gate_start, "(-inf, inf)")
+    check_number("gate_path", min(gate_path, 1e30), "(0, inf)")
+    volume.gates_per_metre, volume.by_collision = 1.0 / gate_path, int(estimator == "collision")
+    volume.scale = check_number("scale", scale, "(0, inf)")
+    return volume
+
+
+def make_flux_planes(
+    count: int,
+    *,
+    axis: Sequence[float],
+    right: Sequence[float],
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    radius: float = math.inf,
+    polar: int = 0,
+    azimuth: int = 0,
+    scale: float = 2.0**20,
+) -> FluxPlanes:
+    """So many planes, see `FluxPlanes`; their positions, in the order of the sections, go to `make_flux`. Raises
+    `ArgumentError`."""
+    planes: Any = FluxPlanes()
+    for name, vector in {"axis": axis, "right": right, "centre": centre}.items():
+        check_vector(name, vector, unit=name != "centre")
+        setattr(planes, name, wp.vec3(*vector))
+    for name, number, least in (("count", count, 1), ("polar", polar, 0), ("azimuth", azimuth, 0)):
+        setattr(planes, name, check_integer(name, number, least, 1 << 16))
+    planes.radius2 = min(check_number("radius", min(radius, 1e15), "(0, inf)") ** 2, 1e30)
+    planes.scale = check_number("scale", scale, "(0, inf)")
+    return planes
+
+
+def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, device: wp.DeviceLike = None) -> Flux:
+    """The sections, FluxVolume or FluxPlanes, one after the other in the tally, and the positions of all their planes.
+
+    Raises `ArgumentError`: a tally of 2^31 entries or more, or positions that are not those of the planes.
+    """
+    device, flux, size, begin = check_device("device", device), Flux(), 0, 0
+    kinds: dict[str, list[Any]] = {"tracks": [], "collisions": [], "planes": []}
+    for section in sections:
+        section.first = size
+        if hasattr(section, "polar"):
+            section.begin = begin
+            begin += section.count
+            size += section.count * (4 + section.polar * section.azimuth)
+            kinds["planes"].append(section)
+        else:
+            size += math.prod(section.size) * section.gates
+            kinds["collisions" if section.by_collision else "tracks"].append(section)
+        check_integer("entries of the tally of flux", size, 0, 2**31 - 1)
+    if len(positions) != begin:
+        raise ArgumentError(f"positions: {len(positions)} of {begin} planes")
+    flux.size = size
+    for name, found in kinds.items():
+        setattr(flux, name, wp.array(found, dtype=FluxPlanes if name == "planes" else FluxVolume, device=device))
+    flux.positions = wp.array(list(positions), dtype=float, device=device)
+    return flux

@@ -1,0 +1,185 @@
+"""The light inside the water: canonical problems of ocean optics, a float64 walk, and parts of runs."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+
+import spadwarp
+from reference import sea as float64
+from spadwarp.scene import Scene
+
+FLUX = [
+    {"name": "depths", "positions": [0.1, 0.5, 1.0], "polar_bins": 6},
+    {"name": "sea", "voxels": [1, 1, 1], "estimator": "collision"},
+]
+CAMERA = {"width": 1, "height": 1, "horizontal_fov_deg": 10.0, "aperture_diameter": 0.01}
+TABLE = {"phase_function": "tabulated", "phase_table": "petzold-average-particle"}
+MOVED = {"position": [0.3, -0.2, 0.5], "rotation_deg": [0.0, 90.0, 0.0]}  # of a camera that looks along x
+
+
+def sea(**sections):
+    """Sun at 60° on a flat surface, n 1.34, over water of albedo .9 without a bottom."""
+    tables = {
+        "medium": {"absorption": 1.0, "scattering": 9.0, "phase_index": 1.34, "phase_function": "rayleigh"},
+        "camera": CAMERA,
+        "gate": {"bin_width_ps": 1e3, "bins": 1},
+        "domain": {"shape": "slab", "lower": [-math.inf, -math.inf, 0.0], "outside_index": {"z_low": 1.0}},
+        "sun": {"zenith_deg": 60.0},
+        "flux": FLUX,
+        "transport": {
+            "estimator": "none",
+            "axis_threshold": 1.0,
+            "termination": "roulette",
+            "weight_cutoff": 0.05,
+            "max_collisions": 100_000,
+        },
+    }
+    return Scene.from_dict(
+        {name: {**tables.get(name, {}), **fields} for name, fields in sections.items()}
+        | {name: table for name, table in tables.items() if name not in sections}
+    )
+
+
+@functools.cache
+def result(phase, photons=60_000):
+    return spadwarp.simulate(sea(medium={} if phase == "rayleigh" else TABLE), photons=photons, seed=1, device="cpu")
+
+
+# Means of seven models, E_d and upward scalar irradiance for .5 on the surface: Mobley et al. 1993, problems 1 and 2.
+MODELS = {
+    "rayleigh": ([0.366, 0.0433, 0.00316], [0.372, 0.0435, 0.0032]),
+    "petzold": ([0.413, 0.187, 0.0685], [0.0931, 0.0463, 0.0165]),
+}
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("phase", MODELS)
+def test_canonical_problems(phase):
+    light = result(phase).flux["depths"]["irradiance"]
+    down, scalar_up = MODELS[phase]
+    allowed = np.maximum([0.01, 0.01, 0.03] * np.array(down), 4 * 0.5 * light.errors[:, 0])
+    assert (np.abs(0.5 * light.values[:, 0] - down) < allowed).all()
+    allowed = np.maximum(0.07 * np.array(scalar_up), 4 * 0.5 * light.errors[:, 3])
+    assert (np.abs(0.5 * light.values[:, 3] - scalar_up) < allowed).all()
+
+
+@pytest.mark.physics
+def test_irradiances_are_those_of_a_walk_in_float64():
+    runs = np.array(
+        [
+            float64.irradiance(1.0, 9.0, float64.rayleigh, [0.1, 0.5, 1.0], 10_000, np.random.default_rng(k))
+            for k in range(8)
+        ]
+    )
+    light = result("rayleigh").flux["depths"]["irradiance"]
+    error = np.hypot(light.errors, runs.std(axis=0, ddof=1) / math.sqrt(8))
+    assert (np.abs(light.values - runs.mean(axis=0)) < 5.0 * error).all()
+
+
+def test_absorption_and_escapes_are_all_that_was_emitted():
+    found = result("rayleigh")
+    absorbed = 1.0 * found.flux["sea"]["fluence"].values.item()
+    report = found.energy_report()
+    escaped = sum(part for name, part in report["fractions"].items() if name != "absorbed_water")
+    assert report["exact"] and absorbed + escaped == pytest.approx(1.0, abs=1e-6)
+    assert report["fractions"]["laser_port"] == pytest.approx(float(float64.fresnel(0.7631, 1.34)), rel=1e-3)
+
+
+def test_apparent_properties():
+    found = result("petzold")
+    light, radiance = (found.flux["depths"][name] for name in ("irradiance", "radiance"))
+    seen = spadwarp.result.apparent(found)
+    down, up, scalar_down, scalar_up = light.values.T
+    assert seen.reflectance == pytest.approx(up / down)
+    assert seen.mean_cosine == pytest.approx((down - up) / (scalar_down + scalar_up))
+    assert seen.attenuation == pytest.approx(-np.diff(np.log(down)) / [0.4, 0.5])
+    assert all((error > 0).all() for error in seen.errors.values())
+    polar = np.cos(np.linspace(0.0, math.pi, 7))
+    assert (radiance.values[..., 0] @ -np.diff(polar)) * 2 * math.pi == pytest.approx(scalar_down + scalar_up)
+
+
+def test_parts_of_a_run_and_files_keep_the_bits(tmp_path):
+    scene = sea()
+    whole = spadwarp.simulate(scene, photons=4_096, seed=1, device="cpu")
+    parts = [
+        spadwarp.simulate(
+            scene, photons=2_048, seed=1, device="cpu", run=spadwarp.RunOptions(first_photon=k, threads=1)
+        )
+        for k in (0, 2_048)
+    ]
+    joined = spadwarp.merge([parts[0], parts[1].save(tmp_path / "part.h5")])
+    resumed = spadwarp.simulate(
+        scene, photons=4_096, device="cpu", run=spadwarp.RunOptions(resume=parts[0], launch_size=300)
+    )
+    for other in (joined, resumed, spadwarp.load(whole.save(tmp_path / "whole.h5"))):
+        assert np.array_equal(whole.flux_tallies.tallies, other.flux_tallies.tallies)
+    errors = [one.flux["depths"]["irradiance"].errors[0] for one in (whole, joined, resumed)]
+    assert errors[1] == pytest.approx(errors[0], rel=0.5) and errors[2] == pytest.approx(errors[0], rel=0.5)
+    data = whole.to_xarray()
+    assert data["depths_irradiance"].dims == ("depths_position", "depths_kind")
+    assert data["sea_fluence"].item() == whole.flux["sea"]["fluence"].values.item()
+
+
+def test_fluence_of_a_beam_from_a_turned_camera_by_gate():
+    """In water that only absorbs; sections are in the world's frame."""
+    edges, speed = np.linspace(0.5, 4.5, 9), 0.299792458
+    box = {"lower": [0.5, -0.3, 0.4], "upper": [4.5, -0.1, 0.6], "voxels": [8, 1, 1]}
+    gates = {"gates": 4, "gate_start_ns": 0.0, "gate_width_ps": 1e3 / speed}  # 1 m each
+    scene = Scene.from_dict(
+        {
+            "medium": {"absorption": 0.5, "scattering": 0.0, "group_index": 1.0},
+            "laser": {"profile": "collimated", "beam_radius": 0.05},
+            "camera": CAMERA | MOVED,
+            "gate": {"bin_width_ps": 1e3, "bins": 1},
+            "flux": [{"name": "beam", **box, **gates}, {"name": "all", **box, "estimator": "collision"}],
+            "transport": {"estimator": "none", "axis_threshold": 1.0, "termination": "roulette", "weight_cutoff": 0.05},
+        }
+    )
+    found = spadwarp.simulate(scene, photons=40_000, seed=2, device="cpu")
+    beam, whole = found.flux["beam"]["fluence"], found.flux["all"]["fluence"]
+    near, far = edges[:-1] - 0.3, edges[1:] - 0.3  # from the laser
+    first, last = np.arange(4.0)[:, None], np.arange(1.0, 5.0)[:, None]
+    near, far = np.clip(near, first, last), np.clip(far, first, last)
+    expected = (np.exp(-0.5 * near) - np.exp(-0.5 * far)) / 0.5 / (0.5 * 0.2 * 0.2)
+    values, errors = beam.values[..., 0, 0], beam.errors[..., 0, 0]
+    assert (np.abs(values - expected) <= 4.5 * errors + 1e-3 * expected).all()
+    assert beam.rate() == pytest.approx(beam.values / (1e-9 / speed))
+    total = whole.values[0, :, 0, 0]
+    assert (
+        np.abs(total - values.sum(axis=0))[:7] < 4.5 * np.hypot(whole.errors[0, :, 0, 0], errors.sum(axis=0))[:7]
+    ).all()
+
+
+@pytest.mark.parametrize(
+    ("sections", "text"),
+    [
+        ({"transport": {"estimator": "guided"}}, "take 'next_event', or 'none' for flux alone"),
+        ({"transport": {"axis_threshold": 0.9998}}, "does not go with flux: set it to 1"),
+        ({"domain": {"shape": "unbounded", "outside_index": {}}}, "sun.surface = 'z_low' is no face of the domain"),
+        ({"domain": {"shape": "box", "upper": [1.0, math.inf, math.inf]}}, "bound the water along the surface"),
+        (
+            {"medium": {"layers": [{"start": 1.0, "extinction": 1.0, "albedo": 0.5}], "layer_axis": [1.0, 0.0, 0.0]}},
+            "varies",
+        ),
+    ],
+)
+def test_what_flux_and_sun_exclude(sections, text):
+    with pytest.raises(spadwarp.ConfigError, match=text):
+        sea(**sections)
+
+
+@pytest.mark.parametrize(
+    ("flux", "text"),
+    [
+        ({"voxels": [2, 1, 1]}, r"voxels\[0\] = 2 needs lower and upper in x"),
+        ({}, "needs either voxels or positions"),
+        ({"positions": [1.0, 1.0]}, "positions do not rise"),
+        ({"voxels": [1, 1, 1], "gates": 2}, "gates = 2 needs gate_width_ps"),
+        ({"positions": [1.0], "gate_start_ns": 2.0}, "gate_start_ns = 2.0 goes with voxels only"),
+    ],
+)
+def test_sections_that_cannot_be(flux, text):
+    with pytest.raises(spadwarp.ConfigError, match=text):
+        spadwarp.scene.Flux(name="one", **flux)
