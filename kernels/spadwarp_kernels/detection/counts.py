@@ -370,14 +370,13 @@ class FirstPhotons:
 
 
 @wp.func
-def draw_bin(draws: FirstPhotons, hazard: float, sparse: wp.float64, seed: wp.uint64, id: wp.uint64) -> FirstPhotons:
-    """The counts of the next bin; `id` names the pixel and frame. Counts come one by one where fewer than `sparse` are
-    expected."""
+def draw_bin(draws: FirstPhotons, hazard: float, seed: wp.uint64, id: wp.uint64) -> FirstPhotons:
+    """The counts of the next bin; `id` names the pixel and frame."""
     draws.count = 0
     h = wp.float64(hazard)
     if h > wp.float64(0.0) and draws.left > 0:
-        if wp.float64(draws.left) * h < sparse:
-            # What passes between two of them is exponential, whatever bins it spans.
+        if wp.float64(draws.left) * h < _SPARSE:
+            # Counts one by one: what passes between two of them is exponential, whatever bins it spans.
             if draws.waiting == 0:
                 draws.wait = _exponential(seed, id, PURPOSE_COUNTS, draws.block)
                 draws.block = draws.block + _ONE
@@ -421,7 +420,7 @@ def _first_photon_kernel(
         draws = FirstPhotons()
         draws.left = pulses
         for k in range(hazard.shape[1]):
-            draws = draw_bin(draws, hazard[pixel, k], _SPARSE, seed, id)
+            draws = draw_bin(draws, hazard[pixel, k], seed, id)
             if draws.count > 0:
                 counts[row, k] = counts[row, k] + wp.min(draws.count, depth)
 

@@ -107,7 +107,6 @@ class WindowSearch:
     own_b: wp.float64
     best: wp.vec4d  # deviance, counts, mean, trials
     window: int  # its first bin
-    end: int  # of this half
     state: wp.uint32  # hash of the counts
 
 
@@ -119,25 +118,8 @@ def begin_search(search: Windows, pixel: int) -> WindowSearch:
     s.level = ONE
     s.best = wp.vec4d(ZERO, ZERO, ONE, ONE)
     s.window = search.first
-    s.end = wp.min(search.first + search.half_width, search.stop)
     s.state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
     return s
-
-
-@wp.func
-def _may_exceed(s: WindowSearch, n: wp.float64, mean: wp.float64) -> bool:
-    """Whether n counts may be more unlikely than the best window: most end here, by float32 with room for its error."""
-    expected = float(mean)
-    kept = float(1.0)  # at least, of the variance of a Poisson law
-    if s.pulses > ZERO:
-        rate = expected / float(s.pulses)
-        chance = wp.where(rate < 0.01, rate * (1.0 - 0.5 * rate), 1.0 - wp.exp(-rate))
-        expected = float(wp.max(s.pulses - s.before, n)) * chance
-        kept = wp.max(1.0 - 1.00001 * chance, 0.0)
-    elif s.total > ZERO:
-        kept = wp.max(1.0 - 1.00001 * expected / float(s.total), 0.0)
-    excess = float(n) - 0.9999 * expected
-    return excess > 0.0 and 1.001 * excess * excess > float(s.best[0]) * expected * kept
 
 
 @wp.func
@@ -147,24 +129,22 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
         s.own_n += wp.float64(count)
         s.state = (((s.state ^ wp.uint32(k)) * _HASH_FACTOR) ^ wp.uint32(count)) * _HASH_FACTOR
     s.own_b += wp.float64(background)
-    if k + 1 == s.end:
-        m = (k - search.first) / search.half_width
-        start = search.first + m * search.half_width
-        s.end = wp.min(s.end + search.half_width, search.stop)
+    m = (k - search.first) / search.half_width
+    start = search.first + m * search.half_width
+    if k + 1 == wp.min(start + search.half_width, search.stop):
         n = s.last_n + s.own_n
         mean = wp.max((s.last_b + s.own_b) * s.level, _LEAST)
+        trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
+        if s.pulses > ZERO:
+            trials = wp.max(s.pulses - s.before, n)
+            mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
+        # The deviance is at most the square of the excess over the variance: most windows end here.
         single = search.stop - search.first <= search.half_width
-        if (m > 0 or single) and _may_exceed(s, n, mean):
-            trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
-            if s.pulses > ZERO:
-                trials = wp.max(s.pulses - s.before, n)
-                mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
-            # The deviance is at most the square of the excess over the variance.
-            if n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials):
-                value = _deviance(n, mean, trials)
-                if value > s.best[0]:
-                    s.best = wp.vec4d(value, n, mean, trials)
-                    s.window = wp.max(start - search.half_width, search.first)
+        if (m > 0 or single) and n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials):
+            value = _deviance(n, mean, trials)
+            if value > s.best[0]:
+                s.best = wp.vec4d(value, n, mean, trials)
+                s.window = wp.max(start - search.half_width, search.first)
         s.before += s.last_n
         s.last_n = s.own_n
         s.last_b = s.own_b

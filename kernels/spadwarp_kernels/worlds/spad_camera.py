@@ -50,9 +50,6 @@ TARGET, NO_RETURN, SATURATED, OUTSIDE_GATE = (wp.constant(i) for i in range(len(
 # Part of the pulses that count at which a pixel is saturated: three mean photons a pulse.
 _SATURATION = wp.constant(0.95)
 
-# Expected counts of a bin below which they are drawn one by one: the lanes of a GPU wait for the one with most.
-_SPARSE = wp.constant(wp.float64(0.125))
-
 _ROWS = 1 << 18  # pixels that are drawn side by side: enough for a GPU, and 270 MB of counts of 256 bins
 
 _see = IN_WATER.see
@@ -313,7 +310,7 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
                 rate = _expected(sensor, light, k, level)
                 if rates.shape[0] > 0:
                     rates[i, k] = rate
-            draws = draw_bin(draws, rate, _SPARSE, sensor.seed, id)
+            draws = draw_bin(draws, rate, sensor.seed, id)
             histogram[i, k] = draws.count
             search = offer_bin(windows, search, k, wp.int64(draws.count), float(pulses) * (level + light.dark))
         counts[i] = pulses - draws.left
