@@ -59,26 +59,10 @@ def _stirling_rest(k: wp.float64) -> wp.float64:
     return (wp.float64(1.0 / 12.0) - (wp.float64(1.0 / 360.0) - y * wp.float64(1.0 / 1260.0)) * y) * x
 
 
-# A GPU has half as many units of float64, whose logarithms and quotients take most of a draw: what float32 decides by
-# more than its own error is left to it. Counts are those of float64 to the bit.
-_SURE = wp.constant(2.0e-5)
-
-
 @wp.func
 def _inversion(n: wp.float64, hazard: wp.float64, u: wp.float64) -> wp.float64:
     # Sequential search from 0: P(0) = exp(-n hazard), P(k) / P(k - 1) = (n + 1 - k) / k * p / q.
     odds = expm1(hazard)
-    ratio = float(odds)
-    trials = float(n)
-    part = wp.exp(float(-n * hazard))
-    left = float(u)
-    few = float(0.0)
-    while left - part > _SURE and few < trials:
-        left = left - part
-        few = few + 1.0
-        part = part * ratio * (trials + 1.0 - few) / few
-    if part - left > _SURE or few >= trials:
-        return wp.float64(few)
     probability = wp.exp(-n * hazard)
     rest = wp.float64(u)
     count = wp.float64(0.0)
@@ -89,29 +73,6 @@ def _inversion(n: wp.float64, hazard: wp.float64, u: wp.float64) -> wp.float64:
         if probability < wp.float64(1e-300):
             return count
     return count
-
-
-@wp.func
-def _deviance(x: float, excess: float) -> float:
-    """x ln(x / m) + m − x with m = x − excess > 0, x > 0."""
-    v = excess / (2.0 * x - excess)
-    if wp.abs(v) > 0.1:
-        return x * wp.log(x / (x - excess)) - excess
-    w = v * v
-    return v * (excess + 2.0 * x * w * (0.33333333 + w * (0.2 + w * 0.14285714)))
-
-
-@wp.func
-def _log_probability(k: wp.float64, n: wp.float64, p: wp.float64) -> float:
-    """ln of Binomial(n, p) at k, but for a number that k does not change, to 1e-3 and 1e-4 of itself."""
-    x = float(k) + 1.0
-    y = float(n - k) + 1.0
-    excess = float(k + ONE - p * (n + TWO))
-    a = 1.0 / x
-    b = 1.0 / y
-    rest = a * (0.083333333 - a * a * (0.0027777778 - a * a * 7.9365079e-4))
-    rest += b * (0.083333333 - b * b * (0.0027777778 - b * b * 7.9365079e-4))
-    return 0.5 * (wp.log(x) + wp.log(y)) - _deviance(x, excess) - _deviance(y, -excess) - rest
 
 
 @wp.func
@@ -132,9 +93,7 @@ def binomial(
     rate = wp.float64(hazard)
     if swapped:
         rate = -log1p(-wp.exp(-hazard))  # of the failures
-    p = wp.float64(0.0)
-    if trials * rate >= wp.float64(10.0):  # p is less than the rate
-        p = -expm1(-rate)
+    p = -expm1(-rate)
     mean = trials * p
     if mean < wp.float64(10.0):
         single = uniforms(seed, id, purpose, block)
@@ -154,7 +113,6 @@ def binomial(
     mode = wp.floor((trials + ONE) * p)
     at_mode = wp.float64(0.0)
     ready = int(0)
-    about_mode = _log_probability(mode, trials, p)
     count = wp.float64(-1.0)
     while count < ZERO:
         draw = uniforms(seed, id, purpose, block)
@@ -166,27 +124,21 @@ def binomial(
         if us >= wp.float64(0.07) and v <= squeeze:
             count = k
         elif us > ZERO and k >= ZERO and k <= trials:
-            far = float(us)
-            about = _log_probability(k, trials, p) - about_mode
-            excess = wp.log(float(v) * float(alpha) / (float(a) / (far * far) + float(b))) - about
-            if far < 1.0e-6 or v < wp.float64(1.0e-6) or wp.abs(excess) < 2.0e-3 - 3.0e-4 * about:
-                if ready == 0:
-                    at_mode = (
-                        (mode + HALF) * wp.log((mode + ONE) / (odds * (trials - mode + ONE)))
-                        + _stirling_rest(mode)
-                        + _stirling_rest(trials - mode)
-                    )
-                    ready = 1
-                bound = (
-                    at_mode
-                    + (trials + ONE) * wp.log((trials - mode + ONE) / (trials - k + ONE))
-                    + (k + HALF) * wp.log(odds * (trials - k + ONE) / (k + ONE))
-                    - _stirling_rest(k)
-                    - _stirling_rest(trials - k)
+            if ready == 0:
+                at_mode = (
+                    (mode + HALF) * wp.log((mode + ONE) / (odds * (trials - mode + ONE)))
+                    + _stirling_rest(mode)
+                    + _stirling_rest(trials - mode)
                 )
-                if wp.log(v * alpha / (a / (us * us) + b)) <= bound:
-                    count = k
-            elif excess < 0.0:
+                ready = 1
+            bound = (
+                at_mode
+                + (trials + ONE) * wp.log((trials - mode + ONE) / (trials - k + ONE))
+                + (k + HALF) * wp.log(odds * (trials - k + ONE) / (k + ONE))
+                - _stirling_rest(k)
+                - _stirling_rest(trials - k)
+            )
+            if wp.log(v * alpha / (a / (us * us) + b)) <= bound:
                 count = k
     if swapped:
         count = trials - count
