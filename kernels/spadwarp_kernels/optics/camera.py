@@ -381,4 +381,4 @@ CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated)
 """Focal lengths and principal point in pixels, Brown's distortion: all of `Camera` but `columns`."""
 
 SCANNED = Lens("scanned", project_shot, _view_calibrated)
-"""A row of `Camera.columns` pixels that moves with the laser, see `Scan.pose`: the image holds a shot after the other."""
+"""A row of `Camera.columns` pixels that moves with the laser, see `Scan.pose`: the image holds shot after shot."""

@@ -298,8 +298,8 @@ def _may_hide_anywhere(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3)
 
 
 class Sight(NamedTuple):
-    """How the lens sees the water, as Warp functions: x and u are of the water, o is a point of the lens; all of them in
-    the frame of the camera, see `pose`."""
+    """How the lens sees the water, as Warp functions: x and u are of the water, o is a point of the lens; in the frame
+    of the camera, see `pose`."""
 
     cosines: wp.Function | None  # see `PortKind`; None without a port
     project: wp.Function  # this and the next two: see `Lens`
