@@ -153,9 +153,8 @@ def _frames(text: str) -> int | slice:
 # one is refused. The files of each in a folder, as patterns.
 _FORMATS: dict[str, tuple[str, ...]] = {"fusion": ("{}.txt", "intensity/{}-[0-9]*.mat", "spad/{}-[0-9]*_p1.mat")}
 _FORMATS |= {one: (f"{{}}.{one}", f"{{}}-[0-9]*.{one}") for one in ("ptu", "mat", "npy", "npz", "exr", "png", "xml")}
-_FORMATS |= {one: (f"{{}}.{one}",) for one in ("parquet", "las", "laz")} | {
-    "wdp": ("{}-waveforms.wdp", "{}-waveforms.las")
-}
+_FORMATS |= {one: (f"{{}}.{one}",) for one in ("parquet", "las", "laz")}
+_FORMATS["wdp"] = ("{}-waveforms.wdp", "{}-waveforms.las")
 _Format = Literal[
     "npy", "npz", "png", "mat", "ptu", "exr", "xml", "fusion", "las", "laz", "wdp", "parquet", "webdataset", "zarr"
 ]

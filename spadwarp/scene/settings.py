@@ -241,7 +241,7 @@ class Scan(Section):
     """confocal: the beam visits the pixels, each sees its own light; trajectory: laser and camera move"""
     distance: float = field(math.inf, "confocal: where beam and sight cross [m]; inf is parallel", "[1e-6, inf]")
     pattern: Literal["fixed", "raster", "conical", "elliptic", "rosette", "push_broom"] = "raster"
-    """trajectory: none; lines along x; a cone, a turn a row; an ellipse; two counter-rotating prisms; a row of pixels"""
+    """trajectory: none; lines along x; a cone, a turn a row; an ellipse; two prisms that turn; a row of pixels"""
     half_angle_deg: float = field(15.0, "trajectory: half the angle that the pattern spans along x [°]", "(0, 80]")
     half_angle_y_deg: float = field(10.0, "elliptic: the same along y [°]", "(0, 80]")
     rosette_ratio: float = field(2.6, "rosette: speed of the second prism over that of the first", "[0.01, 1000]")

@@ -57,6 +57,15 @@ _AUTO_VOXELS_PER_PHOTON = {"cpu": 128, "cuda": 16}
 
 # Bins of all pixels, at most, whose errors are kept: in memory they take 88 bytes each, without errors 24.
 MOST_BINS_WITH_ERRORS = 1 << 27
+# Of a scan along a trajectory: 20 000 shots of 800 bins. Each shot has few photons of its own, and what its counts are
+# drawn from is noisy beside their shot noise or not whatever its errors; 1e5 shots of 500 bins take 1.2 GB without.
+_MOST_BINS_OF_SHOTS = 1 << 24
+
+
+def keeps_errors(scene: Scene) -> bool:
+    """Whether a run of a scene keeps standard errors, see `MOST_BINS_WITH_ERRORS`."""
+    most = _MOST_BINS_OF_SHOTS if scene.scan.mode == "trajectory" else MOST_BINS_WITH_ERRORS
+    return scene.camera.width * scene.camera.height * scene.gate.bins <= most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,7 +204,7 @@ def _batch_size(
 ) -> int:
     """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches."""
     bins = scene.camera.width * scene.camera.height * scene.gate.bins
-    if bins > MOST_BINS_WITH_ERRORS and relative_error is None:
+    if not keeps_errors(scene) and relative_error is None:
         return 0
     fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
     if kind == "cuda" and relative_error is None:
@@ -209,7 +218,7 @@ def _batch_size(
 def _auto_batch_size(scene: Scene, kind: str) -> int:
     """As `_batch_size`, for a number of photons that is not known: some hundredths of a second."""
     bins = scene.camera.width * scene.camera.height * scene.gate.bins
-    if bins > MOST_BINS_WITH_ERRORS:
+    if not keeps_errors(scene):
         return 0
     least = max(_AUTO_BATCH[kind], len(COMPONENTS) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
     return scene.scan_positions << max(0, (least // scene.scan_positions - 1).bit_length())

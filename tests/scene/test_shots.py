@@ -31,9 +31,8 @@ def test_the_platform_flies_along_a_line():
     shots = shots_of(moving(velocity=[2.0, 0.0, -1.0]))
     np.testing.assert_allclose(shots.time, 0.005 * np.arange(24), rtol=1e-12)
     np.testing.assert_allclose(shots.position[7], [1.0 + 2.0 * 0.035, 2.0, 3.0 - 0.035], rtol=1e-12)
-    np.testing.assert_allclose(
-        shots.rotation @ shots.rotation.transpose(0, 2, 1), np.eye(3)[None].repeat(24, 0), atol=1e-12
-    )
+    identity = shots.rotation @ shots.rotation.transpose(0, 2, 1)
+    np.testing.assert_allclose(identity, np.eye(3)[None].repeat(24, axis=0), atol=1e-12)
     assert np.allclose(np.linalg.det(shots.rotation), 1.0)
 
 
@@ -107,7 +106,7 @@ def test_what_a_moving_scan_excludes_is_named(tmp_path):
         ({"scan.distance": 3.0}, "scan.distance = 3.0"),
         ({"transport.lateral_limit": 3.0}, "transport.lateral_limit = 3.0"),
         ({"camera.distortion": [-0.1, 0.0, 0.0, 0.0]}, "camera.distortion"),
-        ({"camera.port": {"thickness": 0.0}}, "camera.port"),
+        ({"camera.port": {"distance": 0.1}}, "camera.port"),
     ):
         with pytest.raises(spadwarp.ConfigError, match=r"does not go with scan.mode = 'trajectory'") as error:
             one.with_overrides(changes)
