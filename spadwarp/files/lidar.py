@@ -205,7 +205,7 @@ def _write_waveforms(result: Result, path: Path, seed: int) -> list[Path]:
     """A point, format 9, at the fullest bin of each pixel that has counts, and beside it the counts of all its bins."""
     import laspy
 
-    scene, frames = result.scene, detect(result, seed=seed)
+    scene, frames = result.scene, detect(result, seed=seed, tags=True)  # the same as of the photons
     spacing = 1e12 * frames.bin_width
     if abs(spacing - round(spacing)) > 1e-6 * spacing:
         text = f"gate.bin_width_ps = {spacing:.6g}: samples of a LAS file are whole picoseconds apart"
