@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
@@ -22,7 +21,6 @@ from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.scene import (
     Scene,
     SceneLike,
-    Shots,
     as_scene,
     daylight_rate,
     downwelling_irradiance,
@@ -98,7 +96,7 @@ class Survey:
         self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
         self.moving = None if scene.scan.mode != "trajectory" else scene
         if self.moving is not None:  # all else is of one of its shots
-            scene = _shot_at_targets(scene, mesh)
+            self.balls, scene = _balls(scene, mesh), _shot_at_targets(scene, mesh)
             mesh = build_mesh(scene) if scene.targets else None
         self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
@@ -540,50 +538,42 @@ def _check_scan(survey: Survey) -> None:
 
 def _shot_at_targets(scene: Scene, mesh: TriangleMesh | None) -> Scene:
     """The shot that looks nearest to the middle of a target, as a scene that stands still with its part of photons."""
-    shots, best = shots_of(scene), 0
-    if mesh is not None:
-        best = min((aside.min(), aside.argmin()) for aside, _ in _aside(scene, shots, mesh))[1]
-    photons = scene.transport.photons
+    shots, balls, photons = shots_of(scene), _balls(scene, mesh), scene.transport.photons
+    best = min(((aside := shots.aside(middle)).min(), int(aside.argmin())) for middle, _ in balls)[1] if balls else 0
     share = photons if isinstance(photons, str) else max(photons // scene.scan_positions, 1)
-    return shot_scene(scene, int(best)).with_overrides({"transport.photons": share})
+    return shot_scene(scene, best).with_overrides({"transport.photons": share})
 
 
-def _aside(scene: Scene, shots: Shots, mesh: TriangleMesh) -> Iterator[tuple[Points, float]]:
-    """Of each target by how far the shots' axes pass its middle [m], `[N]`, and the radius of a ball that holds it."""
-    axis = shots.rotation[:, :, 2]
-    for number in range(len(scene.targets)):
-        corners = to_world(scene.camera, mesh.vertices[mesh.faces[mesh.target == number]]).reshape(-1, 3)
-        middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-        to_middle = middle - shots.position
-        along = np.maximum((to_middle * axis).sum(axis=1), 0.0)
-        radius = float(np.linalg.norm(corners - middle, axis=1).max())
-        yield np.linalg.norm(to_middle - along[:, None] * axis, axis=1), radius
+def _balls(scene: Scene, mesh: TriangleMesh | None) -> list[tuple[Points, float]]:
+    """Middle in the world and radius [m] of a ball that holds each target."""
+    every = [] if mesh is None else [mesh.vertices[mesh.faces[mesh.target == k]] for k in range(len(scene.targets))]
+    corners = [to_world(scene.camera, triangles.reshape(-1, 3)) for triangles in every]
+    return [(m := 0.5 * (p.min(axis=0) + p.max(axis=0)), float(np.linalg.norm(p - m, axis=1).max())) for p in corners]
 
 
 def _check_shots(survey: Survey) -> None:
     """Whether a scan along a trajectory comes to its targets, and how dense its shots are."""
-    scene = survey.moving
-    if scene is None:
+    if survey.moving is None:
         return
     # That one shot does not see a target says nothing.
     survey.messages = [one for one in survey.messages if not one.field.startswith("targets")]
-    shots, path = shots_of(scene), scene.path_limit
-    wide = 0.5 * path * scene.receiver.pixel_tangent * scene.receiver.width
-    far = float(np.linalg.norm(shots.position - scene.camera.position, axis=1).max())
-    if far > _FARTHEST:
+    scene, shots = survey.moving, shots_of(survey.moving)
+    if (far := float(np.linalg.norm(shots.position - scene.camera.position, axis=1).max())) > _FARTHEST:
         text = f"shots are up to {far:.4g} m from camera.position, about which light is traced in single precision"
         survey.warn("scan.path", text, distance=far)
-    for number, (aside, radius) in enumerate(_aside(scene, shots, build_mesh(scene)) if scene.targets else ()):
-        if aside.min() > radius + wide:
-            text = f"no shot looks at it: the nearest passes {aside.min():.4g} m beside its middle"
-            survey.warn(f"targets[{number}]", text, aside=float(aside.min()))
-    middle = 0.5 * (scene.gate.start + scene.gate.stop)
-    distance = survey.range_of(middle) if survey.target_range is None else survey.target_range[0]
-    start, along = shots.lines()
+    wide = 0.5 * scene.path_limit * scene.receiver.pixel_tangent * scene.receiver.width
+    for number, (middle, radius) in enumerate(survey.balls):
+        if (aside := float(shots.aside(middle).min())) > radius + wide:
+            text = f"no shot looks at it: the nearest passes {aside:.4g} m beside its middle"
+            survey.warn(f"targets[{number}]", text, aside=aside)
+    gate = survey.range_of(0.5 * (scene.gate.start + scene.gate.stop))
+    distance, (start, along) = (survey.target_range or (gate,))[0], shots.lines()
     gaps = [np.linalg.norm(np.diff(start + distance * along, axis=k), axis=2).ravel() for k in (1, 0)]
     in_row, rows = (float(np.median(gap)) if gap.size else 0.0 for gap in gaps)
-    text = f"at {distance:.4g} m pixels are {in_row:.3g} m apart in a row and rows {rows:.3g} m, all in"
-    survey.note("scan.pattern", f"{text} {shots.time[-1]:.4g} s", in_row=in_row, rows=rows, time=float(shots.time[-1]))
+    text = (
+        f"at {distance:.4g} m pixels are {in_row:.3g} m apart in a row and rows {rows:.3g} m, in {shots.time[-1]:.4g} s"
+    )
+    survey.note("scan.pattern", text, in_row=in_row, rows=rows)
 
 
 # The light: time of flight, spectrum, daylight, polarisation, and whether enough photons come back

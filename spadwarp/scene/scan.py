@@ -44,6 +44,12 @@ class Shots:
         along = np.einsum("nij,rj->nri", self.rotation, self.view)
         return start.reshape(*self.shape, 3), along.reshape(*self.shape, 3)
 
+    def aside(self, point: Floats) -> Floats:
+        """By how far the axis of each shot passes a point of the world [m], `[N]`."""
+        to_point, axis = point - self.position, self.rotation[:, :, 2]
+        along = np.maximum((to_point * axis).sum(axis=1), 0.0)
+        return np.linalg.norm(to_point - along[:, None] * axis, axis=1)
+
 
 def shots_of(scene: Scene) -> Shots:
     """When and where each shot of a scan along a trajectory is.
