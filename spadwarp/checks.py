@@ -18,15 +18,8 @@ from numpy.typing import NDArray
 from spadwarp.analytic import PILE_UP, axis_fluence
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
-from spadwarp.scene import (
-    Scene,
-    SceneLike,
-    as_scene,
-    daylight_rate,
-    downwelling_irradiance,
-    shot_scene,
-    shots_of,
-)
+from spadwarp.mesh.targets import target_balls
+from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwelling_irradiance, shot_scene, shots_of
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
 from spadwarp.scene.medium import (
@@ -96,7 +89,7 @@ class Survey:
         self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
         self.moving = None if scene.scan.mode != "trajectory" else scene
         if self.moving is not None:  # all else is of one of its shots
-            self.balls, scene = _balls(scene, mesh), _shot_at_targets(scene, mesh)
+            self.balls, scene = target_balls(scene, mesh), _shot_at_targets(scene, mesh)
             mesh = build_mesh(scene) if scene.targets else None
         self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
@@ -538,17 +531,10 @@ def _check_scan(survey: Survey) -> None:
 
 def _shot_at_targets(scene: Scene, mesh: TriangleMesh | None) -> Scene:
     """The shot that looks nearest to the middle of a target, as a scene that stands still with its part of photons."""
-    shots, balls, photons = shots_of(scene), _balls(scene, mesh), scene.transport.photons
+    shots, balls, photons = shots_of(scene), target_balls(scene, mesh), scene.transport.photons
     best = min(((aside := shots.aside(middle)).min(), int(aside.argmin())) for middle, _ in balls)[1] if balls else 0
     share = photons if isinstance(photons, str) else max(photons // scene.scan_positions, 1)
     return shot_scene(scene, best).with_overrides({"transport.photons": share})
-
-
-def _balls(scene: Scene, mesh: TriangleMesh | None) -> list[tuple[Points, float]]:
-    """Middle in the world and radius [m] of a ball that holds each target."""
-    every = [] if mesh is None else [mesh.vertices[mesh.faces[mesh.target == k]] for k in range(len(scene.targets))]
-    corners = [to_world(scene.camera, triangles.reshape(-1, 3)) for triangles in every]
-    return [(m := 0.5 * (p.min(axis=0) + p.max(axis=0)), float(np.linalg.norm(p - m, axis=1).max())) for p in corners]
 
 
 def _check_shots(survey: Survey) -> None:
@@ -559,8 +545,7 @@ def _check_shots(survey: Survey) -> None:
     survey.messages = [one for one in survey.messages if not one.field.startswith("targets")]
     scene, shots = survey.moving, shots_of(survey.moving)
     if (far := float(np.linalg.norm(shots.position - scene.camera.position, axis=1).max())) > _FARTHEST:
-        text = f"shots are up to {far:.4g} m from camera.position, about which light is traced in single precision"
-        survey.warn("scan.path", text, distance=far)
+        survey.warn("scan.path", f"shots are up to {far:.4g} m from camera.position: single precision", distance=far)
     wide = 0.5 * scene.path_limit * scene.receiver.pixel_tangent * scene.receiver.width
     for number, (middle, radius) in enumerate(survey.balls):
         if (aside := float(shots.aside(middle).min())) > radius + wide:
