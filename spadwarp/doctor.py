@@ -27,7 +27,7 @@ NEEDED = ["warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "py
 NEEDED += ["tomli-w", "PyYAML", "jinja2"]
 
 # Package → extra that brings it.
-OPTIONAL = {"torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "plotly": "view"}
+OPTIONAL = {"torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "laspy": "las", "plotly": "view"}
 OPTIONAL["imageio-ffmpeg"] = "video"
 
 _OLDEST_CUDA = 13000  # of the driver, R580: the CUDA that Warp is built with

@@ -153,7 +153,11 @@ def _frames(text: str) -> int | slice:
 # one is refused. The files of each in a folder, as patterns.
 _FORMATS: dict[str, tuple[str, ...]] = {"fusion": ("{}.txt", "intensity/{}-[0-9]*.mat", "spad/{}-[0-9]*_p1.mat")}
 _FORMATS |= {one: (f"{{}}.{one}", f"{{}}-[0-9]*.{one}") for one in ("ptu", "mat", "npy", "npz", "exr", "png", "xml")}
-_Format = Literal["npy", "npz", "png", "mat", "ptu", "exr", "xml", "fusion", "parquet", "webdataset", "zarr"]
+_FORMATS |= {one: (f"{{}}.{one}",) for one in ("parquet", "las", "laz")}
+_FORMATS["wdp"] = ("{}-waveforms.wdp", "{}-waveforms.las")
+_Format = Literal[
+    "npy", "npz", "png", "mat", "ptu", "exr", "xml", "fusion", "las", "laz", "wdp", "parquet", "webdataset", "zarr"
+]
 _Frames = Annotated[int | slice, _frames]
 
 
@@ -167,6 +171,7 @@ def export(
     split: str = "all",
     factor: int = 8,
     channel: opt.Channel = "I",
+    seed: int = 0,
     field: list[str] | None = None,
     frames_per_file: int = 1000,
 ) -> None:
@@ -181,13 +186,17 @@ def export(
     exr     images: depth, intensity, truth; one file a frame
     xml     the camera's calibration, as OpenCV's cv::FileStorage reads it
     fusion  mat files and a camera image of finer pixels, for sensor fusion: intensity/, spad/ with bin_hr, a list
+    Single photons of a result, drawn by its detector, with position and truth, as a lidar delivers them:
+    parquet     a table with a row for each: pandas, Hugging Face
+    las, laz    LAS 1.4, a point for each, and the same compressed
+    wdp         NAME-waveforms: waveforms of all shots, and a .las with a point for each
     A whole dataset in a new folder with a card (README.md) and Croissant metadata (croissant.json):
     parquet     datasets.load_dataset(DIR) of Hugging Face
     webdataset  train-00000.tar, ... of .npy images and one .json a frame
     zarr        xarray.open_zarr(DIR / "frames.zarr", group="train")
 
     The folder may hold other files, but of a whole dataset. fusion, mat and ptu are for counts (`spadwarp detect`);
-    ptu needs spadwarp[formats], parquet and zarr need spadwarp[datasets].
+    ptu needs spadwarp[formats], las, laz and wdp need spadwarp[las], parquet and zarr need spadwarp[datasets].
 
     Args:
         path (FILE): A result, frames, an analytic file, a dataset or a shard; or their directory.
@@ -195,6 +204,7 @@ def export(
         frames (N or A:B): Only frame N, or A to B - 1; by default all.
         split: Split of a dataset: train, validation, test or all.
         factor: fusion: finer pixels of the camera image, each way.
+        seed: Of the photons of parquet, las, laz and wdp.
         field: Whole dataset: image of a frame; may be repeated: noisy, clean, label, intensity, bound, normal, albedo,
             prior, and of traced scenes features, counts, expected, polarisation. By default the first five, and
             features.
@@ -206,13 +216,13 @@ def export(
       spadwarp export data/small/ --split test --frames 0:20 --format exr --out exported/
       spadwarp export data/small/ --format webdataset --field noisy --field clean --out data/small-tar/
     """
-    if whole := [one for one in format if one not in _FORMATS]:
+    source = spadwarp.files.locate(path)
+    if whole := [one for one in format if one not in _FORMATS or (one == "parquet" and source.is_dir())]:
         if len(set(format)) > 1:
             wrong(f"{whole[0]} cannot be combined with other formats", "--format")
         _export_dataset(path, whole[0], out, field, frames_per_file)
         return
     opt.refuse("is for parquet, webdataset and zarr", "--field", "--frames-per-file")
-    source = spadwarp.files.locate(path)
     stem = source.resolve().stem
     names = [name.format(glob.escape(stem)) for one in set(format) for name in _FORMATS[one]]
     needed = source.stat().st_size if source.is_file() else 0
@@ -224,7 +234,8 @@ def export(
         if one == "fusion":
             paths = spadwarp.files.export_sensor_fusion(source, out, stem=stem, factor=factor, **options)
         else:
-            paths = spadwarp.export(source, out / f"{stem}.{one}", channel=channel, **options)
+            name = f"{stem}-waveforms.wdp" if one == "wdp" else f"{stem}.{one}"
+            paths = spadwarp.export(source, out / name, channel=channel, seed=seed, **options)
         lines[one] = f"{paths[0]}" + (f" to {paths[-1].name} ({len(paths)} files)" if len(paths) > 1 else "")
         files += paths
     say(rows(lines))

@@ -15,6 +15,7 @@ from spadwarp.analytic import AnalyticFile
 from spadwarp.arrays import on_host
 from spadwarp.dataset import FrameReader
 from spadwarp.dataset.recipe import SPLITS
+from spadwarp.files.lidar import LIDAR_FORMATS, write_lidar
 from spadwarp.files.loader import load, locate
 from spadwarp.frames import Frames, FramesFile, SequenceFile
 from spadwarp.io.arrays import write_array, write_exr
@@ -30,7 +31,7 @@ from spadwarp.values import ArgumentError, FileError, check_choice, check_intege
 
 __all__ = ["FORMATS", "export", "export_sensor_fusion", "open_source", "sequence"]
 
-FORMATS = (".npy", ".npz", ".png", ".mat", ".ptu", ".exr", *CALIBRATION_ENDINGS)
+FORMATS = (".npy", ".npz", ".png", ".mat", ".ptu", ".exr", *LIDAR_FORMATS, *CALIBRATION_ENDINGS)
 """Endings of the files that `export` writes."""
 
 _DATASET_IMAGES = {"Z": "noisy", "truth.Z": "clean", "background": "label", "intensity": "intensity", "bound": "bound"}
@@ -231,6 +232,7 @@ def export(
     split: str = "all",
     result: Result | None = None,
     channel: Channel = "I",
+    seed: int = 0,
 ) -> list[Path]:
     """Writes a result, frames or a dataset in another program's format, which the ending of `path` selects.
 
@@ -250,6 +252,10 @@ def export(
       the window's start, which the comment of the file states, as behind a delayed sync.
     - `.exr`: images of one frame: depth `Z` [m], `intensity`, `truth.Z` and what else the source has: components of a
       result, `<method>.Z` of each estimator, `background` where the pixel reports it, the bound of the depth.
+    - `.parquet`, `.las`, `.laz`: single photons of one frame that the result's detector draws, see
+      `spadwarp.files.photon_cloud`: a table with a row, or LAS 1.4 with a point (format 6, GPS time) for each, in the
+      world [m]; the classes are those of ASPRS: 40 what met a target, 45 the water column, 7 noise.
+    - `.wdp`: the waveform of each pixel, counts of its bins, and beside it `.las` (format 9) with a point at its peak.
     - `.xml`, `.yml`, `.yaml`, `.json`: the camera's calibration, as OpenCV's `cv::FileStorage` reads it.
 
     Args:
@@ -260,6 +266,7 @@ def export(
         split: Of a dataset: "train", "validation", "test" or "all".
         result: The result that the `Frames` were drawn from; `.mat` needs its truth.
         channel: Of a result: which light counts, see `spadwarp.result.analyser_channel`.
+        seed: Of the photons of `.parquet`, `.las`, `.laz` and `.wdp`.
 
     Returns the files that were written. Raises `ArgumentError`: no such frame, or what the format holds is not in the
     source; `FileError`: a file cannot be read or written, or the package for its format is not installed.
@@ -273,6 +280,10 @@ def export(
         opened = open_source(source, result=result, split=split)
         if ending in CALIBRATION_ENDINGS:
             return [_write_calibration(opened, path)]
+        if ending in LIDAR_FORMATS and not isinstance(opened, Result):
+            raise ArgumentError(f"{ending} is for a result: its photons have the truth that frames do not hold")
+        if isinstance(opened, Result) and ending in LIDAR_FORMATS:
+            return write_lidar(analyser_channel(opened, channel), path, seed=seed)
         if isinstance(opened, Result):
             return [_write_result(analyser_channel(opened, channel), path, ending, frames)]
         if channel != "I":
@@ -285,7 +296,8 @@ def export(
         numbered = {number: path.with_name(f"{path.stem}-{number:05}{path.suffix}") for number in chosen}
         return [write(opened, numbered[number] if len(chosen) > 1 else path, number) for number in chosen]
     except ModuleNotFoundError as error:
-        raise FileError(f"{path}: writing it needs {error.name}: pip install 'spadwarp[formats]'") from error
+        extra = {"pyarrow": "datasets", "laspy": "las", "lazrs": "las"}.get(error.name or "", "formats")
+        raise FileError(f"{path}: writing it needs {error.name}: pip install 'spadwarp[{extra}]'") from error
 
 
 def export_sensor_fusion(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from spadwarp.io.paths import MESH_ENDINGS, file_problem, similar
 from spadwarp.mesh.files import USD_ENDINGS, Images, Pattern, check_sizes, check_triangles, read_coloured_mesh, read_usd
 from spadwarp.scene import Scene, Target
-from spadwarp.scene.camera import to_camera
+from spadwarp.scene.camera import to_camera, to_world
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import camera_port
@@ -447,3 +447,10 @@ def _axis_depths(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     met = ((weights >= 0.0).all(axis=1) | (weights <= 0.0).all(axis=1)) & (weights != 0.0).any(axis=1)
     weights, z = weights[met], z[met]
     return (weights * z).sum(axis=1) / weights.sum(axis=1)
+
+
+def target_balls(scene: Scene, mesh: TriangleMesh | None) -> list[tuple[NDArray[np.float64], float]]:
+    """Middle in the world and radius [m] of a ball that holds each target; none without a mesh."""
+    every = [] if mesh is None else [mesh.vertices[mesh.faces[mesh.target == k]] for k in range(len(scene.targets))]
+    corners = [to_world(scene.camera, triangles.reshape(-1, 3)) for triangles in every]
+    return [(m := 0.5 * (p.min(axis=0) + p.max(axis=0)), float(np.linalg.norm(p - m, axis=1).max())) for p in corners]

@@ -33,6 +33,7 @@ from spadwarp.result.result import (
 from spadwarp.result.tallies import FluxTallies, Range, SignedTallies, added, joined, moments_of, rebatched, total_of
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import camera_attributes
+from spadwarp.scene.scan import shots_of
 from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, shown
 
 __all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps", "merge"]
@@ -49,6 +50,7 @@ _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
     "times laser_photons_per_pulse * detector_pde (with the filter before it) it is the expected detections per pulse. "
     "tallies: [component, height, width, bin]. In a scan photons_per_position [height, width] stands for photons. "
+    "shot: of a scan along a trajectory, when and where each pixel sees; its truth is in the frame of that shot. "
     "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
     "time * 299792458 / group_index is the path in metres, laser to target to lens. "
     "second_moment, where errors are kept: low and high 64 bits of the sum over batches of the squared tally over the "
@@ -66,6 +68,9 @@ _READ_ME = (
 
 _DIMENSIONS = {name: entry[1:] for name, entry in ARRAYS.items()} | {
     "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
+    "shot/time": (PIXELS, "s", "of the pixel's shot, from the first shot on"),
+    "shot/position": ((*PIXELS, "axis"), "m", "of the lens in the world"),
+    "shot/line_of_sight": ((*PIXELS, "axis"), "1", "unit vector in the world along which truth/range counts"),
     "photon_ranges": (("run", "limit"), "1", "ids of the photons"),
     "requested": (("limit",), "1", "ids of the requested photons"),
 }
@@ -89,6 +94,8 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     arrays = arrays_of(result)
     if result.scene.scan_positions > 1:
         arrays["photons_per_position"] = result.unit / result.tally_value
+    if result.scene.scan.mode == "trajectory":
+        arrays |= _shots(result.scene)
     arrays |= {name: np.array(getattr(result, name), dtype=np.uint64) for name in ("photon_ranges", "requested")}
     coordinates: dict[str, Coordinate | int | None] = {
         **coordinates_of(result),
@@ -115,6 +122,13 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
             file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
         name_dimensions(file, coordinates | axes, _DIMENSIONS | described)
     return Path(path)
+
+
+def _shots(scene: Scene) -> dict[str, Any]:
+    """When and where each pixel of a scan along a trajectory sees, for readers of the file alone."""
+    shots = shots_of(scene)
+    position, line = shots.lines()
+    return {"shot/time": shots.time[shots.number], "shot/position": position, "shot/line_of_sight": line}
 
 
 def load_result(path: str | Path) -> Result:

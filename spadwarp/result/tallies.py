@@ -302,9 +302,9 @@ def photons_per_position(scene: Scene, photon_ranges: Sequence[Range]) -> NDArra
     shape = (scene.camera.height, scene.camera.width)
     if scene.scan_positions == 1:
         return np.full(shape, float(count(photon_ranges)))
-    pixels = shape[0] * shape[1]
-    position = np.arange(pixels)
-    photons = np.zeros(pixels)
+    positions = scene.scan_positions
+    position = np.arange(positions)
+    photons = np.zeros(positions)
     for start, stop in photon_ranges:  # ids that are the position modulo the number of positions
-        photons += (stop - position + pixels - 1) // pixels - (start - position + pixels - 1) // pixels
-    return np.maximum(photons, 1.0).reshape(shape)
+        photons += (stop - position + positions - 1) // positions - (start - position + positions - 1) // positions
+    return np.repeat(np.maximum(photons, 1.0), shape[0] * shape[1] // positions).reshape(shape)

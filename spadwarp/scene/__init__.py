@@ -12,11 +12,12 @@ from spadwarp.scene.flux import *
 from spadwarp.scene.laser import *
 from spadwarp.scene.medium import *
 from spadwarp.scene.pose import *
+from spadwarp.scene.scan import *
 from spadwarp.scene.scene import *
 from spadwarp.scene.sections import *
 from spadwarp.scene.settings import *
 from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    _MODULES = (ambient_light, camera, flux, laser, medium, pose, scene, sections, settings)
+    _MODULES = (ambient_light, camera, flux, laser, medium, pose, scan, scene, sections, settings)
     __all__ = guarded(__name__, [name for module in _MODULES for name in module.__all__])

@@ -61,6 +61,7 @@ class Scene(Shown, Document):
         if self.polarised:
             self._polarise()
         yield from self._exclusions()
+        yield from self._scan_problems()
         yield from self._blocked_ports()
         yield from self._flux_exclusions()
 
@@ -131,6 +132,25 @@ class Scene(Shown, Document):
         ):
             yield "sun: water that varies along the surface; layers across it are allowed"
 
+    def _scan_problems(self) -> Iterator[str]:
+        """Why a scan along a trajectory excludes settings of other sections."""
+        if self.scan.mode != "trajectory":
+            return
+        camera, laser, needs = self.camera, self.laser, "does not go with scan.mode = 'trajectory'"
+        found = {
+            f"scan.distance = {self.scan.distance}": math.isfinite(self.scan.distance),
+            "camera.port or laser.port": camera.port is not None or laser.port is not None,
+            f"camera.distortion = {list(camera.distortion)}": any(camera.distortion),
+            "camera.cx or cy": (camera.cx, camera.cy) != (None, None),
+            "polarised light": self.polarised,
+            "daylight": self.daylight is not None,
+            "domain.outside_index": bool(self.domain.reflecting),
+            f"transport.lateral_limit = {self.transport.lateral_limit}": math.isfinite(self.transport.lateral_limit),
+        }
+        yield from (f"{name} {needs}" for name, holds in found.items() if holds)
+        if laser.frame == "world":
+            yield f"laser.frame = 'world' {needs}: the laser moves with the camera, in whose frame it stands"
+
     def _blocked_ports(self) -> Iterator[str]:
         """Why light cannot pass the ports, or cannot be computed through them."""
         camera, laser = self.camera.port, self.laser.port
@@ -149,7 +169,7 @@ class Scene(Shown, Document):
                     "daylight does not go with a camera.port that is the surface, seen from above: the sky that it "
                     "reflects is not modelled"
                 )
-        if self.scan.mode != "none" and (camera is not None or laser is not None):
+        if self.scan.mode == "confocal" and (camera is not None or laser is not None):
             if laser != "camera":
                 yield "scan.mode = 'confocal' behind a port needs laser.port = 'camera': one port for both"
             if math.isfinite(self.scan.distance):
@@ -168,7 +188,16 @@ class Scene(Shown, Document):
     @property
     def scan_positions(self) -> int:
         """Positions of the beam: photon i is emitted at position i modulo this number."""
-        return 1 if self.scan.mode == "none" else self.camera.width * self.camera.height
+        width = 1 if self.scan.mode == "trajectory" and self.scan.pattern == "push_broom" else self.camera.width
+        return 1 if self.scan.mode == "none" else width * self.camera.height
+
+    @property
+    def receiver(self) -> Camera:
+        """The camera as one shot has it: of a scan along a trajectory one pixel or, of an array, a row of them."""
+        if self.scan.mode != "trajectory":
+            return self.camera
+        width = self.camera.width if self.scan.pattern == "push_broom" else 1
+        return self.camera.model_copy(update={"width": width, "height": 1})
 
     def unseen_peak(self, photons: float, ranges: ArrayLike = ()) -> tuple[float, float]:
         """The forward peak that so many photons hardly see: `PhaseFunction.unseen_share` of the directions in which

@@ -230,10 +230,26 @@ class Gate(Section):
 
 
 class Scan(Section):
-    """How the beam moves over the scene."""
+    """How the beam moves over the scene: over the pixels of a camera that stands still, or with laser and camera.
 
-    mode: Literal["none", "confocal"] = field("none", "confocal: the beam visits the pixels, each sees its own light")
-    distance: float = field(math.inf, "where beam and line of sight cross [m]; inf is parallel", "[1e-6, inf]")
+    Laser and camera move from shot to shot by `trajectory`: the image has a row of pixels for each line, turn or, of a
+    push-broom array, shot, and `camera.horizontal_fov_deg` is what one shot sees. The platform flies along a straight
+    line or as a file says; the pattern deflects beam and line of sight together from the camera's axis.
+    """
+
+    mode: Literal["none", "confocal", "trajectory"] = "none"
+    """confocal: the beam visits the pixels, each sees its own light; trajectory: laser and camera move"""
+    distance: float = field(math.inf, "confocal: where beam and sight cross [m]; inf is parallel", "[1e-6, inf]")
+    pattern: Literal["fixed", "raster", "conical", "elliptic", "rosette", "push_broom"] = "raster"
+    """trajectory: none; lines along x; a cone, a turn a row; an ellipse; two prisms that turn; a row of pixels"""
+    half_angle_deg: float = field(15.0, "trajectory: half the angle that the pattern spans along x [°]", "(0, 80]")
+    half_angle_y_deg: float = field(10.0, "elliptic: the same along y [°]", "(0, 80]")
+    rosette_ratio: float = field(2.6, "rosette: speed of the second prism over that of the first", "[0.01, 1000]")
+    velocity: Vector = (0.0, 0.0, 0.0)
+    """trajectory: of the platform in the world [m/s]; it starts at the camera's pose and keeps its attitude"""
+    path: CsvFile = None
+    """trajectory: .csv of time and pose, as `load_trajectory` reads it, in place of velocity: the first shot is at its
+    first time, and the camera's own pose is an origin near it"""
 
 
 class Transport(Section):

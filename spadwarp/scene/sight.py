@@ -39,6 +39,14 @@ def pixel_directions(camera: Camera) -> Floats:
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
+def view_directions(scene: Scene) -> Floats:
+    """As `pixel_directions` of a scene's camera; of a scan along a trajectory in the frame of each shot."""
+    if scene.scan.mode != "trajectory":
+        return pixel_directions(scene.camera)
+    size = (scene.camera.height, scene.camera.width, 3)
+    return np.broadcast_to(pixel_directions(scene.receiver), size)
+
+
 def scan_axes(scene: Scene) -> Floats:
     """Axis of the beam of a confocal scan at each pixel, unit vectors in the camera frame, float64 `[H, W, 3]`.
 
@@ -146,7 +154,7 @@ class LinesOfSight:
 
 def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
     """Lines of sight of a scene's pixels `[H, W]`, or those that leave the lens centre along unit vectors."""
-    view = pixel_directions(scene.camera) if view is None else view
+    view = view_directions(scene) if view is None else view
     port, laser = camera_port(scene), np.array(scene.beam.position, np.float64)
     lines = _in_water(view) if port is None else port.enter(np.zeros(3), view)
     return LinesOfSight(*lines, laser, laser_port(scene))

@@ -23,8 +23,9 @@ from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scan import Shots, shots_of
 from spadwarp.scene.scene import camera_port, laser_port
-from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes, within_port
+from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes, view_directions, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_scale
 from spadwarp.values import ConfigError, DeviceError
@@ -32,7 +33,7 @@ from spadwarp.values import ConfigError, DeviceError
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["points_per_flight", "truth_maps"]
+__all__ = ["points_per_flight", "target_map", "truth_maps"]
 
 # The albedo of Lu et al. 2024 is uniform in (0, 0.97).
 _LU2024_ALBEDO = 0.97
@@ -73,8 +74,8 @@ def build_model(
     if scale is None:
         scale = tally_scale(scene, mesh) if camera else 1.0
     lens, limits = _camera(scene, mesh), _limits(scene, device, camera)
-    # Behind a port, light bends: the map of what the lens sees for certain is of straight lines.
-    mapped = lens if camera and scene.camera.port is None else None
+    # Behind a port, light bends: the map of what the lens sees for certain is of straight lines to a lens at rest.
+    mapped = lens if camera and scene.camera.port is None and scene.scan.mode != "trajectory" else None
     device_mesh, surfaces = _surfaces(mesh, mapped, device, mesh_cache)
     parts: dict[str, Any] = {}
     if scene.medium.varies:
@@ -259,9 +260,9 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         pattern=mesh is not None and mesh.pattern is not None,
         specular=mesh is not None and mesh.specular is not None,
         layered=bool(scene.medium.layers),
-        lens=sk.PLAIN if _has_plain_lens(scene) else sk.CALIBRATED,
+        lens=_lens(scene),
         measured_beam=scene.laser.profile == "measured",
-        confocal=scene.scan.mode == "confocal",
+        confocal=scene.scan.mode != "none",
         rotated_domain=_has_rotated_domain(scene),
         port=port_kind(camera_port(scene)),
         laser_port=port_kind(laser_port(scene)) if scene.sun is None else sk.FLAT_PORT,
@@ -372,16 +373,17 @@ def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
         sk.Camera(),
         width=camera.width,
         height=camera.height,
-        pixel_tangent=camera.pixel_tangent,
+        pixel_tangent=scene.receiver.pixel_tangent,
         aperture_area=camera.aperture_area,
     )
     if (focus := focus_distance(scene, mesh)) is not None:
         lens.aperture_radius, lens.inverse_focus = camera.aperture_radius, 1.0 / focus
-    if not _has_plain_lens(scene):
-        k1, k2, p1, p2, k3 = camera.distortion
-        lens.focal, lens.principal = wp.vec2(*camera.focal_pixels), wp.vec2(*camera.principal_point)
+    if _lens(scene) is not sk.PLAIN:
+        receiver = scene.receiver
+        k1, k2, p1, p2, k3 = receiver.distortion
+        lens.focal, lens.principal = wp.vec2(*receiver.focal_pixels), wp.vec2(*receiver.principal_point)
         lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
-        lens.view = wp.vec4(*view_box(camera))
+        lens.view, lens.columns = wp.vec4(*view_box(receiver)), receiver.width
     if (port := camera_port(scene)) is not None:
         lens.port = port_parameters(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
     return lens
@@ -412,13 +414,30 @@ def port_parameters(
         raise ConfigError(f"camera.port or laser.port: {error}", source=scene.source) from None
 
 
-def _has_plain_lens(scene: Scene) -> bool:
-    """Whether the image needs no intrinsics and no view of its own for each photon."""
-    return scene.camera.is_plain and scene.scan.mode == "none"
+def _lens(scene: Scene) -> Any:
+    """How the kernels image: plainly where the image needs no intrinsics and no view of its own for each photon."""
+    if scene.scan.mode == "trajectory":
+        return sk.SCANNED
+    return sk.PLAIN if scene.camera.is_plain and scene.scan.mode == "none" else sk.CALIBRATED
+
+
+def shot_poses(scene: Scene) -> tuple[Shots, NDArray[np.float64], NDArray[np.float64]]:
+    """The shots of a scan along a trajectory, and their positions `[N, 3]` and axes `[N, 3, 3]` in the frame of the
+    scene's camera, in which light is traced."""
+    shots = shots_of(scene)
+    turn = rotation_matrix(scene.camera.rotation_deg).T
+    return shots, to_camera(scene.camera, shots.position), turn @ shots.rotation
 
 
 def _scan(scene: Scene, device: wp.Device) -> Any:
-    """A raster over the pixels: the beam goes through the middle of each."""
+    """The poses of a trajectory's shots; or a raster over the pixels: the beam goes through the middle of each."""
+    if scene.scan.mode == "trajectory":
+        from scipy.spatial.transform import Rotation
+
+        _, position, axes = shot_poses(scene)
+        poses = np.concatenate([position, Rotation.from_matrix(axes).as_quat()], axis=1)
+        pose: wp.array = wp.array(poses.astype(np.float32), dtype=wp.transform, device=device)
+        return _filled(sk.Scan(), count=len(poses), pose=pose)
     axes, views = scan_axes(scene).reshape(-1, 3), pixel_views(scene.camera).reshape(-1, 4)
     axis: wp.array = wp.array(axes.astype(np.float32), dtype=wp.vec3, device=device)
     view: wp.array = wp.array(views.astype(np.float32), dtype=wp.vec4, device=device)
@@ -557,6 +576,8 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
     nowhere = np.zeros((0, 0, 3))
     origins, directions, lead = nowhere, nowhere if camera.is_plain else pixel_directions(camera), None
+    if scene.scan.mode == "trajectory":
+        return _trace_shots(scene, model)
     if camera.port is not None:
         lines = lines_of_sight(scene)
         origins, directions, lead = lines.start, lines.direction, lines.lead
@@ -573,6 +594,29 @@ def first_hits(triangles: NDArray[np.float64], start: Any, direction: NDArray[np
     model: Any = SimpleNamespace(device=device, camera=sk.Camera(), surfaces=sk.make_surfaces(mesh, 0.5), mesh=mesh)
     origins = np.broadcast_to(np.asarray(start, np.float64), direction.shape)
     return trace_rays(model, origins[None], direction[None], (1, len(direction)))[1][0].astype(np.float64)
+
+
+def _trace_shots(scene: Scene, model: sk.Model) -> Truth:
+    """The truth of a scan along a trajectory, in the frame of each pixel's shot."""
+    shots, position, axes = shot_poses(scene)
+    origins, directions = dataclasses.replace(shots, position=position, rotation=axes).lines()
+    _, ranges, normal, reflectance = trace_rays(model, origins, directions, shots.shape)
+    normal = np.einsum("hwij,hwi->hwj", axes[shots.number], normal).astype(np.float32)
+    depth = (ranges * view_directions(scene)[..., 2]).astype(np.float32)
+    return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
+
+
+def target_map(scene: SceneLike, *, device: str | None = None) -> NDArray[np.int32]:
+    """Number of the target at each pixel's centre, from 0 in the order of the scene; -1 for none; int32 `[H, W]`."""
+    scene, target = as_scene(scene), pick_device(device)
+    mesh = build_mesh(scene)
+    model = build_model(scene, target, mesh, camera=False)
+    if mesh is None:
+        return np.full((scene.camera.height, scene.camera.width), -1, np.int32)
+    # The numbers take the place of what faces reflect.
+    number: wp.array = wp.array(mesh.target.astype(np.float32), dtype=float, device=target)
+    labelled = dataclasses.replace(model, surfaces=sk.make_surfaces(model.mesh, number))
+    return np.nan_to_num(np.rint(trace_truth(scene, labelled).reflectance), nan=-1.0).astype(np.int32)
 
 
 def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int, int]) -> list[NDArray[np.float32]]:

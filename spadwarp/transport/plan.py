@@ -17,7 +17,9 @@ from spadwarp.result import COMPONENTS, Result, ResultLike
 from spadwarp.result.result import ResultHead, difference
 from spadwarp.result.tallies import count, shard_of
 from spadwarp.scene import Laser, Scene, Transport, phase_function
+from spadwarp.scene.camera import to_camera
 from spadwarp.scene.laser import load_profile, profile_extent
+from spadwarp.scene.scan import shots_of
 from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import view_planes
@@ -55,6 +57,15 @@ _AUTO_VOXELS_PER_PHOTON = {"cpu": 128, "cuda": 16}
 
 # Bins of all pixels, at most, whose errors are kept: in memory they take 88 bytes each, without errors 24.
 MOST_BINS_WITH_ERRORS = 1 << 27
+# Of a scan along a trajectory: 20 000 shots of 800 bins. Each shot has few photons of its own, and what its counts are
+# drawn from is noisy beside their shot noise or not whatever its errors; 1e5 shots of 500 bins take 1.2 GB without.
+_MOST_BINS_OF_SHOTS = 1 << 24
+
+
+def keeps_errors(scene: Scene) -> bool:
+    """Whether a run of a scene keeps standard errors, see `MOST_BINS_WITH_ERRORS`."""
+    most = _MOST_BINS_OF_SHOTS if scene.scan.mode == "trajectory" else MOST_BINS_WITH_ERRORS
+    return _bins(scene) <= most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +210,7 @@ def _batch_size(
 ) -> int:
     """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches."""
     bins = _bins(scene)
-    if bins > MOST_BINS_WITH_ERRORS and relative_error is None:
+    if not keeps_errors(scene) and relative_error is None:
         return 0
     fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
     if kind == "cuda" and relative_error is None:
@@ -213,7 +224,7 @@ def _batch_size(
 def _auto_batch_size(scene: Scene, kind: str) -> int:
     """As `_batch_size`, for a number of photons that is not known: some hundredths of a second."""
     bins = _bins(scene)
-    if bins > MOST_BINS_WITH_ERRORS:
+    if not keeps_errors(scene):
         return 0
     least = max(_AUTO_BATCH[kind], len(COMPONENTS) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
     return scene.scan_positions << max(0, (least // scene.scan_positions - 1).bit_length())
@@ -299,7 +310,8 @@ def _faintest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> floa
     furthest = 0.5 * scene.path_limit
     scattered = max(scene.medium.range.albedo, 1e-3) * float(density(np.array([2.0]))[0])
     if mesh is not None:
-        furthest = min(furthest, float(np.linalg.norm(np.abs(mesh.bounds).max(axis=0))))
+        reaches = [np.linalg.norm(np.abs(mesh.bounds - lens).max(axis=0)) for lens in _lens_positions(scene)]
+        furthest = min(furthest, float(max(reaches)))
         scattered = max(float(mesh.reflectance.max()), 1e-3) / math.pi
     through = math.exp(-scene.optical_depth([0.0, 0.0, 0.0], [0.0, 0.0, furthest]))
     return scattered * through * scene.camera.aperture_area / furthest**2
@@ -314,10 +326,11 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
     into the view before the beam reaches it. Times 16 for multiple scattering, and lost by absorption alone, since what
     scatters may still arrive.
     """
-    camera, laser, gate, medium = scene.camera, scene.beam, scene.gate, scene.medium
+    camera, laser, gate, medium = scene.receiver, scene.beam, scene.gate, scene.medium
     speed = medium.pulse_speed
     pixels = camera.width * camera.height
     half_field = 0.5 * camera.width * camera.pixel_tangent
+    lenses = _lens_positions(scene)
     spread = _spread(laser)
     # Each position of a scan has its own part of the photons.
     share = scene.scan_positions
@@ -338,14 +351,14 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
     water = backward / (nearest * (nearest + reach))
     surface, bistatic = 0.0, _crossing(scene, illuminated_pixels, density)
     if mesh is not None:
-        gap = _distance(np.zeros(3), mesh)
+        gap = min(_distance(lens, mesh) for lens in lenses)
         white = 1.0
         if mesh.specular is not None and mesh.roughness is not None:
             # A lobe is brighter than white by the density of its facets, 1/(4 alpha^2) times their reflectance.
             white = max(1.0, float((mesh.reflectance + 0.25 * mesh.specular / mesh.roughness**2).max()))
         surface = white / (math.pi * max(gap, nearest) ** 2)
         if math.hypot(*laser.position) > 0.25 * gap:
-            thrown = _distance(np.array(laser.position), mesh)
+            thrown = min(_distance(lens + laser.position, mesh) for lens in lenses)
             spot = illuminated_pixels(min(1.0, thrown / max(gap, 1e-3)))
             through = math.exp(-absorption * (gap + thrown))
             bistatic = max(bistatic, white * through / (math.pi * max(gap, camera.aperture_radius, 0.01) ** 2 * spot))
@@ -357,6 +370,18 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
         aside = min(scattering * baseline, 1.0) * backward * view * math.exp(-absorption * longest) / baseline**2
         aside /= share if share > 1 else pixels
     return 16.0 * camera.aperture_area * max(coaxial, bistatic, aside)
+
+
+_MOST_LENSES = 64
+
+
+def _lens_positions(scene: Scene) -> NDArray[np.float64]:
+    """Where the lens is, in the camera's frame [m] `[N, 3]`: at its origin, or at some of the shots of a trajectory."""
+    if scene.scan.mode != "trajectory":
+        return np.zeros((1, 3))
+    shots = shots_of(scene)
+    chosen = np.unique(np.linspace(0, len(shots) - 1, _MOST_LENSES).astype(int))
+    return to_camera(scene.camera, shots.position[chosen])
 
 
 def _distance(point: NDArray[np.float64], mesh: TriangleMesh) -> float:

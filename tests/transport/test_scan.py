@@ -13,7 +13,7 @@ from helpers.scenes import scene
 from spadwarp import RunOptions, simulate
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.scene import Camera
+from spadwarp.scene import Camera, shot_scene, shots_of
 from spadwarp.scene.sight import scan_axes
 from spadwarp.transport.model import build_model, transport_spec
 
@@ -137,3 +137,61 @@ def test_the_check_knows_that_a_pixel_gets_the_photons_of_its_position_alone():
     ]
     flash, scan = (message.values["photons_per_pixel"] for message in printed)
     assert scan == pytest.approx(flash / 16, rel=0.05)
+
+
+# Laser and camera that move
+
+MOVING = {"mode": "trajectory", "pattern": "conical", "half_angle_deg": 8.0, "velocity": [0.0, 40.0, 0.0]}
+POSE = {"position": [0.05, -0.05, -0.1], "rotation_deg": [4.0, -3.0, 20.0], "horizontal_fov_deg": 30.0}
+
+
+def _moving(**sections):
+    """A cone of 4 x 4 shots of a wide receiver, 1 ms from shot to shot."""
+    return scene(**{"scan": MOVING, "camera": POSE, "laser": {"half_angle_deg": 8.0}} | sections)
+
+
+def test_moving_shots_have_the_truth_of_their_pose(device):
+    """Range, normal and target on a plane, by the formula of a ray; and nothing where there is none."""
+    half = {"builtin": "box", "size": [1.5, 3.0, 0.1], "translation": [-0.75, 0.0, 1.8], "reflectance": 0.2}
+    one = _moving(targets=[{"builtin": "plane", "size": [3.0, 3.0], "translation": [0.0, 0.0, 2.2]}, half])
+    truth, target = spadwarp.transport.truth_maps(one, device=device), spadwarp.transport.target_map(one, device=device)
+    start, along = shots_of(one).lines()
+    to_plate, to_box = ((z - start[..., 2]) / along[..., 2] for z in (2.2, 1.75))
+    on_box = (start + to_box[..., None] * along)[..., 0] < 0.0
+    assert 4 <= on_box.sum() <= 12
+    np.testing.assert_array_equal(target, on_box)
+    np.testing.assert_allclose(truth.range, np.where(on_box, to_box, to_plate), rtol=1e-6)
+    # The normal of both is -z of the world, seen in the frame of each shot.
+    np.testing.assert_allclose(truth.normal, -shots_of(one).rotation[:, 2].reshape(4, 4, 3), atol=1e-6)
+    assert (spadwarp.transport.target_map(_moving(targets=[]), device=device) == -1).all()
+
+
+def test_each_shot_is_the_run_of_its_pose_alone(device):
+    """Totals by component of the shots of a moving scan, against scenes in which nothing moves."""
+    one, photons, shots = _moving(), 4000, (0, 6, 13)
+    runs = [simulate(one, photons=16 * photons, seed=seed, device=device) for seed in range(12)]
+    parts = np.array([run.tallies.sum(axis=3) * (run.unit / photons) for run in runs]).reshape(12, 3, 16)
+    assert all(run.energy_report()["exact"] for run in runs)
+    for shot in shots:
+        alone = [simulate(shot_scene(one, shot), photons=photons, seed=100 + seed, device=device) for seed in range(12)]
+        fixed = np.array([run.tallies.sum(axis=(1, 2, 3)) * (run.unit / photons) for run in alone])
+        moved = parts[:, :, shot]
+        error = np.sqrt((fixed.var(axis=0, ddof=1) + moved.var(axis=0, ddof=1)) / 12)
+        assert (np.abs(fixed.mean(axis=0) - moved.mean(axis=0)) < 4.0 * error).all()
+        assert (error < 0.1 * fixed.mean(axis=0)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pattern", ["conical", "push_broom"])
+def test_the_estimators_agree_in_a_moving_scan(device, pattern):
+    one = _moving(scan={**MOVING, "pattern": pattern}, gate={"start_ns": 6.671, "bins": 4})
+    photons = {"analog": 100_000, "next_event": 40_000, "guided": 40_000}
+    agreeing_cells(one, device, photons=photons, seeds=16, converged=0.1, pixels=pattern == "push_broom", clear=True)
+
+
+def test_a_row_of_a_push_broom_array_shares_the_photons_of_its_shot():
+    one = _moving(scan={**MOVING, "pattern": "push_broom"})
+    result = simulate(one, photons=1001, seed=5, device="cpu")
+    expected = np.bincount(np.arange(1001) % 4, minlength=4)[:, None].repeat(4, axis=1)
+    np.testing.assert_array_equal(result.unit / result.tally_value, expected)
+    assert result.tallies.any(axis=(0, 3)).all()

@@ -179,7 +179,7 @@ class ScoredPoint:
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
-    tracks, rides = spec.water.profile is not None, make_rider(spec).rides
+    tracks, rides, point_in = spec.water.profile is not None, make_rider(spec).rides, spec.sight.pose.point_in
 
     @wp.func
     def event_request(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
@@ -187,7 +187,8 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
         on_surface = s.hit.face >= 0
         # Mirrored, any point may be seen.
         if wp.static(not flights or reflects) or on_surface:
-            if wp.static(reflects) or shows(world.camera, view_of(world.camera, s.view), s.x):
+            x = point_in(world.scan, s.target, s.x)
+            if wp.static(reflects) or shows(world.camera, view_of(world.camera, s.view), x):
                 q.wanted = True
                 if wp.static(reflects):
                     q.wanted = s.bounces.face == 0
@@ -232,7 +233,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     sample_flight = make_sample_flight(water.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
     has_profile, collides = profile is not None, spec.scores_collisions
     depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
-    apparent_lens = spec.sight.apparent
+    apparent_lens, point_in, point_out = spec.sight.apparent, spec.sight.pose.point_in, spec.sight.pose.point_out
 
     @wp.func
     def flight_point(request: Request, world: wp.ref[World]) -> ScoredPoint:
@@ -243,7 +244,9 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         middle = request.x + (0.5 * (s0 + request.interval[1])) * request.u
         begin = request.x + s0 * request.u
         seed = join_words(request.first, request.second)
-        from_lens = request.x - apparent_lens(world.camera, middle, request.lens)
+        middle = point_in(world.scan, request.target, middle)
+        seen = apparent_lens(world.camera, middle, request.lens)
+        from_lens = request.x - point_out(world.scan, request.target, seen)
         xi_choice = u01(request.first)
         xi = u01_fine(request.second)
         if wp.static(collides):
@@ -338,6 +341,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     sight = spec.sight
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
+    point_in, point_out, turn_out = sight.pose.point_in, sight.pose.point_out, sight.pose.turn_out
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
 
@@ -345,9 +349,10 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):
         carried = request.carried
         fork(carried, world)
+        to_lens = turn_out(world.scan, request.target, link.to_lens)
         fly(carried, world, request.x, request.u, wp.length(found.origin - request.x))
-        event(carried, world, request.slot, found.origin, request.u, link.to_lens)
-        fly(carried, world, found.origin, link.to_lens, link.water)
+        event(carried, world, request.slot, found.origin, request.u, to_lens)
+        fly(carried, world, found.origin, to_lens, link.water)
         deliver(found.contribution, carried, world, link.end, link.to_lens, wp.normalize(inside))
 
     @wp.func
@@ -371,10 +376,11 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                 path = point.path
                 ahead = point.ahead
         view = scan_view(world.camera, world.scan, request.target)
-        link = link_to(world.camera, found.origin, lens)
-        found.lens = link.end
+        link = link_to(world.camera, point_in(world.scan, request.target, found.origin), lens)
+        to_lens = turn_out(world.scan, request.target, link.to_lens)
+        found.lens = point_out(world.scan, request.target, link.end)
         pixel = image_of(world.camera, view, request.target, link.image, lens)
-        scattering = scattering_density(request, found.origin, link.to_lens, world)
+        scattering = scattering_density(request, found.origin, to_lens, world)
         if pixel >= 0 and not scattering <= 0.0:
             seed = join_words(request.second, request.first)
             if wp.static(collides):
@@ -382,14 +388,14 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                 extinction = float(0.0)
                 while ahead >= 0.0:
                     begin = wp.where(ahead > 0.0, request.x, found.origin)
-                    u = wp.where(ahead > 0.0, request.u, link.to_lens)
+                    u = wp.where(ahead > 0.0, request.u, to_lens)
                     length = wp.where(ahead > 0.0, ahead, link.water)
                     extinction = water_extinction(world.medium, world.layers, begin, u, length, seed)
                     weight *= wp.where(ahead > 0.0, wp.exp(-extinction * ahead), 1.0)
                     seed += wp.uint64(0x632BE59BD9B4E019)  # another sequence
                     ahead = wp.where(ahead > 0.0, 0.0, -1.0)
             else:
-                extinction = water_extinction(world.medium, world.layers, found.origin, link.to_lens, link.water, seed)
+                extinction = water_extinction(world.medium, world.layers, found.origin, to_lens, link.water, seed)
             found.contribution.value = value_of(world.camera, extinction, weight, scattering, link)
             found.contribution.index = index_of(world.camera, world.gate, pixel, path + link.path, request.component)
             if wp.static(rides):

@@ -55,23 +55,25 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
     sight, varies, has_phase_guide = spec.sight, spec.varies, spec.water.phase.guide is not None
     view_of, clip_to_view, gate_of, sample_lens = sight.view, sight.clip, sight.gate, sight.sample_lens
-    within = spec.domain.within
+    within, point_in, turn_in = spec.domain.within, sight.pose.point_in, sight.pose.turn_in
 
     @wp.func
     def plan_flight(s: wp.ref[PhotonState], block: wp.vec4ui, world: wp.ref[World]) -> FlightPlan:
         plan = FlightPlan()
+        x = point_in(world.scan, s.target, s.x)
+        u = turn_in(world.scan, s.target, s.u)
         if wp.static(has_phase_guide):
             # The direction was drawn for this point, see `make_direct`.
             plan.lens = lens_point(world.camera, u01(block[2]), u01(block[3]))
             plan.lens_weight = 1.0
         else:
-            lens = sample_lens(world.camera, s.x, s.u, u01(block[2]), u01(block[3]))
+            lens = sample_lens(world.camera, x, u, u01(block[2]), u01(block[3]))
             plan.lens = lens.point
             plan.lens_weight = lens.weight
         limit = within(world.limits, world.limits.max_path - s.path, s.x, s.u)
-        plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), s.x, s.u, plan.lens, limit)
+        plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), x, u, plan.lens, limit)
         gate = gate_of(world.camera, world.gate)
-        plan.interval = clip_to_gate(gate, s.x, s.u, s.path, plan.lens, plan.interval)
+        plan.interval = clip_to_gate(gate, x, u, s.path, plan.lens, plan.interval)
         if not (wp.static(varies) or world.medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
         return plan
@@ -229,6 +231,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     face_pdf, specular, sight = spec.faces.pdf, spec.faces.specular, spec.sight
     view_of, in_view, toward_middle = sight.view, sight.shows, sight.toward_middle
     toward, toward_centre, gate_of = sight.toward, sight.toward_centre, sight.gate
+    point_in, turn_in, turn_out = sight.pose.point_in, sight.pose.turn_in, sight.pose.turn_out
 
     @wp.func
     def direct(
@@ -236,6 +239,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     ) -> Direction:
         new = Direction()
         on_surface = s.hit.face >= 0
+        x = point_in(world.scan, s.target, s.x)
         here = water_at(world.medium, world.layers, s.x)
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
         extinction = float(0.0)
@@ -243,32 +247,34 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             extinction = here.extinction
         elif on_surface:  # else no cell need be looked up
             extinction = water_at(world.medium, world.layers, s.x).extinction
-        at_surface = world.guiding.surface_probability * wp.min(2.0 * extinction * wp.length(s.x), 1.0)
+        at_surface = world.guiding.surface_probability * wp.min(2.0 * extinction * wp.length(x), 1.0)
         to_lens_chance = world.guiding.probability
         if wp.static(collides):
             # Two chances for light that flies back: what comes late through a cloud has turned in several steps, and
             # such histories are few and heavy. A grid that repeats layers has the histories of layers, and one chance.
-            to_lens_chance = wp.where(s.u[2] < 0.0, to_lens_chance * (2.0 - to_lens_chance), to_lens_chance)
+            u = turn_in(world.scan, s.target, s.u)
+            to_lens_chance = wp.where(u[2] < 0.0, to_lens_chance * (2.0 - to_lens_chance), to_lens_chance)
         to_lens_chance = wp.where(on_surface, at_surface, to_lens_chance)
         # Light that goes straight to the lens and arrives before the gate is not worth a chance.
-        if s.path + wp.length(s.x) < gate_of(world.camera, world.gate).start:
+        if s.path + wp.length(x) < gate_of(world.camera, world.gate).start:
             to_lens_chance = 0.0
         met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_from(s.u, world.medium.axis_threshold)
-        v = toward_centre(world.camera, s.x)
+        v = toward_centre(world.camera, x)
         if wp.static(has_phase_guide):
             # To the point of the lens at which the flight to come will be scored: a lobe about the lens's centre could
             # not have a peak narrower than the lens.
             ahead = random_block_keyed(world.keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
-            v = toward(world.camera, s.x, lens_point(world.camera, u01(ahead[2]), u01(ahead[3])))
+            v = toward(world.camera, x, lens_point(world.camera, u01(ahead[2]), u01(ahead[3])))
+        v = turn_out(world.scan, s.target, v)
         view = view_of(world.camera, s.view)
-        way = toward_middle(view, s.x)
+        way = toward_middle(view, x)
         to_axis = wp.vec3()
         to_view_chance = float(0.0)
-        if wp.dot(way, way) > 0.0 and not in_view(world.camera, view, s.x):
+        if wp.dot(way, way) > 0.0 and not in_view(world.camera, view, x):
             to_view_chance = world.guiding.return_probability
             way *= 1.0 / wp.length(way)
-            to_axis = wp.vec3(way[0], way[1], 0.0)
+            to_axis = turn_out(world.scan, s.target, wp.vec3(way[0], way[1], 0.0))
         part = guided_part(s.weight.value, s.analog_weight, met, to_lens_chance + to_view_chance)
         to_lens_chance *= part
         to_view_chance *= part

@@ -26,6 +26,7 @@ def make_none(spec: TransportSpec) -> Estimator:
 def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
     reflects, image_of, leave = spec.domain.reflects, spec.sight.project, spec.sight.leave
+    point_in, turn_in = spec.sight.pose.point_in, spec.sight.pose.turn_in
 
     @wp.func
     def cross(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:
@@ -33,7 +34,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
         anything else happens to it."""
         found = Contribution()
         found.index = -3
-        ray = leave(world.camera, s.x, s.u)
+        ray = leave(world.camera, point_in(world.scan, s.target, s.x), turn_in(world.scan, s.target, s.u))
         # Events but reflections, which alone bring no light that next events could.
         scatterings = s.collisions - s.bounces.count
         radius2 = ray.x[0] * ray.x[0] + ray.x[1] * ray.x[1]

@@ -21,7 +21,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
 
-__all__ = ["C0", "CALIBRATED", "PLAIN", "Camera", "Gate", "Lens", "make_camera", "make_gate"]
+__all__ = ["C0", "CALIBRATED", "PLAIN", "SCANNED", "Camera", "Gate", "Lens", "make_camera", "make_gate"]
 
 
 @wp.struct
@@ -42,6 +42,7 @@ class Camera:
     radial: wp.vec3  # k1, k2, k3 of Brown's model
     tangential: wp.vec2  # p1, p2 of Brown's model
     view: wp.vec4  # least and largest tangents (left, top, right, bottom) of what the image shows: a box that holds it
+    columns: int  # pixels of the receiver, which stand in one row, of `SCANNED` alone
     port: Port
     """What is between the lens and the water, see `make_flat_port`; read by specs with a port alone. View and focus are
     those in the air behind it."""
@@ -102,6 +103,18 @@ def project_calibrated(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o
         return -1
     pixel = int(row) * camera.width + int(column)
     return wp.where(target >= 0 and pixel != target, -1, pixel)
+
+
+@wp.func
+def project_shot(camera: Camera, view: wp.vec4, target: int, x: wp.vec3, o: wp.vec3) -> int:
+    """As `project` of the row of pixels with which a shot, `target`, sees."""
+    t = image_tangents(camera, x, o)
+    column = t[0] * camera.focal[0] + camera.principal[0]
+    row = t[1] * camera.focal[1] + camera.principal[1]
+    inside = column >= 0.0 and row >= 0.0 and column < float(camera.columns) and row < 1.0
+    if not (inside and x[2] > 0.0):
+        return -1
+    return target * camera.columns + int(column)
 
 
 @wp.func
@@ -365,4 +378,7 @@ PLAIN = Lens("plain", project, _view_plain, in_field, toward_axis)
 """Square pixels about the optical axis: the first six attributes of `Camera`, the others stay 0."""
 
 CALIBRATED = Lens("calibrated", project_calibrated, _view_calibrated)
-"""Focal lengths and principal point in pixels, Brown's distortion: all of `Camera`."""
+"""Focal lengths and principal point in pixels, Brown's distortion: all of `Camera` but `columns`."""
+
+SCANNED = Lens("scanned", project_shot, _view_calibrated)
+"""A row of `Camera.columns` pixels that moves with the laser, see `Scan.pose`: the image holds shot after shot."""

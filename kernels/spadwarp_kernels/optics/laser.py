@@ -230,38 +230,88 @@ def emit_sun(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
     return laser.position, direction
 
 
-# ---- A raster that beam and pixel scan together.
+# ---- Positions that beam and pixel, or laser and camera, visit together.
 
 
 @wp.struct
 class Scan:
-    """A raster that laser and pixel walk together: photon id belongs to position id mod `count`."""
+    """Positions that laser and pixel visit together: photon id belongs to position id mod `count`."""
 
-    count: int  # number of positions; position i is scored into pixel i
+    count: int  # number of positions; position i is scored into pixel i, or the row i of a receiver's pixels
     axis: wp.array[wp.vec3]  # unit vector of the beam at each
     view: wp.array[wp.vec4]
     """Tangents (left, top, right, bottom) of what each position's pixel sees; a box that holds it."""
+    pose: wp.array[wp.transform]
+    """From the frame of camera and laser at each shot to the frame of all else. With the lens `SCANNED`, which reads
+    this alone: `Laser.axis` and `Camera.view` are those of every shot."""
+
+
+class Pose(NamedTuple):
+    """Into the frame of camera and laser at a position of the scan, and out of it: Warp functions
+    ``(scan, target, vec3) -> vec3`` of points [m] and of directions. Where nothing moves they change nothing."""
+
+    point_in: wp.Function
+    turn_in: wp.Function
+    point_out: wp.Function
+    turn_out: wp.Function
+
+
+@memoised
+def make_pose(moves: bool) -> Pose:
+    """Of positions with a pose each, or of none."""
+
+    @wp.func
+    def point_in(scan: Scan, target: int, x: wp.vec3) -> wp.vec3:
+        y = wp.vec3(x)
+        if wp.static(moves):
+            y = wp.transform_point(wp.transform_inverse(scan.pose[target]), x)
+        return y
+
+    @wp.func
+    def turn_in(scan: Scan, target: int, u: wp.vec3) -> wp.vec3:
+        v = wp.vec3(u)
+        if wp.static(moves):
+            v = wp.quat_rotate_inv(wp.transform_get_rotation(scan.pose[target]), u)
+        return v
+
+    @wp.func
+    def point_out(scan: Scan, target: int, x: wp.vec3) -> wp.vec3:
+        y = wp.vec3(x)
+        if wp.static(moves):
+            y = wp.transform_point(scan.pose[target], x)
+        return y
+
+    @wp.func
+    def turn_out(scan: Scan, target: int, u: wp.vec3) -> wp.vec3:
+        v = wp.vec3(u)
+        if wp.static(moves):
+            v = wp.normalize(wp.transform_vector(scan.pose[target], u))
+        return v
+
+    return Pose(point_in, turn_in, point_out, turn_out)
 
 
 class Beam(NamedTuple):
     """How photons start, as Warp functions."""
 
-    emit: wp.Function  # ``(laser, scan, seed, id) -> spatial_vector``: start [m], then unit direction
+    emit: wp.Function
+    """``(laser, scan, seed, id) -> spatial_vector``: start [m], then unit direction, in the frame of the camera."""
     axis: wp.Function  # ``(laser, scan, target) -> vec3``, the beam's, for a position of the scan
     enter: wp.Function | None  # this and the next: see `PortKind`; None without a port
     cosines: wp.Function | None
     scans: bool
+    pose: Pose
 
 
 @memoised
-def make_beam(measured: bool, port: PortKind | None, scans: bool, sun: bool = False) -> Beam:
+def make_beam(measured: bool, port: PortKind | None, scans: bool, moves: bool = False, sun: bool = False) -> Beam:
     """The beam of a spec."""
     emit_from = emit_sun if sun else emit_measured if measured else emit_along
 
     @wp.func
     def axis(laser: Laser, scan: Scan, target: int) -> wp.vec3:
         along = laser.axis
-        if wp.static(scans):
+        if wp.static(scans and not moves):
             along = scan.axis[target]
         return along
 
@@ -273,4 +323,4 @@ def make_beam(measured: bool, port: PortKind | None, scans: bool, sun: bool = Fa
         start, heading = emit_from(laser, axis(laser, scan, target), seed, id)
         return wp.spatial_vector(start, heading)
 
-    return Beam(emit, axis, port and port.enter, port and port.cosines, scans)
+    return Beam(emit, axis, port and port.enter, port and port.cosines, scans, make_pose(moves))

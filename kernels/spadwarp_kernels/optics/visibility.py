@@ -8,8 +8,8 @@ from spadwarp_kernels.base.arguments import check_array, check_kind
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import cos_sin_turn
 
-from .camera import Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
-from .laser import Scan
+from .camera import SCANNED, Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
+from .laser import Pose, Scan, make_pose
 from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay
 
 __all__ = ["next_event_value"]
@@ -292,13 +292,14 @@ def make_sample_lens(port: PortKind | None) -> wp.Function:
 
 
 @wp.func
-def _may_hide_behind_port(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
-    """True: the map is of straight lines to the lens."""
+def _may_hide_anywhere(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> bool:
+    """True: the map is of straight lines to a lens that stands still."""
     return True
 
 
 class Sight(NamedTuple):
-    """How the lens sees the water, as Warp functions: x and u are of the water, o is a point of the lens."""
+    """How the lens sees the water, as Warp functions: x and u are of the water, o is a point of the lens; in the frame
+    of the camera, see `pose`."""
 
     cosines: wp.Function | None  # see `PortKind`; None without a port
     project: wp.Function  # this and the next two: see `Lens`
@@ -316,6 +317,7 @@ class Sight(NamedTuple):
     toward: wp.Function  # ``(camera, x, o) -> vec3``, unit direction of the way at x; straight where there is no way
     toward_centre: wp.Function  # ``(camera, x) -> vec3``, about that to the lens's centre
     sample_lens: wp.Function  # see `make_sample_lens`
+    pose: Pose  # between the frame of the water and that of the camera, in which all of the above is
 
 
 @memoised
@@ -402,16 +404,19 @@ _VIEWS = {
 @memoised
 def make_sight(lens: Lens, port: PortKind | None, confocal: bool) -> Sight:
     """For a way of imaging, a kind of port or None, and whether pixels are scanned."""
+    moves = lens.name == SCANNED.name
 
     @wp.func
     def scan_view(camera: Camera, scan: Scan, target: int) -> wp.vec4:
         view = camera.view
-        if wp.static(confocal):
+        if wp.static(confocal and not moves):
             view = scan.view[target]
         return view
 
     cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows, _same_gate)
     if port is not None:
-        cosines, may_hide, view = port.cosines, _may_hide_behind_port, _VIEWS[port.name]
+        cosines, may_hide, view = port.cosines, _may_hide_anywhere, _VIEWS[port.name]
+    if moves:
+        may_hide = _may_hide_anywhere
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
-    return Sight(cosines, *imaging, *view, may_hide, *_make_ways(port), make_sample_lens(port))
+    return Sight(cosines, *imaging, *view, may_hide, *_make_ways(port), make_sample_lens(port), make_pose(moves))

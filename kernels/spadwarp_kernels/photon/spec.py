@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, get_origin
 import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer
-from spadwarp_kernels.optics.camera import PLAIN, Lens
+from spadwarp_kernels.optics.camera import PLAIN, SCANNED, Lens
 from spadwarp_kernels.optics.laser import Beam, make_beam
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
 from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
@@ -43,7 +43,8 @@ class TransportSpec(NamedTuple):
     lens: Lens = PLAIN  # how the camera images
     measured_beam: bool = False  # emit from the laser's measured profile
     confocal: bool = False
-    """Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED."""
+    """Beam and pixel scan together: each photon has a beam axis and a pixel of its own. Needs CALIBRATED, or SCANNED:
+    then each has a pose of laser and camera of its own."""
     rotated_domain: bool = False  # the domain has axes of its own
     reflecting: bool = False  # faces of the domain reflect, as `Limits.boundary` says; needs `bounded`
     use_warp_bvh: bool = False  # rays take `wp.mesh_query_ray`, see `make_surfaces`
@@ -115,7 +116,8 @@ class TransportSpec(NamedTuple):
     @property
     def beam(self) -> Beam:
         """Of the laser."""
-        return make_beam(self.measured_beam, self.laser_port, self.confocal, self.sun)
+        moves = self.lens.name == SCANNED.name
+        return make_beam(self.measured_beam, self.laser_port, self.confocal, moves, self.sun)
 
     @property
     def tally_index(self) -> wp.Function:
@@ -167,6 +169,10 @@ def check_spec(spec: Any) -> None:
     check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
+        (
+            spec.lens.name == SCANNED.name and (not spec.confocal or spec.polarised or spec.reflecting),
+            "lens = SCANNED needs spec.confocal = True, and cannot be combined with spec.polarised and spec.reflecting",
+        ),
         (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
         (
             spec.grid and (spec.layered or spec.random_albedo),

@@ -25,7 +25,7 @@ from spadwarp_kernels.base.native import zeros
 from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.base.tables import TABLE_CELLS
 from spadwarp_kernels.estimators.registry import make_estimator
-from spadwarp_kernels.optics.camera import PLAIN, Camera, Gate, check_camera, ready_camera
+from spadwarp_kernels.optics.camera import PLAIN, SCANNED, Camera, Gate, check_camera, ready_camera
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
 from spadwarp_kernels.optics.polarisation import MATRIX_POINTS, Polarisation
 from spadwarp_kernels.optics.port import check_port
@@ -224,8 +224,9 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
     if spec.confocal:
         most = camera.width * camera.height if estimator.scores else 2**31 - 1
         count = check_integer("model.scan.count", model.scan.count, 1, most)
-        yield "scan", {"axis": (None,), "view": (None,)}
-        for name in ("axis", "view"):
+        arrays = ("pose",) if spec.lens.name == SCANNED.name else ("axis", "view")
+        yield "scan", dict.fromkeys(arrays, (None,))
+        for name in arrays:
             check_integer(f"entries of model.scan.{name}", getattr(model.scan, name).size, count)
     else:
         yield "laser", {"axis": "unit"}

@@ -88,13 +88,14 @@ def make_emit(spec: TransportSpec) -> wp.Function:
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
     scans, enter, begin_carried = spec.beam.scans, spec.beam.enter, make_rider(spec).begin
-    has_port = enter is not None
+    scan_view, has_port = spec.sight.scan_view, enter is not None
+    point_out, turn_out = spec.beam.pose.point_out, spec.beam.pose.turn_out
 
     @wp.func
     def begin(s: PhotonRef, world: WorldRef, sink: SinkRef, emitted: wp.spatial_vector, id: wp.uint64):
         if wp.static(scans):
             s.target = int(id % wp.uint64(world.scan.count))
-            s.view = world.scan.view[s.target]
+            s.view = scan_view(world.camera, world.scan, s.target)
         s.x = wp.spatial_top(emitted)
         s.u = wp.spatial_bottom(emitted)
         s.path = 0.0
@@ -108,6 +109,8 @@ def make_begin(spec: TransportSpec) -> wp.Function:
                 s.u = passage.u
                 s.path = passage.path
             book_weight(s.weight, s.account, sink, ledger.LASER_PORT)
+        s.x = point_out(world.scan, s.target, s.x)
+        s.u = turn_out(world.scan, s.target, s.u)
         s.analog_weight = s.weight.value
         s.collisions = 0
         s.surface_count = 0
@@ -351,7 +354,8 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
 def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Function) -> wp.Function:
     """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
     estimator says so, with what rides along."""
-    crosses, leave = cross is not None, spec.sight.leave
+    crosses, leave, pose = cross is not None, spec.sight.leave, spec.sight.pose
+    point_in, turn_in = pose.point_in, pose.turn_in
     rider = make_rider(spec)
     rides, (_begin, fork, fly, _event, _mirror, deliver) = rider.rides, rider
 
@@ -363,7 +367,8 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
             if wp.static(rides):
                 if c.value > 0.0:
                     carried = s.carried
-                    passage = leave(world.camera, s.x, s.u)
+                    x, u = point_in(world.scan, s.target, s.x), turn_in(world.scan, s.target, s.u)
+                    passage = leave(world.camera, x, u)
                     fork(carried, world)
                     fly(carried, world, s.x, s.u, passage.water)
                     deliver(c, carried, world, s.x, s.u, passage.u)
