@@ -35,6 +35,7 @@ class Port:
     water_slope: wp.vec2  # the same in the water
     turn: float  # bound of the sine of the angle by which a ray of the view is bent (dome)
     aside: float  # bound of a ray's distance from the centre, in the water [m] (dome)
+    margin: float  # bound of how far a rough surface moves a line of sight aside, over the depth below it (sea)
     early: float
     """The way through the port takes at most this much less than the straight line in water [m of water]."""
     late: float  # and at most this much more [m of water]
