@@ -17,7 +17,7 @@ from spadwarp.analytic import AnalyticResult
 from spadwarp.frames import Frames, FramesFile, Method, first_photon_probabilities
 from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
-from spadwarp.result import COMPONENTS, Channel, Result, degree_of_polarisation, unclear_pixels
+from spadwarp.result import Channel, Result, degree_of_polarisation, unclear_pixels
 from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
@@ -136,7 +136,7 @@ def _result_figure(result: Result, kind: str, depth: NDArray[Any] | None, method
     if kind == "intensity":
         panels.unclear = unclear
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
-        ballistic = result.tallies[COMPONENTS.index("ballistic")].sum(axis=-1) * result.tally_value
+        ballistic = result.tallies[result.scene.components.index("ballistic")].sum(axis=-1) * result.tally_value
         panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
         panels.unclear = None
         panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
@@ -226,7 +226,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> None:
         weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
     edges = merged_edges(total, weight * total, [int(part.argmax()) for part in parts > 0])  # no light before its time
     curves: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
-    for name, part in zip(COMPONENTS, parts, strict=True):
+    for name, part in zip(result.scene.components, parts, strict=True):
         own = np.arange(len(time)) if name == "ballistic" else merged_edges(part, weight * part)
         wide = {"linewidth": 1.4, "zorder": 3} if name == "ballistic" else {"linewidth": 0.9, "zorder": 2}
         label, colour = style.COMPONENTS[name]

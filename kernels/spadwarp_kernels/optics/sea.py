@@ -28,9 +28,6 @@ _INV_SQRT_PI = wp.constant(0.5641895835477563)
 _WIDE_PART = wp.constant(0.1)
 _WIDE = wp.constant(3.0)
 
-# Slopes that the view is made wide enough for, in standard deviations: the others hold 3e-7 of the light.
-_STEEPEST = 5.5
-
 
 @wp.struct
 class Sea:
@@ -339,26 +336,3 @@ def make_sea(
     sea.slope = wp.vec2(*(math.sqrt(2.0 * variance) for variance in variances))
     sea.index, sea.delay, sea.extinction = index, delay, extinction
     return sea
-
-
-def widen_port(port: Port, variances: Sequence[float], largest_angle: float) -> None:
-    """Fills what of a port, the mean plane seen from the air, allows for the slopes of the surface: `margin`, and the
-    times. `largest_angle`: as for `make_flat_port`."""
-    steepest = _STEEPEST * math.sqrt(max(variances))
-    ratio = port.index[2] / port.index[0]
-    angles = np.linspace(-largest_angle, largest_angle, 61)[:, None, None]
-    turn = np.linspace(0.0, math.pi, 25)[:, None]
-    slopes = steepest * np.linspace(0.0, 1.0, 25)
-    u = np.stack(np.broadcast_arrays(np.sin(angles), 0.0, -np.cos(angles)), axis=-1)
-    m = np.stack(np.broadcast_arrays(-slopes * np.cos(turn), -slopes * np.sin(turn), 1.0), axis=-1)
-    m = m / np.linalg.norm(m, axis=-1, keepdims=True)
-    cosine = -(u * m).sum(axis=-1, keepdims=True)
-    across = (u + cosine * m) / ratio
-    behind = across - np.sqrt(1.0 - (across * across).sum(axis=-1, keepdims=True)) * m
-    flat = u[..., :2] / np.sqrt(ratio**2 - (u[..., :2] ** 2).sum(axis=-1, keepdims=True))
-    seen = (cosine[..., 0] > 0.0) & (behind[..., 2] < -0.05)
-    aside = np.linalg.norm(behind[..., :2] / np.maximum(-behind[..., 2:], 0.05) - flat, axis=-1)
-    port.margin = float(np.where(seen, aside, 0.0).max())
-    bend = np.where(seen, (behind * u).sum(axis=-1), 1.0).min()
-    longest = port.distance / max(math.cos(largest_angle), 0.02)
-    port.late += float(1.0 - bend) * longest

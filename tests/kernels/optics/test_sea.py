@@ -128,7 +128,7 @@ def test_transmitted_and_reflected_parts(angle, above, transmitted, reflected):
         v, solid_angle = directions(1400, up)
         rows = np.broadcast_to(u.astype(np.float32), v.shape).copy()
         integral = launched(density_kernel, [sea, rows, v.astype(np.float32)])[0] @ solid_angle
-        assert integral == pytest.approx(part, abs=5e-5)
+        assert integral == pytest.approx(part, abs=8e-5)
 
 
 def test_slopes_of_cox_and_munk():
@@ -186,7 +186,7 @@ def test_reciprocity():
 
 
 def test_glint_of_a_parallel_beam():
-    """L = E F D(m) G/(4 cosθ_o), G of Smith, E across the beam: what a patch sends into a direction, over its cosine."""
+    """L = E F D(m) G/(4 cosθ_o) with Smith's G and E across the beam."""
     mss = 0.0286
     sea = sea_of(mss)
     for zenith, azimuth, incidence in ((20.0, 0.0, 30.0), (45.0, 1.0, 40.0), (10.0, 3.0, 5.0)):
