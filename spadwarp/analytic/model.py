@@ -265,6 +265,8 @@ def _not_covered(scene: Scene) -> dict[str, bool]:
     ported = scene.camera.port is not None or scene.laser.port is not None
     port, parallel, lu2024 = laser_port(scene), laser.profile == "collimated", chosen.form == "lu2024"
     return {
+        "analytic: the model knows no surface of the sea; simulate follows light through it, and for a flat one "
+        "camera.port with a distance and no window stands for it": scene.surface is not None,
         "analytic: laser.profile = 'measured' has no closed form; simulate takes any": laser.profile == "measured",
         f"analytic: scan.mode = {scene.scan.mode!r} is not one beam for all pixels; simulate takes it": (
             scene.scan.mode != "none"

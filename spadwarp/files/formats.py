@@ -22,7 +22,7 @@ from spadwarp.io.arrays import write_array, write_exr
 from spadwarp.io.paths import atomic_path
 from spadwarp.io.text import write_text
 from spadwarp.result import Channel, analyser_channel
-from spadwarp.result.result import COMPONENTS, Result
+from spadwarp.result.result import Result
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.camera import CALIBRATION_ENDINGS, save_calibration
 from spadwarp.scene.sight import lines_of_sight
@@ -409,7 +409,7 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
         return _save_png(path, result.depth())
     if ending == ".exr":
         channels: dict[str, Any] = {"Z": result.depth(), "intensity": result.intensity}
-        for name, tallies in zip(COMPONENTS, result.tallies, strict=True):
+        for name, tallies in zip(result.scene.components, result.tallies, strict=True):
             channels[name] = tallies.sum(axis=-1, dtype=np.float64) * result.tally_value
         truth = result.truth
         channels |= {f"truth.{name}": getattr(truth, field) for name, field in _TRUTH_CHANNELS.items()}

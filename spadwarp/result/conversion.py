@@ -11,7 +11,7 @@ import numpy as np
 
 from spadwarp.arrays import Variable, is_torch, labelled
 from spadwarp.result.flux import flux_arrays
-from spadwarp.result.result import ARRAYS, COMPONENTS, Component, Result, coordinates_of
+from spadwarp.result.result import ARRAYS, Component, Result, coordinates_of
 from spadwarp.values import ArgumentError, check_choice
 
 if TYPE_CHECKING:
@@ -43,7 +43,8 @@ class TorchResult:
 
     def component(self, name: Component) -> torch.Tensor:
         """`[H, W, T]`."""
-        chosen = COMPONENTS.index(check_choice("component", name, COMPONENTS))
+        names = self.scene.components
+        chosen = names.index(check_choice("component", name, names))
         return self.tallies[chosen] * self.tally_value[..., None]
 
     @property
@@ -113,7 +114,7 @@ def to_xarray(result: Result) -> xarray.Dataset:
     Raises `FileError`: xarray is not installed.
     """
     cube = ("component", "y", "x", "time")
-    values = np.stack([result.component(name) for name in COMPONENTS])
+    values = np.stack([result.component(name) for name in result.scene.components])
     variables: dict[str, Variable] = {
         "histogram": (cube, values, "1", "expected fraction of the emitted photons per pixel and bin"),
         "detections_per_photon": ((), result.scene.detections_per_photon, "1", "detection efficiency with the filter"),

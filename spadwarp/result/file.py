@@ -18,7 +18,6 @@ from spadwarp.io.paths import file_within
 from spadwarp.result.flux import flux_arrays, part_of
 from spadwarp.result.result import (
     ARRAYS,
-    COMPONENTS,
     Reconstruction,
     Result,
     ResultHead,
@@ -141,7 +140,8 @@ def load_result(path: str | Path) -> Result:
         head = _head(file)
         names = {group: _names(file, group) for group in ("derivatives", "channels")}
         counts = {"parameter": len(names["derivatives"]), "channel": len(names["channels"])}
-        camera, counts["time"] = head.scene.camera, head.scene.gate.bins
+        counts |= {"component": len(head.scene.components), "time": head.scene.gate.bins}
+        camera = head.scene.camera
 
         def array(name: str) -> Any:
             return file.array(name, ARRAYS[name][0], shape_of(name, camera.height, camera.width, **counts))
@@ -165,7 +165,8 @@ def load_result(path: str | Path) -> Result:
             if np.isinf(values).any():
                 file.refuse(f"truth/{name}", "is infinite in some pixels")
         moments = file.integers("batch_moments", bits=256)
-        if not moments.keys() <= moments_of(COMPONENTS, [0] * len(COMPONENTS), 1, 1).keys():
+        components = head.scene.components
+        if not moments.keys() <= moments_of(components, [0] * len(components), 1, 1).keys():
             file.refuse("batch_moments", "are not those of the components")
         batches, half_photons = (file.integer(name, default=0) for name in ("batches", "half_photons"))
         if (head.batch_size > 0) != (batches > 0) or not 0 <= batches <= head.photons:
@@ -295,7 +296,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         "batches": result.batches,
         "half_photons": result.half_photons,
         "file_hashes": " ".join(result.file_hashes),
-        "components": list(COMPONENTS),
+        "components": list(scene.components),
         "gate_start": gate.start,
         "bin_width": gate.bin_width,
         **water_of(scene),

@@ -18,6 +18,7 @@ from spadwarp.result.flux import FluxValues, check_flux, flux_arrays, flux_of
 from spadwarp.result.noise import noise_ratios, photons_needed, target_noise_ratio
 from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
 from spadwarp.scene.medium import NOTABLE_UNSEEN
+from spadwarp.scene.scene import Component
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_choice, percent
 
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "Half", "Reconstruction", "Result", "Truth"]
 __all__ += ["analyser_channel", "component_errors", "degree_of_polarisation"]
 
-Component = Literal["ballistic", "forward_scattered", "backscatter"]
-COMPONENTS: tuple[Component, ...] = get_args(Component)
+COMPONENTS: tuple[Component, ...] = get_args(Component)[:3]
+"""Those of every result; `Scene.components` are those of a scene."""
 
 Channel = Literal["I", "co", "cross"]
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
@@ -182,6 +183,7 @@ class Result(Shown, ResultHead, Tallies):
             text = f"channels are {', '.join(channels) or 'none'}; those of the scene's camera are"
             raise ArgumentError(f"{text} {', '.join(expected) or 'none'}")
         counts = {_SIGNED[group][0]: len(found.names) for group, found in signed.items()}
+        counts["component"] = len(self.scene.components)
         camera, counts["time"] = self.scene.camera, self.scene.gate.bins
         for name, array in arrays_of(self).items():
             _check_array(name, array, shape_of(name, camera.height, camera.width, **counts))
@@ -214,9 +216,10 @@ class Result(Shown, ResultHead, Tallies):
         """One part of the histogram, float64 `[H, W, T]`.
 
         `"ballistic"`: one surface and no collision. `"forward_scattered"`: every other history with a surface.
-        `"backscatter"`: water alone. Their sum is the histogram (eq 2).
+        `"backscatter"`: water alone. `"surface"`: the surface of the sea alone, where there is one. Their sum is the
+        histogram (eq 2).
         """
-        return self._fraction(self.tallies[COMPONENTS.index(check_choice("component", name, COMPONENTS))])
+        return self._fraction(self.tallies[_number(self, name)])
 
     def expected(self, name: Component | None = None) -> Floats:
         """The best estimate of the histogram or of a component, float64 `[H, W, T]`: of `reconstruction`, where there
@@ -226,7 +229,7 @@ class Result(Shown, ResultHead, Tallies):
         parts = self.reconstruction.histogram
         if name is None:
             return parts.sum(axis=0, dtype=np.float64)
-        return parts[COMPONENTS.index(check_choice("component", name, COMPONENTS))].astype(np.float64)
+        return parts[_number(self, name)].astype(np.float64)
 
     @property
     def expected_error(self) -> Floats:
@@ -378,7 +381,7 @@ class Result(Shown, ResultHead, Tallies):
         """Relative standard error that rounding to the tally's unit adds to an average illuminated bin, at most, by
         component; infinite where light came but none was left. Values of one unit or more round without notice."""
         errors: dict[str, float] = {}
-        for name, tally in zip(COMPONENTS, self.tallies, strict=True):
+        for name, tally in zip(self.scene.components, self.tallies, strict=True):
             small, total = self.counters.get(f"below_unit_{name}", 0), float(tally.sum(dtype=np.float64))
             # A value f < 1 has the variance f (1 - f), of at most 1/4 and f.
             variance = min(0.25 * small, total) * np.count_nonzero(tally)
@@ -461,7 +464,7 @@ class Result(Shown, ResultHead, Tallies):
                 **({"layers": len(scene.medium.layers)} if scene.medium.layers else {}),
                 **({} if scene.medium.grid is None else {"grid": scene.medium.grid.shape or scene.medium.grid.file}),
             },
-            "collected_fraction": dict(zip(COMPONENTS, map(float, fractions), strict=True)),
+            "collected_fraction": dict(zip(scene.components, map(float, fractions), strict=True)),
             "detections_per_pulse": float(
                 fractions.sum() * scene.laser.photons_per_pulse * scene.detections_per_photon
             ),
@@ -510,6 +513,12 @@ def signed_of(result: Result) -> dict[str, SignedTallies]:
     return {group: found for group, found in groups.items() if found is not None}
 
 
+def _number(result: Result, name: Component) -> int:
+    """That of a component."""
+    names = result.scene.components
+    return names.index(check_choice("component", name, names))
+
+
 def arrays_of(result: Result) -> dict[str, NDArray[Any]]:
     """The arrays of a result, of those of `ARRAYS`."""
     found: dict[str, Any] = {name: getattr(result, name) for name in ("tallies", "half", "second_moment")}
@@ -525,7 +534,7 @@ def arrays_of(result: Result) -> dict[str, NDArray[Any]]:
 def coordinates_of(result: Result) -> dict[str, Coordinate]:
     """Values, unit and meaning of the dimensions of `ARRAYS`."""
     return {
-        "component": (list(COMPONENTS), "1", "history of the light"),
+        "component": (list(result.scene.components), "1", "history of the light"),
         **image_coordinates(*result.truth.depth.shape),
         "time": (result.bin_centres, "s", "time of flight at the centre of the bin"),
         "parameter": (list(result.derivatives), "1", "by which the histogram is differentiated"),
@@ -704,7 +713,7 @@ def _spreads(result: Result) -> dict[Component, tuple[int, int, int, int]]:
     moments, photons, size, found = result.batch_moments, result.photons, result.batch_size, {}
     if not moments or result.batches < 2:
         return {}
-    for name, tally in zip(COMPONENTS, result.tallies, strict=True):
+    for name, tally in zip(result.scene.components, result.tallies, strict=True):
         # In rows and halves, since a sum over all voxels may exceed 64 bits.
         total = sum((int((row >> 32).sum()) << 32) + int((row & 0xFFFFFFFF).sum()) for row in tally)
         # In integers: no cancellation. Where no batch has `batch_size` photons, none is known to be far from the mean.

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,12 +25,16 @@ from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium, phase_function
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import interpolated_angles, rotation_matrix, vector_of
+from spadwarp.scene.sea import Surface
 from spadwarp.scene.sections import Document, Overrides, listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
 from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_integer, check_real, read_real, shown
 
 __all__ = ["Scene", "SceneLike", "Trajectory", "WaterLine", "as_scene", "load_scene", "load_trajectory", "template"]
 __all__ += ["water_lines"]
+
+# What the light has met.
+Component = Literal["ballistic", "forward_scattered", "backscatter", "surface"]
 
 _DOWNWARDS = 0.999  # Cosine with the vertical, of the normal of a surface.
 
@@ -44,6 +48,7 @@ class Scene(Shown, Document):
     scan: Scan = Scan()
     detector: Detector = Detector()
     gate: Gate
+    surface: Surface | None = None
     daylight: Daylight | None = None
     targets: Annotated[tuple[Target, ...], BeforeValidator(listed)] = ()
     domain: Domain = Domain()
@@ -64,6 +69,8 @@ class Scene(Shown, Document):
         yield from self._scan_problems()
         yield from self._blocked_ports()
         yield from self._flux_exclusions()
+        if self.surface is not None:
+            yield from self._at_the_surface(self.surface)
 
     def _polarise(self) -> None:
         """Sets what polarised light needs where the defaults are without it."""
@@ -185,6 +192,42 @@ class Scene(Shown, Document):
             hint = "move the laser, or give it a port of its own: [laser.port]" if is_shared else "change it"
             yield f"laser.position = {position} is outside laser.port: {why}; {hint}"
 
+    def _at_the_surface(self, surface: Surface) -> Iterator[str]:
+        """Why light cannot be followed through the surface of the sea."""
+        for field, found in {
+            "camera.port, a table": self.camera.port is not None,
+            "laser.port, a table": self.laser.port is not None,
+            "domain.outside_index, a table": bool(self.domain.reflecting),
+            "daylight, a table": self.daylight is not None,
+            "medium.grid, a table": self.medium.grid is not None,
+            f"scan.mode = {self.scan.mode!r}": self.scan.mode != "none",
+            "flux, a table": bool(self.flux),
+            "sun, a table": self.sun is not None,
+        }.items():
+            if found:
+                yield f"{field}: cannot be combined with surface"
+        if self.polarised:
+            yield "surface: cannot be combined with polarised light, since its facets have no matrices"
+        if (threshold := self.transport.axis_threshold) < 1.0:
+            yield f"transport.axis_threshold = {threshold} does not go with surface: set it to 1"
+        camera, beam = self.camera, self.beam
+        places = {"camera.position": camera.position, "laser.position": vector_of(to_world(camera, beam.position))}
+        normal = np.array(surface.normal) @ rotation_matrix(camera.rotation_deg)
+        wide = {"camera.position": (0.0 if camera.pinhole else camera.aperture_radius, np.array([0.0, 0.0, 1.0]))}
+        wide["laser.position"] = beam.beam_radius if beam.profile == "collimated" else 0.0, np.array(beam.axis)
+        for field, place in places.items():
+            radius, axis = wide[field]
+            height, reach = surface.height_of(place), radius * math.sqrt(max(1.0 - float(axis @ normal) ** 2, 0.0))
+            if abs(height) <= max(reach, 1e-6):
+                yield f"{field}: {height:.4g} m above the surface, which the lens or the beam, {reach:.4g} m, reaches"
+        if surface.is_flat and surface.height_of(camera.position) < 0.0:
+            yield (
+                "surface.mean_square_slope = 0 does not go with a camera in the water: a flat surface seen from below "
+                "is a face of the domain with an outside_index"
+            )
+        if surface.air(self.laser.wavelength_nm)[0] >= self.medium.phase_index:
+            yield f"medium.phase_index = {self.medium.phase_index} is not above that of the air"
+
     @property
     def scan_positions(self) -> int:
         """Positions of the beam: photon i is emitted at position i modulo this number."""
@@ -238,6 +281,11 @@ class Scene(Shown, Document):
         position, axis = to_camera(camera, laser.position), laser.axis @ rotation_matrix(camera.rotation_deg)
         moved = {"position": vector_of(position), "direction": vector_of(axis), "frame": "camera"}
         return laser.model_copy(update=moved)
+
+    @property
+    def components(self) -> tuple[Component, ...]:
+        """Parts of the light in the order of a result's tallies: `"surface"` is there with a surface of the sea."""
+        return get_args(Component)[: 3 if self.surface is None else 4]
 
     @property
     def polarised(self) -> bool:
@@ -347,20 +395,39 @@ def water_lines(scene: Scene) -> list[WaterLine]:
 
 
 def camera_port(scene: Scene) -> PortGeometry | None:
-    """The port that a scene's camera looks through; None: it is in the water."""
+    """The port that a scene's camera looks through, or the mean plane of the sea below it; None: it is in the water."""
     port = scene.camera.port
+    if scene.surface is not None:
+        return mean_plane(scene) if scene.surface.height_of(scene.camera.position) > 0.0 else None
     return None if port is None else _placed(scene, port, np.zeros(3), np.array(port.axis))
 
 
 def laser_port(scene: Scene) -> PortGeometry | None:
-    """The port that a scene's laser shines through; None: it is in the water."""
+    """The port that a scene's laser shines through, or the mean plane of the sea below it; None: it is in the water."""
     port = scene.laser.port
+    if scene.surface is not None:
+        place = vector_of(to_world(scene.camera, scene.beam.position))
+        return mean_plane(scene) if scene.surface.height_of(place) > 0.0 else None
     if not isinstance(port, Port):
         return None if port is None else camera_port(scene)
     normal = np.array(port.axis)
     if scene.laser.frame == "world" and scene.camera.is_posed:
         normal = normal @ rotation_matrix(scene.camera.rotation_deg)
     return _placed(scene, port, np.array(scene.beam.position), normal)
+
+
+def mean_plane(scene: Scene, *, from_below: bool = False) -> PortGeometry:
+    """The mean plane of the scene's surface as a port without a window, from the air into the water or back."""
+    surface, camera, medium = scene.surface, scene.camera, scene.medium
+    assert surface is not None
+    down = -np.array(surface.normal) @ rotation_matrix(camera.rotation_deg)
+    height = surface.height_of(camera.position)
+    (index, group), water = surface.air(scene.laser.wavelength_nm), (medium.phase_index, medium.group_index)
+    if from_below:
+        indices, groups = (water[0], water[0], index), (water[1], water[1], group)
+        return PortGeometry("flat", -height, vector_of(-down), 0.0, (0.0, 0.0, 0.0), 0.0, indices, groups)
+    indices, groups = (index, index, water[0]), (group, group, water[1])
+    return PortGeometry("flat", height, vector_of(down), 0.0, (0.0, 0.0, 0.0), 0.0, indices, groups)
 
 
 def _placed(scene: Scene, port: Port, origin: Any, normal: Any) -> PortGeometry:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
 from spadwarp.mesh import build_mesh, focus_distance
-from spadwarp.result import COMPONENTS, Truth
+from spadwarp.result import Truth
 from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix
 from spadwarp.scene.camera import pixel_views, to_camera, to_world, view_box
 from spadwarp.scene.flux import Sun, azimuth_zero
@@ -24,7 +24,7 @@ from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scan import Shots, shots_of
-from spadwarp.scene.scene import camera_port, laser_port
+from spadwarp.scene.scene import camera_port, laser_port, mean_plane
 from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes, view_directions, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_scale
@@ -75,7 +75,8 @@ def build_model(
         scale = tally_scale(scene, mesh) if camera else 1.0
     lens, limits = _camera(scene, mesh), _limits(scene, device, camera)
     # Behind a port, light bends: the map of what the lens sees for certain is of straight lines to a lens at rest.
-    mapped = lens if camera and scene.camera.port is None and scene.scan.mode != "trajectory" else None
+    straight = scene.camera.port is None and scene.surface is None and scene.scan.mode != "trajectory"
+    mapped = lens if camera and straight else None
     device_mesh, surfaces = _surfaces(mesh, mapped, device, mesh_cache)
     parts: dict[str, Any] = {}
     if scene.medium.varies:
@@ -85,6 +86,8 @@ def build_model(
     if derivatives:
         grid = parts.get("layers", sk.Layers()).grid
         parts["derivatives"] = make_derivatives(scene, derivatives, mesh, scale, device, grid)
+    if scene.surface is not None:
+        parts["sea"] = _sea(scene)
     if scene.polarised:
         parts |= _polarised(scene, mesh, scale, device)
     if camera and scene.flux:
@@ -170,7 +173,7 @@ def _guiding(scene: Scene, max_path: float) -> Any:
         far_point = [p + 0.5 * max_path * u for p, u in zip(beam.position, beam.axis, strict=True)]
         thickness = max(2.0 * scene.optical_depth(beam.position, far_point), 1e-6)
     else:
-        thickness = max(scene.medium.extinction * max_path, 1e-6)
+        thickness = max(scene.medium.extinction * (max_path - _path_in_air(scene)), 1e-6)
     in_grid = scene.medium.grid is not None
     return _filled(
         sk.Guiding(),
@@ -180,6 +183,12 @@ def _guiding(scene: Scene, max_path: float) -> Any:
         return_probability=0.1 * min(1.0, 5.0 / thickness),
         return_anisotropy=0.5,
     )
+
+
+def _path_in_air(scene: Scene) -> float:
+    """Of the path down to the sea and back what is in the air, as a length in water [m]."""
+    ports = [camera_port(scene), laser_port(scene)] if scene.surface is not None else []
+    return sum(port.distance * port.group_index[0] / port.group_index[2] for port in ports if port is not None)
 
 
 def _device_mesh(mesh: TriangleMesh, device: wp.Device, cache: MeshCache | None) -> wp.Mesh:
@@ -264,8 +273,9 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         measured_beam=scene.laser.profile == "measured",
         confocal=scene.scan.mode != "none",
         rotated_domain=_has_rotated_domain(scene),
-        port=port_kind(camera_port(scene)),
-        laser_port=port_kind(laser_port(scene)) if scene.sun is None else sk.FLAT_PORT,
+        port=None if scene.surface else port_kind(camera_port(scene)),
+        laser_port=sk.FLAT_PORT if scene.sun else None if scene.surface else port_kind(laser_port(scene)),
+        sea=scene.surface is not None,
         reflecting=bool(scene.domain.reflecting),
         grid=_grid_tracking(scene),
         derivatives=kinds,
@@ -354,7 +364,7 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
         return _sun(scene, scene.sun)
     beam = scene.beam
     laser: Any = _filled(sk.Laser(), position=wp.vec3(*beam.position), axis=wp.vec3(*beam.axis))
-    if (port := laser_port(scene)) is not None:
+    if (port := laser_port(scene)) is not None and scene.surface is None:
         laser.port = port_parameters(scene, port, beam.position, 0.0, 0.0)
     if beam.profile == "measured":
         for name, table in zip(("rows", "columns"), sk.profile_tables(load_profile(beam)), strict=True):
@@ -384,9 +394,30 @@ def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
         lens.focal, lens.principal = wp.vec2(*receiver.focal_pixels), wp.vec2(*receiver.principal_point)
         lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
         lens.view, lens.columns = wp.vec4(*view_box(receiver)), receiver.width
-    if (port := camera_port(scene)) is not None:
+    port = camera_port(scene)
+    if port is None and scene.surface is not None:
+        port = mean_plane(scene, from_below=True)
+    if port is not None:
         lens.port = port_parameters(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
     return lens
+
+
+def _sea(scene: Scene) -> Any:
+    """The surface of the sea as the kernels take it."""
+    surface, plane = scene.surface, mean_plane(scene)
+    assert surface is not None
+    along = None
+    if surface.direction is not None:
+        along = (np.array(surface.direction) @ rotation_matrix(scene.camera.rotation_deg)).tolist()
+    return sk.make_sea(
+        surface.slope_variances,
+        index=plane.index[2] / plane.index[0],
+        normal=tuple(-x for x in plane.normal),
+        height=-plane.distance,
+        along=along,
+        delay=plane.group_index[0] / plane.group_index[2],
+        extinction=surface.air_extinction,
+    )
 
 
 def port_kind(port: PortGeometry | None) -> Any:
@@ -408,7 +439,8 @@ def port_parameters(
     choices |= {"origin": origin, "aperture_radius": aperture_radius, "largest_angle": min(angle, 1.55)}
     try:
         if port.shape == "flat":
-            return sk.make_flat_port(distance=port.distance, normal=port.normal, **choices)
+            variance = 0.0 if scene.surface is None else max(scene.surface.slope_variances)
+            return sk.make_flat_port(distance=port.distance, normal=port.normal, slope_variance=variance, **choices)
         return sk.make_dome_port(radius=port.radius, centre=port.centre, **choices)
     except sk.ArgumentError as error:
         raise ConfigError(f"camera.port or laser.port: {error}", source=scene.source) from None
@@ -494,7 +526,7 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
     """Refuses a laser or a target within the camera's port; a camera or a laser, or the way out of its port, outside
     the domain; and a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
     corners = np.zeros((0, 3, 3)) if mesh is None or scene.camera.port is None else mesh.vertices[mesh.faces]
-    if camera and (found := within_port(scene, corners.astype(np.float64))):
+    if camera and scene.surface is None and (found := within_port(scene, corners.astype(np.float64))):
         raise ConfigError(": ".join(found), source=scene.source)
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
@@ -537,7 +569,7 @@ def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bo
     """Refuses what cannot fit before anything is computed; returns whether half as much again would, which is more than
     the low words of the histograms take."""
     camera, size, cuda = scene.camera, model.tally_size, model.device.is_cuda
-    shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(COMPONENTS)} components"
+    shape = f"{camera.height} x {camera.width} pixels x {scene.gate.bins} bins x {len(scene.components)} components"
     outside, count = f"is outside [1, {2**31 - 1}]", size * max(signed, 1)
     if count >= 2**31 and signed:
         text = f"{shape} x {signed} derivatives or channels = {count} {outside}"
@@ -574,6 +606,8 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     if model.mesh is None:
         nothing = np.full(shape, np.nan, np.float32)
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
+    if scene.surface is not None:
+        return _truth_by_sea(scene, model, shape)
     nowhere = np.zeros((0, 0, 3))
     origins, directions, lead = nowhere, nowhere if camera.is_plain else pixel_directions(camera), None
     if scene.scan.mode == "trajectory":
@@ -584,6 +618,18 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
     depth, ranges, normal, reflectance = trace_rays(model, origins, directions, shape)
     ranges = ranges if lead is None else (ranges + lead).astype(np.float32)
     return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
+
+
+def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Truth:
+    """Of what stands before the mean plane of the sea, and of what is seen through it."""
+    view = pixel_directions(scene.camera)
+    plane = camera_port(scene) or mean_plane(scene, from_below=True)
+    start, direction, lead, _ = plane.enter(np.zeros(3), view)
+    near, far = (trace_rays(model, *rays, shape) for rays in ((np.zeros(view.shape), view), (start, direction)))
+    far[1] = (far[1] + lead).astype(np.float32)
+    before = near[1] < np.nan_to_num(lead, nan=np.inf)
+    values = [np.where(before[..., None] if a.ndim == 3 else before, a, b) for a, b in zip(near, far, strict=True)]
+    return Truth(**dict(zip(("depth", "range", "normal", "reflectance"), values, strict=True)))
 
 
 def first_hits(triangles: NDArray[np.float64], start: Any, direction: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.mesh import build_mesh, focus_distance
-from spadwarp.result import COMPONENTS, Result, ResultLike
+from spadwarp.result import Result, ResultLike
 from spadwarp.result.result import ResultHead, difference
 from spadwarp.result.tallies import count, shard_of
 from spadwarp.scene import Laser, Scene, Transport, phase_function
@@ -215,7 +215,7 @@ def _batch_size(
     fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
     if kind == "cuda" and relative_error is None:
         most = min(max(photons // _GPU_BATCH, fewest), most)
-    least = min(max(photons * _VOXELS_PER_PHOTON // (len(COMPONENTS) * bins), fewest), most)
+    least = min(max(photons * _VOXELS_PER_PHOTON // (len(scene.components) * bins), fewest), most)
     least = least if shard is None else max(least, shard[1])
     positions = scene.scan_positions
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH[kind])
@@ -226,7 +226,7 @@ def _auto_batch_size(scene: Scene, kind: str) -> int:
     bins = _bins(scene)
     if not keeps_errors(scene):
         return 0
-    least = max(_AUTO_BATCH[kind], len(COMPONENTS) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
+    least = max(_AUTO_BATCH[kind], len(scene.components) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
     return scene.scan_positions << max(0, (least // scene.scan_positions - 1).bit_length())
 
 
@@ -313,7 +313,9 @@ def _faintest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> floa
         reaches = [np.linalg.norm(np.abs(mesh.bounds - lens).max(axis=0)) for lens in _lens_positions(scene)]
         furthest = min(furthest, float(max(reaches)))
         scattered = max(float(mesh.reflectance.max()), 1e-3) / math.pi
-    through = math.exp(-scene.optical_depth([0.0, 0.0, 0.0], [0.0, 0.0, furthest]))
+    above = camera_port(scene) if scene.surface is not None else None
+    begin = 0.0 if above is None else min(above.distance, furthest)
+    through = math.exp(-scene.optical_depth([0.0, 0.0, begin], [0.0, 0.0, furthest]))
     return scattered * through * scene.camera.aperture_area / furthest**2
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_device, pick_devices, processor_name
 from spadwarp.parallel import Ray, interruptible
 from spadwarp.parallel.worker import Event
-from spadwarp.result import COMPONENTS, Result, as_result, merge, save_result
+from spadwarp.result import Result, as_result, merge, save_result
 from spadwarp.result.noise import NOISE_GOAL
 from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets, unseen_warnings
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
@@ -174,7 +174,7 @@ def simulate(
 
 def _warn_of_rounding(result: Result) -> None:
     """Warns where contributions are so small that rounding them to the tally's unit decides the error."""
-    for name, tally in zip(COMPONENTS, result.tallies, strict=True):
+    for name, tally in zip(result.scene.components, result.tallies, strict=True):
         small = result.counters.get(f"below_unit_{name}", 0)
         # The first rows of pixels mostly show that there is more.
         if small <= _MANY or any(total * _MANY >= small for total in accumulate(map(_units, tally))):

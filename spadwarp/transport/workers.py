@@ -23,7 +23,7 @@ from spadwarp.device import core_count, pick_device, pick_devices, processor_nam
 from spadwarp.parallel import Ray, Worker
 from spadwarp.parallel.ray import RayWorkers
 from spadwarp.parallel.worker import Event
-from spadwarp.result import COMPONENTS, FluxTallies, SignedTallies, Tallies, Truth
+from spadwarp.result import FluxTallies, SignedTallies, Tallies, Truth
 from spadwarp.result.tallies import (
     OVERFLOW,
     IdQueue,
@@ -55,13 +55,7 @@ class _Histogram:
     """A tally on the device, `[voxel * parts]`, and its batches, if any; `total` may be the caller's."""
 
     def __init__(
-        self,
-        array: wp.array,
-        *,
-        signed: bool,
-        batched: bool,
-        total: wp.array | None = None,
-        components: int = len(COMPONENTS),
+        self, array: wp.array, components: int, *, signed: bool, batched: bool, total: wp.array | None = None
     ) -> None:
         self.array, self._signed = array, signed
         halved = not signed and components > 1
@@ -137,7 +131,8 @@ class DeviceWorker:
         signed: tuple[str, ...] = (),
         tallies: Any = None,
     ) -> None:
-        self._shape = (len(COMPONENTS), model.camera.height, model.camera.width, model.gate.bins)
+        self._names = model.components
+        self._shape = (len(self._names), model.camera.height, model.camera.width, model.gate.bins)
         total = None if tallies is None else caller_tallies(tallies, shape=self._shape, device=model.device)
         self.model, self._spec, self._seed, self._signed = model, spec, seed, signed
         self._threads, self._launch_size, self._batch_size = threads, launch_size, batch_size
@@ -145,11 +140,12 @@ class DeviceWorker:
         with device_errors(model.device):
             own = None if batched else total
             self.data = sk.make_data(model, tally=own, histogram=not spec.records, derivatives=len(signed))
-            self._histograms = [_Histogram(self.data.tally, signed=False, batched=batched, total=total)]
+            components = len(self._names)
+            self._histograms = [_Histogram(self.data.tally, components, signed=False, batched=batched, total=total)]
             if self.data.gradients is not None:
-                self._histograms.append(_Histogram(self.data.gradients, signed=True, batched=batched))
+                self._histograms.append(_Histogram(self.data.gradients, components, signed=True, batched=batched))
             if self.data.flux is not None:
-                self._histograms.append(_Histogram(self.data.flux, signed=False, batched=batched, components=1))
+                self._histograms.append(_Histogram(self.data.flux, 1, signed=False, batched=batched))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device, model=model, photon_count=most)
@@ -242,7 +238,7 @@ class DeviceWorker:
             assert histogram.batches is not None
             histogram.batches.close(histogram.array, in_half=in_half, part=photons / size, threads=self._threads)
         assert self._histograms[0].batches is not None
-        moments = moments_of(COMPONENTS, self._histograms[0].batches.take_sums(), photons, size)
+        moments = moments_of(self._names, self._histograms[0].batches.take_sums(), photons, size)
         self._add_closed(_Closed(*sk.read_ledger(self.data), moments, half_photons=photons if in_half else 0))
         self.data.ledger.zero_()
 
@@ -402,7 +398,7 @@ class LocalWorkers:
         if kind == "cuda":  # a run of few photons needs no kernel of larger launches
             size = min(size, max(1, plan.photons))
         threads = 1 if kind == "cuda" else max(1, (threads or core_count()) // len(devices))
-        copies = (3 + 2 / len(COMPONENTS) if plan.batch_size else 1) * max(map(devices.count, devices))
+        copies = (3 + 2 / len(plan.scene.components) if plan.batch_size else 1) * max(map(devices.count, devices))
         choices: Any = {"copies": copies, "scale": plan.scale, "mesh_cache": mesh_cache}
         began = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
@@ -506,7 +502,8 @@ class ClusterWorkers(RayWorkers):
         camera = plan.scene.camera
         voxels = camera.width * camera.height * plan.scene.gate.bins
         histograms = 1 + len(plan.derivatives) + len(camera.tallied_channels)
-        size = 8 * (len(COMPONENTS) + (2 + len(COMPONENTS) if plan.batch_size else 0)) * histograms * voxels
+        components = len(plan.scene.components)
+        size = 8 * (components + (2 + components if plan.batch_size else 0)) * histograms * voxels
         size += 24 * sum(section.size for section in plan.scene.flux)
         super().__init__(engine, device, prepare=functools.partial(_prepare, plan), value_bytes=size, note=note)
         self._total: Tallies | None = None
@@ -627,6 +624,8 @@ class LightTracer:
         mesh_cache: dict[str, Any] | None = None,
         tally: Any = None,
     ) -> None:
+        if scene.surface is not None:
+            raise ConfigError("a fit knows no surface of the sea", source=scene.source)
         names = derivatives or None
         plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=names, batches=False)
         workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)

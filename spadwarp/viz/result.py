@@ -19,7 +19,6 @@ from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
 from spadwarp.result import (
     CHANNELS,
-    COMPONENTS,
     Channel,
     Result,
     analyser_channel,
@@ -174,7 +173,7 @@ def _result_figure(
     if kind == "intensity":
         panels.unclear = unclear
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
-        ballistic = result.tallies[COMPONENTS.index("ballistic")].sum(axis=-1) * result.tally_value
+        ballistic = result.tallies[result.scene.components.index("ballistic")].sum(axis=-1) * result.tally_value
         panels.show_intensity(result.intensity * per_pulse, "All light in the gate", "expected detections per pulse")
         panels.unclear = None
         panels.show_intensity(ballistic * per_pulse, "Ballistic light alone", "expected detections per pulse")
@@ -263,7 +262,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
         weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
     edges = merged_edges(total, weight * total, [int(part.argmax()) for part in parts > 0])  # no light before its time
     curves: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
-    for name, part in zip(COMPONENTS, parts, strict=True):
+    for name, part in zip(result.scene.components, parts, strict=True):
         own = np.arange(len(time)) if name == "ballistic" else merged_edges(part, weight * part)
         wide = {"linewidth": 1.4, "zorder": 3} if name == "ballistic" else {"linewidth": 0.9, "zorder": 2}
         label, colour = style.COMPONENTS[name]

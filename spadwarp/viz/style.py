@@ -47,6 +47,7 @@ COMPONENTS = {
     "ballistic": ("target, ballistic", BLUE),
     "forward_scattered": ("target, forward-scattered", ORANGE),
     "backscatter": ("water, backscatter", GREEN),
+    "surface": ("surface of the sea", PURPLE),
 }
 """Label and colour of the components of a result."""
 CHANNEL_NAMES: dict[Channel, str] = {"co": "co-polarised", "cross": "cross-polarised"}

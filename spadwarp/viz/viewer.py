@@ -136,7 +136,8 @@ def _of_result(result: Result, method: str | None, device: Any) -> _Page:
         intensity=result.intensity * per_pulse,
         intensity_label="detections per pulse",
         layers=[
-            _layer(*names, cube, scale) for names, cube in zip(style.COMPONENTS.values(), result.tallies, strict=True)
+            _layer(*style.COMPONENTS[name], cube, scale)
+            for name, cube in zip(scene.components, result.tallies, strict=True)
         ],
         edges=result.bin_edges,
         unit="detections per pulse and bin",

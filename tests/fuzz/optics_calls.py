@@ -24,7 +24,11 @@ def valid_calls(mesh: wp.Mesh) -> dict:
             faces=[0] * 12, blocks=None, device="cpu")),
         "make_dome_port": (sk.make_dome_port, dict(
             radius=0.08, thickness=0.01, centre=(0.0, 0.0, 0.01), origin=(0.0, 0.0, 0.0), **window, **lens)),
-        "make_flat_port": (sk.make_flat_port, flat | lens),
+        "make_flat_port": (sk.make_flat_port, flat | lens | dict(slope_variance=0.01)),
+        "make_sea": (sk.make_sea, dict(
+            variances=(0.01, 0.02), index=1.34, normal=(0.0, 0.0, -1.0), height=-3.0, along=(1.0, 0.0, 0.0),
+            delay=0.73, extinction=0.1)),
+        "slope_variances": (sk.slope_variances, dict(wind=5.0, by_direction=True)),
         "make_polarisation": (sk.make_polarisation, dict(
             laser=(1.0, 1.0, 0.0, 0.0), matrix=lambda c: np.tile([0.0, 1, 1, 0, 1], (len(c), 1)),
             channels=[[1.0, 0.0, 0.0, 0.0]], facet_index=[1.3], device="cpu")),

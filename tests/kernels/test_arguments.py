@@ -141,6 +141,7 @@ def test_meshes_and_rasters_of_another_model(box):
 
 
 PORT = {"index": (1.0, 1.5, 1.34), "group_index": (1.0, 1.5, 1.36)}
+SEA = {"index": 1.34, "normal": (0.0, 0.0, 1.0), "height": 0.0}
 NONE = {"kinds": (), "value": (), "scale": (1.0,), "channels": 1, "device": "cpu"}
 TILT = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 CORNERS, ONES = np.zeros((1, 3, 2)), np.ones((2, 2, 2))
@@ -207,6 +208,10 @@ def polarised(**arguments):
         (lambda: sk.make_derivatives(**NONE, waters=[0.5]), "waters holds numbers that are not whole"),
         (lambda: sk.make_derivatives(**NONE, faces="x"), "faces is .* not an array of numbers"),
         (lambda: sk.make_derivatives(**NONE, blocks=3), "blocks is .* a Blocks is needed"),
+        (lambda: sk.make_sea((0.01, 0.0), **SEA), r"variances\[1\] = 0.0 is outside"),
+        (lambda: sk.make_sea((0.01, 0.01), **SEA | {"index": 1.0}), r"index = 1.0 is outside \(1, 4\]"),
+        (lambda: sk.make_sea((0.01, 0.01), **SEA, along=(0.0, 0.0, 2.0)), "length of along in the plane"),
+        (lambda: sk.slope_variances(-1.0), r"wind = -1.0 is outside \[0, 30\]"),
         (lambda: sk.make_flat_port(**PORT, distance=0.0), "reaches through the port"),
         (lambda: sk.make_flat_port(**PORT, distance=0.05, thickness=-1.0), "thickness = -1.0 is outside"),
         (lambda: sk.make_flat_port(**PORT, distance=0.001, normal=TILT, aperture_radius=0.02), "through the port"),

@@ -43,7 +43,7 @@ def test_every_package_is_listed():
 # RESOLVING makes of them what is asked of the packages below it, says what a request holds and checks a launch.
 OWNED = {
     "water": "phase random_albedo bounded layered rotated_domain reflecting grid",
-    "optics": "lens measured_beam confocal port laser_port sun",
+    "optics": "lens measured_beam confocal port laser_port sun sea",
     "surface": "mesh brute_force pattern specular use_warp_bvh",
     "photon": "stepped merged",
     "riders": "derivatives blocks polarised channels flux",

@@ -7,12 +7,13 @@ from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import lens_point
+from spadwarp_kernels.optics.sea import height_above, passage_density
 from spadwarp_kernels.optics.visibility import Link
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Contribution, PhotonState, World
+from spadwarp_kernels.photon.state import SEA_FACE, SEA_SLOT, Contribution, PhotonState, World
 from spadwarp_kernels.riders.riders import make_rider
-from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
+from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED, SURFACE
 from spadwarp_kernels.water.medium import Layers, Medium, Profile
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN_GUIDE, PhaseGuide
 
@@ -162,7 +163,8 @@ class Scored:
 
     contribution: Contribution  # to the tally, if nothing stands between the scored point and the lens
     origin: wp.vec3  # the scored point [m]
-    lens: wp.vec3  # where its light leaves the water: the point of the lens, or of a port [m]
+    lens: wp.vec3  # where its light leaves the water: the point of the lens, or of a port; or meets a sea's surface [m]
+    behind: wp.vec3  # by a sea, the point of the lens [m]
 
 
 @wp.struct
@@ -176,9 +178,42 @@ class ScoredPoint:
 
 
 @memoised
+def make_ask_at_sea() -> wp.Function:
+    """The Warp function ``(s, world) -> Request`` of a photon at the surface of a sea, for all that the surface sends
+    to the lens, but for what `Sight.link` finds from the event before: transmitted light of events that scatter."""
+
+    @wp.func
+    def ask_at_sea(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
+        q = Request()
+        lens_above = height_above(world.sea, wp.vec3(0.0)) > 0.0
+        q.wanted = lens_above == s.above or s.collisions == 0
+        q.x = s.x
+        q.u = s.u
+        q.weight = s.weight.value
+        q.path = s.path
+        q.first = s.flight.block[3]
+        q.rounding_sample = s.flight.block[2]
+        q.slot = SEA_SLOT
+        q.target = s.target
+        q.component = sea_component(s, s.collisions - s.bounces.count + 1)
+        return q
+
+    return ask_at_sea
+
+
+@wp.func
+def sea_component(s: wp.ref[PhotonState], scatterings: int) -> int:
+    """The component of light after so many collisions and targets, which the surface of a sea is none of."""
+    component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
+    component = wp.where(s.surface_count == 1 and scatterings == 1, BALLISTIC, component)
+    return wp.where(scatterings == 0, SURFACE, component)
+
+
+@memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
+    sea, ask_at_sea = spec.sight.sea, make_ask_at_sea()
     tracks, rides, point_in = spec.water.profile is not None, make_rider(spec).rides, spec.sight.pose.point_in
 
     @wp.func
@@ -213,6 +248,12 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                     q.weight *= s.albedo
                     if s.surface_count == 0:
                         q.component = BACKSCATTER
+        if wp.static(sea):
+            if s.bounces.face == SEA_FACE:
+                q = ask_at_sea(s, world)
+            q.second = s.flight.block[1]  # of the direction to come
+            if on_surface and s.collisions == s.bounces.count:
+                q.component = BALLISTIC
         return q
 
     return event_request
@@ -316,6 +357,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
     request scatters at x into the direction v."""
     water_at, phase_pdf, face_density = spec.water.at, spec.water.phase.pdf, spec.faces.density
+    sea = spec.sight.sea
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
@@ -325,6 +367,9 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
         else:
             snapped = snap_from(request.u, world.medium.axis_threshold)
             scattering = phase_pdf(one_minus_cosine(snapped, v), water_at(world.medium, world.layers, x))
+        if wp.static(sea):
+            if request.slot == SEA_SLOT:
+                scattering = passage_density(world.sea, request.u, v)
         return scattering
 
     return scattering_density
@@ -339,7 +384,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     reflects, index_of = spec.domain.reflects, spec.tally_index
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    sight = spec.sight
+    sight, sea = spec.sight, spec.sight.sea
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
     point_in, point_out, turn_out = sight.pose.point_in, sight.pose.point_out, sight.pose.turn_out
     rider = make_rider(spec)
@@ -376,9 +421,16 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                 path = point.path
                 ahead = point.ahead
         view = scan_view(world.camera, world.scan, request.target)
-        link = link_to(world.camera, point_in(world.scan, request.target, found.origin), lens)
+        at_sea = bool(False)
+        bits = wp.uint64(0)
+        if wp.static(sea):
+            at_sea = request.slot == SEA_SLOT
+            bits = join_words(request.second, request.first)
+        origin = point_in(world.scan, request.target, found.origin)
+        link = link_to(world.camera, world.sea, origin, lens, at_sea, bits)
         to_lens = turn_out(world.scan, request.target, link.to_lens)
         found.lens = point_out(world.scan, request.target, link.end)
+        found.behind = lens
         pixel = image_of(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)
         if pixel >= 0 and not scattering <= 0.0:
@@ -394,6 +446,8 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                     weight *= wp.where(ahead > 0.0, wp.exp(-extinction * ahead), 1.0)
                     seed += wp.uint64(0x632BE59BD9B4E019)  # another sequence
                     ahead = wp.where(ahead > 0.0, 0.0, -1.0)
+            elif wp.static(sea):
+                extinction = water_extinction(world.medium, world.layers, link.begin, link.along, link.water, seed)
             else:
                 extinction = water_extinction(world.medium, world.layers, found.origin, to_lens, link.water, seed)
             found.contribution.value = value_of(world.camera, extinction, weight, scattering, link)

@@ -55,7 +55,8 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
     sight, varies, has_phase_guide = spec.sight, spec.varies, spec.water.phase.guide is not None
     view_of, clip_to_view, gate_of, sample_lens = sight.view, sight.clip, sight.gate, sight.sample_lens
-    within, point_in, turn_in = spec.domain.within, sight.pose.point_in, sight.pose.turn_in
+    within, sea = spec.domain.within, sight.sea
+    point_in, turn_in = sight.pose.point_in, sight.pose.turn_in
 
     @wp.func
     def plan_flight(s: wp.ref[PhotonState], block: wp.vec4ui, world: wp.ref[World]) -> FlightPlan:
@@ -71,6 +72,8 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
             plan.lens = lens.point
             plan.lens_weight = lens.weight
         limit = within(world.limits, world.limits.max_path - s.path, s.x, s.u)
+        if wp.static(sea):
+            limit = wp.where(s.above, -1.0, wp.min(limit, s.flight.sea))
         plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), x, u, plan.lens, limit)
         gate = gate_of(world.camera, world.gate)
         plan.interval = clip_to_gate(gate, x, u, s.path, plan.lens, plan.interval)

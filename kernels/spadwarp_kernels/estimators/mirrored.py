@@ -118,7 +118,7 @@ def _make_score_image(spec: TransportSpec) -> wp.Function:
         lens = lens_point(world.camera, u01_high(request.first), u01_low(request.first))
         view = scan_view(world.camera, world.scan, request.target)
         # The lens, or a port, sees the image as it would see a point in water without an end.
-        link = link_to(world.camera, seen, lens)
+        link = link_to(world.camera, world.sea, seen, lens, False, wp.uint64(0))
         pixel = image_of(world.camera, view, request.target, link.image, lens)
         if pixel < 0:
             return found

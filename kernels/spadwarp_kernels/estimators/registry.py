@@ -11,7 +11,7 @@ from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import TOO_LONG, Contribution, PhotonState, World, tally_index
 from spadwarp_kernels.tally.tally import BACKSCATTER, BALLISTIC, FORWARD_SCATTERED
 
-from .contribution import make_event_request, make_score
+from .contribution import make_event_request, make_score, sea_component
 from .estimator import Estimator
 from .guided import make_guided
 
@@ -26,7 +26,7 @@ def make_none(spec: TransportSpec) -> Estimator:
 def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
     reflects, image_of, leave = spec.domain.reflects, spec.sight.project, spec.sight.leave
-    point_in, turn_in = spec.sight.pose.point_in, spec.sight.pose.turn_in
+    sea, point_in, turn_in = spec.sight.sea, spec.sight.pose.point_in, spec.sight.pose.turn_in
 
     @wp.func
     def cross(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:
@@ -36,7 +36,9 @@ def make_analog(spec: TransportSpec) -> Estimator:
         found.index = -3
         ray = leave(world.camera, point_in(world.scan, s.target, s.x), turn_in(world.scan, s.target, s.u))
         # Events but reflections, which alone bring no light that next events could.
-        scatterings = s.collisions - s.bounces.count
+        scatterings = s.collisions
+        if wp.static(not sea):
+            scatterings -= s.bounces.count
         radius2 = ray.x[0] * ray.x[0] + ray.x[1] * ray.x[1]
         inside = radius2 <= world.camera.aperture_radius * world.camera.aperture_radius
         if scatterings > 0 and inside and ray.water > 0.0 and ray.transmission > 0.0:
@@ -47,6 +49,11 @@ def make_analog(spec: TransportSpec) -> Estimator:
                     component = BALLISTIC
                 found.value = s.weight.value * ray.transmission
                 path = s.path + ray.water + ray.path
+                if wp.static(sea):
+                    component = sea_component(s, scatterings - s.bounces.count)
+                    if s.above:
+                        path = s.path + world.sea.delay * ray.water
+                        found.value *= wp.exp(-world.sea.extinction * ray.water)
                 found.index = tally_index(world.camera, world.gate, pixel, path, component)
                 found.rounding_sample = u01(s.flight.block[2])
         if wp.static(reflects):

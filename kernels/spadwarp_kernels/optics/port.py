@@ -35,6 +35,7 @@ class Port:
     water_slope: wp.vec2  # the same in the water
     turn: float  # bound of the sine of the angle by which a ray of the view is bent (dome)
     aside: float  # bound of a ray's distance from the centre, in the water [m] (dome)
+    margin: float  # bound of how far a rough surface moves a line of sight aside, over the depth below it (sea)
     early: float
     """The way through the port takes at most this much less than the straight line in water [m of water]."""
     late: float  # and at most this much more [m of water]
@@ -464,6 +465,7 @@ def make_flat_port(
     origin: Sequence[float] = (0.0, 0.0, 0.0),
     aperture_radius: float = 0.0,
     largest_angle: float = 1.5,
+    slope_variance: float = 0.0,
 ) -> Port:
     """The parameters of a plane window.
 
@@ -475,11 +477,13 @@ def make_flat_port(
         origin: The lens centre, or the position of a laser, which must be inside [m].
         aperture_radius: Of the camera [m]: all of the lens must be inside.
         largest_angle: Between the normal and any ray of the view, inside, in [0, pi/2) [rad].
+        slope_variance: Of a sea's surface in place of a window, along the axis where it is largest.
 
     Raises:
         ArgumentError: A number out of its range.
     """
     check_number("distance", distance, "(-inf, inf)")
+    check_number("slope_variance", slope_variance, "[0, 0.5]")
     check_vector("normal", normal, unit=True)
     port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     tilt = aperture_radius * math.hypot(normal[0], normal[1])
@@ -496,6 +500,7 @@ def make_flat_port(
     steepest = max(math.tan(largest_angle), slopes[0][1] * math.tan(largest_angle))
     longest = min(math.hypot(1.0, steepest), _FAR)
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
+    _widen(port, slope_variance, largest_angle)
     return port
 
 
@@ -592,3 +597,32 @@ def _set_times(port: Port, lengths: Sequence[tuple[float, float]]) -> None:
         late += (ratio - 1.0) * (least if ratio < 1.0 else largest)
         late += (delay - ratio) * (least if delay < ratio else largest)
     port.early, port.late = early, late
+
+
+# Slopes that the view is made wide enough for, in standard deviations: the others hold 3e-7 of the light.
+_STEEPEST = 5.5
+
+
+def _widen(port: Port, slope_variance: float, largest_angle: float) -> None:
+    """Fills what of a port, the mean plane of a sea as seen from the air, allows for its slopes: `margin`, and times.
+    `largest_angle`: as for `make_flat_port`."""
+    steepest = _STEEPEST * math.sqrt(slope_variance)
+    ratio = port.index[2] / port.index[0]
+    if ratio <= 1.0 or steepest == 0.0:
+        return
+    angles = np.linspace(-largest_angle, largest_angle, 61)[:, None, None]
+    turn = np.linspace(0.0, math.pi, 25)[:, None]
+    slopes = steepest * np.linspace(0.0, 1.0, 25)
+    u = np.stack(np.broadcast_arrays(np.sin(angles), 0.0, -np.cos(angles)), axis=-1)
+    m = np.stack(np.broadcast_arrays(-slopes * np.cos(turn), -slopes * np.sin(turn), 1.0), axis=-1)
+    m = m / np.linalg.norm(m, axis=-1, keepdims=True)
+    cosine = -(u * m).sum(axis=-1, keepdims=True)
+    across = (u + cosine * m) / ratio
+    behind = across - np.sqrt(1.0 - (across * across).sum(axis=-1, keepdims=True)) * m
+    flat = u[..., :2] / np.sqrt(ratio**2 - (u[..., :2] ** 2).sum(axis=-1, keepdims=True))
+    seen = (cosine[..., 0] > 0.0) & (behind[..., 2] < -0.05)
+    aside = np.linalg.norm(behind[..., :2] / np.maximum(-behind[..., 2:], 0.05) - flat, axis=-1)
+    port.margin = float(np.where(seen, aside, 0.0).max())
+    bend = np.where(seen, (behind * u).sum(axis=-1), 1.0).min()
+    longest = port.distance / max(math.cos(largest_angle), 0.02)
+    port.late += float(1.0 - bend) * longest

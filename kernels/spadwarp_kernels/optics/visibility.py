@@ -11,6 +11,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 from .camera import SCANNED, Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
 from .laser import Pose, Scan, make_pose
 from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay
+from .sea import Sea, connect_sea
 
 __all__ = ["next_event_value"]
 
@@ -150,40 +151,55 @@ def _nearer(port: Port, beyond: float, end: int) -> float:
     return port.thickness * (port.glass_slope[end] - 1.0) + beyond * (port.water_slope[end] - 1.0)
 
 
-@wp.func
-def clip_to_flat_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
-    """As `clip_to_view` behind a flat port: holds all that the lens point o sees."""
-    port = camera.port
-    beyond = wp.dot(x, port.normal) - port.distance - port.thickness
-    climb = wp.dot(u, port.normal)
-    seen = _view_from(camera, view, o)
-    interval = clip_half_space(beyond, climb, wp.vec2(0.0, limit))
-    for k in range(4):
-        side = _side(seen, k)
-        outward = wp.dot(side, port.normal)
-        end = wp.where(outward < 0.0, 1, 0)  # that which widens the view
-        slope = port.water_slope[end] - 1.0
-        value = -outward * _nearer(port, beyond, end) - wp.dot(side, x - o)
-        interval = clip_half_space(value, -wp.dot(side, u) - outward * climb * slope, interval)
-    return interval
+@memoised
+def _make_flat_view(rough: bool) -> tuple[wp.Function, wp.Function]:
+    """`clip` and `shows` of a `Sight` behind a flat port; `rough`: it is the surface of a sea."""
+
+    @wp.func
+    def clip_to_flat_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
+        """As `clip_to_view` behind a flat port: holds all that the lens point o sees."""
+        port = camera.port
+        beyond = wp.dot(x, port.normal) - port.distance - port.thickness
+        climb = wp.dot(u, port.normal)
+        seen = _view_from(camera, view, o)
+        interval = clip_half_space(beyond, climb, wp.vec2(0.0, limit))
+        for k in range(4):
+            side = _side(seen, k)
+            outward = wp.dot(side, port.normal)
+            end = wp.where(outward < 0.0, 1, 0)  # that which widens the view
+            slope = port.water_slope[end] - 1.0
+            value = -outward * _nearer(port, beyond, end) - wp.dot(side, x - o)
+            rise = -wp.dot(side, u) - outward * climb * slope
+            if wp.static(rough):
+                aside = port.margin * wp.length(side)
+                value += aside * beyond
+                rise += aside * climb
+            interval = clip_half_space(value, rise, interval)
+        return interval
+
+    @wp.func
+    def flat_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
+        """As `in_view` behind a flat port; False is certain."""
+        port = camera.port
+        beyond = wp.dot(x, port.normal) - port.distance - port.thickness
+        shown = beyond > 0.0
+        for k in range(4):
+            side = _side(view, k)
+            outward = wp.dot(side, port.normal)
+            value = float(-1.0e30)
+            for end in range(2):
+                near = _nearer(port, beyond, end)
+                blur = camera.aperture_radius * wp.abs((x[2] + near * port.normal[2]) * camera.inverse_focus - 1.0)
+                value = wp.max(value, blur - outward * near)
+            if wp.static(rough):
+                value += port.margin * beyond * wp.length(side)
+            shown = shown and value > wp.dot(side, x)
+        return shown
+
+    return clip_to_flat_view, flat_view_shows
 
 
-@wp.func
-def flat_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
-    """As `in_view` behind a flat port; False is certain."""
-    port = camera.port
-    beyond = wp.dot(x, port.normal) - port.distance - port.thickness
-    shown = beyond > 0.0
-    for k in range(4):
-        side = _side(view, k)
-        outward = wp.dot(side, port.normal)
-        value = float(-1.0e30)
-        for end in range(2):
-            near = _nearer(port, beyond, end)
-            blur = camera.aperture_radius * wp.abs((x[2] + near * port.normal[2]) * camera.inverse_focus - 1.0)
-            value = wp.max(value, blur - outward * near)
-        shown = shown and value > wp.dot(side, x)
-    return shown
+clip_to_flat_view, flat_view_shows = _make_flat_view(False)
 
 
 @wp.func
@@ -227,8 +243,10 @@ class Link:
 
     to_lens: wp.vec3  # unit direction at the point
     image: wp.vec3  # a point that the lens sees in the same direction, in air alone [m]
-    end: wp.vec3  # where the way leaves the water [m]
+    end: wp.vec3  # where the way leaves the water, or crosses the surface of a sea; else the point of the lens [m]
     water: float  # its length in the water [m]
+    begin: wp.vec3  # by a sea, where its way in the water begins [m]
+    along: wp.vec3  # and the unit vector along that
     path: float  # length in water that takes as long as all of it [m]
     # what the lens gets of an intensity in that direction, without extinction, per area of the lens [sr/m^2]; by a port
     gather: float
@@ -311,13 +329,16 @@ class Sight(NamedTuple):
     gate: wp.Function  # ``(camera, gate) -> Gate`` of `clip_to_gate`, for what arrives within the gate
     may_hide: wp.Function  # as `may_be_hidden`
     leave: wp.Function  # ``(camera, x, u) -> PortRay``, see `PortKind`; without a port straight on
-    link: wp.Function  # ``(camera, x, o) -> Link``
+    # ``(camera, sea, x, o, at_sea, seed) -> Link``; `at_sea`: x is a point of the sea's surface; `seed`: 64 random bits
+    # for a sea
+    link: wp.Function
     value: wp.Function  # ``(camera, extinction, weight, scattering, link) -> float``, part of the photon that arrives
     apparent: wp.Function  # ``(camera, x, o) -> vec3``, from where the light of o seems to come at x
     toward: wp.Function  # ``(camera, x, o) -> vec3``, unit direction of the way at x; straight where there is no way
     toward_centre: wp.Function  # ``(camera, x) -> vec3``, about that to the lens's centre
     sample_lens: wp.Function  # see `make_sample_lens`
     pose: Pose  # between the frame of the water and that of the camera, in which all of the above is
+    sea: bool  # whether there is a surface of a sea
 
 
 @memoised
@@ -342,7 +363,7 @@ def _make_ways(port: PortKind | None) -> tuple[wp.Function, ...]:
         return ray
 
     @wp.func
-    def link_to(camera: Camera, x: wp.vec3, o: wp.vec3) -> Link:
+    def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Link:
         link = Link()
         if wp.static(has_port):
             way = connect(camera.port, x, o)
@@ -394,6 +415,117 @@ def _make_ways(port: PortKind | None) -> tuple[wp.Function, ...]:
     return leave, link_to, value_of, apparent, toward, toward_centre
 
 
+# ---- The surface of a sea: what lies across it from the lens is seen through it, all else straight on.
+
+
+@wp.func
+def _lies_across(camera: Camera, x: wp.vec3) -> bool:
+    return wp.dot(x, camera.port.normal) > camera.port.distance
+
+
+@wp.func
+def _in_air(camera: Camera) -> bool:
+    """Whether the lens is in the air: the other side of the surface is denser."""
+    return camera.port.index[2] > camera.port.index[0]
+
+
+@memoised
+def _make_sea_ways() -> tuple[wp.Function, ...]:
+    """As `_make_ways`, with the surface of a sea."""
+    leave, _link, _value, _apparent, _toward, straight_to_centre = _make_ways(None)
+    _leave, _link, _value, apparent_behind, toward_behind, toward_centre_behind = _make_ways(FLAT_PORT)
+
+    @wp.func
+    def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Link:
+        link = Link()
+        in_air = _in_air(camera)
+        if not at_sea and _lies_across(camera, x):
+            way = connect_sea(sea, camera.port, x, o, seed)
+            link.to_lens = way.to_surface
+            link.image = o - way.inside
+            link.end = way.surface
+            link.begin = wp.where(in_air, x, way.surface)
+            link.along = wp.where(in_air, way.to_surface, way.inside)
+            link.water = wp.where(in_air, way.before, way.behind)
+            air = wp.where(in_air, way.behind, way.before)
+            link.path = link.water + sea.delay * air
+            link.gather = way.density * wp.max(-way.inside[2], 0.0) * wp.exp(-sea.extinction * air)
+        else:
+            to_lens = o - x
+            r = wp.length(to_lens)
+            link.to_lens = to_lens / r
+            link.image = x
+            link.end = o
+            link.begin = x
+            link.along = link.to_lens
+            link.water = wp.where(in_air, 0.0, r)
+            air = r - link.water
+            link.path = link.water + sea.delay * air
+            link.gather = wp.max(-link.to_lens[2], 0.0) / (r * r) * wp.exp(-sea.extinction * air)
+        return link
+
+    @wp.func
+    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
+        return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
+
+    @wp.func
+    def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        seen = wp.vec3(o)
+        if _in_air(camera):
+            seen = apparent_behind(camera, x, o)
+        return seen
+
+    @wp.func
+    def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
+        straight = wp.normalize(o - x)
+        if _lies_across(camera, x):
+            straight = toward_behind(camera, x, o)
+        return straight
+
+    @wp.func
+    def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
+        straight = straight_to_centre(camera, x)
+        if _lies_across(camera, x):
+            straight = toward_centre_behind(camera, x)
+        return straight
+
+    return leave, link_to, value_of, apparent, toward, toward_centre
+
+
+@memoised
+def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
+    """`clip`, `shows` and `gate` of a `Sight` with the surface of a sea, for flights in the water; `shows` of the
+    lens."""
+    clip_across, shows_across = _make_flat_view(True)
+
+    @wp.func
+    def clip(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
+        interval = wp.vec2()
+        if _in_air(camera):
+            interval = clip_across(camera, view, x, u, o, limit)
+        else:
+            interval = clip_to_view(camera, view, x, u, o, limit)
+        return interval
+
+    @wp.func
+    def shows_point(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
+        shown = bool(True)
+        if not _lies_across(camera, x):
+            shown = shows(camera, view, x)
+        elif _in_air(camera):
+            shown = shows_across(camera, view, x)
+        return shown
+
+    @wp.func
+    def gate_of(camera: Camera, gate: Gate) -> Gate:
+        wide = gate
+        if _in_air(camera):
+            wide = _gate_behind_port(camera, gate)
+        return wide
+
+    return clip, shows_point, gate_of
+
+
 # Of what lies behind a kind of port: `clip`, `shows` and `gate`.
 _VIEWS = {
     FLAT_PORT.name: (clip_to_flat_view, flat_view_shows, _gate_behind_port),
@@ -402,8 +534,9 @@ _VIEWS = {
 
 
 @memoised
-def make_sight(lens: Lens, port: PortKind | None, confocal: bool) -> Sight:
-    """For a way of imaging, a kind of port or None, and whether pixels are scanned."""
+def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: bool = False) -> Sight:
+    """For a way of imaging, a kind of port or None, and whether pixels are scanned; `sea`: there is the surface of a
+    sea, and no port."""
     moves = lens.name == SCANNED.name
 
     @wp.func
@@ -416,7 +549,10 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool) -> Sight:
     cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows, _same_gate)
     if port is not None:
         cosines, may_hide, view = port.cosines, _may_hide_anywhere, _VIEWS[port.name]
-    if moves:
+    ways = _make_sea_ways() if sea else _make_ways(port)
+    if sea:
+        view = _make_sea_view(lens.shows)
+    if moves or sea:
         may_hide = _may_hide_anywhere
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
-    return Sight(cosines, *imaging, *view, may_hide, *_make_ways(port), make_sample_lens(port), make_pose(moves))
+    return Sight(cosines, *imaging, *view, may_hide, *ways, make_sample_lens(port), make_pose(moves), sea)

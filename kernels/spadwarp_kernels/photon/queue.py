@@ -36,7 +36,7 @@ class Request:
     second: wp.uint32
     rounding_sample: wp.uint32  # random: 24 bits of it are for the tally; what is scored must not depend on it
     component: int  # index into COMPONENTS
-    slot: int  # of the face that scatters, see `SurfaceHit`; -1 for water
+    slot: int  # of the face that scatters, see `SurfaceHit`; -1 for water, SEA_SLOT for the surface of a sea
     target: int  # the pixel of a scan, else -1
     carried: Carried  # what rides along with the photon up to x
 
@@ -241,7 +241,7 @@ def _make_words(spec: TransportSpec, more: bool, begin: int) -> tuple[wp.Functio
     what a request has beside x, u, weight and path: a vector from `begin` on, or a pair where requests are of
     scatterings in water alone, which need one random word beside that of the tally. `more`: see `_has_more`."""
     confocal = spec.confocal
-    short = not (spec.mesh or more or spec.derivatives or spec.polarised or spec.grid)
+    short = not (spec.mesh or more or spec.derivatives or spec.polarised or spec.grid or spec.sea)
 
     @wp.func
     def write_pair(memory: int, entry: int, request: Request):
@@ -303,7 +303,7 @@ def make_queue(
         long: Whether a lane may add two requests, a flight and an event, before the queue is read.
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
     """
-    confocal, polarised, has_mesh, more = spec.confocal, spec.polarised, spec.mesh, _has_more(spec, flights)
+    confocal, polarised, has_slot, more = spec.confocal, spec.polarised, spec.mesh or spec.sea, _has_more(spec, flights)
     rank_of = _among_takers if traces else _lane
     derivative_vectors = -(-len(spec.derivatives) // 4)
     carried = 3 + more
@@ -360,7 +360,7 @@ def make_queue(
             request.lens = wp.vec3(d[2], d[3], 0.0)
         if wp.static(confocal):
             request.slot = wp.where(d[0] < d[1], -1, bits_of(d[2]))
-        if wp.static(not has_mesh):
+        if wp.static(not has_slot):
             request.slot = -1
         for i in range(wp.static(derivative_vectors)):
             part = get(memory, entry, wp.static(carried) + i)

@@ -57,6 +57,9 @@ class TransportSpec(NamedTuple):
     """What the camera looks through, FLAT_PORT or DOME_PORT, as `Camera.port` describes it; None: it is in the
     water."""
     laser_port: PortKind | None = None  # the same of the laser and `Laser.port`
+    sea: bool = False
+    """The surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, without a
+    window, and there are no other ports. The tally has one more component, of light that met the surface alone."""
     grid: Water | None = None
     """The water in a box is that of the cells of `Layers.grid`, tracked by REGULAR_TRACKING or DELTA_TRACKING; None:
     there is no grid."""
@@ -111,7 +114,7 @@ class TransportSpec(NamedTuple):
     @property
     def sight(self) -> Sight:
         """Of the camera."""
-        return make_sight(self.lens, self.port, self.confocal)
+        return make_sight(self.lens, self.port, self.confocal, self.sea)
 
     @property
     def beam(self) -> Beam:
@@ -172,6 +175,12 @@ def check_spec(spec: Any) -> None:
         (
             spec.lens.name == SCANNED.name and (not spec.confocal or spec.polarised or spec.reflecting),
             "lens = SCANNED needs spec.confocal = True, and cannot be combined with spec.polarised and spec.reflecting",
+        ),
+        (
+            (spec.sea and (spec.port or spec.laser_port or spec.reflecting or spec.grid or spec.merged or spec.signed))
+            or (spec.sea and (spec.blocks or spec.polarised or spec.confocal or spec.flux)),
+            "sea cannot be combined with spec.port, spec.laser_port, spec.reflecting, spec.grid, spec.merged, "
+            "spec.derivatives, spec.blocks, spec.polarised, spec.channels, spec.confocal and spec.flux",
         ),
         (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
         (

@@ -10,13 +10,14 @@ from spadwarp_kernels.base.philox import RoundKeys
 from spadwarp_kernels.optics.camera import BEFORE, Camera, Gate, gate_bin
 from spadwarp_kernels.optics.laser import Laser, Scan
 from spadwarp_kernels.optics.polarisation import Polarisation
+from spadwarp_kernels.optics.sea import Sea
 from spadwarp_kernels.surface.bvh import NO_NODE, TreeWalk
 from spadwarp_kernels.surface.mesh import Surfaces
 from spadwarp_kernels.surface.ray_cast import SurfaceHit
 from spadwarp_kernels.tally import ledger
 from spadwarp_kernels.tally.flux import Flux
 from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
-from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64
+from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64, tally_components
 from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Layers, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
@@ -42,6 +43,7 @@ class World:
     derivatives: Derivatives
     polarisation: Polarisation
     flux: Flux
+    sea: Sea
     seed: wp.uint64
     keys: RoundKeys
 
@@ -162,6 +164,7 @@ class Flight:
     sample_block: wp.vec4ui  # random words of the estimator's sample of the flight
     distance: float  # to the event [m]
     reach: float  # how far to look for surfaces [m]
+    sea: float  # to the mean plane of the sea's surface [m]; 1e30 if it leads away from it
     interval: wp.vec2  # the part that an estimator wants to score [m]; empty for none
     lens: wp.vec3  # the point of the lens by which the flight is scored [m]
     lens_weight: float  # its density if it were uniform, over that of the draw
@@ -170,9 +173,9 @@ class Flight:
 
 @wp.struct
 class Bounces:
-    """Reflections of a photon by faces of the domain, and the account of the thread."""
+    """Reflections of a photon by faces of the domain or what the sea's surface does, and the account of the thread."""
 
-    face: int  # that the photon has come to, see EXIT_FACES; 0 at any other event
+    face: int  # that the photon has come to, see EXIT_FACES, or SEA_FACE; 0 at any other event
     count: int  # reflections of the photon
     leg: int  # those since the last other event
     total: int  # reflections of all photons that have ended
@@ -190,6 +193,7 @@ class PhotonState:
     photon: int  # number within the launch
     x: wp.vec3  # position [m]
     u: wp.vec3  # unit direction
+    above: bool  # whether it is in the air above a sea
     weight: Weight
     analog_weight: float  # the product of albedos and reflectances alone, at which histories end
     path: float  # geometric path [m]
@@ -214,12 +218,17 @@ class PhotonState:
     # Sums for the ledger, in its units, and counters:
     account: Account
     absorbed_surface: wp.int64
+    absorbed_air: wp.int64
     directed: wp.int64
     water_collisions: int
     surface_events: int
     surface_queries: int
     shadow_queries: int
     contributions: int
+
+
+# The face of `Bounces`, and the slot of a request, of light at the sea's surface.
+SEA_FACE, SEA_SLOT = wp.constant(7), wp.constant(-2)
 
 
 # Arguments by reference: they cost nothing, and may be changed in place.
@@ -324,26 +333,36 @@ def to_fixed_point(units: float, rounding_sample: float) -> wp.int64:
     return wp.int64(units + rounding_sample)
 
 
-@wp.func
-def _deposit(account: AccountRef, sink: SinkRef, c: Contribution):
-    """Adds a contribution to its voxel of the tally; the ledger counts BEFORE and AFTER, and what is below one unit."""
-    exact = c.value * sink.scale
-    units = to_fixed_point(exact, c.rounding_sample)
-    if not exact <= DEPOSIT_LIMIT:
-        book(account, sink, wp.where(exact > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
-    elif c.index >= 0:
-        if exact >= 1.0:
-            account.pending = add_pending(sink.tally, account.pending, c.index, units)
-        else:
-            if units > wp.int64(0):
+@memoised
+def _make_deposit_unsigned(count: int) -> wp.Function:
+    """The Warp function ``(account, sink, contribution)`` for a tally of so many components."""
+
+    @wp.func
+    def deposit(account: AccountRef, sink: SinkRef, c: Contribution):
+        """Adds a contribution to its voxel of the tally; the ledger counts BEFORE and AFTER, and what is
+        below one unit."""
+        exact = c.value * sink.scale
+        units = to_fixed_point(exact, c.rounding_sample)
+        if not exact <= DEPOSIT_LIMIT:
+            book(account, sink, wp.where(exact > DEPOSIT_LIMIT, ledger.CLIPPED, ledger.INVALID), wp.int64(1))
+        elif c.index >= 0:
+            if exact >= 1.0:
                 account.pending = add_pending(sink.tally, account.pending, c.index, units)
-            voxels = sink.tally.shape[0] // wp.static(len(COMPONENTS))
-            component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
-            book(account, sink, ledger.BELOW_UNIT + component, wp.int64(1))
-    else:
-        # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
-        entry = wp.where(c.index == BEFORE, ledger.BEFORE_GATE, ledger.AFTER_GATE)
-        book(account, sink, entry, (units + wp.int64(128)) >> ledger.OUTSIDE_SHIFT)
+            else:
+                if units > wp.int64(0):
+                    account.pending = add_pending(sink.tally, account.pending, c.index, units)
+                voxels = sink.tally.shape[0] // wp.static(count)
+                component = wp.where(c.index >= voxels, 1, 0) + wp.where(c.index - voxels >= voxels, 1, 0)
+                entry = ledger.BELOW_UNIT + component
+                if wp.static(count > 3):
+                    entry = wp.where(c.index // voxels == 3, ledger.BELOW_UNIT_SURFACE, entry)
+                book(account, sink, entry, wp.int64(1))
+        else:
+            # Coarser, since light from right before the lens is far brighter than what the unit was chosen for.
+            entry = wp.where(c.index == BEFORE, ledger.BEFORE_GATE, ledger.AFTER_GATE)
+            book(account, sink, entry, (units + wp.int64(128)) >> ledger.OUTSIDE_SHIFT)
+
+    return deposit
 
 
 @wp.func
@@ -358,10 +377,11 @@ def _deposit_signed(account: AccountRef, sink: SinkRef, index: int, units: float
 
 
 @memoised
-def make_deposit(signed: int, kinds: int, split: bool) -> wp.Function:
+def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False) -> wp.Function:
     """The Warp function ``(account, sink, world, contribution)`` that adds a contribution to the tally, with so many
     parameters or channels that have signs and so many kinds of derivatives by block; `split`: the low words of the
-    tally are apart."""
+    tally are apart; `sea`: the tally has a component of light that met the surface of the sea alone."""
+    deposit_unsigned = _make_deposit_unsigned(len(tally_components(sea)))
 
     @wp.func
     def deposit(account: AccountRef, sink: SinkRef, world: WorldRef, c: Contribution):
@@ -384,6 +404,6 @@ def make_deposit(signed: int, kinds: int, split: bool) -> wp.Function:
             if c.index >= 0 and units >= 1.0 and units <= DEPOSIT_LIMIT:
                 add_to_words(sink.tally, sink.low, c.index, to_fixed_point(units, c.rounding_sample))
                 return
-        _deposit(account, sink, c)
+        deposit_unsigned(account, sink, c)
 
     return deposit

@@ -46,8 +46,15 @@ COUNTERS = (
 # After all others: what a laser's port reflects, reported where there is one, and counters of faces that reflect.
 PORT_ENTRY = "laser_port"
 BOUNDARY_COUNTERS = ("reflections", "beyond_max_reflections")
-LEDGER_WIDTH = len(LEDGER_ENTRIES) + len(COUNTERS) + 1 + len(BOUNDARY_COUNTERS)
-LASER_PORT, REFLECTIONS, BEYOND_MAX_REFLECTIONS = (wp.constant(LEDGER_WIDTH - 3 + i) for i in range(3))
+# And those of a sea: what its facets mask, and what the air above it takes.
+SEA_ENTRIES = ("surface_masking", "absorbed_air")
+SEA_COUNTERS = ("crossings", "below_unit_surface")
+_LAST = (PORT_ENTRY, *BOUNDARY_COUNTERS, *SEA_ENTRIES, *SEA_COUNTERS)
+ALL_ENTRIES = LEDGER_ENTRIES + COUNTERS + _LAST
+LEDGER_WIDTH = len(ALL_ENTRIES)
+LASER_PORT, REFLECTIONS, BEYOND_MAX_REFLECTIONS, SURFACE_MASKING, ABSORBED_AIR, CROSSINGS, BELOW_UNIT_SURFACE = (
+    wp.constant(ALL_ENTRIES.index(name)) for name in _LAST
+)
 
 ABSORBED_WATER, ABSORBED_SURFACE, WEIGHT_CUTOFF, MAX_COLLISIONS, MAX_PATH, EXIT, ROULETTE, DIRECTED = (
     wp.constant(LEDGER_ENTRIES.index(name))

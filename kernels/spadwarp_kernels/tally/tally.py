@@ -16,7 +16,13 @@ wp.set_module_options({"enable_backward": False})
 
 # What a history's events make of its light: the first axis of the tally.
 COMPONENTS = ("ballistic", "forward_scattered", "backscatter")
-BALLISTIC, FORWARD_SCATTERED, BACKSCATTER = (wp.constant(i) for i in range(3))
+BALLISTIC, FORWARD_SCATTERED, BACKSCATTER, SURFACE = (wp.constant(i) for i in range(4))
+
+
+def tally_components(sea: bool) -> tuple[str, ...]:
+    """Those of a tally; with the surface of a sea also that of light which met the surface alone."""
+    return (*COMPONENTS, "surface") if sea else COMPONENTS
+
 
 # A voxel's sum beyond this has used up its 64 bits, or soon will.
 VOXEL_LIMIT = wp.constant(wp.int64(1 << 62))

@@ -78,7 +78,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)
     meet = make_meet(estimator.meet)
-    deposit = make_deposit(spec.signed, len(spec.blocks), split)
+    deposit = make_deposit(spec.signed, len(spec.blocks), split, spec.sea)
     memory, push, pop = make_queue(spec, flights, scores, two_requests, in_tree)
     serve = _make_serve(spec, split, deposit, waits=in_tree and not alone) if scores else push
     ask_flight, ask_event = _make_asks(spec, _make_serve_now(serve) if alone and scores else push)
@@ -93,7 +93,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
         collide=make_collide(spec, estimator.meet is not None, flies_on, make_flux_score(spec)),
         scatter=make_scatter(spec, estimator.direct, flies_on),
         finish=make_finish(spec.records, len(spec.derivatives)),
-        flush=make_flush(not cuda and estimator.scores, spec.reflecting),
+        flush=make_flush(not cuda and estimator.scores, spec.reflecting, spec.sea),
         ask_flight=ask_flight,
         ask_event=ask_event,
         deposit=deposit,
@@ -168,13 +168,21 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
 def _make_serve(spec: TransportSpec, split: bool, deposit: wp.Function, waits: bool) -> wp.Function:
     """See `Stages.serve`; with `waits` a contribution behind which a tree must be walked is left in the state, else the
     ray is traced here, and what a face hides is set to 0."""
-    has_mesh, hides, reflects = spec.mesh, spec.faces.hides, spec.reflecting
+    has_mesh, hides, reflects, sea = spec.mesh, spec.faces.hides, spec.reflecting, spec.sea
     view_of, may_hide = spec.sight.view, spec.sight.may_hide
     score, score_images = make_estimator(spec).score, make_score_images(spec, split)
 
     @wp.func
     def is_seen(s: PhotonRef, found: wp.ref[Scored], world: WorldRef) -> bool:
         seen = bool(True)
+        if wp.static(has_mesh and sea):
+            # The rest of the way, on the other side of the surface: few scenes have targets there.
+            rest = found.behind - found.lens
+            length = wp.length(rest)
+            if segment_meets_box(found.lens, rest, 1.0, world.surfaces.lower, world.surfaces.upper) and length > 0.0:
+                s.shadow_queries += 1
+                if hides(world.surfaces, found.lens, rest / length, length):
+                    found.contribution.value = 0.0
         if wp.static(has_mesh):
             if may_hide(view_of(world.camera, world.camera.view), world.surfaces.near_depth, found.origin):
                 to = found.lens - found.origin

@@ -28,7 +28,8 @@ from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.optics.camera import PLAIN, SCANNED, Camera, Gate, check_camera, ready_camera
 from spadwarp_kernels.optics.laser import LASER_PROFILES, Laser, Scan
 from spadwarp_kernels.optics.polarisation import MATRIX_POINTS, Polarisation
-from spadwarp_kernels.optics.port import check_port
+from spadwarp_kernels.optics.port import FLAT_PORT, check_port
+from spadwarp_kernels.optics.sea import Sea
 from spadwarp_kernels.photon.derivatives import (
     DERIVATIVES,
     MOST_BLOCK_DERIVATIVES,
@@ -44,6 +45,7 @@ from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, 
 from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
 from spadwarp_kernels.tally.flux import FLUX_KINDS, Flux
 from spadwarp_kernels.tally.ledger import (
+    ALL_ENTRIES,
     BOUNDARY_COUNTERS,
     COUNTERS,
     LEDGER_ENTRIES,
@@ -51,6 +53,8 @@ from spadwarp_kernels.tally.ledger import (
     LEDGER_WIDTH,
     OUTSIDE_SHIFT,
     PORT_ENTRY,
+    SEA_COUNTERS,
+    SEA_ENTRIES,
 )
 from spadwarp_kernels.tally.tally import (
     COMPONENTS,
@@ -58,6 +62,7 @@ from spadwarp_kernels.tally.tally import (
     find_overflow_kernel,
     fold_accumulators,
     splitting_pays,
+    tally_components,
 )
 from spadwarp_kernels.water.limits import Limits, ready_limits
 from spadwarp_kernels.water.medium import Layers, Medium, ready_medium
@@ -96,6 +101,7 @@ class Model:
     polarisation: Polarisation = field(default_factory=Polarisation)
     """Those of a polarised spec, from `make_polarisation`."""
     flux: Flux = field(default_factory=Flux)  # sections of a spec with flux, from `make_flux`
+    sea: Sea = field(default_factory=Sea)  # the surface of a sea, from `make_sea`; of index 0 without one
     split_accumulators: bool = False
     """Whether large launches on CUDA may take half the tally's memory more where that makes them faster, with the same
     sums."""
@@ -110,7 +116,17 @@ class Model:
 
     @property
     def tally_size(self) -> int:
-        return len(COMPONENTS) * self.camera.width * self.camera.height * self.gate.bins
+        return len(self.components) * self.camera.width * self.camera.height * self.gate.bins
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Those of the tally, the first of its axes."""
+        return tally_components(self.has_sea)
+
+    @property
+    def has_sea(self) -> bool:
+        """Whether there is a surface of a sea."""
+        return float(self.sea.index) > 0.0
 
 
 @dataclass
@@ -126,6 +142,7 @@ class Data:
     offset: wp.array | None = None
     """uint64 [1], added to the photons' ids where `spec.stepped` is set; the caller moves it on."""
     reflecting: bool = False  # whether faces of the domain reflect, so that `read_ledger` reports on them
+    has_sea: bool = False  # whether there is a surface of a sea, likewise
     gradients: wp.array | None = None
     """int64 [voxel of the tally * derivative], the tally of a spec's derivatives, or of its channels; None without
     them."""
@@ -164,6 +181,7 @@ def make_data(
         cursor=wp.zeros(1, dtype=int, device=model.device),
         offset=wp.zeros(1, dtype=wp.uint64, device=model.device),
         reflecting=any((*model.limits.boundary.low, *model.limits.boundary.high)),
+        has_sea=model.has_sea,
         gradients=zeros(signed, wp.int64, model.device) if histogram and derivatives else None,
         flux=zeros(model.flux.size, wp.int64, model.device) if model.flux.size else None,
     )
@@ -221,6 +239,13 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
         yield "laser", _BEAM[check_integer("model.laser.profile", laser.profile, 0, len(LASER_PROFILES) - 1)]
     if spec.laser_port is not None:
         check_port("model.laser.port", laser.port, spec.laser_port)
+    if spec.sea != model.has_sea:
+        raise ArgumentError(f"spec.sea = {spec.sea} does not go with model.sea.index = {float(model.sea.index):g}")
+    if spec.sea:
+        yield "sea", {"normal": "unit", "along": "unit", "index": "(1, 4]", "delay": "(0, 4]"}
+        yield "sea", {"height": "(-inf, inf)", "slope": "[0, 1]", "extinction": "[0, inf)"}
+        if model.medium.axis_threshold < 1.0:
+            raise ArgumentError(f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.sea needs 1")
     if spec.confocal:
         most = camera.width * camera.height if estimator.scores else 2**31 - 1
         count = check_integer("model.scan.count", model.scan.count, 1, most)
@@ -234,6 +259,8 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
         check_camera("model.camera", camera, calibrated=spec.lens.name != PLAIN.name)
         yield "gate", {"bins": "[1, inf)", "start": "(-inf, inf)", "bins_per_metre": "(0, inf)"}
         yield "gate", {"stop": f"({float(model.gate.start)}, inf)"}
+        if spec.sea:
+            check_port("model.camera.port", camera.port, FLAT_PORT)
         if spec.port is not None:
             check_port("model.camera.port", camera.port, spec.port)
     if estimator.cross is not None:
@@ -394,7 +421,7 @@ def splits_accumulators(spec: TransportSpec, model: Model, photon_count: int) ->
     """Whether a launch into a tally of the model keeps its low words apart; see `tally.split_accumulators`."""
     if not (model.split_accumulators and model.device.is_cuda and make_estimator(spec).scores):
         return False
-    voxels = model.tally_size // len(COMPONENTS)
+    voxels = model.tally_size // len(tally_components(spec.sea))
     return not (spec.signed or spec.blocks) and splitting_pays(voxels, photon_count)
 
 
@@ -488,14 +515,15 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """Ledger entries (units of LEDGER_UNIT photon) and counters summed over slots; waits for the device.
 
     Entries are LEDGER_ENTRIES and, behind a laser's port, what that reflects: `laser_port`. Counters are COUNTERS and,
-    where faces of the domain reflect, BOUNDARY_COUNTERS.
+    where faces of the domain reflect, BOUNDARY_COUNTERS; with the surface of a sea SEA_ENTRIES and SEA_COUNTERS, too.
     """
     check_kind("data", data, Data)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
     sums = exact_sums(data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS))
-    values = dict(zip(LEDGER_ENTRIES + COUNTERS + (PORT_ENTRY,) + BOUNDARY_COUNTERS, sums, strict=True))
+    values = dict(zip(ALL_ENTRIES, sums, strict=True))
     for name in ("before_gate", "after_gate"):
         values[name] <<= int(OUTSIDE_SHIFT)
     entries = (*LEDGER_ENTRIES, PORT_ENTRY) if values[PORT_ENTRY] else LEDGER_ENTRIES
-    counters = COUNTERS + BOUNDARY_COUNTERS if data.reflecting else COUNTERS
+    entries += SEA_ENTRIES if data.has_sea else ()
+    counters = COUNTERS + BOUNDARY_COUNTERS * data.reflecting + SEA_COUNTERS * data.has_sea
     return {name: values[name] for name in entries}, {name: values[name] for name in counters}

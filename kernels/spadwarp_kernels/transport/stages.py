@@ -18,6 +18,7 @@ from spadwarp_kernels.base.philox import (
 )
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
+from spadwarp_kernels.optics.sea import height_above, sample_passage, surface_distance
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import (
     END,
@@ -25,6 +26,7 @@ from spadwarp_kernels.photon.state import (
     FLIGHT,
     RAY,
     SCATTER,
+    SEA_FACE,
     TOO_LONG,
     Draws,
     Launch,
@@ -88,7 +90,7 @@ def make_emit(spec: TransportSpec) -> wp.Function:
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
     scans, enter, begin_carried = spec.beam.scans, spec.beam.enter, make_rider(spec).begin
-    scan_view, has_port = spec.sight.scan_view, enter is not None
+    scan_view, has_port, sea = spec.sight.scan_view, enter is not None, spec.sight.sea
     point_out, turn_out = spec.beam.pose.point_out, spec.beam.pose.turn_out
 
     @wp.func
@@ -99,6 +101,8 @@ def make_begin(spec: TransportSpec) -> wp.Function:
         s.x = wp.spatial_top(emitted)
         s.u = wp.spatial_bottom(emitted)
         s.path = 0.0
+        if wp.static(sea):
+            s.above = height_above(world.sea, s.x) > 0.0
         s.weight.value = 1.0
         s.weight.absorbed_water += to_ledger(1.0)
         if wp.static(has_port):
@@ -147,7 +151,7 @@ def make_finish(records: bool, derivatives: int) -> wp.Function:
     return finish
 
 
-def make_flush(adds: bool, reflecting: bool) -> wp.Function:
+def make_flush(adds: bool, reflecting: bool, sea: bool) -> wp.Function:
     """The Warp function ``(s, sink)``: adds what a thread has summed up to the ledger, and with `adds` to the tally
     what `add_pending` has left."""
 
@@ -163,6 +167,10 @@ def make_flush(adds: bool, reflecting: bool) -> wp.Function:
         book(s.account, sink, ledger.SURFACE_QUERIES, wp.int64(s.surface_queries))
         book(s.account, sink, ledger.SHADOW_QUERIES, wp.int64(s.shadow_queries))
         book(s.account, sink, ledger.CONTRIBUTIONS, wp.int64(s.contributions))
+        if wp.static(sea):
+            book(s.account, sink, ledger.ABSORBED_WATER, -s.absorbed_air)
+            book(s.account, sink, ledger.ABSORBED_AIR, s.absorbed_air)
+            book(s.account, sink, ledger.CROSSINGS, wp.int64(s.bounces.total))
         if wp.static(reflecting):
             book(s.account, sink, ledger.REFLECTIONS, wp.int64(s.bounces.total))
             book(s.account, sink, ledger.BEYOND_MAX_REFLECTIONS, wp.int64(s.bounces.dropped))
@@ -203,7 +211,7 @@ def make_fly(
     plans, water_free_path, tried = plan_flight is not None, spec.water.free_path, spec.faces.tried
     events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
-    has_bvh = spec.faces.mesh and not tried
+    has_bvh, sea = spec.faces.mesh and not tried, spec.sight.sea
 
     @wp.func
     def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
@@ -219,7 +227,13 @@ def make_fly(
         seed = join_words(s.flight.block[0], s.flight.block[2])
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
         s.flight.distance = water_free_path(world.medium, world.layers, s.x, s.u, xi, seed)
+        if wp.static(sea):
+            s.flight.sea = surface_distance(world.sea, s.x, s.u, s.above)
+            s.flight.distance = wp.min(wp.where(s.above, 1.0e30, s.flight.distance), s.flight.sea)
         s.flight.reach = wp.min(s.flight.distance, world.limits.max_path - s.path)
+        if wp.static(sea):
+            if s.above:
+                s.flight.reach = wp.min(s.flight.distance, (world.limits.max_path - s.path) / world.sea.delay)
         if wp.static(plans):
             if wp.static(cuda):
                 s.flight.sample_block = random_block_keyed(draws.keys, id, event, STREAM_FLIGHT_SAMPLE)
@@ -287,7 +301,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
     tallies_flux = score_flux is not None
     domain, local_albedo = spec.domain, spec.local_albedo
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
-    water_at, fly_carried = spec.water.at, make_rider(spec).fly
+    water_at, fly_carried, sea = spec.water.at, make_rider(spec).fly, spec.sight.sea
     outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
 
     @wp.func
@@ -296,6 +310,8 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
         c.distance = s.flight.distance
         c.reason = -1
         limit = world.limits.max_path - s.path
+        if wp.static(sea):
+            limit = wp.where(s.above, limit / world.sea.delay, limit)
         if s.flight.distance > limit:
             c.reason = ledger.MAX_PATH
             c.distance = limit
@@ -315,6 +331,9 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
                     c.mirror = face
                 else:
                     c.reason = ledger.EXIT + face
+        if wp.static(sea):
+            if c.reason < 0 and s.hit.face < 0 and s.flight.distance == s.flight.sea:
+                c.mirror = SEA_FACE
         if wp.static(flies_on):
             if s.collisions > 0 and s.reason >= 0:
                 c.reason = s.reason
@@ -333,6 +352,13 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
         if wp.static(tallies_flux):
             score_flux(s, world, sink, c.distance, c.reason < 0 and c.mirror == 0 and s.hit.face < 0)
         s.x = s.x + c.distance * s.u
+        if wp.static(sea):
+            if s.above:
+                s.path -= (1.0 - world.sea.delay) * c.distance
+                passed = wp.exp(-world.sea.extinction * c.distance)
+                reweigh(s.weight, passed)
+                s.absorbed_air += s.weight.taken
+                s.analog_weight *= passed
         s.path += c.distance
         s.reason = c.reason
         s.stage = END
@@ -341,7 +367,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
                 s.albedo = water_at(world.medium, world.layers, s.x).albedo
             if s.hit.face >= 0 and c.mirror == 0:
                 s.x = offset_from_surface(s.x, s.hit.normal, c.distance)
-        if wp.static(reflects):
+        if wp.static(reflects or sea):
             s.bounces.face = c.mirror
             s.bounces.leg = wp.where(c.mirror > 0, s.bounces.leg + 1, 0)
             s.bounces.count += wp.where(c.mirror > 0, 1, 0)
@@ -492,6 +518,36 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
     return bounce
 
 
+def make_meet_sea(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, world, sink, id)`` of a photon that the surface of a sea reflects or lets through.
+
+    `directed`, `flies_on`: see `make_bounce`.
+    """
+    terminate, continues = make_terminate(spec), make_continues(flies_on)
+
+    @wp.func
+    def meet_sea(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
+        draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
+        passage = sample_passage(world.sea, s.u, s.above, draw)
+        new = Outcome()
+        new.reason = s.reason
+        new.weight = s.weight
+        # The light of an event that was the last goes to the lens; what is reflected would come from an event here.
+        reweigh(new.weight, wp.where(s.reason >= 0 and passage.reflected, 0.0, passage.part))
+        book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.SURFACE_MASKING, s.reason))
+        if s.reason < 0:
+            new.analog_weight = wp.where(wp.static(directed), s.analog_weight * passage.part, new.weight.value)
+            terminate(new, s, world, sink, id)
+        if continues(new.reason):
+            s.u = passage.u
+            s.above = s.above == passage.reflected
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.reason = new.reason
+
+    return meet_sea
+
+
 def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool) -> wp.Function:
     """The Warp function ``(s, world, sink, draws)``: takes a photon from its event to FLIGHT, or to END.
 
@@ -500,6 +556,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     specular, reflects, directed = spec.faces.specular, spec.domain.reflects, direct is not None
     survival_of, sample_direction = spec.faces.survival, make_sample_direction(spec, direct)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
+    sea, meet_sea = spec.sight.sea, make_meet_sea(spec, directed, flies_on)
     continues, turn_carried = make_continues(flies_on), make_rider(spec).event
 
     @wp.func
@@ -564,6 +621,10 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             bounced = s.bounces.face > 0
             if bounced:
                 bounce(s, world, sink, id)
+        if wp.static(sea):
+            bounced = s.bounces.face > 0
+            if bounced:
+                meet_sea(s, world, sink, id)
         if not bounced:
             collision(s, world, sink, id)
         s.stage = wp.where(continues(s.reason), FLIGHT, END)

@@ -1,0 +1,114 @@
+"""Light through the surface of the sea: the estimators agree, energy is kept, a nearly flat sea is a flat one."""
+
+import math
+
+import pytest
+
+import spadwarp
+from helpers.estimators import cells
+from helpers.scenes import scene
+from helpers.statistics_of_samples import equal_means_p
+
+PLATE = {"builtin": "plane", "size": [4.0, 4.0], "reflectance": 0.7}
+
+# Where the mean plane, the laser and a target are: +z is the camera's axis, and a wide lens is 1 to 1.5 m from the sea.
+PLACES = {
+    "camera in air, laser in water": (
+        {"point": [0.0, 0.0, 1.0], "up": [0.0, 0.0, -1.0]},
+        {"position": [-0.4, 0.0, 1.6]},
+        {**PLATE, "translation": [0.0, 0.0, 2.8]},
+    ),
+    "both in air": (
+        {"point": [0.0, 0.0, 1.0], "up": [0.0, 0.0, -1.0]},
+        {"position": [-0.3, 0.0, 0.2]},
+        {**PLATE, "translation": [0.0, 0.0, 2.2]},
+    ),
+    "both in water, a target in air": (
+        {"point": [0.0, 0.0, 1.2], "up": [0.3, 0.0, 1.0]},
+        {"position": [-0.3, 0.0, 0.0]},
+        {**PLATE, "translation": [0.0, 0.0, 2.2]},
+    ),
+    "camera in water, laser in air": (
+        {"point": [0.0, 0.0, 1.2], "up": [0.0, 0.0, 1.0]},
+        {"position": [-0.5, 0.0, 2.0], "direction": [0.2, 0.0, -1.0]},
+        {**PLATE, "translation": [0.0, 0.0, 3.0]},
+    ),
+}
+
+
+def sea_scene(place, *, wind=5.0, estimator="guided", **sections):
+    surface, laser, target = PLACES[place]
+    tables = {
+        "surface": {"wind": wind, **surface},
+        "laser": laser,
+        "camera": {"aperture_diameter": 0.5},
+        "targets": [target],
+        "gate": {"bins": 12},
+        "transport": {"estimator": estimator},
+    }
+    for name, fields in sections.items():
+        tables[name] = {**tables.get(name, {}), **fields} if isinstance(fields, dict) else fields
+    return scene(**tables)
+
+
+CASES = [(place, 5.0) for place in PLACES] + [("both in air", 0.0), ("both in air", 12.0)]
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+@pytest.mark.parametrize(("place", "wind"), CASES)
+def test_estimators_agree(place, wind):
+    """In each bin of each component; next events where the lens is in the air: in water their variance
+    is infinite."""
+    photons = {"guided": 15_000, "analog": 50_000}
+    if place == "both in air" and wind == 5.0:
+        photons["next_event"] = 15_000
+    found = {one: cells(sea_scene(place, wind=wind, estimator=one), "cpu", photons[one], 10) for one in photons}
+    for one in photons.keys() - {"guided"}:
+        assert equal_means_p(found[one], found["guided"]) > 1e-3, one
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+def test_nearly_flat_and_flat_seas_are_a_calm_surface():
+    """As a port without a window, for light that is not scattered: with slopes of 1e-5 and with none. Behind a port,
+    what comes from below is not reflected."""
+    calm = {"distance": 1.0, "inside_index": 1.00028}
+    runs = {}
+    for mss in (None, 0.0, 1e-5):
+        surface, laser, target = PLACES["both in air"]
+        sections = {"targets": [target], "gate": {"bins": 12}, "transport": {"estimator": "guided"}}
+        if mss is None:
+            sections |= {"camera": {"aperture_diameter": 0.5, "port": calm}, "laser": {**laser, "port": "camera"}}
+        else:
+            sea = {**surface, "mean_square_slope": mss, "air_index": 1.00028}
+            sections |= {"camera": {"aperture_diameter": 0.5}, "laser": laser, "surface": sea}
+        rows = cells(scene(**sections), "cpu", 20_000, 10)
+        runs[mss] = rows[:, :12]  # ballistic
+    for mss in (0.0, 1e-5):
+        assert equal_means_p(runs[mss], runs[None]) > 1e-3
+        a, b = runs[mss].sum(axis=1), runs[None].sum(axis=1)
+        assert a.mean() == pytest.approx(b.mean(), rel=3e-3)
+
+
+def test_masking_is_an_entry_of_the_energy_balance():
+    """At most 1.4 % of light from the air up to 60°, and 3 % of light from the water up to 48°, up to 12 m/s."""
+    for angle, place, most in ((0.0, "both in air", 0.014), (60.0, "both in air", 0.014), (45.0, "below", 0.03)):
+        beam = {"profile": "collimated", "position": [0.0, 0.0, 0.0]}
+        beam["direction"] = [math.sin(math.radians(angle)), 0.0, math.cos(math.radians(angle))]
+        up = -1.0 if place == "both in air" else 1.0
+        one = sea_scene(
+            "both in air",
+            wind=12.0,
+            laser=beam,
+            surface={"up": [0.0, 0.0, up]},
+            medium={"extinction": 1e-4, "albedo": 0.5},
+            targets=[],
+            transport={"max_collisions": 1},
+        )
+        result = spadwarp.simulate(one, photons=200_000, seed=2, device="cpu")
+        report = result.energy_report()
+        assert report["exact"]
+        masked = result.energy_balance["surface_masking"] * result.energy_balance_unit / result.photons
+        assert 0.0 < masked < most
+        assert result.counters["crossings"] == pytest.approx(200_000, rel=1e-3)
