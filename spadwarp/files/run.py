@@ -121,7 +121,7 @@ def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[
     output = result.scene.output
     formats = [ending for ending in _ENDINGS if getattr(output, ending)]
     draw = functools.partial(_Pictures.plot, result, folder, depth=depth, method=output.depth_method, formats=formats)
-    kinds = _KINDS[:-1] if result.scene.transport.estimator != "none" else ()
+    kinds: tuple[str, ...] = _KINDS[:-1] if result.scene.transport.estimator != "none" else ()
     kinds += _KINDS[-1:] if result.scene.flux else ()
     return [functools.partial(draw, kinds=(kind,)) for kind in kinds] if formats else []
 

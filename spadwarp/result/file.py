@@ -206,7 +206,9 @@ def _write_flux(file: Any, result: Result, options: Mapping[str, Any]) -> tuple[
         section = f"flux/{name.partition('/')[0]}"
         own = {f"{section}/{axis}": coordinate for axis, coordinate in array.dimensions.items()}
         axes |= own
-        texts = {f"flux/{name}": (held.tallies, (*own,), f"times unit over photons: {array.meaning} [{array.unit}]")}
+        texts: dict[str, Any] = {
+            f"flux/{name}": (held.tallies, (*own,), f"times unit over photons: {array.meaning} [{array.unit}]")
+        }
         if held.second_moment is not None:
             text = "sum over batches of the squared tally"
             texts[f"flux/{name}_second_moment"] = held.second_moment, ("word", *own), text

@@ -154,7 +154,7 @@ class Flux(Section):
     def _gate_centres(self) -> NDArray[np.float64]:
         if self.gate_width_ps is None:
             return np.zeros(1)
-        return self.gate_start_ns * 1e-9 + self.gate_width_ps * 1e-12 * (np.arange(self.gates) + 0.5)
+        return self.gate_start_ns * 1e-9 + self.gate_width_ps * 1e-12 * (np.arange(self.gates, dtype=np.float64) + 0.5)
 
 
 class Sun(Section):

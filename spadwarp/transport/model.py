@@ -328,16 +328,16 @@ def _flux(scene: Scene, device: wp.Device) -> Any:
     for section in scene.flux:
         scale = section.scale(absorption)
         if section.voxels is not None:
-            gates = {"gates": section.gates, "gate_start": section.gate_start_ns * 1e-9 * speed}
+            gates: Any = {"gates": section.gates, "gate_start": section.gate_start_ns * 1e-9 * speed}
             if section.gate_width_ps is not None:
                 gates["gate_path"] = section.gate_width_ps * 1e-12 * speed
             frame: Any = {"rotation": rotation, "origin": camera.position, "scale": scale, **gates}
             lower = [low if math.isfinite(low) else 0.0 for low in section.lower]
-            box = {"lower": lower, "edge": section.edges, "estimator": section.estimator}
+            box: Any = {"lower": lower, "edge": section.edges, "estimator": section.estimator}
             sections.append(sk.make_flux_volume(section.voxels, **box, **frame))
             continue
         axis, right = section.normal, azimuth_zero(section.normal)
-        bins = {"polar": section.polar_bins, "azimuth": section.azimuth_bins if section.polar_bins else 0}
+        bins: Any = {"polar": section.polar_bins, "azimuth": section.azimuth_bins if section.polar_bins else 0}
         frame = {"axis": axis @ rotation, "right": right @ rotation, "centre": to_camera(camera, section.centre)}
         count = len(section.positions or ())
         sections.append(sk.make_flux_planes(count, radius=section.radius, scale=scale, **bins, **frame))
@@ -351,8 +351,8 @@ def _sun(scene: Scene, sun: Sun) -> Any:
     level = scene.domain.bounds[sun.surface.endswith("high")][k] - scene.camera.position[k]
     outside = scene.domain.reflecting.get(sun.surface, scene.medium.phase_index)
     return sk.make_sun(
-        sun.direction @ rotation,
-        normal=sun.down @ rotation,
+        (sun.direction @ rotation).tolist(),
+        normal=(sun.down @ rotation).tolist(),
         distance=level * float(sun.down[k]),
         index=scene.medium.phase_index / outside,
         sky=sun.sky,

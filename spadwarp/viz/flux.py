@@ -74,6 +74,6 @@ def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: 
     if not top > 0.0:
         style.middle_text(axis, "no light")
         return
-    look = {"norm": LogNorm(_LEAST * top, top), "cmap": colour_map(INTENSITY_MAP), "interpolation": "nearest"}
+    look: Any = {"norm": LogNorm(_LEAST * top, top), "cmap": colour_map(INTENSITY_MAP), "interpolation": "nearest"}
     shown = axis.imshow(np.maximum(image, _LEAST * top), extent=(*ends[0], ends[1][1], ends[1][0]), **look)
     figure.colorbar(shown, ax=axis, label=f"fluence [{light.unit}]", shrink=0.6)
