@@ -120,7 +120,10 @@ class Survey:
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
             self.target_range = float(ranges.min()), float(ranges.max())
             self.target_arrival_ns = self.arrival_ns(float(paths.min())), self.arrival_ns(float(paths.max()))
-            self.optical_depth = scene.optical_depth((0.0, 0.0, 0.0), illuminated[ranges.argmin()].tolist())
+            nearest, begin = illuminated[ranges.argmin()], np.zeros(3)
+            if scene.surface is not None and self.camera_port is not None:  # from the air: of the way in the water
+                begin = self.camera_port.enter(begin, self.camera_port.connect(nearest, begin)[0])[0]
+            self.optical_depth = scene.optical_depth(begin.tolist(), nearest.tolist())
             if self.target_range[0] > 1e-5:
                 self.on_axis = self._on_axis(self.target_range[0], self.optical_depth)
 

@@ -257,7 +257,7 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
     """What is in the housing or the window of the camera's port and is not meant for it, a laser that shines through no
     port, or parts of triangles: the field, and a text about it."""
     port, camera, laser = camera_port(scene), scene.camera, scene.beam
-    if port is None or len(set(port.index)) == 1:
+    if port is None or scene.surface is not None or len(set(port.index)) == 1:
         return None
     radius = 0.0 if camera.pinhole else camera.aperture_radius
     wide = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)

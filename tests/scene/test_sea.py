@@ -85,3 +85,11 @@ def test_the_analytic_model_and_derivatives_refuse():
         spadwarp.simulate_analytic(one, device="cpu")
     with pytest.raises(ConfigError, match="cannot be combined with surface"):
         spadwarp.simulate(one, photons=1000, derivatives=["medium.absorption"], device="cpu")
+
+
+def test_check_counts_the_way_in_the_water_alone():
+    one = scene(**BAY, targets=[BOTTOM], medium={"phase_index": 1.34}, transport={"photons": 100_000})
+    messages = spadwarp.check(one)
+    assert not [m for m in messages if m.field == "laser.position"]
+    depth = next(m for m in messages if "optical depth" in m.text)
+    assert "optical depth to the nearest illuminated point 2.5" in depth.text  # 5 m at 0.5 1/m

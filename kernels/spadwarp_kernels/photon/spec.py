@@ -24,6 +24,20 @@ __all__ = ["TransportSpec"]
 
 MOST_POINTS = 3
 
+# What light through the surface of a sea cannot be combined with.
+_NOT_BY_SEA = (
+    "port",
+    "laser_port",
+    "reflecting",
+    "grid",
+    "merged",
+    "signed",
+    "blocks",
+    "polarised",
+    "confocal",
+    "flux",
+)
+
 
 class TransportSpec(NamedTuple):
     """Compile-time choices: the key of the kernel cache."""
@@ -177,10 +191,8 @@ def check_spec(spec: Any) -> None:
             "lens = SCANNED needs spec.confocal = True, and cannot be combined with spec.polarised and spec.reflecting",
         ),
         (
-            (spec.sea and (spec.port or spec.laser_port or spec.reflecting or spec.grid or spec.merged or spec.signed))
-            or (spec.sea and (spec.blocks or spec.polarised or spec.confocal or spec.flux)),
-            "sea cannot be combined with spec.port, spec.laser_port, spec.reflecting, spec.grid, spec.merged, "
-            "spec.derivatives, spec.blocks, spec.polarised, spec.channels, spec.confocal and spec.flux",
+            spec.sea and any(getattr(spec, name) for name in _NOT_BY_SEA),
+            "sea cannot be combined with spec." + ", spec.".join(_NOT_BY_SEA),
         ),
         (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
         (
