@@ -84,7 +84,7 @@ def photon_cloud(result: Result, *, seed: int = 0, device: str | None = None) ->
         row=row.astype(np.int32),
         column=column.astype(np.int32),
         pulse=pulse.astype(np.int64),
-        time=emitted,
+        time=np.asarray(emitted, np.float64),
         time_of_flight=flight,
         position=_positions(result, at, flight),
         component=_components(result, frames, (*at, tag_bin), seed),
@@ -211,7 +211,7 @@ def _write_waveforms(result: Result, path: Path, seed: int) -> list[Path]:
         text = f"gate.bin_width_ps = {spacing:.6g}: samples of a LAS file are whole picoseconds apart"
         raise ArgumentError(text)
     counts = frames.counts[0]
-    at = np.nonzero(counts.any(axis=2))
+    at: tuple[Any, Any] = np.nonzero(counts.any(axis=2))  # type: ignore[assignment]
     if not len(at[0]):
         raise ArgumentError("no photon was detected: more pulses (detector.pulses_per_frame), or a brighter laser")
     samples = counts[at].astype("<u4" if counts.max() > 0xFFFF else "<u2")
@@ -235,7 +235,7 @@ def _write_waveforms(result: Result, path: Path, seed: int) -> list[Path]:
     las.wavepacket_size = np.full(len(shot), size, np.uint32)
     las.return_point_wave_location = (peak + 0.5) * spacing
     # Along the line of sight, as fast as the light of the last two bins there and back.
-    end = np.full(len(peak), frames.gate_start + frames.edges[-1])
+    end: Floats = np.full(len(peak), frames.gate_start + frames.edges[-1])
     step = _positions(result, at, end) - _positions(result, at, end - frames.bin_width)
     las.x_t, las.y_t, las.z_t = (step / spacing).T
     with atomic_path(path) as temporary, temporary.open("wb") as file:

@@ -64,7 +64,7 @@ def shots_of(scene: Scene) -> Shots:
     if scene.scan.mode != "trajectory":
         raise ArgumentError(f"scan.mode = {scene.scan.mode!r}; 'trajectory' is needed")
     count, camera = scene.scan_positions, scene.camera
-    time = np.arange(count) * (scene.detector.pulses_per_frame / scene.laser.repetition_rate)
+    time: Floats = np.arange(count, dtype=np.float64) * (scene.detector.pulses_per_frame / scene.laser.repetition_rate)
     if scene.scan.path is None:
         position = np.asarray(camera.position) + time[:, None] * np.asarray(scene.scan.velocity)
         platform = np.broadcast_to(rotation_matrix(camera.rotation_deg), (count, 3, 3))
