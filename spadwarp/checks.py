@@ -19,7 +19,7 @@ from spadwarp.analytic import PILE_UP, axis_fluence
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.mesh.targets import target_balls
-from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwelling_irradiance, shot_scene, shots_of
+from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwelling_irradiance, shot_at, shots_of
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
 from spadwarp.scene.medium import (
@@ -89,7 +89,8 @@ class Survey:
         self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
         self.moving = None if scene.scan.mode != "trajectory" else scene
         if self.moving is not None:  # all else is of one of its shots
-            self.balls, scene = target_balls(scene, mesh), _shot_at_targets(scene, mesh)
+            self.balls = target_balls(scene, mesh)
+            scene = shot_at(scene, [middle for middle, _ in self.balls])
             mesh = build_mesh(scene) if scene.targets else None
         self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
@@ -543,35 +544,22 @@ def _check_scan(survey: Survey) -> None:
         survey.warn("scan.distance", text, aside=aside, spot=spot, pixel=pixel)
 
 
-def _shot_at_targets(scene: Scene, mesh: TriangleMesh | None) -> Scene:
-    """The shot that looks nearest to the middle of a target, as a scene that stands still with its part of photons."""
-    shots, balls, photons = shots_of(scene), target_balls(scene, mesh), scene.transport.photons
-    best = min(((aside := shots.aside(middle)).min(), int(aside.argmin())) for middle, _ in balls)[1] if balls else 0
-    share = photons if isinstance(photons, str) else max(photons // scene.scan_positions, 1)
-    return shot_scene(scene, best).with_overrides({"transport.photons": share})
-
-
 def _check_shots(survey: Survey) -> None:
     """Whether a scan along a trajectory comes to its targets, and how dense its shots are."""
     if survey.moving is None:
         return
-    # That one shot does not see a target says nothing.
-    survey.messages = [one for one in survey.messages if not one.field.startswith("targets")]
+    survey.messages = [one for one in survey.messages if not one.field.startswith("targets")]  # of one shot
     scene, shots = survey.moving, shots_of(survey.moving)
     if (far := float(np.linalg.norm(shots.position - scene.camera.position, axis=1).max())) > _FARTHEST:
         survey.warn("scan.path", f"shots are up to {far:.4g} m from camera.position: single precision", distance=far)
     wide = 0.5 * scene.path_limit * scene.receiver.pixel_tangent * scene.receiver.width
     for number, (middle, radius) in enumerate(survey.balls):
         if (aside := float(shots.aside(middle).min())) > radius + wide:
-            text = f"no shot looks at it: the nearest passes {aside:.4g} m beside its middle"
-            survey.warn(f"targets[{number}]", text, aside=aside)
-    gate = survey.range_of(0.5 * (scene.gate.start + scene.gate.stop))
-    distance, (start, along) = (survey.target_range or (gate,))[0], shots.lines()
+            survey.warn(f"targets[{number}]", f"no shot looks at it: all pass {aside:.4g} m beside it", aside=aside)
+    distance, (start, along) = (survey.target_range or (survey.range_of(scene.gate.stop),))[0], shots.lines()
     gaps = [np.linalg.norm(np.diff(start + distance * along, axis=k), axis=2).ravel() for k in (1, 0)]
     in_row, rows = (float(np.median(gap)) if gap.size else 0.0 for gap in gaps)
-    text = (
-        f"at {distance:.4g} m pixels are {in_row:.3g} m apart in a row and rows {rows:.3g} m, in {shots.time[-1]:.4g} s"
-    )
+    text = f"at {distance:.4g} m pixels of a row are {in_row:.3g} m apart, rows {rows:.3g} m"
     survey.note("scan.pattern", text, in_row=in_row, rows=rows)
 
 

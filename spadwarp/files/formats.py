@@ -254,7 +254,8 @@ def export(
       result, `<method>.Z` of each estimator, `background` where the pixel reports it, the bound of the depth.
     - `.parquet`, `.las`, `.laz`: single photons of one frame that the result's detector draws, see
       `spadwarp.files.photon_cloud`: a table with a row, or LAS 1.4 with a point (format 6, GPS time) for each, in the
-      world [m]; the classes are those of ASPRS: 40 what met a target, 45 the water column, 7 noise.
+      world [m]; the classes are those of ASPRS: 40 what met a target, 41 the surface, 45 the
+      water column, 7 noise.
     - `.wdp`: the waveform of each pixel, counts of its bins, and beside it `.las` (format 9) with a point at its peak.
     - `.xml`, `.yml`, `.yaml`, `.json`: the camera's calibration, as OpenCV's `cv::FileStorage` reads it.
 

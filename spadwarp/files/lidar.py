@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spadwarp.frames import Frames, Receiver, detect
 from spadwarp.io.paths import atomic_path
-from spadwarp.result import COMPONENTS, Result
+from spadwarp.result import Result
 from spadwarp.scene import shots_of
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sight import lines_of_sight
@@ -28,8 +28,8 @@ Floats = NDArray[np.float64]
 
 NOISE = "noise"
 
-# Classes of ASPRS for bathymetry: 40 bottom or object, 45 water column, 7 noise.
-_CLASSES = {"ballistic": 40, "forward_scattered": 40, "backscatter": 45, NOISE: 7}
+# Classes of ASPRS for bathymetry: 40 bottom or object, 41 water surface, 45 water column, 7 noise.
+_CLASSES = {"surface": 41, "ballistic": 40, "forward_scattered": 40, "backscatter": 45, NOISE: 7}
 
 _COORDINATE = 1e-4  # unit of coordinates in a LAS file [m]
 _HEADER = 60  # bytes of the record that a file of waveforms begins with
@@ -88,7 +88,7 @@ def photon_cloud(result: Result, *, seed: int = 0, device: str | None = None) ->
         time_of_flight=flight,
         position=_positions(result, at, flight),
         component=_components(result, frames, (*at, tag_bin), seed),
-        components=(*COMPONENTS, NOISE),
+        components=(*scene.components, NOISE),
         target=target_map(scene, device=device)[at],
         true_range=result.truth.range[at],
     )
@@ -102,11 +102,11 @@ def _shot_numbers(result: Result) -> NDArray[np.int32]:
 
 
 def _positions(result: Result, at: tuple[Any, Any], flight: Floats) -> Floats:
-    """Points of the world [m] on the lines of sight of pixels at times of flight; the lens where that is too short."""
+    """Points of the world [m] on the lines of sight of pixels at times of flight, or where these lines begin."""
     scene = result.scene
     lines = lines_of_sight(scene)[at]
     ranges = lines.range_from_path(path_from_time(flight, scene.medium.group_index))
-    points = lines.points(np.nan_to_num(ranges))
+    points = lines.points(np.where(np.isnan(ranges), lines.lead, ranges))
     if scene.scan.mode != "trajectory":
         return to_world(scene.camera, points)
     shots, number = shots_of(scene), _shot_numbers(result)[at]
@@ -124,12 +124,13 @@ def _components(result: Result, frames: Frames, at: tuple[Any, Any, Any], seed: 
     receiver = Receiver.of(scene.detector, scene.laser, irf=frames.irf, **choices)
     dark = wp.zeros(shape[0] * shape[1], dtype=wp.float32, device="cpu")
     left = np.random.Generator(np.random.Philox(key=[seed, 0x70686F74])).random(len(at[0])) * frames.expected[at]
-    component = np.full(len(left), len(COMPONENTS), np.int8)
-    for number, name in enumerate(COMPONENTS):
+    noise = len(scene.components)
+    component = np.full(len(left), noise, np.int8)
+    for number, name in enumerate(scene.components):
         light = (result.expected(name) * scale).astype(np.float32).reshape(-1, gate.bins)
         rows: Any = wp.array(light, device="cpu")
         share = receiver.light(rows, dark).numpy().reshape(*shape, -1)[at]
-        component[(component == len(COMPONENTS)) & (left < share)] = number
+        component[(component == noise) & (left < share)] = number
         left = left - share
     return component
 

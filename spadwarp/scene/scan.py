@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ from spadwarp.scene.scene import Scene, load_trajectory
 from spadwarp.scene.sight import view_directions
 from spadwarp.values import ArgumentError, ConfigError, check_integer
 
-__all__ = ["Shots", "shot_scene", "shots_of"]
+__all__ = ["Shots", "shot_at", "shot_scene", "shots_of"]
 
 Floats = NDArray[np.float64]
 
@@ -135,3 +136,13 @@ def shot_scene(scene: Scene, shot: int) -> Scene:
     pose = {"position": vector_of(shots.position[at]), "rotation_deg": rotation_angles(shots.rotation[at])}
     size = {"width": receiver.width, "height": 1}
     return scene.with_overrides({"camera": {**size, **pose}, "scan": {"mode": "none", "path": None}})
+
+
+def shot_at(scene: Scene, points: Sequence[Floats]) -> Scene:
+    """The scene of the shot, alone and with its part of the photons, whose axis passes nearest to one of some points of
+    the world; without points the first."""
+    shots, photons = shots_of(scene), scene.transport.photons
+    passes = [shots.aside(point) for point in points] or [np.zeros(len(shots))]
+    best = min((aside.min(), int(aside.argmin())) for aside in passes)[1]
+    share = photons if isinstance(photons, str) else max(photons // scene.scan_positions, 1)
+    return shot_scene(scene, best).with_overrides({"transport.photons": share})
