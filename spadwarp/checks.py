@@ -115,8 +115,7 @@ class Survey:
         self.target_range = self.target_arrival_ns = self.optical_depth = self.on_axis = None
         if found := within_port(scene, triangles):
             self.warn(*found)
-        illuminated = self.illuminated_part(triangles)
-        if len(illuminated):
+        if len(illuminated := self.illuminated_part(triangles)):
             illuminated = self.visible(illuminated)
             ranges, paths = self._ways(illuminated, self._sides[:1], 2), self.paths(illuminated)
             self.target_range = float(ranges.min()), float(ranges.max())
@@ -158,9 +157,8 @@ class Survey:
     def visible(self, points: Points) -> Points:
         """Those of the points of targets that nothing hides from the lens; all of them where there is none."""
         distance = np.linalg.norm(points, axis=1)
-        rays = points / np.maximum(distance, 1e-30)[:, None]
-        seen = first_hits(np.concatenate(self.targets), np.zeros(3), rays) >= 0.999 * distance
-        return points[seen] if seen.any() else points
+        hit = first_hits(np.concatenate(self.targets), np.zeros(3), points / np.maximum(distance, 1e-30)[:, None])
+        return points[seen] if (seen := hit >= 0.999 * distance).any() else points
 
     def _rays(self) -> tuple[Points, Points]:
         """Rays in the water over what the camera sees and the beam, which corners of triangles may all lie beside."""
@@ -296,8 +294,9 @@ def _check_plausible(survey: Survey) -> None:
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
     for section, fields in _PLAUSIBLE.items():
         for place, model in (ports if section == "port" else {section: getattr(scene, section)}).items():
-            for name, plausible in fields.items():
-                _check_value(survey, f"{place}.{name}", model, *plausible)
+            for name, plausible in fields.items():  # scanners, and lidars in the air, may see less than a degree
+                if name != "horizontal_fov_deg" or not (survey.moving or scene.surface):
+                    _check_value(survey, f"{place}.{name}", model, *plausible)
     if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
         energy, rate = with_prefix(laser.pulse_energy, "J"), with_prefix(laser.repetition_rate, "Hz")
         text = f"{energy} at {rate} are {with_prefix(laser.average_power, 'W')} on average"
@@ -550,7 +549,7 @@ def _check_shots(survey: Survey) -> None:
         return
     survey.messages = [one for one in survey.messages if not one.field.startswith("targets")]  # of one shot
     scene, shots = survey.moving, shots_of(survey.moving)
-    if (far := float(np.linalg.norm(shots.position - scene.camera.position, axis=1).max())) > _FARTHEST:
+    if (far := float(np.linalg.norm(shots.position - scene.camera.position, axis=1).max())) > 1e4:  # floats have mm
         survey.warn("scan.path", f"shots are up to {far:.4g} m from camera.position: single precision", distance=far)
     wide = 0.5 * scene.path_limit * scene.receiver.pixel_tangent * scene.receiver.width
     for number, (middle, radius) in enumerate(survey.balls):
@@ -566,7 +565,6 @@ def _check_shots(survey: Survey) -> None:
 # The light: time of flight, spectrum, daylight, polarisation, and whether enough photons come back
 
 _FRESH, _SEA = WATER_INDICES["fresh"][1], WATER_INDICES["seawater"][1]
-_FARTHEST = 1e4  # [m], where a float has a millimetre
 _MEMORY_LIMIT = 2 * 2**30  # [bytes] of one set of tallies, from which on it is mentioned
 
 
@@ -894,8 +892,7 @@ def _grid_summary(scene: Scene) -> dict[str, Any] | None:
 
 _CHECKS = (
     *(_check_plausible, _check_targets, _check_shots, _check_focus, _check_ports, _check_scan, _check_timing),
-    _check_spectrum,
-    *(_check_daylight, _check_medium, _check_phase_table, _check_collisions, _check_grid),
+    *(_check_spectrum, _check_daylight, _check_medium, _check_phase_table, _check_collisions, _check_grid),
     *(_check_peak, _check_polarisation, _check_statistics),
 )
 
