@@ -22,7 +22,8 @@ __all__ = ["Flux", "Sun"]
 IRRADIANCES = ("downward", "upward", "scalar_downward", "scalar_upward")
 _Edge = Annotated[int, Field(ge=1, le=1024)]
 _Voxels = Annotated[tuple[_Edge, _Edge, _Edge], BeforeValidator(listed)]
-_Positions = Annotated[tuple[float, ...], BeforeValidator(listed)]
+_Position = Annotated[float, Field(ge=-1e9, le=1e9)]
+_Positions = Annotated[tuple[_Position, ...], BeforeValidator(listed)]
 
 
 class FluxArray(NamedTuple):

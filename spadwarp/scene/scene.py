@@ -63,8 +63,8 @@ class Scene(Shown, Document):
             self.__dict__["medium"] = self.medium.at_wavelength(self.laser.wavelength_nm)
         except ValueError as error:
             yield f"laser.{error}, for which medium.chlorophyll, temperature and salinity hold"
-        if self.polarised:
-            self._polarise()
+        if self.polarised or self.surface is not None:
+            self._take_exact_directions()
         yield from self._exclusions()
         yield from self._scan_problems()
         yield from self._blocked_ports()
@@ -72,12 +72,12 @@ class Scene(Shown, Document):
         if self.surface is not None:
             yield from self._at_the_surface(self.surface)
 
-    def _polarise(self) -> None:
-        """Sets what polarised light needs where the defaults are without it."""
+    def _take_exact_directions(self) -> None:
+        """Sets what polarised light, or the surface of a sea, needs where the defaults are without it."""
         medium, transport = self.medium, self.transport
         if transport.axis_threshold == Transport().axis_threshold:
             self.__dict__["transport"] = transport.model_copy(update={"axis_threshold": 1.0})
-        if medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
+        if self.polarised and medium.scattering_matrix == "none" and medium.range.scattering > 0.0:
             matrix = "rayleigh" if medium.phase_function == "rayleigh" else "voss_fry"
             self.__dict__["medium"] = medium.model_copy(update={"scattering_matrix": matrix})
 

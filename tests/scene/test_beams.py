@@ -182,9 +182,9 @@ def test_checks_tell_how_far_out_of_focus_a_target_is_and_one_smaller_than_a_pix
         one = scene(camera={"focus_distance": focus}, targets=[sphere])
         return spadwarp.checks.summary(one)["target_range"][1], {m.field: m for m in spadwarp.check(one)}
 
-    far, messages = found(1.2, 1.1)
+    far, messages = found(1.2, 1.0)
     pixel = 2 * math.tan(math.radians(25)) / 4
-    assert messages["camera.focus_distance"].values["pixels"] == pytest.approx(0.4 * (1 / 1.1 - 1 / far) / pixel)
+    assert messages["camera.focus_distance"].values["pixels"] == pytest.approx(0.4 * (1.0 - 1 / far) / pixel)
     assert not {"camera.focus_distance", "targets[0]"} & found(1.2, 2.5)[1].keys()
     assert "smaller than a pixel" in found(0.3, 2.5)[1]["targets[0]"].text
 

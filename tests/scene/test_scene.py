@@ -64,8 +64,9 @@ def test_index_names_stand_for_water_at_532_nm():
 @pytest.mark.parametrize("name", sorted(name for name in presets() if not name.startswith("port.")))
 def test_a_preset_gives_its_fields_and_each_can_be_overridden(name):
     section, _, preset = name.partition(".")
-    lens = {"focal_length": 0.01, "f_number": 2.0} if name == "camera.photon-force-pf32" else {}
-    base = scene(**{section: {"preset": preset, **lens}})
+    more = {"focal_length": 0.01, "f_number": 2.0} if name == "camera.photon-force-pf32" else {}
+    more |= {"point": [0.0, 1.0, 0.0]} if section == "surface" else {}
+    base = scene(**{section: {"preset": preset, **more}})
     for field, value in presets(section)[preset].values.items():
         assert getattr(getattr(base, section), field) == value
         if isinstance(value, (int, float)):
@@ -193,7 +194,7 @@ def number_fields(model, path=""):
 
 
 # Fields that document infinity.
-INFINITE = {"analyser_extinction_ratio", "focus_distance", "distance", "lower", "upper", "lateral_limit"}
+INFINITE = {"analyser_extinction_ratio", "focus_distance", "distance", "lower", "upper", "lateral_limit", "flux.radius"}
 
 
 @pytest.mark.parametrize("model", [Scene, Recipe, TrainingRecipe])
@@ -202,7 +203,8 @@ def test_every_number_has_a_range(model):
         interval, of_a_port = interval_of(info), ".port." in f".{path}"
         assert interval.low > -math.inf or interval.includes_low, path
         assert interval.high < math.inf or interval.includes_high, path
-        assert ("inf" in str(interval)) == (path.rpartition(".")[2] in INFINITE and not of_a_port), path
+        named = not INFINITE.isdisjoint({path, path.rpartition(".")[2]})
+        assert ("inf" in str(interval)) == (named and not of_a_port), path
 
 
 def test_every_field_is_described():
