@@ -237,6 +237,8 @@ def plan(
     problem = ""
     if channel != "I" and not scene.camera.channels:
         problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'"
+    elif not scene.reconstructs:
+        problem = "plan knows neither [surface] nor scan.mode = 'trajectory'; simulate and detect do"
     elif ranges is None:
         distance = truth_maps(scene, device=device).range
         if np.isnan(distance).all():

@@ -122,6 +122,8 @@ def simulate(
         return
     else:
         read = opt.read_scene(scene, overrides, mesh=mesh, photons=asked, seed=seed)
+    if reconstruct and not read.reconstructs:
+        wrong("knows neither [surface] nor scan.mode = 'trajectory'", "--reconstruct")
     if records and (first_photon or shard):
         wrong("needs all photons from photon 0 on", "--records")
     if records and (read.transport.photons == "auto" or read.transport.photons >= 2**31):
@@ -152,7 +154,7 @@ def simulate(
             ),
         )
     device = opt.one_device(devices, engine)
-    automatic = reconstruct is None and read.transport.photons == "auto"
+    automatic = reconstruct is None and read.transport.photons == "auto" and read.reconstructs
     if (reconstruct or automatic) and result.batches > 1:
         note("the light is reconstructed")
         result = spadwarp.reconstruct(result, device=device)

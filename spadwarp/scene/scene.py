@@ -288,6 +288,11 @@ class Scene(Shown, Document):
         return get_args(Component)[: 3 if self.surface is None else 4]
 
     @property
+    def reconstructs(self) -> bool:
+        """Whether `spadwarp.reconstruct` knows the ways of unscattered light: not through waves or to a moving lens."""
+        return self.surface is None and self.scan.mode != "trajectory"
+
+    @property
     def polarised(self) -> bool:
         """Whether light is polarised: the laser's, what water scatters, or as far as the camera can tell."""
         chosen = (self.laser.polarisation, self.medium.scattering_matrix, self.camera.polarisation)

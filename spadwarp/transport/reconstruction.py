@@ -59,8 +59,8 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
         result: With two halves, `Result.halves`, and a scene whose files are still there.
         device: "cpu" or "cuda:0"; by default as `simulate` picks it.
 
-    Raises `ConfigError`: fewer than two batches of photons, or the surface of the sea; what `simulate` raises of the
-    scene's files.
+    Raises `ConfigError`: fewer than two batches of photons, the surface of the sea, a moving scan; what `simulate`
+    raises of the scene's files.
     """
     halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
     return replace(result, reconstruction=reconstructed(result, halves, pick_device(device)))
@@ -71,8 +71,8 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
     from scipy.ndimage import distance_transform_edt
 
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
-    if scene.surface is not None:
-        raise ConfigError("reconstruct knows no surface of the sea", source=scene.source)
+    if not scene.reconstructs:
+        raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)
         focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None

@@ -79,10 +79,12 @@ def test_truth_has_targets_on_both_sides():
     np.testing.assert_allclose(depth[1, 1], 2.0, rtol=1e-5)
 
 
-def test_the_analytic_model_and_derivatives_refuse():
+def test_models_that_know_no_waves_refuse():
     one = scene(**BAY, targets=[BOTTOM])
     with pytest.raises(ConfigError, match="knows no surface of the sea"):
         spadwarp.simulate_analytic(one, device="cpu")
+    with pytest.raises(ConfigError, match=r"plan knows neither \[surface\]"):
+        spadwarp.plan(one, device="cpu")
     with pytest.raises(ConfigError, match="cannot be combined with surface"):
         spadwarp.simulate(one, photons=1000, derivatives=["medium.absorption"], device="cpu")
 
