@@ -124,10 +124,8 @@ def simulate(
         read = opt.read_scene(scene, overrides, mesh=mesh, photons=asked, seed=seed)
     if reconstruct and not read.reconstructs:
         wrong("knows neither [surface] nor scan.mode = 'trajectory'", "--reconstruct")
-    if records and (first_photon or shard):
-        wrong("needs all photons from photon 0 on", "--records")
-    if records and (read.transport.photons == "auto" or read.transport.photons >= 2**31):
-        raise ConfigError(f"--records: photons = {read.transport.photons} is outside [1, {2**31 - 1}]")
+    if records:
+        _check_records(read, whole=not (first_photon or shard))
     engine = opt.read_engine(ray, workers)
     if engine is None:
         spadwarp.transport.prepare_kernels(devices)
@@ -280,6 +278,14 @@ def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
     if result.batches > 1:
         found |= {"noise_ratio": result.target_noise_ratio, "relative_error": result.relative_error}
     return {**found, "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"}
+
+
+def _check_records(scene: Scene, *, whole: bool) -> None:
+    """Whether records of all photons can be kept; `whole`: of photons from 0 on."""
+    if not whole:
+        wrong("needs all photons from photon 0 on", "--records")
+    if scene.transport.photons == "auto" or scene.transport.photons >= 2**31:
+        raise ConfigError(f"--records: photons = {scene.transport.photons} is outside [1, {2**31 - 1}]")
 
 
 def _simulate_moving(path: Path, trajectory: Path, out: Path, scene: Scene, **options: Any) -> None:
