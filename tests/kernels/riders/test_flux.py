@@ -47,7 +47,7 @@ def test_lengths_in_voxels_and_gates_are_those_of_dense_points():
     gates = {"gates": 3, "gate_start": 1.5, "gate_path": 0.6}
     volume = sk.make_flux_volume((4, 5, 6), lower=lower, edge=edge, rotation=turn, origin=origin, scale=SCALE, **gates)
     sk.make_flux([volume], device="cpu")
-    tally = wp.zeros(3 * 4 * 5 * 6, dtype=wp.int64)
+    tally = wp.zeros(3 * 4 * 5 * 6, dtype=wp.int64, device="cpu")
     launched(_tracks, [volume, x, u, tally], out=())
     steps = (np.arange(4_000) + 0.5) * 3.0 / 4_000
     expected = np.zeros((3, 4, 5, 6))
@@ -67,7 +67,7 @@ def test_light_through_planes_of_even_radiance():
     x = rng.uniform(-1.0, 1.0, (count, 3)) * (5.0, 3.0, 5.0)
     planes = sk.make_flux_planes(2, axis=(0, 1, 0), right=(0, 0, 1), radius=2.0, polar=6, azimuth=3, scale=SCALE)
     sk.make_flux([planes], [-0.1, 0.0], device="cpu")
-    tally = wp.zeros(2 * (4 + 18), dtype=wp.int64)
+    tally = wp.zeros(2 * (4 + 18), dtype=wp.int64, device="cpu")
     positions = wp.array([-0.1, 0.0], dtype=float, device="cpu")
     launched(_planes, [planes, x, u, positions, tally], out=())
     down, up, scalar_down, scalar_up, *radiance = (tally.numpy().reshape(2, 22)[1] / SCALE).tolist()
