@@ -17,6 +17,7 @@ SCENE = scene(
 )
 
 
+@pytest.mark.slow
 def test_a_row_is_the_analytic_model_on_the_axis():
     row = budget(SCENE, ranges=[2.2])[0]
     result = simulate_analytic(SCENE, frames=0)

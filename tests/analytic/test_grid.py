@@ -36,6 +36,7 @@ def test_cells_without_matter_change_nothing():
         np.testing.assert_allclose(getattr(through, name), getattr(plain, name), rtol=close)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ports", PORTS)
 @pytest.mark.parametrize("laser", [{}, BEAM])
 def test_cells_of_one_water_are_that_water_behind_ports_too(ports, laser, tmp_path):
@@ -54,6 +55,7 @@ def test_cells_of_one_water_are_that_water_behind_ports_too(ports, laser, tmp_pa
     assert depths[1] == pytest.approx(depths[0])
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 @pytest.mark.parametrize("ports", ["none", "flat"])
 def test_signal_and_backscatter_are_those_of_single_scattering(ports, device):

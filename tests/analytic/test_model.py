@@ -215,6 +215,7 @@ def test_a_file_holds_maps_frames_and_scene(tmp_path):
     assert held.seed == 2**64 - 1 and held.scene == one
 
 
+@pytest.mark.slow
 def test_agrees_with_monte_carlo_on_the_ballistic_return_and_on_single_backscatter():
     """A tilted plate filling the field, its corners included: 1 % on the return; thin water: 2 % on the backscatter.
 

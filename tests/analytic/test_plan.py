@@ -12,19 +12,21 @@ from spadwarp.analytic import PILE_UP, axis_fluence, eye_limit, permissible_expo
 from spadwarp.scene import Laser, Scene
 from spadwarp.values import range_from_time
 
+pytestmark = pytest.mark.usefixtures("shared_runs")
+
 
 def make(**sections):
     return Scene.from_dict({**SCENE, **{name: {**SCENE.get(name, {}), **fields} for name, fields in sections.items()}})
 
 
 def proposal(scene=None, **options):
-    options = {"photons": 800_000, "device": "cpu", "largest_range": False} | options
+    options = {"photons": 400_000, "device": "cpu", "largest_range": False} | options
     return spadwarp.plan(scene or make(), **options)
 
 
 @pytest.fixture(scope="module")
-def found():
-    return proposal(photons=1_600_000)
+def found(shared_runs):
+    return proposal()
 
 
 def test_the_gate_holds_the_target_and_its_margin(found):
@@ -50,6 +52,7 @@ def test_terms_add_up_and_go_into_json(found):
     assert set(fields["pilot"]) == {field.name for field in dataclasses.fields(found.pilot)}
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_a_short_run_has_the_bound_of_a_long_one(found):
     """And says how much of what it saw was noise."""
@@ -58,6 +61,7 @@ def test_a_short_run_has_the_bound_of_a_long_one(found):
     assert short.bound == pytest.approx(found.pilot.bound, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_counts_and_floor_are_those_of_the_whole_simulation(found):
     """Independent photons, all pixels; many pulses leave the floor alone."""
@@ -74,6 +78,7 @@ def test_counts_and_floor_are_those_of_the_whole_simulation(found):
     assert floor > 3 * found.pilot.unscattered_floor["likelihood"]
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
     clear = make(medium={"extinction": 0.1, "albedo": 0.0}, detector={"dark_count_rate": 0.0})
@@ -90,7 +95,7 @@ def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
 def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
     first = proposal(depth_error=0.05)
     least = math.hypot(first.terms["forward scattering"], first.terms["pile-up"])
-    worse, better = (proposal(depth_error=factor * least, photons=1_600_000) for factor in (2.0, 1.5))
+    worse, better = (proposal(depth_error=factor * least) for factor in (2.0, 1.5))
     assert worse.pulses < better.pulses and better.pulses_for == "depth error"
     assert better.terms["total"] == pytest.approx(better.depth_error, rel=0.02)
     coarse = proposal(depth_error=0.5)
@@ -101,17 +106,20 @@ def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
     assert hopeless.terms["total"] < 1.1 * hopeless.terms["forward scattering"]
 
 
+@pytest.mark.slow
 def test_coarse_bins_are_the_limit_of_coarse_bins():
     coarse = proposal(make(medium={"extinction": 0.05, "albedo": 0.2}, gate={"bin_width_ps": 1000.0}))
     assert coarse.limit == "bin width" and "bin_width_ps" in coarse.advice and not coarse.reached
 
 
+@pytest.mark.slow
 def test_a_rate_that_would_fold_is_lowered():
     fast, kept = (proposal(make(laser={"repetition_rate": 50e6}, detector={"wrap": wrap})) for wrap in (True, False))
     assert fast.scene.laser.repetition_rate <= fast.largest_rate < 50e6 == kept.scene.laser.repetition_rate
     assert fast.unambiguous_range > fast.target_range[1]
 
 
+@pytest.mark.slow
 def test_pulse_energy_keeps_the_limits():
     lowered = proposal(make(laser={"pulse_energy": 1e-3}))
     assert lowered.energy_limit == "pile-up" and lowered.scene.laser.pulse_energy <= lowered.pile_up_energy
@@ -123,9 +131,10 @@ def test_pulse_energy_keeps_the_limits():
 
 
 @pytest.mark.slow
-def test_largest_range_falls_with_the_extinction():
+def test_largest_range_falls_with_the_extinction(monkeypatch):
+    monkeypatch.setattr(planning, "_RESOLUTION", 1.2)
     options = {"largest_range": True, "depth_error": 0.1, "photons": 60_000}
-    clear, turbid = (proposal(make(medium={"extinction": c}), **options) for c in (0.1, 0.3))
+    clear, turbid = (proposal(make(medium={"extinction": c}), **options) for c in (0.15, 0.3))
     assert 0 < turbid.largest_range < clear.largest_range
     assert turbid.range_limit
 
@@ -142,6 +151,7 @@ def test_the_brightest_pixel_has_light_where_a_run_is_so_short_that_few_have():
     assert planning.measure(runs, scene, "cpu").brightest == pytest.approx(detected, rel=1e-9) and detected > 0.0
 
 
+@pytest.mark.slow
 def test_ranges_stand_for_an_unknown_target():
     anywhere = proposal(ranges=(3.0, 5.0))
     assert anywhere.target_range == (3.0, 5.0) and anywhere.gate_range[0] < 2.75 and anywhere.gate_range[1] > 5.25
@@ -166,10 +176,11 @@ def test_wrong_arguments_are_named(options, words):
         proposal(**options)
 
 
+@pytest.mark.slow
 def test_daylight_is_noise(found):
     """Counts of daylight in the gate, from a window of the image; the return stays as it is."""
     scene = make(daylight={"sun_elevation_deg": 40.0, "depth": 40.0}, detector={"filter_fwhm_nm": 1.0})
-    lit = proposal(scene, photons=1_600_000)
+    lit = proposal(scene)
     window = lit.scene.gate.stop - lit.scene.gate.start
     rate = np.median(spadwarp.scene.noise_rate(scene, spadwarp.truth_maps(scene, device="cpu")))
     assert lit.pilot.noise == pytest.approx(rate * window, rel=0.1)

@@ -74,6 +74,7 @@ CASES = {
 few_units = pytest.mark.filterwarnings("ignore:.*rounding to the histogram:RuntimeWarning")
 
 
+@pytest.mark.slow
 @few_units
 @pytest.mark.physics
 @pytest.mark.parametrize(("name", "angle"), [("flat", 0.0), ("flat", 25.0), ("tilted", 25.0), ("dome", 25.0)])
@@ -105,6 +106,7 @@ def test_backscatter_is_that_of_photons_that_scatter_once(name):
     assert profile[:median].sum() == pytest.approx(0.5 * profile.sum(), rel=0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [{"distance": 1e-6}, {"shape": "dome", "radius": 2e-3}])
 @pytest.mark.parametrize("laser", [None, "camera"])
 def test_equal_indices_are_a_camera_in_the_water(form, laser):
@@ -145,6 +147,7 @@ def test_frames_report_background_evenly_over_the_gate_behind_a_port():
     assert stats.kstest(time, stats.uniform(*gate).cdf).pvalue > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_the_gate_of_a_plan_holds_the_return_of_a_simulation():
     laser = {"half_angle_deg": 12.0, "repetition_rate": 1e5, "pulse_energy": 1e-9}

@@ -9,15 +9,18 @@ from helpers.planned import SCENE
 from spadwarp.analytic import planning
 from spadwarp.scene import Scene
 
+pytestmark = pytest.mark.usefixtures("shared_runs")
+
 
 def plan(photons, extinction=0.4, **options):
     scene = Scene.from_dict(SCENE).with_overrides({"medium.extinction": extinction})
     return spadwarp.plan(scene, photons=photons, device="cpu", largest_range=False, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth_error", [0.002, 0.3])
 def test_few_photons_say_that_they_do_not_judge_or_judge_as_many_do(depth_error):
-    many = plan(800_000, depth_error=depth_error, seed=9)
+    many = plan(400_000, depth_error=depth_error, seed=9)
     assert many.judged
     for seed in range(2):
         for photons in (1_000, 30_000):
@@ -35,6 +38,7 @@ def test_hopeless_water_is_named_before_a_photon_is_traced(monkeypatch):
         plan("auto", extinction=6.0)
 
 
+@pytest.mark.slow
 def test_the_bound_before_tracing_is_above_what_is_traced():
     """Light of the target that is traced, of all scatterings, against the bound's 1 in all pulses: it names no water
     in which a pixel detects more."""

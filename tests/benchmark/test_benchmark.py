@@ -59,6 +59,7 @@ def test_rates_are_counts_over_the_fastest_run(staircase):
     assert 0.0 < staircase.error_per_root_second < math.inf
 
 
+@pytest.mark.slow
 def test_cube60_absorbs_what_mcx_says():
     """17.69 % (MCX's own figure); 20 000 photons know it to 0.2 %."""
     (result,) = spadwarp.benchmark.run(["cube60"], device="cpu", photons=20_000, repeats=1)

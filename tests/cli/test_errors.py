@@ -151,6 +151,7 @@ def test_what_is_wrong_with_a_command_is_named(line, scene, done, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_date_or_rank_of_the_environment_that_is_no_number(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     pdf = ("--set", "output.png=true", "--set", "output.pdf=true", "--photons", "1e3")
@@ -227,6 +228,7 @@ def limited(mebibytes, *arguments):
     return process("-m", "spadwarp", *arguments, stdout=subprocess.DEVNULL, preexec_fn=limit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mebibytes", "needed", "arguments"),
     [

@@ -13,6 +13,7 @@ from spadwarp.io.arrays import read_exr
 pytestmark = pytest.mark.filterwarnings("ignore:Monte Carlo noise")
 
 
+@pytest.mark.slow
 def test_frames_are_those_of_detect(done, tmp_path, monkeypatch):
     """Drawn one by one as where they are many."""
     monkeypatch.setattr("spadwarp.frames.file._PART_BYTES", 1)

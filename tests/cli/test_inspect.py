@@ -108,6 +108,7 @@ def test_a_table_wider_than_the_terminal_is_printed_in_parts(monkeypatch, capsys
     assert printed.count("coastal") == printed.count("range [m]") == 3 and printed.count("5 [ps]") == 6
 
 
+@pytest.mark.slow
 def test_a_process_loads_nothing_heavy_and_keeps_stdout_for_the_answer():
     """Also on a machine without a GPU, of which Warp's native code would complain."""
     code = "import sys, spadwarp.cli; print(*sys.modules); from spadwarp.__main__ import main; main()"

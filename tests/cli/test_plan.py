@@ -64,6 +64,7 @@ def test_a_budget_of_polarised_light_says_what_is_left_out(scene, tmp_path):
     assert printed.stderr.count("has no polarisation") == 1 and f"warning: {note}" in printed.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "vary", [["medium.extinction=0.1:2:3"], ["laser.pulse_energy=1 nJ,4 nJ", "detector.mode=first_photon,free_running"]]
 )

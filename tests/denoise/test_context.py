@@ -110,6 +110,7 @@ def test_two_returns_are_not_averaged():
     assert np.mean(np.abs(place - 30.5) < 1.0) > 0.99
 
 
+@pytest.mark.slow
 def test_few_photons_beside_an_edge_are_answered_better_with_the_wide_view(tmp_path):
     """Two signal photons a pixel among ten of the background; over six noises 0.75 ± 0.05 times the squared error."""
     torch.manual_seed(1)
@@ -153,6 +154,7 @@ def test_scattered_light_is_dimmer_and_later_than_a_target():
     assert left[8] > 0.9 and right[8] < 0.5 and left[10] < 0.01 and right[10] > 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "wrong"), [(64, 0.05), (192, 0.01)])
 def test_scattered_light_beside_a_bright_target_and_far_from_it_is_water(size, wrong):
     """A ball in open water, 800 counts a pixel, and three tenths more light that is late and beside.

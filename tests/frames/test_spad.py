@@ -247,6 +247,7 @@ def test_wrong_counts_are_named(counts, pulses, match):
 WEAK = Laser(pulse_energy=1e-15)  # far from pile-up
 
 
+@pytest.mark.slow
 def test_frames_of_two_runs_differ_by_what_is_said(whole):
     """Pixel by pixel, the mean over frames is off by the standard error, in units of the shot noise of a frame; that
     noise grows with the square root of the pulses, the standard error with their number."""

@@ -85,6 +85,7 @@ IN_ONE_BIN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("depth", "is_inside"), [(1.5, True), (1.506, False)], ids=["inside a bin", "at its edge"])
 def test_no_error_of_the_depth_is_below_its_bound(depth, is_inside):
     """Light inside a bin hardly changes when its target moves by less; the bound is that of moves by 1 mm."""

@@ -78,6 +78,7 @@ def test_wrong_models_are_flagged_and_right_ones_are_not(light):
     assert wrong.goodness.is_bad and wrong.warnings[0].startswith("bad fit: deviance of ")
 
 
+@pytest.mark.slow
 def test_where_nothing_was_seen_there_is_no_value(light):
     frames = detected(light)
     counts = frames.counts[0].copy()
@@ -120,6 +121,7 @@ def test_priors_are_of_the_depth_itself_and_of_a_width(light):
     assert abs(found.estimates["depth"].value - 1.503) < 1e-4
 
 
+@pytest.mark.slow
 def test_command_says_how_good_the_fit_is(light, tmp_path):
     scene = tmp_path / "scene.toml"
     scene.write_text(plate({"targets[0].translation": [0.0, 0.0, 1.6]}).to_toml())

@@ -39,6 +39,7 @@ def test_gradients_are_those_of_clear_water():
     assert 0.4 * reflectance == pytest.approx(total.item(), rel=0.02)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_loss_point_to_the_truth():
     scene = plate()
     measured = torch.tensor(spadwarp.simulate(scene, photons=400_000, seed=1, device="cpu").detections.sum((0, 1)))

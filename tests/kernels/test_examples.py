@@ -93,6 +93,7 @@ def test_depth_camera_takes_torch(depth_camera):
     assert np.nanstd(old - depth.numpy()) == pytest.approx(0.02, rel=0.3)
 
 
+@pytest.mark.slow
 def test_own_phase_function():
     """In the transport kernel the directions after one scattering follow the density: χ² over 1 − cos θ."""
     module = example("own_phase_function")

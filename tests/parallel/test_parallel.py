@@ -129,6 +129,7 @@ def test_the_stopping_rule_is_the_same_over_ray(cluster):
     same(simulate(scene(), **options, engine=Ray(workers=1)), simulate(scene(), **options, device="cpu"))
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
     def interrupt(stage, done, total):
         if stage == "trace" and done >= 10_000 and not fired:

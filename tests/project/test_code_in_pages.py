@@ -59,7 +59,12 @@ LEFT_OUT = {
 }
 
 
-WITH_PYTHON = [page for page in (README, *PAGES) if page != TUTORIAL and blocks(page, "python")]
+# The README's always, those of the other pages with the slow tests.
+WITH_PYTHON = [
+    pytest.param(page, marks=() if page == README else pytest.mark.slow)
+    for page in (README, *PAGES)
+    if page != TUTORIAL and blocks(page, "python")
+]
 WITH_COMMANDS = [page for page in (README, *PAGES) if page != TUTORIAL and commands(page)]
 
 

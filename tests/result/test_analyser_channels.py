@@ -69,6 +69,7 @@ def test_the_wall_is_depolarised_and_the_water_is_not(analysed, light):
     assert degree_of_polarisation(analysed, gated=True).shape == (6, 8)
 
 
+@pytest.mark.slow
 def test_stokes_cubes_hold_what_an_analyser_passes(analysed, light, tmp_path):
     stokes = spadwarp.simulate(polarised("stokes"), photons=analysed.photons, seed=5, device="cpu")
     assert np.array_equal(stokes.tallies, analysed.tallies)

@@ -48,6 +48,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_changed_file_is_named_by_resume_and_merge(tmp_path, case):
     name, write, (before, after), sections, key = CASES[case]

@@ -15,6 +15,7 @@ DIM |= {"detector": {"pulses_per_frame": 10_000, "jitter_fwhm_ps": 1500.0, "wrap
 CPU = {"device": "cpu"}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Monte Carlo noise")
 @pytest.mark.parametrize("mode", ["first_photon", "free_running"])
 def test_ratio_is_that_of_seeds_and_frames(mode):
@@ -79,6 +80,7 @@ def test_halves_are_two_runs_that_add_up():
     assert np.mean(squares) == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.slow
 def test_auto_stops_at_the_goal_or_in_time_with_the_bits_of_its_photons():
     one = scene(**DIM, transport={"photons": "auto"})
     seen = []

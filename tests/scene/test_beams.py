@@ -120,6 +120,7 @@ LASERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LASERS)
 def test_a_tally_holds_its_photons_wherever_the_laser_stands(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -41,6 +41,7 @@ json_like = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(
     st.dictionaries(st.sampled_from([*Scene.model_fields, "x"]), json_like, max_size=4),

@@ -34,6 +34,7 @@ def simulated(one, device, blocks):
     return simulate(one, photons=20_000, seed=1, device=device, derivatives=WITH_TARGET, blocks=blocks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("estimator", "tracking"), [("analog", "regular"), ("guided", "regular")])
 def test_blocks_share_the_derivatives_of_one_water(estimator, tracking, everywhere, device):
     """The same photons; with the derivatives of a target beside them."""
@@ -77,6 +78,7 @@ def test_ballistic_light_in_closed_form(everywhere, device):
         np.testing.assert_allclose(lengths, expected, atol=0.004)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracking", ["regular", "delta"])
 def test_single_scatter_of_two_half_spaces_is_that_of_the_integral(tracking, tmp_path, device):
     """The light, and its derivatives by two blocks, a step from c 0.3 to 1.2 at z = 1.25 m; 0.3 % of each bin

@@ -40,6 +40,7 @@ def within_path_limits(result):
     return (mean > edges[:-1][seen] - 1e-3).all() and (mean < edges[1:][seen] + 1e-3).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["analog", "guided"])
 def test_the_photons_stay_the_same(estimator, device):
     one = layered(transport={"estimator": estimator})
@@ -76,6 +77,7 @@ def test_single_scatter_in_closed_form(device):
     np.testing.assert_allclose(by_g / h, expected, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_estimators_agree(device):
     """Each component's bins over all pixels, of each derivative, without and with a near-axis rule that is felt."""
 
@@ -124,6 +126,7 @@ HALVES = [
 NAMES = (*ALL, "targets[1].reflectance")
 
 
+@pytest.mark.slow
 def test_light_by_way_of_mirrors(device):
     """A closed box of mirrors: one scattering, any number of reflections, index 1."""
     one = scene(
@@ -161,6 +164,7 @@ def test_behind_a_port_the_path_is_that_in_water_and_lambertian_bounces_are_coun
     assert 0.0 < 0.4 * glossy[:, 2:].sum() < 0.99 * light[:, 2:].sum()
 
 
+@pytest.mark.slow
 def test_errors_between_batches_are_those_between_seeds(device):
     runs = [simulated(layered(), device, ALL, 32_768, seed=seed) for seed in range(24)]
     for name in ALL:

@@ -199,6 +199,7 @@ def test_estimators_share_one_ledger(end, device):
     assert equal_means_p(*means) > 1e-3
 
 
+@pytest.mark.slow
 def test_records_of_a_capped_walk_have_no_more_events_than_allowed(device):
     """The analog photon's record is of the end of the flight after its last event, the others' of that event."""
     one = scene(transport={"max_collisions": 3, "weight_cutoff": 0.0})

@@ -128,6 +128,7 @@ def _in_bins(one, edges):
     return np.histogram(z + np.hypot(0.1, z), edges, weights=value)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracking", TRACKING)
 def test_single_scatter_of_a_gaussian_cloud_is_that_of_the_integral(tracking, device):
     """Optical depth 2 on the axis. By bins that of the cells, in sum that of the cloud: 0.3 %, 4 standard errors."""

@@ -75,6 +75,7 @@ def test_single_scattering_is_that_of_the_quadrature(estimator, device):
     assert (error < 0.05 * expected).all()
 
 
+@pytest.mark.slow
 def test_a_slab_of_three_layers_passes_and_returns_what_adding_says(device):
     one = scene(
         medium=LAYERED,

@@ -36,6 +36,7 @@ def totals(result):
     return np.array([values.sum(axis=(1, 2)) for values in result.channels.values()])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("targets", [[PLATE], [TREE]], ids=["plate", "tree"])
 @pytest.mark.parametrize("estimator", ["analog", "guided"])
 def test_the_intensity_keeps_its_bits_where_nothing_polarises(estimator, targets, device):

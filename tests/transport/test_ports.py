@@ -73,6 +73,7 @@ def test_estimators_share_one_mean_behind_a_port(name, device):
     agreeing_cells(one, device, photons=photons, seeds=16, pixels=True, clear=True)
 
 
+@pytest.mark.slow
 def test_equal_indices_are_a_camera_in_the_water(device, monkeypatch):
     """Photon by photon in water that is empty where the window is, for guided in a domain that begins there: flights
     then end there with and without it. Those of a dome, whose view has a margin, do not; of a tilted window the empty

@@ -399,6 +399,7 @@ def test_guided_warns_of_no_heavy_photons_where_next_event_does():
 # Runs with an error as their goal
 
 
+@pytest.mark.slow
 def test_a_run_stops_when_its_depth_bins_are_known_well_enough(device):
     one = scene(transport={"estimator": "guided"})
     found = simulate(one, photons=2**22, seed=1, device=device, relative_error=0.015)

@@ -99,6 +99,7 @@ def test_counts_of_photons_a_position_hold_for_any_range_of_ids():
     np.testing.assert_array_equal(resumed.tallies, whole.tallies)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*few heavy photons decide it")
 def test_the_standard_error_of_a_scan_is_the_spread_between_seeds():
     runs = [simulate(scene(**CONFOCAL), photons=16 * 640, seed=seed, device="cpu") for seed in range(48)]

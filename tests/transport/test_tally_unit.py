@@ -58,6 +58,7 @@ def test_a_far_target_is_seen_behind_a_bright_bin_at_the_lens(estimator, device)
     assert result.counters["clipped"] == 0 and not result.counters["below_unit_ballistic"]
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(
     distance=st.floats(1.5, 30.0),

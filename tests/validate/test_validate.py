@@ -163,6 +163,7 @@ def test_deviations_are_standard_normal(results):
     assert 0.75 < np.sqrt(np.mean(z**2)) < 1.25
 
 
+@pytest.mark.slow
 def test_a_table_of_henyey_greenstein_and_the_mean_path_pass_as_well():
     found = run(["near-axis", "single-scatter"], photons=10_000, seed=8, device="cpu", tabulated=True)
     assert all(r.passed for r in [*found, *run(["mean-path"], photons=1000, seed=4, device="cpu")])

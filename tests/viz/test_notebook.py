@@ -60,6 +60,7 @@ def test_a_scene_whose_mesh_is_missing_still_has_numbers_and_its_text_is_escaped
     assert "<b>.stl" not in page and "&lt;b&gt;.stl" in page
 
 
+@pytest.mark.slow
 def test_a_proposal_is_a_table():
     proposal = spadwarp.plan(SCENE, photons=20_000, largest_range=False, device="cpu")
     assert len(repr(proposal)) < 160

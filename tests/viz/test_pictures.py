@@ -247,6 +247,7 @@ def test_figures_of_the_docs_are_drawn(kind, tmp_path, monkeypatch):
     assert drawn(monkeypatch, lambda: PICTURES_OF_THE_DOCS[kind](tmp_path / "picture.png", style.PAGE), kind).axes
 
 
+@pytest.mark.slow
 def test_images_of_samples_fill_their_rows(tmp_path, monkeypatch):
     truth = np.full((24, 32), 15.0, np.float32)
     whole = [(truth, (13.5, 16.0), {"median": truth}, "staircase, backscatter fraction 0.183")] * 3

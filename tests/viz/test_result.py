@@ -35,6 +35,7 @@ def test_folders_that_cannot_be_written_are_named(tmp_path):
         draw_result(make_result(make_scene()), tmp_path / "file", method="peak")
 
 
+@pytest.mark.slow
 def test_pictures_need_no_pyplot():
     # pyplot would choose a window system for the caller.
     code = "import sys, spadwarp.viz; assert 'matplotlib.pyplot' not in sys.modules"

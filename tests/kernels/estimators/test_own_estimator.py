@@ -24,6 +24,7 @@ def make_half(spec: sk.TransportSpec) -> sk.Estimator:
     return next_event._replace(request_event=request_event)
 
 
+@pytest.mark.slow
 def test_an_estimator_of_ones_own(monkeypatch):
     monkeypatch.setitem(sk.ESTIMATORS, "half", make_half)
     monkeypatch.setitem(sk.ESTIMATORS, "nothing", lambda spec: sk.Estimator())

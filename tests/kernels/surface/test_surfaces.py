@@ -156,6 +156,7 @@ def tally(model, spec, first_id=0, offset=0):
     return data.tally.numpy()
 
 
+@pytest.mark.slow
 def test_transport_by_public_queries_and_by_steps(device):
     """Warp's own queries give the light of our tree; photons are numbered from the offset on the device."""
     mesh, points = ball(device)

@@ -38,6 +38,7 @@ def reflectance(cosine, index):
     return 0.5 * ((np.sin(a - b) / np.sin(a + b)) ** 2 + (np.tan(a - b) / np.tan(a + b)) ** 2)
 
 
+@pytest.mark.slow
 def test_reflectance_is_fresnels_and_that_of_a_very_large_index_is_a_mirrors(device):
     cosines = np.concatenate([np.linspace(0.02, 1.0, 50), [np.cos(np.arcsin(1 / 1.34)) * 0.999]])
     pairs = np.array(list(itertools.product(cosines, (1 / 1.34, 1.02, 1.52 / 1.34, 3.0))), np.float32)

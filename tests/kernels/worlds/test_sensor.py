@@ -27,6 +27,7 @@ def look(config, device, cameras=1, poses=None, **options):
     return camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["centroid", "matched", "likelihood"])
 def test_outputs_are_chosen(method, device):
     """A depth without stored bins is that of a camera that stores them."""
@@ -81,6 +82,7 @@ def test_false_alarms_of_worlds_that_differ(method, device):
     assert (camera.status.numpy() == sk.CAMERA_STATUS.index("no_return")).sum() == (~found).sum()
 
 
+@pytest.mark.slow
 def test_traced_water_is_no_target(device):
     """Multiple scattering in water of four mean free paths, with nothing behind it: the stated false alarms."""
     shapes = sk.make_shapes(["plane"], [(0.1, 0.1, 0)], local=[(0, 0, -5, 0, 0, 0, 1)], frame="optical", device=device)

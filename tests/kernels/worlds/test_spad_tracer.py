@@ -9,6 +9,7 @@ import spadwarp_kernels as sk
 from helpers.worlds import SMALL, STILL, garden, transforms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_warp_bvh", [False, True])
 def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
     """Light of the whole image and of its parts, in absorbing water; edges of polygons aside."""
