@@ -2,8 +2,7 @@
 
 Links in the sources lead from file to file, so that they work where the files are read; here they become those of the
 site. What a link leads to that is not on the site keeps its text. Notebooks are executed; those with outputs are kept
-in out/notebooks until the notebook changes. Tests put those that they have executed there, if
-SPADWARP_EXECUTED_NOTEBOOKS names that folder.
+in out/notebooks until the notebook changes. With SPADWARP_NOTEBOOKS=plain they are shown without outputs.
 """
 
 from __future__ import annotations
@@ -72,6 +71,8 @@ def executed(path: Path) -> Any:
 
     source = path.read_bytes()
     kept = ROOT / "out" / "notebooks" / f"{path.stem}-{hashlib.sha256(source).hexdigest()[:16]}.ipynb"
+    if os.environ.get("SPADWARP_NOTEBOOKS") == "plain":
+        return nbformat.read(path, as_version=4)
     if kept.exists():
         return nbformat.read(kept, as_version=4)
     with TemporaryDirectory() as folder:

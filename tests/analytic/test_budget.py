@@ -30,6 +30,7 @@ def test_a_row_is_the_analytic_model_on_the_axis():
     assert row.sigma_depth / row.sigma_time == pytest.approx(0.5 * 299_792_458.0, rel=1e-9)  # index 1
 
 
+@pytest.mark.slow
 def test_rows_run_over_waters_and_ranges_and_the_gate_follows():
     ranges = [1.0, 4.0, 9.0]
     rows = budget(SCENE, ranges=ranges, media=["uwoc-clear", "uwoc-harbour"])

@@ -88,6 +88,7 @@ def test_return_and_its_time_are_those_of_unscattered_photons(name, angle):
     assert mean == pytest.approx(time, abs=8e-12)  # 1 mm; the pixels' own spread is 60 ps
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 @pytest.mark.parametrize("name", CASES)
 def test_backscatter_is_that_of_photons_that_scatter_once(name):

@@ -143,6 +143,7 @@ def test_two_commands_do_not_write_to_one_directory(scene, tmp_path):
     assert not list(out.glob(".*"))
 
 
+@pytest.mark.slow
 def test_a_dataset_is_no_output(tmp_path):
     folder = tmp_path / "data"
     small = {"targets.builtin": ["staircase"], "targets.validation": [], "frames.per_scene": 1, "scenes_per_target": 1}

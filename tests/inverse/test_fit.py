@@ -61,6 +61,7 @@ def test_depth_is_not_that_of_the_centroid(light):
     assert abs(centroid) > 2 * abs(depth.value - 1.5)
 
 
+@pytest.mark.slow
 def test_each_pixel_has_its_depth(light):
     frames = exposure(light, pulses=4_000_000)
     found = fit(frames, plate(), "depth:pixel,background:pixel", photons=200_000)

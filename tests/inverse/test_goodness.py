@@ -111,6 +111,7 @@ def test_counts_that_cannot_be_are_refused(overrides, count, words):
         spadwarp.fit(counts, plate(overrides), unknown="depth", pulses=40, device="cpu")
 
 
+@pytest.mark.slow
 def test_priors_are_of_the_depth_itself_and_of_a_width(light):
     frames = detected(light)
     for width in (1e-300, 1e300, 0.0):

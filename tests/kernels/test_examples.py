@@ -36,6 +36,7 @@ def test_examples_need_the_kernel_library_alone(path):
                 assert top in {"numpy", "warp", "spadwarp_kernels", "matplotlib"} | sys.stdlib_module_names | SIMULATORS
 
 
+@pytest.mark.slow
 def test_moving_target(monkeypatch):
     """The brightest light of the middle pixels has gone to the wave and back, step by step."""
     module = example("moving_target")
@@ -132,6 +133,7 @@ def test_cameras_in_simulators(simulator):
     assert np.nanmin(camera.depth.numpy()) == pytest.approx(height - 0.6, abs=0.1)  # the top of the ball
 
 
+@pytest.mark.slow
 def test_vehicles_stop_before_an_obstacle():
     """In clear water with the margin, in murky water too late."""
     clearance, began = example("obstacle_stop").main(extinctions=np.array([0.2, 3.0]), start=5.0, device="cpu")

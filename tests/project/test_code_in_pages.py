@@ -1,6 +1,5 @@
 """Code in the pages and notebooks of the documentation runs, at a small size, or there is a reason why not."""
 
-import hashlib
 import json
 import os
 import re
@@ -178,13 +177,7 @@ def execute(path, folder):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of Jupyter's own packages
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=by_name)
 def test_notebook_runs(path, tmp_path):
-    folder = os.environ.get("SPADWARP_EXECUTED_NOTEBOOKS")  # where docs/hooks.py looks for them
-    executed = execute(path, tmp_path)
-    if folder:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        pytest.importorskip("nbformat").write(executed, Path(folder) / f"{path.stem}-{digest}.ipynb")
-    outputs = [output for cell in executed.cells for output in cell.get("outputs", [])]
+    outputs = [output for cell in execute(path, tmp_path).cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     said = "".join(output["text"] for output in outputs if output.get("name") == "stderr")
     assert "Warning" not in said.replace("SpadwarpWarning: Monte Carlo noise", ""), said

@@ -81,6 +81,7 @@ def test_a_point_out_of_focus_is_a_disc_of_confusion(focus, device):
     assert image[inner].sum() / image.sum() == pytest.approx(np.count_nonzero(inner) / (math.pi * disc**2), rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_spot_in_the_world_is_imaged_where_opencv_puts_it(device):
     rvec, tvec, coefficients = (0.2, -0.3, 0.4), (0.1, -0.05, 1.0), (-0.25, 0.05, 0.01, -0.008, 0.0)
     spots = np.array([[0.55, 0.35, 2.0], [-0.5, 0.4, 1.5]])  # as the camera sees them
@@ -132,6 +133,7 @@ def test_a_camera_outside_the_water_is_refused():
             simulate(scene(**sections, transport={"termination": "roulette"}), photons=10, device="cpu")
 
 
+@pytest.mark.slow
 def test_layers_of_water_stand_in_the_world(device):
     """Camera, laser and layers under one motion: photons end where the motion takes their ends."""
     turn, shift = rotation_matrix((25.0, -40.0, 70.0)), np.array([3.0, -1.0, 2.0])

@@ -39,6 +39,7 @@ def test_more_points_have_the_expectation_of_one(device):
         assert found.sum(axis=1).std() / found.sum(axis=1).mean() / np.sqrt(len(found)) < 0.015
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_more_points_leave_less_noise_in_the_bins_of_a_pixel(device):
     """Variance of 32 × 32 pixels' bins in water over 24 seeds: 1/3 if they were independent, a little more as the

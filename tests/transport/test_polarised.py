@@ -76,6 +76,7 @@ def in_blocks(elements):
     return matrices
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("laser", ["linear", "right_circular"])
 def test_single_scatter_is_the_quadrature(laser, device, tmp_path):
     """Every channel of every pixel within 0.3 % of its intensity, and of all pixels with their signs too."""

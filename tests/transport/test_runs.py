@@ -136,6 +136,7 @@ SIGNED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*few heavy photons decide it")
 @pytest.mark.parametrize("kind", SIGNED)
 def test_derivatives_and_channels_survive_files_merging_and_resuming(kind, tmp_path):

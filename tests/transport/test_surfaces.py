@@ -266,6 +266,7 @@ def test_estimators_agree_on_shiny_and_shaded_surfaces(device, tmp_path):
     agreeing_cells(scene(targets=targets), device, photons={"analog": 40_000, "guided": 20_000})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("alpha", "aside"), [(0.25, 0.3), (0.05, 0.42)])
 def test_ballistic_return_of_a_shiny_plate_meets_the_closed_form(alpha, aside, hidden, device):
     """A pencil beam from the side onto a tilted plate: (R/pi + s D G/(4 cos cos)) cos A/r^2 exp(-c path) to 1 %; a

@@ -209,6 +209,7 @@ def single_scatter(reflections):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_light_scattered_once_between_two_faces_is_that_of_the_images(device):
     """Mirroring a point in one face after the other gives the images here in their order from the beam, and the

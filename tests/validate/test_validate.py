@@ -157,6 +157,7 @@ def test_engine_agrees_with_every_reference(results):
     assert {r.name for r in results} == set(CASES) - LONG
 
 
+@pytest.mark.slow
 def test_deviations_are_standard_normal(results):
     """Too small an error would make them wide, too large a one narrow."""
     z = np.array([r.z for r in results if r.standard_error > 0])
