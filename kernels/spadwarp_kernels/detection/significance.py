@@ -57,6 +57,12 @@ def _deviance(n: wp.float64, mean: wp.float64, trials: wp.float64) -> wp.float64
 
 
 @wp.func
+def _deviance_at_most(n: float, mean: float, excess: float, left: float) -> float:
+    """What `_deviance` does not exceed, for a tenth of its time; excess = n - mean, left = trials - n."""
+    return n * (wp.log(n / mean) + 2.0e-6) - excess * left / (left + excess)  # ln(1 + x) <= x, and float32's rounding
+
+
+@wp.func
 def _stirling_error(n: wp.float64) -> wp.float64:
     """ln n! less Stirling's formula, n >= 1, to 3e-4."""
     return (ONE - ONE / (wp.float64(30.0) * n * n)) / (wp.float64(12.0) * n)
@@ -107,6 +113,7 @@ class WindowSearch:
     own_b: wp.float64
     best: wp.vec4d  # deviance, counts, mean, trials
     window: int  # its first bin
+    begin: int  # first bin of this half
     state: wp.uint32  # hash of the counts
 
 
@@ -118,6 +125,7 @@ def begin_search(search: Windows, pixel: int) -> WindowSearch:
     s.level = ONE
     s.best = wp.vec4d(ZERO, ZERO, ONE, ONE)
     s.window = search.first
+    s.begin = search.first
     s.state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
     return s
 
@@ -129,9 +137,7 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
         s.own_n += wp.float64(count)
         s.state = (((s.state ^ wp.uint32(k)) * _HASH_FACTOR) ^ wp.uint32(count)) * _HASH_FACTOR
     s.own_b += wp.float64(background)
-    m = (k - search.first) / search.half_width
-    start = search.first + m * search.half_width
-    if k + 1 == wp.min(start + search.half_width, search.stop):
+    if k + 1 == wp.min(s.begin + search.half_width, search.stop):
         n = s.last_n + s.own_n
         mean = wp.max((s.last_b + s.own_b) * s.level, _LEAST)
         trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
@@ -140,11 +146,14 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
             mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
         # The deviance is at most the square of the excess over the variance: most windows end here.
         single = search.stop - search.first <= search.half_width
-        if (m > 0 or single) and n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials):
-            value = _deviance(n, mean, trials)
-            if value > s.best[0]:
-                s.best = wp.vec4d(value, n, mean, trials)
-                s.window = wp.max(start - search.half_width, search.first)
+        closes = s.begin > search.first or single
+        if closes and n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials):
+            if _deviance_at_most(float(n), float(mean), float(n - mean), float(trials - n)) >= float(s.best[0]):
+                value = _deviance(n, mean, trials)
+                if value > s.best[0]:
+                    s.best = wp.vec4d(value, n, mean, trials)
+                    s.window = wp.max(s.begin - search.half_width, search.first)
+        s.begin = k + 1
         s.before += s.last_n
         s.last_n = s.own_n
         s.last_b = s.own_b

@@ -50,7 +50,7 @@ TARGET, NO_RETURN, SATURATED, OUTSIDE_GATE = (wp.constant(i) for i in range(len(
 # Part of the pulses that count at which a pixel is saturated: three mean photons a pulse.
 _SATURATION = wp.constant(0.95)
 
-_ROWS = 1 << 18  # pixels that are drawn side by side: enough for a GPU, and 270 MB of counts of 256 bins
+_ROWS = 1 << 19  # pixels that are drawn side by side: enough for a GPU, and 540 MB of counts of 256 bins
 
 _see = IN_WATER.see
 
