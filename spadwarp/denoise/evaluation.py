@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import combinations
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -263,7 +264,9 @@ def evaluate(
         )
     frames = check_integer("frames", frames, "[1, 1000000000]")
     bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
-    comparison = _Comparison(data, split, frames, crop, compared(["input", *wanted], weights), device)
+    comparison = _Comparison(
+        data, split, frames, crop, compared(["input", *wanted], None if weights is None else Path(weights)), device
+    )
     return comparison.scored(bm3d_frames, progress)
 
 
