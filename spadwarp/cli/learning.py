@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import spadwarp
 from spadwarp.cli import options as opt
-from spadwarp.cli.app import note, running, say, wrong
+from spadwarp.cli.app import complain, note, running, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, progress, show_table, write_json, written
 from spadwarp.values import count, environment_integer
@@ -84,7 +84,9 @@ def train(recipe: Path, *, out: Path, overrides: list[str] | None = None, device
     running.quiet |= not first
     trained = spadwarp.denoise.train(chosen, out, device=device, progress=progress("steps"), notify=note)
     if first:
-        answer({"psnr": trained.psnr, "seconds": trained.seconds, "weights": trained.weights})
+        if trained.psnr < trained.input_psnr:
+            complain("the network makes frames worse than they are: train it for more steps", "warning")
+        answer({name: getattr(trained, name) for name in ("psnr", "input_psnr", "seconds", "weights")})
 
 
 _PICTURES = ("metrics", "samples", "rescaled", "detail", "ranking", "photons", "reliability")
@@ -122,7 +124,7 @@ def evaluate(
         bm3d_frames: Frames of each level for BM3D, up to a minute each.
         crop (WIDTH HEIGHT): Only the middle part of each frame [pixels]; 128 96 makes BM3D faster.
         report (DIR): Also write report.html, its pictures and scores.json there; for a result only photons.png.
-        weights: Weights of spadwarp train for the network that they name. By default the package's.
+        weights: Weights of spadwarp train, compared with the others as "your weights".
         seed: Seed of the noise, except that of a dataset.
 
     \b

@@ -17,7 +17,7 @@ from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames
-from spadwarp.denoise.network_files import own_weights
+from spadwarp.denoise.network_files import compared
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["Evaluation", "evaluate"]
@@ -241,7 +241,7 @@ def evaluate(
         frames: Of each target and level, at most; the same for each method.
         bm3d_frames: Of each level for BM3D, which takes up to a minute per frame; 0 leaves it out.
         crop: (width, height) of the middle part of each frame that is used [pixels]; default: the whole frame.
-        weights: File of `spadwarp train`, replacing the package's weights of the network that it names.
+        weights: File of `spadwarp train`; the method "own" is its network with these weights.
         device: torch device of the networks.
         progress: Called with ("frames", done, total).
 
@@ -250,7 +250,7 @@ def evaluate(
     one in the middle of the gate.
 
     Raises:
-        ArgumentError: An argument out of range; weights of a network that is not among the models.
+        ArgumentError: An argument out of range; weights of the network for histograms.
         FileError: No dataset, or no frames in the split; weights that cannot be read.
         SpadwarpError: A package of the extra `denoise` is missing.
     """
@@ -264,8 +264,9 @@ def evaluate(
         )
     frames = check_integer("frames", frames, "[1, 1000000000]")
     bm3d_frames = check_integer("bm3d_frames", bm3d_frames, "[0, 1000000000]")
-    own = own_weights(wanted, None if weights is None else Path(weights))
-    comparison = _Comparison(data, split, frames, crop, ("input", *wanted), own, device)
+    comparison = _Comparison(
+        data, split, frames, crop, compared(["input", *wanted], None if weights is None else Path(weights)), device
+    )
     return comparison.scored(bm3d_frames, progress)
 
 
@@ -278,11 +279,10 @@ class _Comparison:
         split: str,
         frames: int,
         crop: tuple[int, int] | None,
-        methods: tuple[str, ...],
-        weights: dict[str, Path],
+        methods: dict[str, dict[str, Any]],
         device: str | None,
     ) -> None:
-        self.data, self.split, self.methods, self.weights, self.device = data, split, methods, weights, device
+        self.data, self.split, self.methods, self.device = data, split, methods, device
         self.chosen, self.photons, self.summary = _choose(data, split, frames)
         self.reader = FrameReader(data, split, fields=("noisy", "clean", "bound", "prior"))
         rows, columns = self.reader.shape
@@ -293,7 +293,8 @@ class _Comparison:
         self.part = slice(top, top + height), slice(left, left + width)
         if crop is not None:
             self.summary += f"; the middle {width} x {height} pixels of each frame"
-        self.summary += "".join(f"; {name} with weights {path}" for name, path in self.weights.items())
+        if own := methods.get("own"):
+            self.summary += f"; own weights of {own['model']}: {own['weights']}"
         self.scores: dict[tuple[str, str, str], list[Scores]] = {}
         self.steps: dict[tuple[str, str], Steps] = {}
         self.frames: dict[tuple[str, str], int] = {}
@@ -332,8 +333,8 @@ class _Comparison:
         for method in self.methods:
             if method == "bm3d" and count > bm3d_frames:
                 continue
-            window, weights = self.windows.get(level, 5), self.weights.get(method)
-            found, seen_by = denoise_frames(noisy, model=method, window=window, weights=weights, device=self.device)
+            window = self.windows.get(level, 5)
+            found, seen_by = denoise_frames(noisy, window=window, device=self.device, **self.methods[method])
             images[method] = np.where(seen_by[0], found[0], np.float32(np.nan))
             self.scores.setdefault((method, target, level), []).append(score(clean, found[0], gate=noisy.gate))
             if target == _STAIRCASE:
@@ -362,7 +363,7 @@ class _Comparison:
         return Evaluation(
             data=f"{self.reader.manifest['name']} ({self.data})",
             summary=self.summary,
-            methods=self.methods,
+            methods=tuple(self.methods),
             targets=tuple(dict.fromkeys(target for target, _ in self.frames)),
             levels=tuple(sorted(dict.fromkeys(level for _, level in self.frames), key=_level_order)),
             scores={key: Scores.mean(values) for key, values in self.scores.items()},

@@ -23,7 +23,7 @@ from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
 from spadwarp.denoise.evaluation import Steps, near_jumps, staircase_steps
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, Estimate, denoise_frames, estimate_frames, target_threshold
-from spadwarp.denoise.network_files import own_weights
+from spadwarp.denoise.network_files import compared
 from spadwarp.denoise.recipe import LEVELS
 from spadwarp.values import ArgumentError
 
@@ -306,7 +306,7 @@ def evaluate_scenes(
         raise ArgumentError(f"models: {unknown[0]!r} is not a method for depth frames")
     if scenes is None:
         scenes = [evaluation_scene(shape, setting) for setting in SETTINGS for shape in SHAPES]
-    chosen, own = list(scenes), own_weights(models, weights)
+    chosen, methods = list(scenes), compared(["input", *models], weights)
     rows: dict[tuple[str, str, str, float, str], FrameScores] = {}
     best: dict[tuple[str, str, float], int] = {}
     reliability: dict[tuple[str, str], NDArray[np.int64]] = {}
@@ -318,15 +318,15 @@ def evaluate_scenes(
         frames = [depth_frames(one, gate=scene.gate, profile=profile) for one, scene in zip(drawn, alike, strict=True)]
         window = best[setting, water, level] = _best_window(alike, frames)
         for scene, noisy in zip(alike, frames, strict=True):
-            for method in ("input", *models):
-                found = estimate_frames(noisy, model=method, window=window, weights=own.get(method), device=device)
-                seen = found.target_probability[0] >= target_threshold(method)
+            for method, named in methods.items():
+                found = estimate_frames(noisy, window=window, device=device, **named)
+                seen = found.target_probability[0] >= target_threshold(named["model"])
                 rows[method, setting, water, level, scene.shape] = score_frame(scene, noisy, found.depth[0], seen)
                 _count_reliability(reliability, method, scene, found)
             done += 1
             if progress is not None:
                 progress("frames", done, total)
-    return SceneScores(methods=("input", *models), rows=rows, windows=best, reliability=reliability)
+    return SceneScores(methods=tuple(methods), rows=rows, windows=best, reliability=reliability)
 
 
 def score_frame(

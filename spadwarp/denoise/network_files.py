@@ -72,16 +72,20 @@ def fast_precision(device: str) -> Precision:
     return "bfloat16" if capabilities.get("amx_bf16", False) else "float32"
 
 
-def own_weights(models: Sequence[str], weights: str | Path | None) -> dict[str, Path]:
-    """`weights` by the network that the file names; empty without. Raises `ArgumentError` if it is none of `models`."""
+def compared(models: Sequence[str], weights: str | Path | None, *, counts: bool = False) -> dict[str, dict[str, Any]]:
+    """`model` and `weights` of each method of a comparison, by its name; that of own weights, if given, is "own".
+
+    Raises `ArgumentError` for weights of the network for histograms where there are no `counts`.
+    """
+    methods: dict[str, dict[str, Any]] = {name: {"model": name, "weights": None} for name in models}
     if weights is None:
-        return {}
+        return methods
     model = _header(existing_file(weights)).get("model")
     if model not in MODELS:
         raise FileError(f"{weights}: not weights of spadwarp train: its header names no network")
-    if model not in models:
-        raise ArgumentError(f"weights = '{weights}' are of {model!r}, which is not among models: {', '.join(models)}")
-    return {model: Path(weights)}
+    if model == "histograms" and not counts:
+        raise ArgumentError(f"weights = '{weights}' are of the network for histograms; evaluate a result with them")
+    return methods | {"own": {"model": model, "weights": Path(weights)}}
 
 
 def require_torch() -> Any:

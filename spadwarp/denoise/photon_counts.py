@@ -21,7 +21,7 @@ from spadwarp.denoise.evaluation_scenes import EvaluationScene, evaluation_scene
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.histograms import features_of_histograms
 from spadwarp.denoise.inference import METHODS, denoise_frames
-from spadwarp.denoise.network_files import own_weights
+from spadwarp.denoise.network_files import compared
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import detector_response
@@ -232,9 +232,9 @@ def photon_sweep(
         for value in values:
             check_real(f"{name}: an item", value, "[1e-9, 1e9]")
     frames, seed = check_integer("frames", frames, "[1, 1000000]"), check_integer("seed", seed, SEED)
-    own = own_weights(models, weights)
+    methods = compared(["input", *models], weights, counts=True)
     shape, truth, done = (len(sbr), len(photons)), result.truth.depth, 0
-    squares = {name: np.zeros((len(MEDIAN_WINDOWS) if name == "median" else 1, *shape)) for name in ("input", *models)}
+    squares = {name: np.zeros((len(MEDIAN_WINDOWS) if name == "median" else 1, *shape)) for name in methods}
     bound = np.zeros(shape)
     for row, column in np.ndindex(shape):
         for _ in range(frames):
@@ -246,7 +246,7 @@ def photon_sweep(
             bound[row, column] += float(np.mean(np.minimum(sigma[seen], guess) ** 2)) / frames
             for name, sums in squares.items():  # a median of each window is tried; the others have one variant
                 for total, window in zip(sums, MEDIAN_WINDOWS, strict=False):
-                    found, _ = denoise_frames(noisy, model=name, window=window, weights=own.get(name), device=device)
+                    found, _ = denoise_frames(noisy, window=window, device=device, **methods[name])
                     total[row, column] += float(np.mean((found[0][seen] - truth[seen]) ** 2)) / frames
             done += 1
             if progress is not None:
@@ -259,7 +259,7 @@ def photon_sweep(
         f"{1e12 * scene.gate.bin_width:.3g} ps; seed {seed}"
     )
     return PhotonSweep(
-        summary=summary + "".join(f"; {name} with weights {path}" for name, path in own.items()),
+        summary=summary + (f"; own weights of {methods['own']['model']}: {weights}" if "own" in methods else ""),
         photons=tuple(map(float, photons)),
         sbr=tuple(map(float, sbr)),
         rmse={name: np.sqrt(sums.min(axis=0)) for name, sums in squares.items()},

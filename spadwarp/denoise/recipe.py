@@ -120,9 +120,14 @@ class Optimiser(Section):
         0, ge=0, le=10**7, description="samples at hand, of which each update takes some; 0: each update draws its own"
     )
     uses: float = Field(1.0, ge=1, le=1e6, description="updates that a sample of the pool is used in, on average")
-    report_every: Whole = Field(
-        500, ge=1, le=10**12, description="updates between two lines of the log and two checkpoints"
+    report_every: Whole | None = Field(
+        None, ge=1, le=10**12, description="updates between two lines of the log; default: steps / 20, at most 500"
     )
+
+    @property
+    def interval(self) -> int:
+        """Updates between two lines of the log and two checkpoints."""
+        return self.report_every or min(500, -(-self.steps // 20))
 
 
 class TrainingRecipe(Document):

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -113,12 +114,14 @@ _EAGER = 12  # steps before one is recorded as a CUDA graph
 class Trained:
     """Files and validation of a training.
 
-    A line of the log is JSON: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, pairs per second, s.
+    A line of the log is JSON: step, loss, validation PSNR [dB] at each of `LEVELS` or `PHOTONS`, its mean and that of
+    the noisy input, pairs per second, s.
     """
 
     weights: Path
     log: Path
     psnr: float  # of the validation, mean over the levels [dB]
+    input_psnr: float  # the same of its noisy frames, without a network [dB]
     seconds: float  # of all parts of the run together
 
 
@@ -262,9 +265,9 @@ class Run:
             raise FileError(f"{self.checkpoint}: not whole; remove it to start anew: {error}") from error
         if rank == 0 and self.log.is_file():  # a line is written before its checkpoint
             settings = self.recipe.optimiser
-            reports = kept["step"] // settings.report_every
+            reports = kept["step"] // settings.interval
             if kept["step"] == settings.steps:
-                reports = math.ceil(kept["step"] / settings.report_every)
+                reports = math.ceil(kept["step"] / settings.interval)
             found = self.log.read_text(errors="replace").splitlines(keepends=True)[:reports]
             if len(lines := [line for line in found if _is_report(line)]) < len(found):
                 text = f"{self.log}: damaged; {len(found) - len(lines)} of its lines are left out"
@@ -274,14 +277,15 @@ class Run:
         self.loss_sum += kept.get("loss_sum", 0.0)
         return int(kept["step"]), float(kept["seconds"])
 
-    def report(self, psnr: dict[float, float]) -> None:
+    def report(self, psnr: dict[float, float], input_psnr: float) -> None:
         """Writes a line of the log and a checkpoint."""
         settings, now = self.recipe.optimiser, time.monotonic()
         line = {
             "step": self.step,
-            "loss": float(self.loss_sum) / (self.step % settings.report_every or settings.report_every),
+            "loss": float(self.loss_sum) / (self.step % settings.interval or settings.interval),
             "psnr": {f"{level:.3f}": round(value, 3) for level, value in psnr.items()},
-            "mean_psnr": round(sum(psnr.values()) / len(psnr), 3),
+            "mean_psnr": round(fmean(psnr.values()), 3),
+            "input_psnr": round(input_psnr, 3),
             "pairs_per_second": round((self.step - self.timed_from) * settings.batch / (now - self.last_report)),
             "seconds": round(now - self.began, 1),
         }
@@ -362,7 +366,7 @@ class Run:
             with atomic_path(self.checkpoint) as temporary:
                 torch.save(kept, temporary)
 
-    def finish(self, psnr: dict[float, float]) -> Trained:
+    def finish(self, psnr: dict[float, float], input_psnr: float) -> Trained:
         """Writes the weights, the running mean of the network, as float16 with metadata in the file's header."""
         from safetensors.torch import save
 
@@ -379,7 +383,8 @@ class Run:
             }
             with atomic_path(weights) as temporary:
                 temporary.write_bytes(save(values, metadata=metadata))
-        return Trained(weights=weights, log=self.log, psnr=sum(psnr.values()) / len(psnr), seconds=seconds)
+        psnrs = {"psnr": fmean(psnr.values()), "input_psnr": input_psnr}
+        return Trained(weights=weights, log=self.log, seconds=seconds, **psnrs)
 
 
 # The loop.
@@ -432,6 +437,7 @@ def fit(
     run = Run(recipe, Path(out), workers, training)
     first, spent = run.step, 0.0
     psnr: dict[float, float] = {}
+    input_psnr = fmean(validation_psnr(nn.Identity(), validation, recipe).values())
     with interruptible() as interrupted:
         while run.step < settings.steps and not workers.any(interrupted.is_set()):
             if not _prepared(run, interrupted, notify):
@@ -439,9 +445,9 @@ def fit(
             began = time.monotonic()
             run.update()
             spent += time.monotonic() - began
-            if run.step % settings.report_every == 0 or run.step == settings.steps:
+            if run.step % settings.interval == 0 or run.step == settings.steps:
                 psnr = validation_psnr(run.average, validation, recipe)
-                run.report(psnr)
+                run.report(psnr, input_psnr)
             if workers.rank == 0:
                 if notify is not None and run.step == first + _TIMED:
                     seconds = spent / _TIMED + run.samples.seconds
@@ -455,7 +461,7 @@ def fit(
                 f"interrupted at step {run.step} of {settings.steps}; the same command resumes from {run.checkpoint}; "
                 "another number of steps needs a new folder"
             )
-    trained = run.finish(psnr or validation_psnr(run.average, validation, recipe))
+    trained = run.finish(psnr or validation_psnr(run.average, validation, recipe), input_psnr)
     workers.close()
     return trained
 
@@ -499,12 +505,12 @@ def _advice(workers: Workers) -> str:
 
 @torch.no_grad()
 def validation_psnr(network: nn.Module, scenes: CleanScenes, recipe: TrainingRecipe) -> dict[float, float]:
-    """PSNR [dB] over the gate at each of `LEVELS`, or of `PHOTONS` for a network that reads histograms.
+    """PSNR [dB] over the gate at each of `LEVELS`, or of `PHOTONS` for a recipe of histograms.
 
     Mean over crops with a target; the same crops and photons every time.
     """
     network.eval()
-    device, counting, result = scenes.depth.device, reads_histograms(network), {}
+    device, counting, result = scenes.depth.device, recipe.model == "histograms", {}
     plain: dict[str, Any] = {"own_gate": 1.0, "own_profile": 1.0}
     plain |= dict.fromkeys(("dead", "slanted_gate", "unknown_water"), 0.0)
     for level in PHOTONS if counting else LEVELS:

@@ -144,8 +144,8 @@ def draw_learning_curves(
 ) -> Path:
     """Loss and validation PSNR against steps; returns the picture's path.
 
-    `log`: for each report its `step`, `loss` and `psnr` [dB], a mapping from the backscatter fraction, or from the
-    signal photons per pixel (1 and more), to the PSNR there. `width`: of the picture [inch].
+    `log`: for each report its `step`, `loss`, `psnr` [dB], a mapping from the backscatter fraction, or from the signal
+    photons per pixel (1 and more), to the PSNR there, and `input_psnr`, the mean without a network. `width`: [inch].
     """
     steps, losses = [line["step"] for line in log], [line["loss"] for line in log]
     drawn: dict[str, Any] = {"marker": "o", "markersize": 5.0 if len(log) == 1 else 2.0}  # one point has no line
@@ -159,6 +159,7 @@ def draw_learning_curves(
     for level, shade in zip(levels, np.linspace(0.85, 0.0, len(levels)), strict=True):
         drawn |= {"color": matplotlib.colormaps["viridis"](shade), "label": f"{float(level):g}" if counted else level}
         psnr.plot(steps, [line["psnr"][level] for line in log], **drawn)
+    psnr.axhline(log[-1]["input_psnr"], color="0.4", linestyle="--", label="noisy input, mean")
     psnr.set(xlabel="step", ylabel="validation PSNR [dB]")
     for axis in (loss, psnr):
         axis.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))

@@ -26,6 +26,7 @@ METHODS = {
     "usdn": ("USDN", style.GREEN, "^", "-"),
     "dncnn": ("DnCNN", style.RED, "P", "-"),
     "pyramid": ("PyramidNet", style.BLUE, "o", "-"),
+    "own": ("your weights", "#AA4499", "X", "-"),
     "histograms": ("PyramidNet, histograms", "black", "*", "-"),
     "likelihood": ("likelihood of each pixel", "0.35", "+", ":"),
     "pooled": ("pooled likelihood", "#882255", "<", "-"),

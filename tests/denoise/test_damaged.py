@@ -6,7 +6,7 @@ import struct
 import pytest
 from safetensors.torch import load_file, save_file
 
-from spadwarp.denoise.network_files import WEIGHTS, load_network, own_weights, weights_metadata
+from spadwarp.denoise.network_files import WEIGHTS, compared, load_network, weights_metadata
 from spadwarp.values import FileError, SpadwarpError
 
 SOURCE = WEIGHTS / "usdn.safetensors"
@@ -47,6 +47,6 @@ def test_sizes_that_a_header_declares_and_the_file_does_not_have(tmp_path):
         b"",
     ):
         path.write_bytes(changed)
-        for read in (lambda: load_network("usdn", path), lambda: own_weights(["usdn"], path)):
+        for read in (lambda: load_network("usdn", path), lambda: compared([], path)):
             with pytest.raises(SpadwarpError, match=r"usdn\.safetensors"):
                 read()

@@ -103,7 +103,7 @@ def draw_photon_sweep(path, **_):
 
 def draw_curves(path, width, **_):
     psnr = {level: 20.0 for level in LEVELS}
-    log = [{"step": 5000 * k, "loss": 1.0 / (k + 1), "psnr": psnr} for k in range(1, 9)]
+    log = [{"step": 5000 * k, "loss": 1.0 / (k + 1), "psnr": psnr, "input_psnr": 12.0} for k in range(1, 9)]
     curves.draw_learning_curves(log, path, title="pyramid, seed 0", width=width)
 
 
