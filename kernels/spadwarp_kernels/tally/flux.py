@@ -83,10 +83,15 @@ class Leg:
 
 
 @wp.func
+def _rounded(units: float, rounding_sample: float) -> wp.int64:
+    return wp.int64(units + rounding_sample)
+
+
+@wp.func
 def _add(tally: wp.array[wp.int64], index: int, units: float, rounding_sample: float):
-    whole = wp.int64(units + rounding_sample)
-    if whole != wp.int64(0):
-        atomic_add_int64(tally, index, whole)
+    added = _rounded(units, rounding_sample)
+    if added != wp.int64(0):
+        atomic_add_int64(tally, index, added)
 
 
 @wp.func
@@ -131,12 +136,13 @@ def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
     steps = int(wp.ceil(wp.max((end - begin) * fastest, 0.5)))
     step = (end - begin) / float(steps)
     # The low bits, which the rounding of what is added hardly depends on.
-    point = leg.rounding_sample * 4096.0
-    point = begin + (point - wp.floor(point)) * step
-    if end > begin:
+    part = leg.rounding_sample * 4096.0
+    p = q + (begin + (part - wp.floor(part)) * step) * v
+    added = _rounded(leg.weight * step * volume.scale, leg.rounding_sample)
+    if end > begin and added != wp.int64(0):
         for _step in range(steps):
-            _add(tally, _voxel(volume, q + point * v), leg.weight * step * volume.scale, leg.rounding_sample)
-            point += step
+            atomic_add_int64(tally, _voxel(volume, p), added)
+            p += step * v
 
 
 @wp.func
