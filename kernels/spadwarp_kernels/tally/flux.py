@@ -83,13 +83,8 @@ class Leg:
 
 
 @wp.func
-def _rounded(units: float, rounding_sample: float) -> wp.int64:
-    return wp.int64(units + rounding_sample)
-
-
-@wp.func
 def _add(tally: wp.array[wp.int64], index: int, units: float, rounding_sample: float):
-    added = _rounded(units, rounding_sample)
+    added = wp.int64(units + rounding_sample)
     if added != wp.int64(0):
         atomic_add_int64(tally, index, added)
 
@@ -138,7 +133,7 @@ def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
     # The low bits, which the rounding of what is added hardly depends on.
     part = leg.rounding_sample * 4096.0
     p = q + (begin + (part - wp.floor(part)) * step) * v
-    added = _rounded(leg.weight * step * volume.scale, leg.rounding_sample)
+    added = wp.int64(leg.weight * step * volume.scale + leg.rounding_sample)
     if end > begin and added != wp.int64(0):
         for _step in range(steps):
             atomic_add_int64(tally, _voxel(volume, p), added)
@@ -181,7 +176,7 @@ def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp
                     angle = wp.acos(wp.clamp(mu, -1.0, 1.0)) / wp.pi
                     i = wp.min(int(angle * float(planes.polar)), planes.polar - 1)
                     turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), leg.u), wp.dot(planes.right, leg.u))
-                    turn = wp.where(turn < 0.0, turn / (2.0 * wp.pi) + 1.0, turn / (2.0 * wp.pi))
+                    turn = turn / (2.0 * wp.pi) + wp.where(turn < 0.0, 1.0, 0.0)
                     j = wp.min(int(turn * float(planes.azimuth)), planes.azimuth - 1)
                     _add(tally, entry + 4 + i * planes.azimuth + j, scalar, leg.rounding_sample)
 
@@ -208,19 +203,15 @@ def make_flux_volume(
     origin; where the `edge` of a voxel is infinite it has no bounds, and one voxel. Gates of `gate_path` follow each
     other from `gate_start` on. Lengths and paths in metres. Raises `ArgumentError`.
     """
-    for name, vector in {
-        "shape": shape,
-        "lower": lower,
-        "edge": [min(x, 1e30) for x in edge],
-        "origin": origin,
-    }.items():
+    widths = [min(x, 1e30) for x in edge]
+    for name, vector in (("shape", shape), ("lower", lower), ("edge", widths), ("origin", origin)):
         check_vector(name, vector)
     if estimator not in FLUX_KINDS[:2]:
         raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
     volume: Any = FluxVolume()
     rows, shift = [], []
     for k, width in enumerate(edge):
-        check_number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
+        check_number(f"edge[{k}]", widths[k], "(0, inf)")
         check_integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
         rows += [x / width for x in rotation[k]]
         shift.append((origin[k] - lower[k]) / width)
