@@ -1,13 +1,14 @@
-"""The light inside the water: canonical problems of ocean optics, a float64 walk, and parts of runs."""
+"""The light inside the water: canonical problems of ocean optics, discrete ordinates, and parts of runs."""
 
 import functools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import spadwarp
-from reference import sea as float64
+from reference import irradiance as ordinates
 from spadwarp.scene import Scene
 
 FLUX = [
@@ -65,17 +66,19 @@ def test_canonical_problems(phase):
     assert (np.abs(0.5 * light.values[:, 3] - scalar_up) < allowed).all()
 
 
+def phase_function(phase):
+    if phase == "rayleigh":
+        return ordinates.rayleigh
+    table = Path(spadwarp.__file__).parent / "water/tables/petzold_average_particle.csv"
+    return ordinates.tabulated(*np.loadtxt(table, delimiter=",", skiprows=5, unpack=True))
+
+
 @pytest.mark.physics
-def test_irradiances_are_those_of_a_walk_in_float64():
-    runs = np.array(
-        [
-            float64.irradiance(1.0, 9.0, float64.rayleigh, [0.1, 0.5, 1.0], 10_000, np.random.default_rng(k))
-            for k in range(8)
-        ]
-    )
-    light = result("rayleigh").flux["depths"]["irradiance"]
-    error = np.hypot(light.errors, runs.std(axis=0, ddof=1) / math.sqrt(8))
-    assert (np.abs(light.values - runs.mean(axis=0)) < 5.0 * error).all()
+@pytest.mark.parametrize("phase", MODELS)
+def test_irradiances_are_those_of_discrete_ordinates(phase):
+    light = result(phase).flux["depths"]["irradiance"]
+    expected = ordinates.irradiance(1.0, 9.0, phase_function(phase), light.dimensions["position"][0])
+    assert (np.abs(light.values - expected) < 4.0 * light.errors).all()
 
 
 def test_absorption_and_escapes_are_all_that_was_emitted():
@@ -84,7 +87,7 @@ def test_absorption_and_escapes_are_all_that_was_emitted():
     report = found.energy_report()
     escaped = sum(part for name, part in report["fractions"].items() if name != "absorbed_water")
     assert report["exact"] and absorbed + escaped == pytest.approx(1.0, abs=1e-6)
-    assert report["fractions"]["laser_port"] == pytest.approx(float(float64.fresnel(0.7631, 1.34)), rel=1e-3)
+    assert report["fractions"]["laser_port"] == pytest.approx(float(ordinates.fresnel(0.7631, 1.34)), rel=1e-3)
 
 
 def test_apparent_properties():

@@ -84,14 +84,22 @@ class Leg:
 
 @wp.func
 def _add(tally: wp.array[wp.int64], index: int, units: float, rounding_sample: float):
-    whole = wp.int64(units + rounding_sample)
-    if whole != wp.int64(0):
-        atomic_add_int64(tally, index, whole)
+    added = wp.int64(units + rounding_sample)
+    if added != wp.int64(0):
+        atomic_add_int64(tally, index, added)
 
 
 @wp.func
-def _voxel(volume: FluxVolume, k: wp.vec4i) -> int:
-    return volume.first + ((k[3] * volume.size[0] + k[0]) * volume.size[1] + k[1]) * volume.size[2] + k[2]
+def _cell(p: float, size: int) -> int:
+    return wp.clamp(int(p), 0, size - 1)
+
+
+@wp.func
+def _voxel(volume: FluxVolume, p: wp.vec4) -> int:
+    """The entry of a point in the box, or by a rounding error beside it."""
+    entry = _cell(p[3], volume.gates) * volume.size[0] + _cell(p[0], volume.size[0])
+    entry = entry * volume.size[1] + _cell(p[1], volume.size[1])
+    return volume.first + entry * volume.size[2] + _cell(p[2], volume.size[2])
 
 
 @wp.func
@@ -102,54 +110,46 @@ def _in_voxels(volume: FluxVolume, x: wp.vec3, path: float) -> wp.vec4:
 
 @wp.func
 def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
-    """Adds weight times length to the voxels and gates on a leg, one after the other (Amanatides & Woo 1987), with
-    gates as the fourth edge of the box."""
-    size = wp.vec4i(volume.size[0], volume.size[1], volume.size[2], volume.gates)
+    """Adds weight times length to the voxels and gates on a leg, by points along its way in the box: one in each of
+    equal steps of at most one voxel or gate, which leave the expectation of each voxel exact and the sum of all."""
     q = _in_voxels(volume, leg.x, leg.path)
     along = volume.turn * leg.u
     v = wp.vec4(along[0], along[1], along[2], volume.gates_per_metre)
-    inverse = wp.vec4()
-    s = float(0.0)
+    size = wp.vec4(float(volume.size[0]), float(volume.size[1]), float(volume.size[2]), float(volume.gates))
+    begin = float(0.0)
     end = float(leg.length)
+    fastest = float(0.0)
     for i in range(4):
         if wp.abs(v[i]) > 1.0e-20:
-            inverse[i] = 1.0 / v[i]
-            near = -q[i] * inverse[i]
-            far = (float(size[i]) - q[i]) * inverse[i]
-            s = wp.max(s, wp.min(near, far))
+            near = -q[i] / v[i]
+            far = (size[i] - q[i]) / v[i]
+            begin = wp.max(begin, wp.min(near, far))
             end = wp.min(end, wp.max(near, far))
-        elif q[i] < 0.0 or q[i] >= float(size[i]):
+            fastest = wp.max(fastest, wp.abs(v[i]))
+        elif q[i] < 0.0 or q[i] >= size[i]:
             end = -1.0
-    k = wp.vec4i()
-    ahead = wp.vec4()  # distance to the next face across each edge
-    for i in range(4):
-        k[i] = wp.clamp(int(wp.floor(q[i] + s * v[i])), 0, size[i] - 1)
-        ahead[i] = wp.where(inverse[i] != 0.0, (float(k[i] + wp.where(v[i] > 0.0, 1, 0)) - q[i]) * inverse[i], 1.0e30)
-    while s < end:
-        stop = wp.max(s, wp.min(end, wp.min(wp.min(ahead[0], ahead[1]), wp.min(ahead[2], ahead[3]))))
-        _add(tally, _voxel(volume, k), leg.weight * (stop - s) * volume.scale, leg.rounding_sample)
-        s = stop
-        for i in range(4):
-            if ahead[i] <= stop:
-                k[i] += wp.where(v[i] > 0.0, 1, -1)
-                ahead[i] = (float(k[i] + wp.where(v[i] > 0.0, 1, 0)) - q[i]) * inverse[i]
-                if k[i] < 0 or k[i] >= size[i]:
-                    end = -1.0
+    steps = int(wp.ceil(wp.max((end - begin) * fastest, 0.5)))
+    step = (end - begin) / float(steps)
+    # The low bits, which the rounding of what is added hardly depends on.
+    part = leg.rounding_sample * 4096.0
+    p = q + (begin + (part - wp.floor(part)) * step) * v
+    added = wp.int64(leg.weight * step * volume.scale + leg.rounding_sample)
+    if end > begin and added != wp.int64(0):
+        for _step in range(steps):
+            atomic_add_int64(tally, _voxel(volume, p), added)
+            p += step * v
 
 
 @wp.func
 def add_flux_collision(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg, extinction: float):
     """Adds weight over extinction [1/m] to the voxel and gate of the collision that ends a leg: the expectation of
     `add_flux_track`."""
-    q = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
-    size = wp.vec4i(volume.size[0], volume.size[1], volume.size[2], volume.gates)
-    k = wp.vec4i()
-    inside = bool(True)
-    for i in range(4):
-        inside = inside and q[i] >= 0.0 and q[i] < float(size[i])
-        k[i] = int(q[i])
+    p = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
+    inside = wp.min(wp.min(p[0], p[1]), wp.min(p[2], p[3])) >= 0.0 and p[3] < float(volume.gates)
+    for i in range(3):
+        inside = inside and p[i] < float(volume.size[i])
     if inside:
-        _add(tally, _voxel(volume, k), leg.weight / extinction * volume.scale, leg.rounding_sample)
+        _add(tally, _voxel(volume, p), leg.weight / extinction * volume.scale, leg.rounding_sample)
 
 
 @wp.func
@@ -176,7 +176,7 @@ def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp
                     angle = wp.acos(wp.clamp(mu, -1.0, 1.0)) / wp.pi
                     i = wp.min(int(angle * float(planes.polar)), planes.polar - 1)
                     turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), leg.u), wp.dot(planes.right, leg.u))
-                    turn = wp.where(turn < 0.0, turn / (2.0 * wp.pi) + 1.0, turn / (2.0 * wp.pi))
+                    turn = turn / (2.0 * wp.pi) + wp.where(turn < 0.0, 1.0, 0.0)
                     j = wp.min(int(turn * float(planes.azimuth)), planes.azimuth - 1)
                     _add(tally, entry + 4 + i * planes.azimuth + j, scalar, leg.rounding_sample)
 
@@ -203,19 +203,15 @@ def make_flux_volume(
     origin; where the `edge` of a voxel is infinite it has no bounds, and one voxel. Gates of `gate_path` follow each
     other from `gate_start` on. Lengths and paths in metres. Raises `ArgumentError`.
     """
-    for name, vector in {
-        "shape": shape,
-        "lower": lower,
-        "edge": [min(x, 1e30) for x in edge],
-        "origin": origin,
-    }.items():
+    widths = [min(x, 1e30) for x in edge]
+    for name, vector in (("shape", shape), ("lower", lower), ("edge", widths), ("origin", origin)):
         check_vector(name, vector)
     if estimator not in FLUX_KINDS[:2]:
         raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
     volume: Any = FluxVolume()
     rows, shift = [], []
     for k, width in enumerate(edge):
-        check_number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
+        check_number(f"edge[{k}]", widths[k], "(0, inf)")
         check_integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
         rows += [x / width for x in rotation[k]]
         shift.append((origin[k] - lower[k]) / width)

@@ -109,11 +109,13 @@ def test_images_of_the_simulator(device):
     depth, normal, reflectance = (wp.clone(one) for one in (camera.true_depth, camera.normal, camera.reflectance))
     rates = camera.rates.numpy()
     camera.update_from_images(depth, normal, reflectance)
-    assert camera.rates.numpy() == pytest.approx(rates, rel=1e-5, abs=1e-12)  # normals are normalised anew
+    # A depth's last bit is 1.7e-4 of the rate in the tail of a pulse, and rounding differs by device.
+    assert camera.rates.numpy() == pytest.approx(rates, rel=4e-4, abs=1e-12)
+    assert camera.rates.numpy() == pytest.approx(rates, rel=1e-5, abs=3e-5 * float(rates.max()))
     view = config.lines_of_sight()[:, 2].reshape(18, 24)
     along, back = on_device(depth.numpy() / view, device), on_device(-normal.numpy(), device, wp.vec3)  # either side
     camera.update_from_images(along, back, reflectance, along_ray=True)
-    assert camera.rates.numpy() == pytest.approx(rates, rel=1e-4, abs=1e-9)
+    assert camera.rates.numpy() == pytest.approx(rates, rel=4e-4, abs=1e-9)
     camera.update_from_images(depth, None, reflectance)
     slopes = np.sum(camera.normal.numpy() * normal.numpy(), axis=-1)
     assert np.median(slopes) > 0.9999 and (slopes > 0).all()
