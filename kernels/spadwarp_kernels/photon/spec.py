@@ -34,7 +34,6 @@ _NOT_BY_SEA = (
     "signed",
     "blocks",
     "polarised",
-    "confocal",
     "flux",
 )
 
@@ -72,8 +71,9 @@ class TransportSpec(NamedTuple):
     water."""
     laser_port: PortKind | None = None  # the same of the laser and `Laser.port`
     sea: bool = False
-    """The surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, without a
-    window, and there are no other ports. The tally has one more component, of light that met the surface alone."""
+    """The surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, in the
+    frame of the water and without a window, and there are no other ports. The tally has one more component, of light
+    that met the surface alone."""
     grid: Water | None = None
     """The water in a box is that of the cells of `Layers.grid`, tracked by REGULAR_TRACKING or DELTA_TRACKING; None:
     there is no grid."""
@@ -194,6 +194,7 @@ def check_spec(spec: Any) -> None:
             spec.sea and any(getattr(spec, name) for name in _NOT_BY_SEA),
             "sea cannot be combined with spec." + ", spec.".join(_NOT_BY_SEA),
         ),
+        (spec.sea and spec.confocal and spec.lens.name != SCANNED.name, "sea: a scan needs spec.lens = SCANNED"),
         (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
         (
             spec.grid and (spec.layered or spec.random_albedo),
