@@ -18,6 +18,7 @@ from spadwarp.scene.camera import Camera, image_tangents, to_camera
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scan import shots_of
 from spadwarp.scene.scene import Scene, camera_port, laser_port
 from spadwarp.values import path_from_time
 
@@ -184,8 +185,6 @@ def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
 
 def _lines_of_shots(scene: Scene, port: PortGeometry | None, laser: Floats) -> LinesOfSight:
     """Lines of sight of a scan by the sea, each in the frame of its shot."""
-    from spadwarp.scene.scan import shots_of  # which imports this file
-
     shots, view = shots_of(scene), view_directions(scene)
     turn = rotation_matrix(scene.camera.rotation_deg).T
     axes, position = (turn @ shots.rotation)[shots.number], to_camera(scene.camera, shots.position)[shots.number]

@@ -390,8 +390,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     sight, sea = spec.sight, spec.sight.sea
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
-    point_in, point_out, turn_out = sight.pose.point_in, sight.pose.point_out, sight.pose.turn_out
-    camera_at, sea_at = sight.camera_at, sight.sea_at
+    (point_in, _, point_out, turn_out), camera_at, sea_at = sight.pose, sight.camera_at, sight.sea_at
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
 
