@@ -248,7 +248,7 @@ class PortGeometry:
         along = y @ normal
         across = y - along[..., None] * normal
         aside = np.linalg.norm(across, axis=-1)
-        inside = self.distance - float(origin @ normal)
+        inside = self.distance - origin @ normal
         water = along - inside - self.thickness
         h: list[Any] = [inside, self.thickness, np.where(water > 0.0, water, np.nan)]
         n = (self.index[0], self.index[1] if self.thickness > 0.0 else self.index[0], self.index[2])

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.scene.camera import image_tangents
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, vector_of
 from spadwarp.scene.scene import Scene, load_trajectory
-from spadwarp.scene.sight import view_directions
 from spadwarp.values import ArgumentError, ConfigError, check_integer
 
 __all__ = ["Shots", "shot_at", "shot_scene", "shots_of"]
@@ -71,11 +71,13 @@ def shots_of(scene: Scene) -> Shots:
         platform = np.broadcast_to(rotation_matrix(camera.rotation_deg), (count, 3, 3))
     else:
         position, platform = _platform(scene, time)
+    row = np.stack([np.arange(scene.receiver.width) + 0.5, np.full(scene.receiver.width, 0.5)], axis=1)
+    view = np.concatenate([image_tangents(scene.receiver, row), np.ones((len(row), 1))], axis=1)
     return Shots(
         time=time,
         position=position,
         rotation=platform @ _deflections(scene, count),
-        view=view_directions(scene)[0, : scene.receiver.width],
+        view=view / np.linalg.norm(view, axis=1, keepdims=True),
         shape=(camera.height, camera.width),
     )
 

@@ -200,7 +200,7 @@ class Scene(Shown, Document):
             "domain.outside_index, a table": bool(self.domain.reflecting),
             "daylight, a table": self.daylight is not None,
             "medium.grid, a table": self.medium.grid is not None,
-            f"scan.mode = {self.scan.mode!r}": self.scan.mode != "none",
+            f"scan.mode = {self.scan.mode!r}": self.scan.mode == "confocal",
             "flux, a table": bool(self.flux),
             "sun, a table": self.sun is not None,
         }.items():

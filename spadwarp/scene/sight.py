@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.scene.camera import Camera, image_tangents
+from spadwarp.scene.camera import Camera, image_tangents, to_camera
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
+from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.scan import shots_of
 from spadwarp.scene.scene import Scene, camera_port, laser_port
 from spadwarp.values import path_from_time
 
@@ -88,11 +90,14 @@ class LinesOfSight:
     delay: Floats  # length in water that takes as long [m]
     laser: Floats  # position of the laser [m]
     laser_port: PortGeometry | None = None  # what it shines through
+    pose: tuple[Floats, Floats] | None = None
+    """By the sea, of the shot of each pixel of a scan: axes `[..., 3, 3]`, position [m] in the frame of that port."""
 
     def __getitem__(self, index: Any) -> LinesOfSight:
         """The lines of some pixels."""
         lines = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
-        return LinesOfSight(*lines, self.laser, self.laser_port)
+        pose = None if self.pose is None else (self.pose[0][index], self.pose[1][index])
+        return LinesOfSight(*lines, self.laser, self.laser_port, pose)
 
     def flat(self) -> LinesOfSight:
         """The lines of all pixels in one row, `[P, 3]`."""
@@ -143,8 +148,24 @@ class LinesOfSight:
             way = points - self.laser
             length = np.linalg.norm(way, axis=-1)
             return way / np.maximum(length, 1e-300)[..., None], length, length
-        inside, light, length, path = self.laser_port.connect(points, self.laser)
-        return light, length - self.laser_port.enter(self.laser, inside)[2], path
+        laser = self.laser
+        if self.pose is not None:
+            points, laser = (self._placed(x) for x in (points, laser))
+        inside, light, length, path = self.laser_port.connect(points, laser)
+        water = length - self.laser_port.enter(laser, inside)[2]
+        return light if self.pose is None else _turned_in(self.pose[0], light), water, path
+
+    def beam_at(self, axis: Floats) -> Floats:
+        """The direction in the water of a parallel beam along a unit vector [1]."""
+        if self.laser_port is None:
+            return axis
+        if self.pose is None:
+            return self.laser_port.enter(self.laser, axis)[1]
+        return _turned_in(self.pose[0], self.laser_port.enter(self._placed(self.laser), self.pose[0] @ axis)[1])
+
+    def _placed(self, x: Floats) -> Floats:
+        assert self.pose is not None
+        return self.pose[1] + np.einsum("...ij,...j->...i", self.pose[0], x)
 
     @property
     def bent(self) -> bool:
@@ -154,10 +175,28 @@ class LinesOfSight:
 
 def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
     """Lines of sight of a scene's pixels `[H, W]`, or those that leave the lens centre along unit vectors."""
-    view = view_directions(scene) if view is None else view
     port, laser = camera_port(scene), np.array(scene.beam.position, np.float64)
+    if view is None and scene.surface is not None and scene.scan.mode == "trajectory":
+        return _lines_of_shots(scene, port, laser)
+    view = view_directions(scene) if view is None else view
     lines = _in_water(view) if port is None else port.enter(np.zeros(3), view)
     return LinesOfSight(*lines, laser, laser_port(scene))
+
+
+def _lines_of_shots(scene: Scene, port: PortGeometry | None, laser: Floats) -> LinesOfSight:
+    """Lines of sight of a scan by the sea, each in the frame of its shot."""
+    shots, view = shots_of(scene), view_directions(scene)
+    turn = rotation_matrix(scene.camera.rotation_deg).T
+    axes, position = (turn @ shots.rotation)[shots.number], to_camera(scene.camera, shots.position)[shots.number]
+    lines = _in_water(view)
+    if port is not None:
+        start, along, *lengths = port.enter(position, np.einsum("hwij,hwj->hwi", axes, view))
+        lines = _turned_in(axes, start - position), _turned_in(axes, along), lengths[0], lengths[1]
+    return LinesOfSight(*lines, laser, laser_port(scene), (axes, position))
+
+
+def _turned_in(axes: Floats, vectors: Floats) -> Floats:
+    return np.einsum("...ij,...i->...j", axes, vectors)
 
 
 def lines_of_camera(camera: Camera) -> LinesOfSight:
@@ -195,8 +234,7 @@ def depth_per_time(scene: Scene, distance: Floats, view: Floats | None = None) -
     if beam.profile != "collimated":
         light = lines.light_at(lines.points(distance))[0]
     else:
-        port = lines.laser_port
-        light = np.array(beam.axis) if port is None else port.enter(beam.position, beam.axis)[1]
+        light = lines.beam_at(np.array(beam.axis))
     # The path rises with the range by 1 + the cosine between both directions of light.
     return scene.medium.pulse_speed / (1.0 + (light * lines.direction).sum(axis=-1)) * lines.direction[..., 2]
 

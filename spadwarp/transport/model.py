@@ -22,9 +22,10 @@ from spadwarp.scene.flux import Sun, azimuth_zero
 from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.medium import grid_cells
 from spadwarp.scene.port import PortGeometry
-from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.scan import Shots, shots_of
 from spadwarp.scene.scene import camera_port, laser_port, mean_plane
+from spadwarp.scene.sea import Surface
 from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes, view_directions, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_scale
@@ -398,8 +399,25 @@ def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
     if port is None and scene.surface is not None:
         port = mean_plane(scene, from_below=True)
     if port is not None:
-        lens.port = port_parameters(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
+        of_port = _plane_of_shots if scene.scan.mode == "trajectory" else port_parameters
+        lens.port = of_port(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
     return lens
+
+
+def _plane_of_shots(scene: Scene, plane: PortGeometry, *lens: Any) -> Any:
+    """`port_parameters` of the mean plane of a sea, with bounds that hold for all shots of a scan."""
+    _, position, axes = shot_poses(scene)
+    left, top, right, bottom = view_box(scene.receiver)
+    corners = np.array([[x, y, 1.0] for x in (left, right) for y in (top, bottom)])
+    normals = np.einsum("nij,i->nj", axes, plane.normal)
+    steepest = normals[(normals @ (corners / np.linalg.norm(corners, axis=1, keepdims=True)).T).min(axis=1).argmin()]
+    heights = plane.distance - position @ plane.normal
+    ends = [
+        port_parameters(scene, dataclasses.replace(plane, distance=float(height), normal=vector_of(steepest)), *lens)
+        for height in (heights.min(), heights.max())
+    ]
+    late = max(end.late for end in ends)
+    return _filled(ends[1], normal=wp.vec3(*plane.normal), distance=plane.distance, late=late)
 
 
 def _sea(scene: Scene) -> Any:
@@ -429,7 +447,7 @@ def port_parameters(
     scene: Scene, port: PortGeometry, origin: tuple[float, float, float], aperture_radius: float, inverse_focus: float
 ) -> Any:
     """A port as the kernels take it."""
-    left, top, right, bottom = view_box(scene.camera)
+    left, top, right, bottom = view_box(scene.receiver)
     corners = np.array([[x, y, 1.0] for x in (left, right) for y in (top, bottom)])
     normal = np.array(port.normal if port.shape == "flat" else (0.0, 0.0, 1.0))
     # Between the corners, cosines are larger; the lens sees the view by up to its radius over the focus aside.
@@ -531,6 +549,9 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
     ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)][scene.sun is not None :]
+    if scene.surface is not None and scene.scan.mode == "trajectory":
+        ends, camera = [], False  # the places are those of the shots
+        _check_shots(scene, scene.surface)
     if camera:
         radius, origin = 0.0 if lens.pinhole else lens.aperture_radius, (0.0, 0.0, 0.0)
         ends.append(("camera", camera_port(scene), origin, (0.0, 0.0, 1.0), "aperture_diameter", radius))
@@ -555,6 +576,23 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
             if beyond > 0.0:
                 text = f"reaches {beyond:.4g} m through {face} of the domain, which has an outside_index"
                 raise ConfigError(f"{section}.{field}: {text}", source=scene.source)
+
+
+def _check_shots(scene: Scene, surface: Surface) -> None:
+    """Refuses shots whose lens or laser reaches the surface of the sea, or stands across it from where the scene's
+    does."""
+    shots, beam, normal = shots_of(scene), scene.beam, np.array(surface.normal)
+    tilt = np.sqrt(np.maximum(1.0 - (shots.rotation[:, :, 2] @ normal) ** 2, 0.0))
+    ends = {"camera": ((0.0, 0.0, 0.0), scene.camera.aperture_radius)}
+    ends["laser"] = beam.position, beam.beam_radius if beam.profile == "collimated" else 0.0
+    for section, (place, radius) in ends.items():
+        at = shots.position + shots.rotation @ np.asarray(place)
+        own = surface.height_of(vector_of(to_world(scene.camera, place)))
+        height = (at - surface.point) @ normal * math.copysign(1.0, own)
+        low = int((height - radius * tilt).argmin())
+        if height[low] <= radius * tilt[low]:
+            text = f"shot {low} is {height[low]:.4g} m from the surface, on the side where {section}.position is"
+            raise ConfigError(f"scan: {text}; it must not reach it", source=scene.source)
 
 
 def _check_gate(scene: Scene) -> None:
@@ -623,9 +661,19 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
 def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Truth:
     """Of what stands before the mean plane of the sea, and of what is seen through it."""
     view = pixel_directions(scene.camera)
+    origin, moving = np.zeros(view.shape), scene.scan.mode == "trajectory"
+    if moving:
+        shots, position, axes = shot_poses(scene)
+        origin, view = dataclasses.replace(shots, position=position, rotation=axes).lines()
     plane = camera_port(scene) or mean_plane(scene, from_below=True)
-    start, direction, lead, _ = plane.enter(np.zeros(3), view)
-    near, far = (trace_rays(model, *rays, shape) for rays in ((np.zeros(view.shape), view), (start, direction)))
+    start, direction, lead, _ = plane.enter(origin, view)
+    near, far = (trace_rays(model, *rays, shape) for rays in ((origin, view), (start, direction)))
+    if moving:  # in the frame of each pixel's shot
+        turns, from_lens = axes[shots.number], start - origin
+        for found, begin, along in ((near, np.zeros(3), view), (far, from_lens, direction)):
+            depth = np.einsum("hwi,hwi->hw", turns[..., 2], begin + found[1][..., None] * along)
+            normal = np.einsum("hwij,hwi->hwj", turns, found[2])
+            found[0], found[2] = depth.astype(np.float32), normal.astype(np.float32)
     far[1] = (far[1] + lead).astype(np.float32)
     before = near[1] < np.nan_to_num(lead, nan=np.inf)
     values = [np.where(before[..., None] if a.ndim == 3 else before, a, b) for a, b in zip(near, far, strict=True)]

@@ -345,7 +345,7 @@ def _brightest(scene: Scene, mesh: TriangleMesh | None, density: Density) -> flo
     baseline = math.hypot(laser.position[0], laser.position[1])
     nearest = max(0.5 * gate.start * speed, baseline / (half_field + spread), camera.aperture_radius, 0.01)
     if (port := camera_port(scene)) is not None:
-        nearest = max(nearest, port.nearest)
+        nearest = max(nearest, port.nearest - float((lenses @ port.normal).max()))
     scattering, absorption = medium.range.scattering, medium.range.absorption
     reach = 0.5 * gate.bin_width * speed
     # The integral of 1/r^2 over the bin.

@@ -2,12 +2,15 @@
 
 import math
 
+import numpy as np
 import pytest
 
 import spadwarp
 from helpers.estimators import cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
+from spadwarp.scene.scan import shot_scene
+from spadwarp.scene.sight import depth_from_time, lines_of_sight
 
 PLATE = {"builtin": "plane", "size": [4.0, 4.0], "reflectance": 0.7}
 
@@ -112,3 +115,43 @@ def test_masking_is_an_entry_of_the_energy_balance():
         masked = result.energy_balance["surface_masking"] * result.energy_balance_unit / result.photons
         assert 0.0 < masked < most
         assert result.counters["crossings"] == pytest.approx(200_000, rel=1e-3)
+
+
+def test_shots_stay_on_their_side():
+    one = sea_scene("both in air", camera={"width": 2, "height": 2}, scan={**SCAN, "velocity": [0.0, 0.0, 400.0]})
+    with pytest.raises(spadwarp.ConfigError, match=r"scan: shot 3 is -0\.1.* m from the surface"):
+        spadwarp.simulate(one, photons=100, device="cpu")
+
+
+SCAN = {"mode": "trajectory", "pattern": "conical", "half_angle_deg": 12.0, "velocity": [0.0, 300.0, 40.0]}
+
+
+def totals(one, photons, seeds):
+    """Fractions of the photons `[seeds, component, pixel]`."""
+    runs = [spadwarp.simulate(one, photons=photons, seed=seed, device="cpu") for seed in seeds]
+    assert all(run.energy_report()["exact"] for run in runs)
+    return np.array([run.tallies.sum(axis=3).reshape(len(run.tallies), -1) * (run.unit / photons) for run in runs])
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+@pytest.mark.parametrize("place", ["both in air", "both in water, a target in air"])
+def test_each_shot_over_the_sea_is_the_run_of_its_pose_alone(place):
+    """Totals by component, truth, and depth from the truth's time of flight; layers below, where they differ."""
+    pose = {"width": 2, "height": 4, "rotation_deg": [6.0, -4.0, 20.0], "aperture_diameter": 0.3}
+    layers = {"layers": [{"start": 1.5, "extinction": 1.0, "albedo": 0.8}]} if place == "both in air" else {}
+    one = sea_scene(place, camera=pose, scan=SCAN, medium={"group_index": 1.36, "phase_index": 1.34, **layers})
+    scanned = totals(one, 8 * 4000, range(10)) * 8
+    truth = spadwarp.truth_maps(one, device="cpu")
+    if place == "both in air":
+        time = lines_of_sight(one).path_from_range(truth.range.astype(float)) * 1.36 / 299_792_458.0
+        np.testing.assert_allclose(depth_from_time(time, scene=one), truth.depth, rtol=1e-5)
+    for shot in (1, 6):
+        alone = shot_scene(one, shot)
+        for name, array in vars(spadwarp.truth_maps(alone, device="cpu")).items():
+            np.testing.assert_allclose(getattr(truth, name).reshape(8, -1)[shot], array.ravel(), rtol=1e-5, atol=1e-5)
+        own = totals(alone, 4000, range(50, 60)).sum(axis=2)
+        both = np.stack([own, scanned[:, :, shot]])
+        mean, error = both.mean(axis=1), np.sqrt(both.var(axis=1, ddof=1).sum(axis=0) / 10)
+        assert (np.abs(mean[0] - mean[1]) < 4.0 * error).all(), (mean, error)
+        assert (error < 0.1 * mean[0])[mean[0] > 0.1 * mean[0].max()].all()

@@ -7,7 +7,7 @@ from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import lens_point
-from spadwarp_kernels.optics.sea import height_above, passage_density
+from spadwarp_kernels.optics.sea import passage_density
 from spadwarp_kernels.optics.visibility import Link
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -185,7 +185,7 @@ def make_ask_at_sea() -> wp.Function:
     @wp.func
     def ask_at_sea(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
         q = Request()
-        lens_above = height_above(world.sea, wp.vec3(0.0)) > 0.0
+        lens_above = world.camera.port.index[2] > world.camera.port.index[0]
         q.wanted = lens_above == s.above or s.collisions == 0
         q.x = s.x
         q.u = s.u
@@ -215,6 +215,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
     view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
     sea, ask_at_sea = spec.sight.sea, make_ask_at_sea()
     tracks, rides, point_in = spec.water.profile is not None, make_rider(spec).rides, spec.sight.pose.point_in
+    camera_at = spec.sight.camera_at
 
     @wp.func
     def event_request(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
@@ -223,7 +224,9 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
         # Mirrored, any point may be seen.
         if wp.static(not flights or reflects) or on_surface:
             x = point_in(world.scan, s.target, s.x)
-            if wp.static(reflects) or shows(world.camera, view_of(world.camera, s.view), x):
+            if wp.static(reflects) or shows(
+                camera_at(world.camera, world.scan, s.target), view_of(world.camera, s.view), x
+            ):
                 q.wanted = True
                 if wp.static(reflects):
                     q.wanted = s.bounces.face == 0
@@ -275,6 +278,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
     has_profile, collides = profile is not None, spec.scores_collisions
     depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
     apparent_lens, point_in, point_out = spec.sight.apparent, spec.sight.pose.point_in, spec.sight.pose.point_out
+    camera_at = spec.sight.camera_at
 
     @wp.func
     def flight_point(request: Request, world: wp.ref[World]) -> ScoredPoint:
@@ -286,7 +290,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         begin = request.x + s0 * request.u
         seed = join_words(request.first, request.second)
         middle = point_in(world.scan, request.target, middle)
-        seen = apparent_lens(world.camera, middle, request.lens)
+        seen = apparent_lens(camera_at(world.camera, world.scan, request.target), middle, request.lens)
         from_lens = request.x - point_out(world.scan, request.target, seen)
         xi_choice = u01(request.first)
         xi = u01_fine(request.second)
@@ -386,7 +390,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     sight, sea = spec.sight, spec.sight.sea
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
-    point_in, point_out, turn_out = sight.pose.point_in, sight.pose.point_out, sight.pose.turn_out
+    (point_in, _, point_out, turn_out), camera_at, sea_at = sight.pose, sight.camera_at, sight.sea_at
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
 
@@ -427,10 +431,11 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
             at_sea = request.slot == SEA_SLOT
             bits = join_words(request.second, request.first)
         origin = point_in(world.scan, request.target, found.origin)
-        link = link_to(world.camera, world.sea, origin, lens, at_sea, bits)
+        camera = camera_at(world.camera, world.scan, request.target)
+        link = link_to(camera, sea_at(world.sea, world.scan, request.target), origin, lens, at_sea, bits)
         to_lens = turn_out(world.scan, request.target, link.to_lens)
         found.lens = point_out(world.scan, request.target, link.end)
-        found.behind = lens
+        found.behind = point_out(world.scan, request.target, lens)
         pixel = image_of(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)
         if pixel >= 0 and not scattering <= 0.0:
@@ -447,7 +452,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                     seed += wp.uint64(0x632BE59BD9B4E019)  # another sequence
                     ahead = wp.where(ahead > 0.0, 0.0, -1.0)
             elif wp.static(sea):
-                extinction = water_extinction(world.medium, world.layers, link.begin, link.along, link.water, seed)
+                begin = point_out(world.scan, request.target, link.begin)
+                along = turn_out(world.scan, request.target, link.along)
+                extinction = water_extinction(world.medium, world.layers, begin, along, link.water, seed)
             else:
                 extinction = water_extinction(world.medium, world.layers, found.origin, to_lens, link.water, seed)
             found.contribution.value = value_of(world.camera, extinction, weight, scattering, link)

@@ -56,7 +56,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     sight, varies, has_phase_guide = spec.sight, spec.varies, spec.water.phase.guide is not None
     view_of, clip_to_view, gate_of, sample_lens = sight.view, sight.clip, sight.gate, sight.sample_lens
     within, sea = spec.domain.within, sight.sea
-    point_in, turn_in = sight.pose.point_in, sight.pose.turn_in
+    point_in, turn_in, camera_at = sight.pose.point_in, sight.pose.turn_in, sight.camera_at
 
     @wp.func
     def plan_flight(s: wp.ref[PhotonState], block: wp.vec4ui, world: wp.ref[World]) -> FlightPlan:
@@ -74,7 +74,8 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
         limit = within(world.limits, world.limits.max_path - s.path, s.x, s.u)
         if wp.static(sea):
             limit = wp.where(s.above, -1.0, wp.min(limit, s.flight.sea))
-        plan.interval = clip_to_view(world.camera, view_of(world.camera, s.view), x, u, plan.lens, limit)
+        camera = camera_at(world.camera, world.scan, s.target)
+        plan.interval = clip_to_view(camera, view_of(world.camera, s.view), x, u, plan.lens, limit)
         gate = gate_of(world.camera, world.gate)
         plan.interval = clip_to_gate(gate, x, u, s.path, plan.lens, plan.interval)
         if not (wp.static(varies) or world.medium.extinction > 0.0):
@@ -235,6 +236,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     view_of, in_view, toward_middle = sight.view, sight.shows, sight.toward_middle
     toward, toward_centre, gate_of = sight.toward, sight.toward_centre, sight.gate
     point_in, turn_in, turn_out = sight.pose.point_in, sight.pose.turn_in, sight.pose.turn_out
+    camera_at = sight.camera_at
 
     @wp.func
     def direct(
@@ -263,18 +265,19 @@ def make_direct(spec: TransportSpec) -> wp.Function:
             to_lens_chance = 0.0
         met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_from(s.u, world.medium.axis_threshold)
-        v = toward_centre(world.camera, x)
+        camera = camera_at(world.camera, world.scan, s.target)
+        v = toward_centre(camera, x)
         if wp.static(has_phase_guide):
             # To the point of the lens at which the flight to come will be scored: a lobe about the lens's centre could
             # not have a peak narrower than the lens.
             ahead = random_block_keyed(world.keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
-            v = toward(world.camera, x, lens_point(world.camera, u01(ahead[2]), u01(ahead[3])))
+            v = toward(camera, x, lens_point(world.camera, u01(ahead[2]), u01(ahead[3])))
         v = turn_out(world.scan, s.target, v)
         view = view_of(world.camera, s.view)
         way = toward_middle(view, x)
         to_axis = wp.vec3()
         to_view_chance = float(0.0)
-        if wp.dot(way, way) > 0.0 and not in_view(world.camera, view, x):
+        if wp.dot(way, way) > 0.0 and not in_view(camera, view, x):
             to_view_chance = world.guiding.return_probability
             way *= 1.0 / wp.length(way)
             to_axis = turn_out(world.scan, s.target, wp.vec3(way[0], way[1], 0.0))

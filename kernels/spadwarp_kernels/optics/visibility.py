@@ -338,6 +338,10 @@ class Sight(NamedTuple):
     toward_centre: wp.Function  # ``(camera, x) -> vec3``, about that to the lens's centre
     sample_lens: wp.Function  # see `make_sample_lens`
     pose: Pose  # between the frame of the water and that of the camera, in which all of the above is
+    # ``(camera, scan, target) -> Camera``: with its port, the mean plane of a sea, in its own frame rather than in that
+    # of the water; and ``(sea, scan, target) -> Sea``
+    camera_at: wp.Function
+    sea_at: wp.Function
     sea: bool  # whether there is a surface of a sea
 
 
@@ -534,6 +538,36 @@ _VIEWS = {
 
 
 @memoised
+def _make_placed(pose: Pose, moves: bool) -> tuple[wp.Function, wp.Function]:
+    """`camera_at` and `sea_at` of a `Sight`; `moves`: the camera does, over a sea."""
+    turn_in = pose.turn_in
+
+    @wp.func
+    def camera_at(camera: Camera, scan: Scan, target: int) -> Camera:
+        if wp.static(moves):
+            position = wp.transform_get_translation(scan.pose[target])
+            distance = camera.port.distance - wp.dot(position, camera.port.normal)
+            normal = turn_in(scan, target, camera.port.normal)
+            camera.port.distance = distance
+            camera.port.normal = normal
+        return camera
+
+    @wp.func
+    def sea_at(sea: Sea, scan: Scan, target: int) -> Sea:
+        if wp.static(moves):
+            position = wp.transform_get_translation(scan.pose[target])
+            height = sea.height - wp.dot(position, sea.normal)
+            normal = turn_in(scan, target, sea.normal)
+            along = turn_in(scan, target, sea.along)
+            sea.height = height
+            sea.normal = normal
+            sea.along = along
+        return sea
+
+    return camera_at, sea_at
+
+
+@memoised
 def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: bool = False) -> Sight:
     """For a way of imaging, a kind of port or None, and whether pixels are scanned; `sea`: there is the surface of a
     sea, and no port."""
@@ -555,4 +589,6 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: bool = Fa
     if moves or sea:
         may_hide = _may_hide_anywhere
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
-    return Sight(cosines, *imaging, *view, may_hide, *ways, make_sample_lens(port), make_pose(moves), sea)
+    pose = make_pose(moves)
+    placed = _make_placed(pose, moves and sea)
+    return Sight(cosines, *imaging, *view, may_hide, *ways, make_sample_lens(port), pose, *placed, sea)

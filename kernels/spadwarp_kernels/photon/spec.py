@@ -24,6 +24,12 @@ __all__ = ["TransportSpec"]
 
 MOST_POINTS = 3
 
+_WORDS = {
+    bool: "True or False",
+    PortKind | None: "a PortKind or None",
+    Water | None: "REGULAR_TRACKING, DELTA_TRACKING or None",
+}
+
 # What light through the surface of a sea cannot be combined with.
 _NOT_BY_SEA = (
     "port",
@@ -34,7 +40,6 @@ _NOT_BY_SEA = (
     "signed",
     "blocks",
     "polarised",
-    "confocal",
     "flux",
 )
 
@@ -72,8 +77,9 @@ class TransportSpec(NamedTuple):
     water."""
     laser_port: PortKind | None = None  # the same of the laser and `Laser.port`
     sea: bool = False
-    """The surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, without a
-    window, and there are no other ports. The tally has one more component, of light that met the surface alone."""
+    """The surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, in the
+    frame of the water and without a window, and there are no other ports. The tally has one more component, of light
+    that met the surface alone."""
     grid: Water | None = None
     """The water in a box is that of the cells of `Layers.grid`, tracked by REGULAR_TRACKING or DELTA_TRACKING; None:
     there is no grid."""
@@ -166,12 +172,10 @@ def check_spec(spec: Any) -> None:
     """A `TransportSpec` whose choices exist and can be combined; raises `ArgumentError`."""
     if not isinstance(spec, TransportSpec):
         raise ArgumentError(f"spec = {spec!r} is not a TransportSpec")
-    words = {bool: "True or False", PortKind | None: "a PortKind or None"}
-    words[Water | None] = "REGULAR_TRACKING, DELTA_TRACKING or None"
     for name, kind in TransportSpec.__annotations__.items():
         value, kind = getattr(spec, name), tuple if get_origin(kind) is tuple else kind
         if kind not in (str, int) and not isinstance(value, kind):  # those are checked by value
-            raise ArgumentError(f"spec.{name} = {value!r} is not {words.get(kind) or f'a {kind.__name__}'}")
+            raise ArgumentError(f"spec.{name} = {value!r} is not {_WORDS.get(kind) or f'a {kind.__name__}'}")
     choices: dict[str, tuple[Iterable[str], int]] = {
         "derivatives": (DERIVATIVES, MOST_DERIVATIVES),
         "blocks": (BLOCK_DERIVATIVES, len(BLOCK_DERIVATIVES)),
@@ -186,6 +190,7 @@ def check_spec(spec: Any) -> None:
     check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
+        (spec.sea and spec.confocal and spec.lens.name != SCANNED.name, "sea: a scan needs spec.lens = SCANNED"),
         (
             spec.lens.name == SCANNED.name and (not spec.confocal or spec.polarised or spec.reflecting),
             "lens = SCANNED needs spec.confocal = True, and cannot be combined with spec.polarised and spec.reflecting",

@@ -101,8 +101,6 @@ def make_begin(spec: TransportSpec) -> wp.Function:
         s.x = wp.spatial_top(emitted)
         s.u = wp.spatial_bottom(emitted)
         s.path = 0.0
-        if wp.static(sea):
-            s.above = height_above(world.sea, s.x) > 0.0
         s.weight.value = 1.0
         s.weight.absorbed_water += to_ledger(1.0)
         if wp.static(has_port):
@@ -115,6 +113,8 @@ def make_begin(spec: TransportSpec) -> wp.Function:
             book_weight(s.weight, s.account, sink, ledger.LASER_PORT)
         s.x = point_out(world.scan, s.target, s.x)
         s.u = turn_out(world.scan, s.target, s.u)
+        if wp.static(sea):
+            s.above = height_above(world.sea, s.x) > 0.0
         s.analog_weight = s.weight.value
         s.collisions = 0
         s.surface_count = 0
