@@ -194,9 +194,9 @@ class Water(Section):
     def _complete(self) -> Self:
         # What was given stays in model_fields_set, from where to_dict() knows it.
         if self.is_mixture:
-            others = [*self.given, *(["chlorophyll"] if self.chlorophyll is not None else [])]
-            if others:
-                raise ValueError(f"constituents determine the coefficients; {', '.join(others)} cannot be given")
+            beside = [*self.given, *(["chlorophyll"] if self.chlorophyll is not None else [])]
+            if beside:
+                raise ValueError(f"constituents determine the coefficients; {', '.join(beside)} cannot be given")
         elif self.chlorophyll is None:
             self.__dict__.update(complete_coefficients({name: getattr(self, name) for name in self.given}))
             if self.extinction not in (allowed := field_range(type(self), "extinction")):
