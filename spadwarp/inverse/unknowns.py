@@ -118,6 +118,8 @@ def _without_derivative(scene: Scene, name: str, target: str | None) -> str:
     if name.startswith("medium."):
         if scene.medium.albedo == "lu2024":
             return ", but medium.albedo is 'lu2024', random at each collision"
+        if scene.medium.is_mixture:
+            return ", but medium has constituents, whose concentrations have no derivatives"
         law = scene.medium.phase_function
         if name == "medium.anisotropy" and law != "henyey_greenstein":
             return f" goes with phase_function = 'henyey_greenstein', not {law!r}"

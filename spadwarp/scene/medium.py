@@ -84,16 +84,72 @@ def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
 
 # Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and those
 # with a default, which phase functions may share.
+MOST_CONSTITUENTS = 4  # as many as the kernels take
+MIXTURE = "mixture"  # what `phase_function` reads with constituents, which each have their own
+
 PHASE_FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "henyey_greenstein": ((), ("anisotropy",)),
     "two_term_henyey_greenstein": (("g1", "g2", "alpha"), ()),
     "fournier_forand": ((), ("particle_index", "junge_slope")),
     "rayleigh": ((), ("depolarisation_ratio",)),
     "tabulated": (("phase_table",), ()),
+    MIXTURE: ((), ()),
 }
+
+_OWN_FIELDS = tuple(name for needed, _ in PHASE_FIELDS.values() for name in needed)
+_LAW_FIELDS = ("phase_function", "anisotropy", *_OWN_FIELDS, "particle_index", "junge_slope")
 
 # Tabulated phase functions: name → file in spadwarp/water/tables, whose head has the source.
 PHASE_TABLES = {"petzold-average-particle": "petzold_average_particle.csv"}
+
+
+class PhaseLaw(Section):
+    """A phase function: its name, and the fields of its own that it takes."""
+
+    phase_function: Literal[
+        "henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "rayleigh", "tabulated"
+    ] = "henyey_greenstein"
+    """law of the scattering angle"""
+    anisotropy: float = field(0.924, "henyey_greenstein: mean cosine g of the scattering angle", "(-1, 1)")
+    g1: float | None = field(None, "two_term_henyey_greenstein: g of the first term", "(-1, 1)")
+    g2: float | None = field(None, "two_term_henyey_greenstein: g of the second term", "(-1, 1)")
+    alpha: float | None = field(None, "two_term_henyey_greenstein: weight of the first term", "[0, 1]")
+    particle_index: float = field(1.10, "fournier_forand: index n of the particles over that of the water", "(1, 1.35]")
+    junge_slope: float = field(3.5835, "fournier_forand: slope µ of the size distribution", "[3.05, 5)")
+    phase_table: Annotated[str | None, FilePath(".csv", tuple(PHASE_TABLES))] = None
+    """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
+    depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
+    """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
+
+    def _problems(self) -> Iterator[str]:
+        yield from super()._problems()
+        law = self.phase_function
+        for other, (needed, _) in PHASE_FIELDS.items():
+            missing = [name for name in needed if getattr(self, name) is None]
+            if other == law and missing:
+                yield f"needs {', '.join(missing)} with phase_function = {law!r}"
+            yield from self._only_with(f"phase_function = {other!r}", other == law, *needed)
+
+    @property
+    def phase_parameters(self) -> dict[str, float | str]:
+        """The fields that `phase_function` takes."""
+        needed, optional = PHASE_FIELDS[self.phase_function]
+        return {name: getattr(self, name) for name in (*needed, *optional)}
+
+
+class Constituent(PhaseLaw):
+    """A part of the water: molecules, algae, sediment, bubbles. Its light adds up with that of the others."""
+
+    displaces: ClassVar = {"phase_function": _OWN_FIELDS}
+    name: str = field(..., "what it is called in layers, cells and derivatives: letters, digits and _")
+    absorption: float = field(0.0, "absorption coefficient at concentration 1 [1/m]", "[0, 1e6]")
+    scattering: float = field(0.0, "scattering coefficient at concentration 1 [1/m]", "[0, 1e6]")
+    concentration: float = field(1.0, "factor on both coefficients, of any scale", "[0, 1e6]")
+
+    def _problems(self) -> Iterator[str]:
+        yield from super()._problems()
+        if not self.name.isidentifier():
+            yield self._that("name", "is not a word of letters, digits and _")
 
 
 class Water(Section):
@@ -102,11 +158,13 @@ class Water(Section):
     section: ClassVar[str] = "medium"
     alternatives: ClassVar = COEFFICIENTS
     displaces: ClassVar = {
-        **dict.fromkeys(COEFFICIENTS, ("chlorophyll",)),
-        "chlorophyll": (*COEFFICIENTS, "preset"),
+        **dict.fromkeys(COEFFICIENTS, ("chlorophyll", "constituents", "concentrations")),
+        "chlorophyll": (*COEFFICIENTS, "preset", "constituents", "concentrations"),
+        "constituents": (*COEFFICIENTS, "chlorophyll", *_LAW_FIELDS),
+        "concentrations": (*COEFFICIENTS, "chlorophyll", "anisotropy"),
         "temperature": ("phase_index", "group_index"),
         "salinity": ("phase_index", "group_index"),
-        "phase_function": tuple(name for needed, _ in PHASE_FIELDS.values() for name in needed),
+        "phase_function": _OWN_FIELDS,
     }
     preset: str | None = field(None, "a named water, see `spadwarp list presets medium`")
     absorption: float = field(0.0, "absorption coefficient a [1/m]", "[0, 1e6]")
@@ -135,7 +193,11 @@ class Water(Section):
     @model_validator(mode="after")
     def _complete(self) -> Self:
         # What was given stays in model_fields_set, from where to_dict() knows it.
-        if self.chlorophyll is None:
+        if self.is_mixture:
+            beside = [*self.given, *(["chlorophyll"] if self.chlorophyll is not None else [])]
+            if beside:
+                raise ValueError(f"constituents determine the coefficients; {', '.join(beside)} cannot be given")
+        elif self.chlorophyll is None:
             self.__dict__.update(complete_coefficients({name: getattr(self, name) for name in self.given}))
             if self.extinction not in (allowed := field_range(type(self), "extinction")):
                 raise ValueError(f"extinction = {self.extinction} is outside {allowed}")
@@ -143,6 +205,11 @@ class Water(Section):
             others = ", ".join(self.given or ["preset"])
             raise ValueError(self._that("chlorophyll", f"cannot be combined with {others}"))
         return self
+
+    @property
+    def is_mixture(self) -> bool:
+        """Whether the coefficients are those of constituents."""
+        return False
 
     @property
     def attenuation_length(self) -> float:
@@ -155,6 +222,13 @@ class Layer(Water):
 
     start: Coordinate = field(..., "where it begins along `layer_axis`, the world's z if not given [m]")
     anisotropy: float | None = field(None, "henyey_greenstein: mean cosine; default: the medium's", "(-1, 1)")
+    concentrations: Annotated[dict[str, Annotated[float, Field(ge=0, le=1e6)]] | None, Field()] = None
+    """in place of coefficients, of the medium's constituents by name: `{algae = 3.0}`; the others as in the medium"""
+
+    @property
+    def is_mixture(self) -> bool:
+        """Whether the coefficients are those of constituents."""
+        return self.concentrations is not None
 
 
 class WaterRange(NamedTuple):
@@ -167,34 +241,24 @@ class WaterRange(NamedTuple):
     anisotropies: tuple[float, ...]  # mean cosines beside the medium's own, the least and the largest of a grid
 
 
-class Medium(Water):
-    """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll; all four can be read.
+class Medium(PhaseLaw, Water):
+    """The water. Give exactly two of absorption, scattering, extinction, albedo, or chlorophyll, or constituents; all
+    four coefficients can be read.
 
     What chlorophyll, temperature and salinity imply follows the laser's wavelength (532 nm outside a scene). With
     `layers` it is the water before the first of them.
     """
 
-    phase_function: Literal[
-        "henyey_greenstein", "two_term_henyey_greenstein", "fournier_forand", "rayleigh", "tabulated"
-    ] = "henyey_greenstein"
-    """law of the scattering angle"""
-    anisotropy: float = field(0.924, "henyey_greenstein: mean cosine g of the scattering angle", "(-1, 1)")
-    g1: float | None = field(None, "two_term_henyey_greenstein: g of the first term", "(-1, 1)")
-    g2: float | None = field(None, "two_term_henyey_greenstein: g of the second term", "(-1, 1)")
-    alpha: float | None = field(None, "two_term_henyey_greenstein: weight of the first term", "[0, 1]")
-    particle_index: float = field(1.10, "fournier_forand: index n of the particles over that of the water", "(1, 1.35]")
-    junge_slope: float = field(3.5835, "fournier_forand: slope µ of the size distribution", "[3.05, 5)")
-    phase_table: Annotated[str | None, FilePath(".csv", tuple(PHASE_TABLES))] = None
-    """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
     scattering_matrix: Literal["none", "rayleigh", "scaled_rayleigh", "voss_fry", "tabulated"] = "none"
     """what scattering does to the polarisation of light, over any phase function; "none": light is not polarised; if
     it is, "voss_fry", or "rayleigh" with that phase function"""
     matrix_table: CsvFile = None
     """tabulated: path of a .csv file of angle [°], m12, m22, m33, m34 and m44 over m11; `spadwarp water` writes one
     """
-    depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
-    """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
     largest_polarisation: float = field(0.66, "scaled_rayleigh: polarisation of light at 90°", RANGES["largest"])
+    constituents: Annotated[tuple[Constituent, ...], BeforeValidator(listed), Field(max_length=MOST_CONSTITUENTS)] = ()
+    """what the water is made of, in place of coefficients and phase function: their coefficients add up, those of pure
+    water among them; at most 4"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
@@ -215,11 +279,8 @@ class Medium(Water):
 
     def _problems(self) -> Iterator[str]:
         law, own_law = self.phase_function, "goes with phase_function = 'henyey_greenstein' only"
-        for other, (needed, _) in PHASE_FIELDS.items():
-            missing = [name for name in needed if getattr(self, name) is None]
-            if other == law and missing:
-                yield f"needs {', '.join(missing)} with phase_function = {law!r}"
-            yield from self._only_with(f"phase_function = {other!r}", other == law, *needed)
+        yield from super()._problems()
+        yield from self._mixture_problems()
         has_table = self.scattering_matrix == "tabulated"
         if has_table and self.matrix_table is None:
             yield "needs matrix_table with scattering_matrix = 'tabulated'"
@@ -240,6 +301,54 @@ class Medium(Water):
         if self.grid is not None and self.grid.anisotropy is not None and law != "henyey_greenstein":
             yield f"grid.anisotropy = {self.grid.anisotropy} {own_law}; cells share any other"
 
+    def _mixture_problems(self) -> Iterator[str]:
+        """Why constituents exclude what is given beside them."""
+        names = [one.name for one in self.constituents]
+        if len(set(names)) < len(names):
+            yield f"constituents: {', '.join(names)} are not different names"
+        for i, layer in enumerate(self.layers):
+            if layer.is_mixture != self.is_mixture:
+                yield f"layers[{i}] needs concentrations with constituents, and without them none"
+            if unknown := set(layer.concentrations or ()) - set(names):
+                yield f"layers[{i}].concentrations: {', '.join(sorted(unknown))} is not one of {', '.join(names)}"
+        if not self.is_mixture:
+            return
+        if others := [name for name in _LAW_FIELDS if name in self.model_fields_set]:
+            yield f"constituents have phase functions of their own; {', '.join(others)} cannot be given"
+        if self.grid is not None:
+            yield "constituents do not go with grid; take layers"
+        for place, water in zip(self._places, self.waters, strict=True):
+            if (c := self._sum(water)[2]) not in (allowed := field_range(type(self), "extinction")):
+                yield f"{place}extinction = {c} of the constituents is outside {allowed}"
+
+    @property
+    def _places(self) -> list[str]:
+        return ["", *(f"layers[{i}]." for i in range(len(self.layers)))]
+
+    @property
+    def is_mixture(self) -> bool:
+        """Whether the coefficients are those of constituents."""
+        return bool(self.constituents)
+
+    def concentrations_in(self, water: Medium | Layer) -> list[float]:
+        """Of the constituents, in the medium or in one of its layers."""
+        own = getattr(water, "concentrations", None) or {}
+        return [own.get(one.name, one.concentration) for one in self.constituents]
+
+    def shares_in(self, water: Medium | Layer) -> list[float]:
+        """Part of each constituent in the scattering of the medium or one of its layers; where nothing scatters, equal
+        parts."""
+        parts = [n * one.scattering for n, one in zip(self.concentrations_in(water), self.constituents, strict=True)]
+        whole = math.fsum(parts)
+        return [part / whole if whole > 0.0 else 1.0 / len(parts) for part in parts]
+
+    def _sum(self, water: Medium | Layer) -> tuple[float, float, float]:
+        """a, b and c of the medium or a layer from constituents [1/m]."""
+        parts = list(zip(self.concentrations_in(water), self.constituents, strict=True))
+        a = math.fsum(n * one.absorption for n, one in parts)
+        b = math.fsum(n * one.scattering for n, one in parts)
+        return a, b, a + b
+
     @model_validator(mode="after")
     def _at_default_wavelength(self) -> Self:
         self._follow(Laser.model_fields["wavelength_nm"].default)
@@ -248,6 +357,12 @@ class Medium(Water):
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""
         self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
+        if self.is_mixture:
+            self.__dict__["phase_function"] = MIXTURE
+            for water in self.waters:
+                a, b, c = self._sum(water)
+                pair = {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c}
+                water.__dict__.update(pair)
         for water in self.waters:
             names = [] if water.chlorophyll is None else [*COEFFICIENTS]
             if water is self and self.follows_wavelength:
@@ -273,18 +388,18 @@ class Medium(Water):
         return pulse_speed(self.group_index)
 
     @property
-    def phase_parameters(self) -> dict[str, float | str]:
-        """The fields that `phase_function` takes."""
-        needed, optional = PHASE_FIELDS[self.phase_function]
-        return {name: getattr(self, name) for name in (*needed, *optional)}
-
-    @property
     def molecular_share(self) -> float:
         """Part of the scattering that is the water's own, beside `phase_function`, which is then of particles alone.
 
         Known with chlorophyll, 0 without it; 0 with layers too, which share one phase function.
         """
         return self._molecular_share
+
+    @property
+    def phase_functions(self) -> list[PhaseFunction]:
+        """Those of the medium and, with constituents, of its layers. Raises what `phase_function` raises."""
+        layers = self.layers if self.is_mixture else ()
+        return [phase_function(self), *(phase_function(self, layer) for layer in layers)]
 
     @property
     def has_phase_table(self) -> bool:
@@ -352,6 +467,8 @@ class Medium(Water):
     def to_dict(self) -> dict[str, Any]:
         """The fields that make an equal section again: of the coefficients the given ones, of the indices too."""
         hidden = {"phase_index", "group_index"} - self.model_fields_set if self.follows_wavelength else set()
+        if self.is_mixture:
+            hidden |= {*COEFFICIENTS, *_LAW_FIELDS}
         if not self.layers:
             hidden |= {"layers", "layer_axis"}
         return {name: value for name, value in super().to_dict().items() if name not in hidden}
@@ -381,6 +498,7 @@ class PhaseFunction:
     molecular_share: float  # part of the scattering that is the water's own and not of that name
     over_t: Callable[[Floats], Floats]  # the density [1/sr] over t = 1 - cosθ in (0, 2]
     first_angle: float = 0.0  # of a table [rad]; below it the table is continued
+    constituents: tuple[PhaseFunction, ...] = ()  # of a mixture
 
     def density(self, angle: ArrayLike) -> Floats:
         """p(θ) [1/sr] at scattering angles θ [rad] in (0, π]; at 0 Fournier–Forand and steep tables are infinite."""
@@ -422,11 +540,26 @@ def _sphere_integral(density: Callable[[Floats], Floats]) -> float:
     return sphere_integral(density)
 
 
-def phase_function(medium: Medium) -> PhaseFunction:
-    """The phase function of a scene's medium, `phase_function(scene.medium)`.
+def phase_function(medium: Medium, layer: Layer | None = None) -> PhaseFunction:
+    """The phase function of a scene's medium, `phase_function(scene.medium)`; of constituents the sum of theirs by
+    their shares in the scattering, of the medium or of one of its layers.
 
     Raises `FileError` if its table cannot be read, `ConfigError` if the table is not a phase function.
     """
+    if not medium.is_mixture:
+        return _law_of(medium, "medium", medium.molecular_share)
+    laws = tuple(_law_of(one, f"medium.constituents[{k}]") for k, one in enumerate(medium.constituents))
+    shares = medium.shares_in(layer or medium)
+
+    def summed(t: Floats) -> Floats:
+        return np.sum([share * law.over_t(t) for share, law in zip(shares, laws, strict=True) if share > 0.0], axis=0)
+
+    first_angle = max(law.first_angle for law in laws)
+    return PhaseFunction(MIXTURE, {}, 0.0, summed, first_angle, laws)
+
+
+def _law_of(medium: PhaseLaw, section: str, share: float = 0.0) -> PhaseFunction:
+    """The phase function of a section, with the water's own as such a share."""
     import spadwarp_kernels as sk
 
     density: Callable[[Floats], Floats]
@@ -436,16 +569,15 @@ def phase_function(medium: Medium) -> PhaseFunction:
         path = Path(str(medium.phase_table))
         if str(path) in PHASE_TABLES:
             path = Path(__file__).parents[1] / "water" / "tables" / PHASE_TABLES[str(path)]
-        angles, values = read_table("medium.phase_table", path, {"angle_deg": "[0, 180]", "value": "[0, 1e30]"})
+        angles, values = read_table(f"{section}.phase_table", path, {"angle_deg": "[0, 180]", "value": "[0, 1e30]"})
         try:
             density = sk.interpolated_density(np.radians(angles), values)
             first_angle = math.radians(float(angles[0]))
         except ValueError as error:
-            raise ConfigError(f"medium.phase_table: {path}: {error}") from None
+            raise ConfigError(f"{section}.phase_table: {path}: {error}") from None
     else:
         numbers: dict[str, Any] = {"g": medium.anisotropy} if name == "henyey_greenstein" else dict(parameters)
         density = partial(getattr(sk, f"{name}_density"), **numbers)
-    share = medium.molecular_share
 
     def mixed(t: Floats) -> Floats:
         return (1.0 - share) * density(t) + share * molecular_density(t)

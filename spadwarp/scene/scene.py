@@ -22,7 +22,7 @@ from spadwarp.io.text import read_text, read_toml
 from spadwarp.scene.camera import Camera, to_camera, to_world
 from spadwarp.scene.flux import Flux, Sun
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
-from spadwarp.scene.medium import Medium, phase_function
+from spadwarp.scene.medium import Medium
 from spadwarp.scene.port import Port, PortGeometry
 from spadwarp.scene.pose import interpolated_angles, rotation_matrix, vector_of
 from spadwarp.scene.sea import Surface
@@ -261,7 +261,8 @@ class Scene(Shown, Document):
         if self.medium.phase_function == "henyey_greenstein":
             with contextlib.suppress(FileError):  # the file of the cells is gone
                 waters += [self.medium.model_copy(update={"anisotropy": g}) for g in self.medium.range.anisotropies]
-        return max((phase_function(water).unseen_share(directions) for water in waters), key=lambda found: found[1])
+        laws = [law for water in waters for law in water.phase_functions]
+        return max((law.unseen_share(directions) for law in laws), key=lambda found: found[1])
 
     def unseen_warning(self, photons: float, angle: float, unseen: float) -> str:
         """The sentence on what `unseen_peak` found."""

@@ -48,6 +48,8 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
     if scene.surface is not None:
         everywhere = "derivatives cannot be combined with surface; take differences of two runs with one seed"
     in_water = everywhere
+    if medium.is_mixture and not everywhere:
+        in_water = "the water is a sum of constituents; take differences of two runs with one seed"
     if medium.grid is not None and not everywhere:
         in_water = "the grid's water differs from cell to cell; medium.grid.absorption and others go by block of cells"
     of_table = ""

@@ -16,7 +16,7 @@ import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import Truth
-from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix
+from spadwarp.scene import Camera, Laser, Medium, Scene, SceneLike, as_scene, phase_function, scattering_matrix
 from spadwarp.scene.camera import pixel_views, to_camera, to_world, view_box
 from spadwarp.scene.flux import Sun, azimuth_zero
 from spadwarp.scene.laser import load_profile, profile_extent
@@ -126,9 +126,26 @@ def _largest_albedo(albedo: float | str) -> float:
 def _medium(scene: Scene, device: wp.Device) -> Any:
     water, medium = scene.medium, sk.Medium()
     if water.has_phase_table:
-        medium.phase = sk.make_phase_tables(phase_function(water).over_t, device=device)
+        law, order = phase_function(water), _constituent_order(scene)
+        parts = [law.constituents[k].over_t for k in order]
+        medium.phase = sk.make_phase_tables(law.over_t, constituents=parts, device=device)
+        medium.shares = wp.vec4(*sk.mixture_shares([_shares(scene)[0]], (1,))[0].tolist() if order else ())
     numbers = {"extinction": water.extinction, "albedo": _largest_albedo(water.albedo), "anisotropy": water.anisotropy}
     return _filled(medium, **numbers, axis_threshold=scene.transport.axis_threshold)
+
+
+def _constituent_order(scene: Scene) -> list[int]:
+    """The constituents in the order of the kernels' tables: that with the sharpest forward peak first."""
+    forward = [float(law.over_t(np.array(1e-9))) for law in phase_function(scene.medium).constituents]
+    return sorted(range(len(forward)), key=lambda k: -forward[k])
+
+
+def _shares(scene: Scene) -> list[list[float]]:
+    """Of the constituents in that order, in the medium and its layers."""
+    medium, order = scene.medium, _constituent_order(scene)
+    if not medium.is_mixture:
+        return []
+    return [[medium.shares_in(water)[k] for k in order] for water in medium.waters]
 
 
 def _gate(scene: Scene, max_path: float) -> Any:
@@ -252,6 +269,7 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
         [_largest_albedo(water.albedo) for water in medium.waters],
         [medium.anisotropy if water.anisotropy is None else water.anisotropy for water in medium.waters],
         axis=(axis @ rotation).tolist(),
+        shares=_shares(scene),
         device=device,
     )
 
@@ -261,7 +279,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
     kinds, by_block = derivative_kinds(scene, derivatives)
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
-        phase=sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN,
+        phase=_phase(scene.medium),
         random_albedo=scene.medium.albedo == "lu2024",
         mesh=mesh is not None,
         brute_force=mesh is not None and mesh.face_count <= sk.BRUTE_FORCE_FACES,
@@ -289,6 +307,13 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         sun=scene.sun is not None,
     )
     return spec._replace(**choices)
+
+
+def _phase(medium: Medium) -> Any:
+    """How the kernels draw the directions of scattered light."""
+    if medium.is_mixture:
+        return sk.make_mixture(len(medium.constituents))
+    return sk.TABULATED if medium.has_phase_table else sk.HENYEY_GREENSTEIN
 
 
 def _grid_tracking(scene: Scene) -> Any:

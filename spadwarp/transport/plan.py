@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +17,7 @@ from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import Result, ResultLike
 from spadwarp.result.result import ResultHead, difference
 from spadwarp.result.tallies import count, shard_of
-from spadwarp.scene import Laser, Scene, Transport, phase_function
+from spadwarp.scene import Laser, Scene, Transport
 from spadwarp.scene.camera import to_camera
 from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.scan import shots_of
@@ -294,14 +295,15 @@ def _own_anisotropies(scene: Scene) -> list[float]:
 
 def _phase_density(scene: Scene) -> Density:
     """Largest density [1/sr] of the phase functions of a scene's waters over t = 1 - cos(angle) in (0, 2]."""
-    common, own = phase_function(scene.medium).over_t, _own_anisotropies(scene)
-    return lambda t: np.max([common(t), *(sk.henyey_greenstein_density(t, g) for g in own)], axis=0)
+    laws: list[Density] = [law.over_t for law in scene.medium.phase_functions]
+    laws += [partial(sk.henyey_greenstein_density, g=g) for g in _own_anisotropies(scene)]
+    return lambda t: np.max([law(t) for law in laws], axis=0)
 
 
 def _backward(scene: Scene, density: Density) -> float:
     """Density [1/sr] with which light is thrown back: the largest of the phase function beyond 90°, or what many
     small deflections come to, isotropic scattering of (1 - <cos>) times the light."""
-    turned = 1.0 - min([phase_function(scene.medium).mean_cosine, *_own_anisotropies(scene)])
+    turned = 1.0 - min([*(law.mean_cosine for law in scene.medium.phase_functions), *_own_anisotropies(scene)])
     return max(float(density(np.linspace(1.0, 2.0, 181)).max()), turned / (4.0 * math.pi))
 
 

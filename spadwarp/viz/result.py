@@ -326,7 +326,9 @@ def _water_text(medium: Medium) -> str:
     if medium.layers:
         extinctions = ", ".join(f"{water.extinction:.3g}" for water in medium.waters)
         return f"{len(medium.waters)} layers of water, c = {extinctions} 1/m"
-    if medium.phase_function == "tabulated":
+    if medium.is_mixture:
+        law = ", ".join(one.name for one in medium.constituents)
+    elif medium.phase_function == "tabulated":
         law = f"phase function {Path(str(medium.phase_table)).stem}"
     else:
         values = (f"{_SYMBOLS.get(name, name)} = {value:.4g}" for name, value in medium.phase_parameters.items())

@@ -118,7 +118,8 @@ class TransportSpec(NamedTuple):
     @property
     def water(self) -> Water:
         """Of the water, with the phase function."""
-        return (self.grid or (LAYERED if self.layered else HOMOGENEOUS))._replace(phase=self.phase)
+        water = self.grid or (LAYERED if self.layered else HOMOGENEOUS)
+        return water._replace(phase=self.phase, at=water.mixture_at if self.phase.constituents else water.at)
 
     @property
     def domain(self) -> Domain:

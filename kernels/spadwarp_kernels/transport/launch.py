@@ -209,12 +209,14 @@ def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: in
 def _water_needs(spec: TransportSpec, model: Model) -> Needs:
     layers, grid = model.layers, model.layers.grid
     yield "medium", {"extinction": "[0, inf)", "albedo": "[0, 1]", "anisotropy": "(-1, 1)", "axis_threshold": "(0, 1]"}
-    if spec.phase.name == TABULATED.name:
-        yield "medium.phase", {"cells": (3, TABLE_CELLS), "guide": (3, TABLE_CELLS)}
+    if (mixed := spec.phase.constituents) or spec.phase.name == TABULATED.name:
+        yield "medium.phase", dict.fromkeys(("cells", "guide"), (3 + mixed, TABLE_CELLS))
     if spec.layered:
         yield "layers", {"start": (None,), "axis": "unit"}
         check_integer("number of model.layers", layers.start.size, 1)
         yield "layers", dict.fromkeys(("extinction", "albedo", "anisotropy"), layers.start.shape)
+        if mixed:
+            yield "layers", {"shares": layers.start.shape}
     if spec.grid is not None:
         yield "layers.grid", dict.fromkeys(("size", "block_size", "block_edge"), "[1, inf)")
         cells, blocks, edge = math.prod(grid.size), math.prod(grid.block_size), grid.block_edge
@@ -225,6 +227,8 @@ def _water_needs(spec: TransportSpec, model: Model) -> Needs:
         yield "layers.grid", {"anisotropy": (None,)}
         if grid.anisotropy.size:
             yield "layers.grid", {"anisotropy": (cells,)}
+        if mixed:
+            yield "layers.grid", {"shares": (cells,)}
 
 
 def _light_needs(spec: TransportSpec, model: Model) -> Needs:

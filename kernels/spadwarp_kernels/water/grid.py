@@ -28,7 +28,7 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.native import load_float, load_vec2
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_open
 
-from .medium import Grid, Layers, Medium, Profile, ProfileSample, Water
+from .medium import Grid, Layers, Medium, Profile, ProfileSample, Water, mixture_shares
 
 __all__ = ["DELTA_TRACKING", "REGULAR_TRACKING", "make_grid", "voxel_values_kernel"]
 
@@ -347,6 +347,16 @@ def grid_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
 
 
 @wp.func
+def grid_mixture(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
+    """`grid_water` with the shares of its constituents."""
+    water = grid_water(medium, layers, x)
+    cell = grid_cell(layers.grid, x)
+    if cell >= 0:
+        water.shares = layers.grid.shares[cell]
+    return water
+
+
+@wp.func
 def regular_free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
     """Free flight [m] for uniform xi in (0, 1]: where the optical depth of the cells reaches -ln(xi)."""
     return distance_to(medium, layers, x, u, -wp.log(xi))
@@ -425,8 +435,10 @@ def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, len
     return (depth - wp.log(wp.max(part, 1.0e-30))) / wp.max(length, 1.0e-30)
 
 
-REGULAR_TRACKING = Water(regular_free_path, regular_extinction, grid_water, Profile(depth_along, draw_by_cells))
-DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, Profile(depth_by_block))
+REGULAR_TRACKING = Water(
+    regular_free_path, regular_extinction, grid_water, grid_mixture, Profile(depth_along, draw_by_cells)
+)
+DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, grid_mixture, Profile(depth_by_block))
 
 
 # ---- Grids from arrays.
@@ -441,6 +453,7 @@ def make_grid(
     centre: Sequence[float] = (0.0, 0.0, 0.0),
     rotation: ArrayLike = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     block_edge: int | None = None,
+    shares: ArrayLike = (),
     device: wp.DeviceLike = None,
 ) -> Grid:
     """Cells for `Layers.grid` of a spec with a grid.
@@ -454,6 +467,7 @@ def make_grid(
         rotation: Its own axes there, as columns.
         block_edge: Cells along the edges of the blocks that delta tracking flies through; None: 6 blocks along the
             longest edge, the fastest for 128^3 cells on an H200.
+        shares: Of mixtures, `[x, y, z, constituent]`, see `mixture_shares`.
 
     Raises:
         ArgumentError: Another shape, a number out of range, or more than 2^30 cells.
@@ -489,6 +503,7 @@ def make_grid(
     grid.size = wp.vec3i(*shape)
     for name, array in arrays.items():
         setattr(grid, name, wp.array(array.ravel(), dtype=float, device=device))
+    grid.shares = wp.array(mixture_shares(shares, shape), dtype=wp.vec4, device=device)
     if anisotropy is None:
         grid.anisotropy = wp.empty(0, dtype=float, device=device)
     blocks = block_statistics(arrays["extinction"], edge_cells)

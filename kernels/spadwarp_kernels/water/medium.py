@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base.arguments import (
     ArgumentError,
@@ -24,7 +25,9 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
-__all__ = ["Grid", "Layers", "Medium", "free_path", "make_layers", "make_medium"]
+__all__ = ["MOST_CONSTITUENTS", "Grid", "Layers", "Medium", "free_path", "make_layers", "make_medium", "mixture_shares"]
+
+MOST_CONSTITUENTS = 4  # of a mixture
 
 
 @wp.struct
@@ -38,7 +41,8 @@ class Medium:
     """|u_z| from which a scattering takes u for the z axis (the near-axis rule), in (0, 1]; 1 switches it off, and
     functions of your own that the transport kernel calls then see 2."""
     per_bit: float  # -ln(2)/c [m], 0 in vacuum; filled by `launch_transport`
-    phase: DensityTables  # of the phase function TABULATED, from `make_phase_tables`; left alone otherwise
+    phase: DensityTables  # of TABULATED and of mixtures, from `make_phase_tables`; left alone otherwise
+    shares: wp.vec4  # of a mixture: the part of the scattering that is each constituent's; their sum is 1
 
 
 def make_medium(absorption: float, scattering: float, *, anisotropy: float = 0.0) -> Medium:
@@ -105,6 +109,7 @@ class Grid:
     block_majorant: wp.array[float]  # largest c in each block [1/m]
     block_control: wp.array[wp.vec2]  # mean c of each block, and the largest difference from it in the block [1/m]
     residual: wp.array[float]  # c less the block's, see `block_statistics` [1/m], by cell
+    shares: wp.array[wp.vec4]  # `Medium.shares` by cell, for mixtures; else empty
 
 
 @wp.struct
@@ -121,6 +126,7 @@ class Layers:
     extinction: wp.array[float]  # c [1/m], > 0
     albedo: wp.array[float]  # single-scattering albedo in [0, 1]
     anisotropy: wp.array[float]  # g in (-1, 1), for phase functions that use the medium's
+    shares: wp.array[wp.vec4]  # `Medium.shares` by layer, for mixtures; else empty
     grid: Grid  # of a spec with a grid, which has no layers: cells in a box; the medium is outside it
 
 
@@ -199,6 +205,14 @@ def layered_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
 
 
 @wp.func
+def layered_mixture(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
+    """`layered_water` with the shares of its constituents."""
+    water = layered_water(medium, layers, x)
+    water.shares = layers.shares[layer_index(layers, wp.dot(layers.axis, x))]
+    return water
+
+
+@wp.func
 def _free_path(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, xi: float, seed: wp.uint64) -> float:
     return ready_free_path(xi, medium)
 
@@ -242,13 +256,29 @@ class Water(NamedTuple):
     # exp(-extinction length) has the expectation of what passes
     extinction: wp.Function
     at: wp.Function  # ``(medium, layers, x) -> Medium``, the water at a point
+    mixture_at: wp.Function  # the same with the shares of several constituents
     profile: Profile | None = None  # how `guided` draws a point of a flight in a grid; None: with the mean extinction
     layered: bool = False
     phase: Any = None  # the phase function, of the water of a spec
 
 
-HOMOGENEOUS = Water(_free_path, _extinction, _water)
-LAYERED = Water(layered_free_path, layered_extinction, layered_water, layered=True)
+HOMOGENEOUS = Water(_free_path, _extinction, _water, _water)
+LAYERED = Water(layered_free_path, layered_extinction, layered_water, layered_mixture, layered=True)
+
+
+def mixture_shares(shares: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Shares `[n, 4]` of the scattering, which add up to 1, from those of up to 4 constituents, `[*shape, count]`;
+    none from none. Raises `ArgumentError`."""
+    if np.size(shares) == 0:
+        return np.zeros((0, MOST_CONSTITUENTS), np.float32)
+    values = check_numbers("shares", shares)
+    if values.shape[:-1] != shape or values.shape[-1] > MOST_CONSTITUENTS:
+        raise ArgumentError(f"shares {values.shape} are not those of up to {MOST_CONSTITUENTS} for each of {shape}")
+    if not (values.min() >= 0.0 and np.allclose(values.sum(axis=-1), 1.0, atol=1e-5)):
+        raise ArgumentError("shares: numbers from 0 on whose sum is 1 are needed")
+    filled = np.zeros((values[..., 0].size, MOST_CONSTITUENTS), np.float32)
+    filled[:, : values.shape[-1]] = values.reshape(-1, values.shape[-1])
+    return filled
 
 
 def make_layers(
@@ -258,11 +288,12 @@ def make_layers(
     anisotropy: Sequence[float],
     *,
     axis: Sequence[float] = (0.0, 0.0, 1.0),
+    shares: Sequence[Sequence[float]] = (),
     device: wp.DeviceLike = None,
 ) -> Layers:
     """The layers of a layered spec, one entry of each list for a layer; see `Layers` for their meaning and ranges.
 
-    Raises `ArgumentError`.
+    `shares`: of mixtures, see `mixture_shares`. Raises `ArgumentError`.
     """
     columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
     for name, column in columns.items():
@@ -279,6 +310,7 @@ def make_layers(
             check_number(f"{name}[{k}]", value, f"[{float(start[k - 1])}, inf)" if above else interval)
     layers = Layers()
     layers.axis = wp.vec3(*axis)
+    layers.shares = wp.array(mixture_shares(shares, (len(start),)), dtype=wp.vec4, device=device)
     for name, column in columns.items():
         setattr(layers, name, wp.array(column, dtype=float, device=device))
     return layers

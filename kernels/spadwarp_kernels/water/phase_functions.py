@@ -1,14 +1,22 @@
 """Phase functions in NumPy float64: densities [1/sr] over t = 1 - cos(theta), for tables and for figures."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_kind, check_number, check_numbers
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_device,
+    check_integer,
+    check_kind,
+    check_number,
+    check_numbers,
+)
+from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.tables import (
     DensityTables,
     Floats,
@@ -22,7 +30,7 @@ from spadwarp_kernels.base.tables import (
     tabulate,
 )
 
-from .medium import Medium
+from .medium import MOST_CONSTITUENTS, Medium
 
 __all__ = [
     "HENYEY_GREENSTEIN",
@@ -34,6 +42,7 @@ __all__ = [
     "henyey_greenstein_density",
     "henyey_greenstein_pdf",
     "interpolated_density",
+    "make_mixture",
     "make_phase_tables",
     "rayleigh_density",
     "sample_henyey_greenstein",
@@ -196,6 +205,8 @@ class PhaseFunction(NamedTuple):
     guide: PhaseGuide | None = None
     """How the estimator `guided` follows it; None: as it follows Henyey-Greenstein with the medium's anisotropy. No
     guide makes it wrong, a poor one makes it noisy."""
+    constituents: int = 0
+    """Of a mixture, from `make_mixture`: how many phase functions it has, weighted by the shares at the point."""
 
 
 # ---- The phase function of Henyey and Greenstein.
@@ -315,6 +326,7 @@ _INV_PI = wp.constant(0.3183098861837907)
 # Rows of the tables: 4 pi p over t/2; p over 1 - theta/pi, from which the angle by which a flight turns to the lens is
 # drawn; over t/2 the directions towards the lens.
 _SCATTERING, _TURNING, _LOBE = (wp.constant(i) for i in range(3))
+_OWN_ROWS = wp.constant(3)  # of a mixture the first of the rows of its constituents, each 4 pi p over t/2
 
 _FLAT = 2.0**-32  # t up to which a table takes the density for constant
 
@@ -372,18 +384,66 @@ TABULATED = PhaseFunction(
 )
 
 
-def make_phase_tables(density: Callable[[Floats], Floats], *, device: wp.DeviceLike = None) -> DensityTables:
-    """The tables of a phase function, for `Medium.phase` with the phase function TABULATED.
+@memoised
+def make_mixture(count: int) -> PhaseFunction:
+    """The phase function of so many constituents, 1 to MOST_CONSTITUENTS: the sum of theirs by `Medium.shares`, on the
+    tables that `make_phase_tables` makes with `constituents`.
+
+    A direction is drawn from one of them, chosen by its share with the number that the direction is drawn with: within
+    the share it is uniform again. Densities are of the sum, which varies less than that of the chosen one would.
+    `guided` follows the tables' own density, whatever the shares are.
+    """
+    check_integer("count", count, 1, MOST_CONSTITUENTS)
+
+    @wp.func
+    def pdf(t: float, medium: Medium) -> float:
+        z = fold(0.5 * t)
+        density = float(0.0)
+        for i in range(wp.static(count)):
+            density += medium.shares[i] * table_density(medium.phase, _OWN_ROWS + i, z)
+        return _INV_4PI * density
+
+    @wp.func
+    def sample(xi: float, medium: Medium) -> float:
+        below = float(0.0)
+        end = float(medium.shares[0])
+        chosen = int(0)
+        share = float(end)
+        for i in range(1, wp.static(count)):
+            if xi >= end and medium.shares[i] > 0.0:
+                chosen = i
+                below = end
+                share = medium.shares[i]
+            end += medium.shares[i]
+        part = wp.clamp((xi - below) / wp.max(share, 1.0e-30), 0.0, 0.99999994)
+        return _one_minus_cosine(table_sample(medium.phase, _OWN_ROWS + chosen, part))
+
+    return PhaseFunction(f"mixture_{count}", pdf, sample, TABULATED.guide, count)
+
+
+def make_phase_tables(
+    density: Callable[[Floats], Floats],
+    *,
+    constituents: Sequence[Callable[[Floats], Floats]] = (),
+    device: wp.DeviceLike = None,
+) -> DensityTables:
+    """The tables of a phase function, for `Medium.phase` with the phase function TABULATED, or a mixture.
 
     Args:
         density: Over t = 1 - cos(theta) in (0, 2), >= 0, of any scale. Towards t = 0 it may rise as t^-0.95.
+        constituents: Of a mixture the phase functions of each, of which `density` is the sum that `guided` follows. The
+            one with the sharpest forward peak comes first: its smallest angles are drawn with the most digits.
 
     Raises:
-        ArgumentError: The density is negative, not finite or zero everywhere.
+        ArgumentError: A density is negative, not finite or zero everywhere.
     """
     device = check_device("device", device)
     check_kind("density", density, Callable)
-    scattering = tabulate(lambda z: density(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
+
+    def over_t(one: Callable[[Floats], Floats]) -> Floats:
+        return tabulate(lambda z: one(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
+
+    scattering = over_t(density)
 
     def over_angle(z: Floats) -> Floats:
         t = 2.0 * np.sin(0.5 * np.pi * np.where(z < 0.0, -z, 1.0 - z)) ** 2
@@ -399,7 +459,7 @@ def make_phase_tables(density: Callable[[Floats], Floats], *, device: wp.DeviceL
         position = np.where(z < 0.0, angle, np.pi - angle) / np.pi
         return np.interp(position, below[1], below[0]) / np.sin(angle)
 
-    return make_density_tables(scattering, turning, tabulate(lobe), device=device)
+    return make_density_tables(scattering, turning, tabulate(lobe), *map(over_t, constituents), device=device)
 
 
 # ---- The phase functions by name.
