@@ -146,13 +146,14 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
             mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
         # The deviance is at most the square of the excess over the variance: most windows end here.
         single = search.stop - search.first <= search.half_width
-        closes = s.begin > search.first or single
-        if closes and n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials):
-            if _deviance_at_most(float(n), float(mean), float(n - mean), float(trials - n)) >= float(s.best[0]):
-                value = _deviance(n, mean, trials)
-                if value > s.best[0]:
-                    s.best = wp.vec4d(value, n, mean, trials)
-                    s.window = wp.max(s.begin - search.half_width, search.first)
+        offered = (s.begin > search.first or single) and n > mean
+        offered = offered and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials)
+        bound = _deviance_at_most(float(n), float(mean), float(n - mean), float(trials - n))
+        if offered and bound >= float(s.best[0]):
+            value = _deviance(n, mean, trials)
+            if value > s.best[0]:
+                s.best = wp.vec4d(value, n, mean, trials)
+                s.window = wp.max(s.begin - search.half_width, search.first)
         s.begin = k + 1
         s.before += s.last_n
         s.last_n = s.own_n
