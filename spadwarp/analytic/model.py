@@ -277,6 +277,9 @@ def _not_covered(scene: Scene) -> dict[str, bool]:
         "analytic: laser.profile = 'collimated' does not stay parallel behind a dome, and has no closed form; "
         "simulate takes it": parallel and port is not None and port.shape == "dome",
         f"medium.layers: {len(medium.layers)} given; the analytic simulator takes one water": bool(medium.layers),
+        "medium.grid.constituent: the analytic simulator takes cells of the medium's phase function": (
+            medium.grid is not None and medium.grid.constituent is not None
+        ),
         "analytic.form = 'lu2024' takes one water, and not medium.grid; 'radiometric' takes both": (
             lu2024 and medium.grid is not None
         ),

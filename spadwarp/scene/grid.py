@@ -54,6 +54,9 @@ class Grid(Section):
     extinction: float = field(1.0, "what density 1 adds to the medium's extinction [1/m]", "[0, 1e6]")
     albedo: float = field(0.8, "single-scattering albedo of what is added", "[0, 1]")
     anisotropy: float | None = field(None, "henyey_greenstein: g of what is added; default: the medium's", "(-1, 1)")
+    constituent: str | None = field(
+        None, "the medium's constituent of which density is so much more than the medium has"
+    )
     turbulence: float = Field(0.0, ge=0, le=3)
     """shape: standard deviation of the logarithm of the density about the shape, by eddies of von Kármán's spectrum"""
     eddy_size: float | None = Field(None, ge=1e-6, le=1e9)
@@ -76,6 +79,9 @@ class Grid(Section):
             is_vdb = self.file.lower().endswith(".vdb")
             hint = "; `nanovdb_convert` of OpenVDB makes a .nvdb file of it" if is_vdb else ""
             yield self._that("file", f"does not end in {', '.join(GRID_ENDINGS)}{hint}")
+        if self.constituent is not None:
+            for name in ("extinction", "albedo", "anisotropy"):
+                yield from self._only_with("suspended matter that is no constituent", False, name)
         if self.shape is not None and self.size is None:
             yield f"needs size with shape = {self.shape!r}"
         for name in ("size", "cells"):
@@ -358,6 +364,8 @@ def cells_of(grid: Grid, water: tuple[float, float, float], has_table: bool, sta
         if edges is None:
             raise ConfigError(f"medium.grid: needs size; {grid.file} has no size and no cell_size")
         found = {name: _frame(grid, values) for name, values in file.arrays.items()}
+    if grid.constituent is not None and "density" not in found:
+        raise ConfigError(f"medium.grid.constituent = {grid.constituent!r} needs density, which {grid.file} has not")
     own_g = found.get("anisotropy")
     if own_g is not None and has_table:
         raise ConfigError(

@@ -312,11 +312,13 @@ class Medium(PhaseLaw, Water):
             if unknown := set(layer.concentrations or ()) - set(names):
                 yield f"layers[{i}].concentrations: {', '.join(sorted(unknown))} is not one of {', '.join(names)}"
         if not self.is_mixture:
+            if self.grid is not None and self.grid.constituent is not None:
+                yield f"grid.constituent = {self.grid.constituent!r} goes with constituents only"
             return
         if others := [name for name in _LAW_FIELDS if name in self.model_fields_set]:
             yield f"constituents have phase functions of their own; {', '.join(others)} cannot be given"
-        if self.grid is not None:
-            yield "constituents do not go with grid; take layers"
+        if self.grid is not None and self.grid.constituent not in names:
+            yield f"grid.constituent = {self.grid.constituent!r} is not one of {', '.join(names)}"
         for place, water in zip(self._places, self.waters, strict=True):
             if (c := self._sum(water)[2]) not in (allowed := field_range(type(self), "extinction")):
                 yield f"{place}extinction = {c} of the constituents is outside {allowed}"
@@ -397,9 +399,11 @@ class Medium(PhaseLaw, Water):
 
     @property
     def phase_functions(self) -> list[PhaseFunction]:
-        """Those of the medium and, with constituents, of its layers. Raises what `phase_function` raises."""
+        """Those of the medium and, with constituents, of its layers and of those that cells have shares of. Raises what
+        `phase_function` raises."""
         layers = self.layers if self.is_mixture else ()
-        return [phase_function(self), *(phase_function(self, layer) for layer in layers)]
+        of_cells = phase_function(self).constituents if self.grid is not None else ()
+        return [phase_function(self), *(phase_function(self, layer) for layer in layers), *of_cells]
 
     @property
     def has_phase_table(self) -> bool:
@@ -483,7 +487,23 @@ def grid_cells(medium: Medium) -> GridCells:
     with suppress(OSError):  # the reader says why
         status = Path(grid.file or "").stat()
         stamp = status.st_mtime_ns, status.st_size
+    if part := next((one for one in medium.constituents if one.name == grid.constituent), None):
+        c = part.absorption + part.scattering
+        grid = grid.model_copy(update={"extinction": c, "albedo": part.scattering / c if c > 0.0 else 0.0})
     return cells_of(grid, (medium.extinction, albedo, medium.anisotropy), medium.has_phase_table, stamp)
+
+
+def cell_shares(medium: Medium) -> Floats:
+    """Part of each constituent in the scattering of the cells of a medium's grid, `[x, y, z, constituent]`. Raises what
+    `grid_cells` raises."""
+    cells, names = grid_cells(medium), [one.name for one in medium.constituents]
+    parts = [n * one.scattering for n, one in zip(medium.concentrations_in(medium), medium.constituents, strict=True)]
+    scattered = np.array(parts) + np.zeros((*cells.extinction.shape, 1))
+    # What the medium scatters without the cells is part of the cells' own.
+    whole = np.maximum(cells.extinction.astype(np.float64) * cells.albedo, medium.scattering)
+    scattered[..., names.index(str(medium.grid and medium.grid.constituent))] += whole - medium.scattering
+    shares = scattered / np.maximum(scattered.sum(axis=-1, keepdims=True), 1e-30)
+    return np.where(scattered.sum(axis=-1, keepdims=True) > 0.0, shares, medium.shares_in(medium))
 
 
 # Scattering

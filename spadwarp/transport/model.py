@@ -20,7 +20,7 @@ from spadwarp.scene import Camera, Laser, Medium, Scene, SceneLike, as_scene, ph
 from spadwarp.scene.camera import pixel_views, to_camera, to_world, view_box
 from spadwarp.scene.flux import Sun, azimuth_zero
 from spadwarp.scene.laser import load_profile, profile_extent
-from spadwarp.scene.medium import grid_cells
+from spadwarp.scene.medium import cell_shares, grid_cells
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.scan import Shots, shots_of
@@ -258,6 +258,7 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
             size=cells.size,
             centre=tuple(to_camera(camera, cells.centre).tolist()),
             rotation=rotation.T @ cells.rotation,
+            shares=cell_shares(medium)[..., _constituent_order(scene)] if medium.is_mixture else (),
             device=device,
         )
         return layers

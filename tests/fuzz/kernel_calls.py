@@ -116,6 +116,8 @@ def _valid_calls():
             count=2, axis=(0, 0, 1.0), right=(1.0, 0, 0), centre=(0, 0, 0), radius=1.0, polar=3, azimuth=2, scale=1.0)),
         "make_sun": (sk.make_sun, dict(direction=(0.5, 0, 1.0), normal=(0, 0, 1.0), distance=1.0, index=1.34, sky=0.2)),
         "make_records": (sk.make_records, dict(count=3, device="cpu")),
+        "make_mixture": (sk.make_mixture, dict(count=2)),
+        "mixture_shares": (sk.mixture_shares, dict(shares=[[0.25, 0.75]], shape=(1,))),
         "phase_tables": (sk.make_phase_tables, dict(density=np.ones_like, device="cpu")),
         "profile_tables": (sk.profile_tables, dict(image=np.ones((3, 4)))),
         "interpolated": (sk.interpolated_density, dict(angles=[0.0, 1.0, 2.0], values=[3.0, 2.0, 1.0])),

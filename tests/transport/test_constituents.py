@@ -10,7 +10,7 @@ from helpers.estimators import agreeing_cells, cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene import phase_function
-from spadwarp.scene.medium import MOST_CONSTITUENTS
+from spadwarp.scene.medium import MOST_CONSTITUENTS, cell_shares, grid_cells
 from spadwarp.values import ConfigError
 
 pytestmark = pytest.mark.physics
@@ -79,6 +79,20 @@ def test_layers_in_which_one_kind_scatters_are_layers_of_its_water(device):
     layer = {"start": 1.2, "absorption": 0.6, "scattering": 0.9, "anisotropy": 0.5}
     expected = scene(medium={**near, "layers": [layer]}, transport=guided)
     assert equal_means_p(*(cells(each, device, 20_000) for each in (found, expected)), 0.2) > 1e-3
+
+
+@pytest.mark.parametrize("tracking", ["regular", "delta"])
+def test_cells_of_one_more_constituent_are_cells_of_suspended_matter(tracking, device):
+    """Of Henyey and Greenstein's law with one g; and the shares of a cell's light are those of its coefficients."""
+    sand = {"name": "sand", "absorption": 0.6, "scattering": 0.9, "anisotropy": 0.8, "concentration": 0.0}
+    box = {"shape": "cloud", "size": 1.2, "cells": 8, "translation": [0.0, 0.0, 1.2], "tracking": tracking}
+    guided = {"estimator": "guided"}
+    found = scene(medium=mixed(sand, ALGAE, grid={**box, "constituent": "sand"}), transport=guided)
+    near = {"extinction": None, "albedo": None, "absorption": 0.05, "scattering": 0.25, "anisotropy": 0.8}
+    expected = scene(medium={**near, "grid": {**box, "extinction": 1.5, "albedo": 0.6}}, transport=guided)
+    cells_of, shares = grid_cells(found.medium), cell_shares(found.medium)
+    assert (cells_of.extinction * cells_of.albedo * shares[..., 1]).ravel() == pytest.approx(0.25, rel=1e-5)
+    assert equal_means_p(*(cells(each, device, 10_000) for each in (found, expected)), 0.2) > 1e-3
 
 
 @pytest.mark.slow
