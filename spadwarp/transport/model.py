@@ -129,7 +129,7 @@ def _medium(scene: Scene, device: wp.Device) -> Any:
         law, order = phase_function(water), _constituent_order(scene)
         parts = [law.constituents[k].over_t for k in order]
         medium.phase = sk.make_phase_tables(law.over_t, constituents=parts, device=device)
-        medium.shares = wp.vec4(*sk.mixture_shares([_shares(scene)[0]], (1,))[0].tolist() if order else ())
+        medium.shares = wp.vec4(*[*(_shares(scene)[0] if order else ()), *[0.0] * sk.MOST_CONSTITUENTS][:4])
     numbers = {"extinction": water.extinction, "albedo": _largest_albedo(water.albedo), "anisotropy": water.anisotropy}
     return _filled(medium, **numbers, axis_threshold=scene.transport.axis_threshold)
 

@@ -105,10 +105,10 @@ def _valid_calls():
         "make_textures": (sk.make_textures, tiles),
         "make_grid": (sk.make_grid, dict(
             extinction=np.ones((2, 3, 4)), albedo=np.full((2, 3, 4), 0.5), anisotropy=None, size=(1, 1, 2),
-            centre=(0, 0, 1.0), rotation=np.eye(3), block_edge=2, device="cpu")),
+            centre=(0, 0, 1.0), rotation=np.eye(3), block_edge=2, shares=np.full((2, 3, 4, 2), 0.5), device="cpu")),
         "make_layers": (sk.make_layers, dict(
             start=[0.0, 1.0], extinction=[1.0, 1.0], albedo=[0.5, 0.5], anisotropy=[0.1, 0.1], axis=(0, 0, 1.0),
-            device="cpu")),
+            shares=[[0.25, 0.75], [0.5, 0.5]], device="cpu")),
         "make_flux_volume": (sk.make_flux_volume, dict(
             shape=(2, 3, 4), lower=(0, 0, 0), edge=(1.0, 1.0, 2.0), rotation=np.eye(3), origin=(0, 0, 1.0), gates=2,
             gate_start=0.0, gate_path=1.0, estimator="track", scale=1.0)),
@@ -117,7 +117,6 @@ def _valid_calls():
         "make_sun": (sk.make_sun, dict(direction=(0.5, 0, 1.0), normal=(0, 0, 1.0), distance=1.0, index=1.34, sky=0.2)),
         "make_records": (sk.make_records, dict(count=3, device="cpu")),
         "make_mixture": (sk.make_mixture, dict(count=2)),
-        "mixture_shares": (sk.mixture_shares, dict(shares=[[0.25, 0.75]], shape=(1,))),
         "phase_tables": (sk.make_phase_tables, dict(density=np.ones_like, device="cpu")),
         "profile_tables": (sk.profile_tables, dict(image=np.ones((3, 4)))),
         "interpolated": (sk.interpolated_density, dict(angles=[0.0, 1.0, 2.0], values=[3.0, 2.0, 1.0])),

@@ -25,7 +25,7 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
-__all__ = ["MOST_CONSTITUENTS", "Grid", "Layers", "Medium", "free_path", "make_layers", "make_medium", "mixture_shares"]
+__all__ = ["MOST_CONSTITUENTS", "Grid", "Layers", "Medium", "free_path", "make_layers", "make_medium"]
 
 MOST_CONSTITUENTS = 4  # of a mixture
 
@@ -271,7 +271,7 @@ def mixture_shares(shares: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.floa
     none from none. Raises `ArgumentError`."""
     if np.size(shares) == 0:
         return np.zeros((0, MOST_CONSTITUENTS), np.float32)
-    values = check_numbers("shares", shares)
+    values = check_numbers("shares", shares, len(shape) + 1)
     if values.shape[:-1] != shape or values.shape[-1] > MOST_CONSTITUENTS:
         raise ArgumentError(f"shares {values.shape} are not those of up to {MOST_CONSTITUENTS} for each of {shape}")
     if not (values.min() >= 0.0 and np.allclose(values.sum(axis=-1), 1.0, atol=1e-5)):

@@ -384,7 +384,6 @@ TABULATED = PhaseFunction(
 )
 
 
-@memoised
 def make_mixture(count: int) -> PhaseFunction:
     """The phase function of so many constituents, 1 to MOST_CONSTITUENTS: the sum of theirs by `Medium.shares`, on the
     tables that `make_phase_tables` makes with `constituents`.
@@ -393,8 +392,11 @@ def make_mixture(count: int) -> PhaseFunction:
     the share it is uniform again. Densities are of the sum, which varies less than that of the chosen one would.
     `guided` follows the tables' own density, whatever the shares are.
     """
-    check_integer("count", count, 1, MOST_CONSTITUENTS)
+    return _mixture(check_integer("count", count, 1, MOST_CONSTITUENTS))
 
+
+@memoised
+def _mixture(count: int) -> PhaseFunction:
     @wp.func
     def pdf(t: float, medium: Medium) -> float:
         z = fold(0.5 * t)
