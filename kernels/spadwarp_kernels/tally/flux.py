@@ -19,8 +19,7 @@ __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume
 FLUX_KINDS = ("track", "collision", "planes")
 """How light is tallied: by the lengths of its ways in voxels, by its collisions there, by its crossings of planes."""
 
-# Crossings with |mu| below this count in scalar irradiance and radiance as their mean would, 2 / _GRAZING, for radiance
-# that is even there: 1/|mu| has no variance.
+# Crossings with |mu| below this count in scalar irradiance and radiance 2 / _GRAZING, their mean: else no variance.
 _GRAZING = wp.constant(0.01)
 
 
@@ -116,8 +115,7 @@ def _in_voxels(volume: FluxVolume, x: wp.vec3, path: float) -> wp.vec4:
 
 @wp.func
 def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
-    """Adds weight times length to the voxels and gates on a leg, by points along its way in the box: one in each of
-    equal steps of at most one voxel or gate, which leave the expectation of each voxel exact and the sum of all."""
+    """Adds weight times length at a point in each of equal steps of a voxel or gate at most: unbiased, exact in sum."""
     q = _in_voxels(volume, leg.x, leg.path)
     along = volume.turn * leg.u
     v = wp.vec4(along[0], along[1], along[2], volume.gates_per_metre)
@@ -148,8 +146,7 @@ def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
 
 @wp.func
 def add_flux_collision(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg, extinction: float):
-    """Adds weight over extinction [1/m] to the voxel and gate of the collision that ends a leg: the expectation of
-    `add_flux_track`."""
+    """Adds weight over extinction [1/m] at the collision that ends a leg: the expectation of `add_flux_track`."""
     p = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
     inside = wp.min(p) >= 0.0 and p[3] < float(volume.gates)
     for i in range(3):
@@ -239,8 +236,7 @@ def make_flux_planes(
     azimuth: int = 0,
     scale: float = 2.0**20,
 ) -> FluxPlanes:
-    """So many planes, see `FluxPlanes`; their positions, in the order of the sections, go to `make_flux`. Raises
-    `ArgumentError`."""
+    """So many planes, see `FluxPlanes`; `make_flux` takes their positions, in order. Raises `ArgumentError`."""
     planes: Any = FluxPlanes()
     for name, vector in {"axis": axis, "right": right, "centre": centre}.items():
         check_vector(name, vector, unit=name != "centre")
