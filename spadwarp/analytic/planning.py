@@ -242,7 +242,7 @@ def plan(
     problem = ""
     if channel != "I" and not scene.camera.channels:
         problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'"
-    elif not scene.reconstructs:
+    elif not scene.has_straight_sight:
         problem = "plan knows neither [surface] nor scan.mode = 'trajectory'; simulate and detect do"
     elif ranges is None:
         distance = truth_maps(scene, device=device).range
@@ -719,13 +719,12 @@ def measure(
     peak, level = _return(returned, pool(background), both.scene)
     bound, shot, information_noise = _bounds(both, (first, second), pool, device)
     lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
-    noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
         unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
         target=float(returned.sum()),
         backscatter=float(both.component("backscatter")[typical].sum(axis=-1).mean() * scale),
-        noise=noise,
+        noise=float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start),
         brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))),
         bound=bound,
         shot_noise=shot,
@@ -784,9 +783,7 @@ def _return(signal: Floats, background: Floats, scene: Scene) -> tuple[Floats, F
 
 class _Pool:
     """The mean over typical pixels of light `[H, W, T]`, whose bins are counted from each pixel's own true path; `[T]`.
-
-    By whole bins: within a bin the run does not know where the light is.
-    """
+    By whole bins: within a bin the run does not know where the light is."""
 
     def __init__(self, result: Result, typical: Mask) -> None:
         self.typical = typical

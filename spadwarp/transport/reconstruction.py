@@ -71,7 +71,7 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
     from scipy.ndimage import distance_transform_edt
 
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
-    if not scene.reconstructs:
+    if not scene.has_straight_sight:
         raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)

@@ -209,6 +209,7 @@ def make_sun(
     for a sun below the horizon.
     """
     height = max(_ABOVE, _ABOVE * abs(check_number("distance", distance, "(-inf, inf)")))
+    check_vector("normal", normal, unit=True)
     laser = make_laser("collimated", radius=0.0, axis=direction, position=[(distance - height) * x for x in normal])
     indices = (1.0, 1.0, check_number("index", index, "[1, 1e3]"))
     laser.port = make_flat_port(
