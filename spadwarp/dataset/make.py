@@ -100,8 +100,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
         whole = _Manifest.model_validate(manifest)
     except ValidationError as error:
         raise FileError(f"{path}: not a whole manifest: {_first_problem(error)}") from error
-    splits = whole.splits  # besides these a manifest may have what no reader knows
-    placed = {*splits.train.targets, *splits.validation.targets, *splits.test.targets}
+    placed = {*whole.splits.train.targets, *whole.splits.validation.targets, *whole.splits.test.targets}
     if lost := sorted(set(manifest["targets"]) - placed):
         raise FileError(f"{path}: not a whole manifest: the target {shown(lost[0])} is in no split")
     return manifest

@@ -290,8 +290,7 @@ class Scene(Shown, Document):
 
     @property
     def has_straight_sight(self) -> bool:
-        """Whether unscattered light has one known way to a lens at rest: not through a sea's surface, not in a moving
-        scan. `spadwarp.reconstruct` and `spadwarp.plan` need it."""
+        """Whether unscattered light has one known way, to a lens at rest: `spadwarp.reconstruct` and `plan` need it."""
         return self.surface is None and self.scan.mode != "trajectory"
 
     @property

@@ -130,8 +130,7 @@ def draw_result(
 
 _NOISY = "; hatched ({} % of the pixels): noise of the simulation, more than the photons have"
 _HATCHED = (
-    "hatched, {} % of the pixels: the brightest bin is not known to a third, what shows is noise of the simulation; "
-    "more photons{} help"
+    "hatched, {} % of the pixels, the brightest bin not known to a third: noise of the simulation; more photons{} help"
 )
 
 
