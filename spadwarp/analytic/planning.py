@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from spadwarp.analytic.budgets import OUTLIERS, axis_line, central_pixel, face_reflectance
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, safe_distance_in_water
 from spadwarp.analytic.model import false_peaks
+from spadwarp.device import pick_device
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
@@ -32,6 +33,7 @@ from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight, port_advance
 from spadwarp.transport import RunOptions, simulate, truth_maps
+from spadwarp.transport.reconstruction import known_light
 from spadwarp.values import (
     SEED,
     ArgumentError,
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
 __all__ = ["PILE_UP", "Pilot", "Proposal", "plan"]
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Progress = Callable[[str, int, int], None]
 
 PILE_UP = 0.05
@@ -88,21 +91,23 @@ _STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
 
 @dataclass(frozen=True, kw_only=True)
 class Pilot:
-    """Detections in a window of the image, medians over its pixels with a target unless said otherwise."""
+    """Detections in a window of the image: of its typical pixel, the mean over the third of the pixels with a target
+    whose known light is nearest to the median, unless said otherwise. Few photons leave a mean unbiased; a median of
+    pixels that each have a few heavy photons is too low."""
 
-    pixels: int  # their number
+    pixels: int  # with a target
     unscattered: float  # detections of the target per pulse in the gate, without scattered light
     target: float  # the same with it
     backscatter: float  # of backscatter
     noise: float  # of dark counts and ambient light
-    brightest: float  # of light in the brightest hundredth of the pixels, or the brightest one if fewer have light
+    brightest: float  # of light in the brightest twentieth of the pixels, which noise does not choose
     bound: float  # Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N
     shot_noise: float  # the same without background and pile-up
     information_noise: float  # part of the runs' information on depth that was their noise; both bounds leave it out
     floor: dict[str, float]  # estimator → median |error| of depth that is left after any number of pulses [m]
     bias: dict[str, float]  # estimator → median error, positive if too far [m]
     unscattered_floor: dict[str, float]  # `floor` of unscattered light alone: slopes, edges within a pixel, bins
-    pile_up: dict[str, float]  # estimator → change of depth by pile-up, median [m]; 0 in free-running mode
+    pile_up: dict[str, float]  # estimator → median change of depth by pile-up [m]; 0 in free-running mode
     peak: float  # detections per pulse of the return within ±3σ of its peak, σ that of the response
     level: float  # of background per σ under it
     light_noise: float  # relative standard error of the target's light in a pixel
@@ -237,7 +242,7 @@ def plan(
     problem = ""
     if channel != "I" and not scene.camera.channels:
         problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'"
-    elif not scene.reconstructs:
+    elif not scene.has_straight_sight:
         problem = "plan knows neither [surface] nor scan.mode = 'trajectory'; simulate and detect do"
     elif ranges is None:
         distance = truth_maps(scene, device=device).range
@@ -282,16 +287,10 @@ _ENOUGH = ("depth error", "false peaks")
 
 
 class _Sample(NamedTuple):
-    """What all runs measure, and what quarters of them do."""
+    """What all runs measure, and what quarters of them do, each at the pulse energy that it allows."""
 
     centre: Pilot
     parts: list[Pilot]
-
-    @classmethod
-    def of(cls, runs: Sequence[Result], scene: Scene, device: str | None, even: bool, channel: Channel) -> _Sample:
-        """Of an even number of runs, in the order in which they were traced."""
-        pairs = [measure(runs[i : i + 2], scene, device, even=even, channel=channel) for i in range(0, len(runs), 2)]
-        return cls(measure(runs, scene, device, even=even, channel=channel), pairs)
 
     def ends(self, factor: float) -> tuple[Pilot, Pilot, Pilot]:
         """The best and the worst pilot, the one measured between them, that `factor` times the photons would leave.
@@ -352,6 +351,7 @@ class _Planner:
             scene = scene.with_overrides(laser={"repetition_rate": rate})
         _refuse_hopeless(scene, span[0], self.time)
         small, asked = window(scene, self.device), scene
+        typical = typical_pixels(small, self.device)
         budget, begin = _SECONDS * (_PART if even else 1.0), clock.monotonic()
         runs: tuple[Result, ...] = ()
         while True:
@@ -362,7 +362,9 @@ class _Planner:
             traced, elapsed = sum(run.photons for run in runs), clock.monotonic() - begin
             last = photons is not None or 2.0 * elapsed > budget or traced > _MOST
             try:
-                scene, energy_limit, piled, eye, found = self._settle(asked, runs, even)
+                scene, energy_limit, piled, eye, pilot = self._settle(asked, runs, typical, even)
+                quarters = (runs[i : i + 2] for i in range(0, _RUNS, 2))
+                found = _Sample(pilot, [self._settle(asked, two, typical, even)[-1] for two in quarters])
             except _NoLight:
                 if last:
                     raise
@@ -412,19 +414,22 @@ class _Planner:
             seconds_needed=sum(run.timing.get("trace", math.nan) for run in runs) * factor,
         )
 
-    def _settle(self, scene: Scene, runs: Sequence[Result], even: bool) -> tuple[Scene, str, float, EyeLimit, _Sample]:
-        """The scene with its pulse energy, what sets it, that of pile-up, the limit for the eye; and what was
-        measured."""
-        found = _Sample.of(runs, scene, self.device, even, self.channel)
+    def _settle(
+        self, scene: Scene, runs: Sequence[Result], typical: Mask, even: bool
+    ) -> tuple[Scene, str, float, EyeLimit, Pilot]:
+        """The scene with its pulse energy, what sets it, that of pile-up, the limit for the eye; and what an even
+        number of runs measured."""
+        options: dict[str, Any] = {"even": even, "channel": self.channel}
+        found = measure(runs, scene, typical, self.device, **options)
         eye = eye_limit(scene, distance=self.eye_distance or 0.1, exposure=self.eye_exposure)
-        piled = scene.laser.pulse_energy * max(PILE_UP - found.centre.noise, 0.0) / found.centre.brightest
+        piled = scene.laser.pulse_energy * max(PILE_UP - found.noise, 0.0) / found.brightest
         allowed = {"pile-up": piled} | ({} if self.eye_distance is None else {"eye": eye.pulse_energy})
         energy_limit = min(allowed, key=allowed.__getitem__)
         lowest = allowed[energy_limit]
         if not (lowest > 0 and ((self.full_power and not even) or scene.laser.pulse_energy > lowest)):
             return scene, "", piled, eye, found
         scene = scene.with_overrides(laser={"pulse_energy": _rounded_down(lowest)})
-        return scene, energy_limit, piled, eye, _Sample.of(runs, scene, self.device, even, self.channel)
+        return scene, energy_limit, piled, eye, measure(runs, scene, typical, self.device, **options)
 
     def _outcome(self, scene: Scene, pilot: Pilot) -> _Outcome:
         pulses, purpose = self._pulses(scene, pilot)
@@ -596,6 +601,16 @@ def window(scene: Scene, device: str | None = None) -> Scene:
     return scene.with_overrides(camera={"width": width, "height": height, "fx": fx, "fy": fy, **centre})
 
 
+def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
+    """The third of the pixels with a target whose unscattered light is nearest to the median: what is known of it
+    without a photon does not choose pixels by their noise. bool `[H, W]`."""
+    light = known_light(scene, None, pick_device(device))[0].sum(axis=-1, dtype=np.float64)
+    light[np.isnan(truth_maps(scene, device=device).depth)] = np.nan
+    off = np.abs(light - np.nanmedian(light))
+    chosen = np.argsort(off, axis=None, kind="stable")[: max(1, np.isfinite(light).sum() // 3)]
+    return np.isin(np.arange(light.size), chosen).reshape(light.shape)
+
+
 def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
     """Raises `ConfigError` where a pixel detects less than one photon of the target in all pulses of a time [s], even
     if scattering took no light away.
@@ -650,10 +665,16 @@ def trace(
 
 
 def measure(
-    runs: Sequence[Result], scene: Scene, device: str | None = None, *, even: bool = False, channel: Channel = "I"
+    runs: Sequence[Result],
+    scene: Scene,
+    typical: Mask,
+    device: str | None = None,
+    *,
+    even: bool = False,
+    channel: Channel = "I",
 ) -> Pilot:
     """Numbers of `scene`, whose laser's energy and detector may differ from those of the runs, in a channel of an
-    analyser.
+    analyser; `typical`: the runs' `typical_pixels`.
 
     `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
     its modulus.
@@ -693,18 +714,18 @@ def measure(
         recorded = errors(frames, first_photon_probabilities(light, device=device))
         piled = {method: median(recorded[method] - error[method]) for method in METHODS}
     scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
-    peak, level = _return(signal, background, both.scene)
-    bound, shot, information_noise = _bounds(both, (first, second), seen, device)
-    detected = both.detections.sum(axis=-1)
+    pool = _Pool(both, typical)
+    returned = pool(signal)
+    peak, level = _return(returned, pool(background), both.scene)
+    bound, shot, information_noise = _bounds(both, (first, second), pool, device)
     lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
-    noise = float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start)
     return Pilot(
         pixels=int(seen.sum()),
-        unscattered=median(both.component("ballistic").sum(axis=-1) * scale),
-        target=median(signal.sum(axis=-1)),
-        backscatter=median(both.component("backscatter").sum(axis=-1) * scale),
-        noise=noise,
-        brightest=float(np.quantile(detected, 0.99) or detected.max()),
+        unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
+        target=float(returned.sum()),
+        backscatter=float(both.component("backscatter")[typical].sum(axis=-1).mean() * scale),
+        noise=float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start),
+        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))),
         bound=bound,
         shot_noise=shot,
         information_noise=information_noise,
@@ -712,8 +733,8 @@ def measure(
         bias=bias,
         unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
         pile_up=piled,
-        peak=median(peak),
-        level=median(level),
+        peak=float(peak),
+        level=float(level),
         light_noise=math.sqrt(np.mean(np.square(lights[0] - lights[1]))) / max(float(np.mean(sum(lights))), 1e-300),
         photons=both.photons,
     )
@@ -733,6 +754,17 @@ def _depth_error(result: Result, frames: Frames, histogram: Any, method: Any, de
     return depth_from_time(time, scene=result.scene) - result.truth.depth
 
 
+def _brightest(first: Floats, second: Floats) -> float:
+    """Mean over the brightest twentieth of the pixels of two halves `[H, W]`, each chosen by the other half's averages
+    over neighbours; over both halves' brightest pixel where these have no light."""
+    from scipy.ndimage import uniform_filter
+
+    count = max(1, first.size // 20)
+    pairs = ((first, second), (second, first))
+    top = [mine.ravel()[np.argsort(uniform_filter(other, 3), axis=None)[-count:]] for mine, other in pairs]
+    return float(np.mean(top)) or float((first + second).max()) / 2.0
+
+
 def _sigma(scene: Scene) -> float:
     """Standard deviation of the response, or of a bin where it is shorter [s]."""
     return max(detector_response(scene.detector, scene.laser).fwhm, scene.gate.bin_width) / FWHM_PER_SIGMA
@@ -749,22 +781,34 @@ def _return(signal: Floats, background: Floats, scene: Scene) -> tuple[Floats, F
     return peak, np.take_along_axis(background, near, axis=-1).mean(axis=-1) * bins_per_sigma
 
 
-def _bounds(
-    result: Result, runs: tuple[Result, Result], seen: NDArray[np.bool_], device: str | None
-) -> tuple[float, float, float]:
-    """Bounds of depth for one pulse [m], medians: as the detector records it, and without background and pile-up; and
-    the part of the information that was noise of the runs, for which the bounds are larger.
+class _Pool:
+    """The mean over typical pixels of light `[H, W, T]`, whose bins are counted from each pixel's own true path; `[T]`.
+    By whole bins: within a bin the run does not know where the light is."""
 
-    From products of the slopes of both runs, which noise does not change in the mean. One pixel has too few photons to
-    say what part is noise, and few bright photons rule a mean over pixels: medians of both are compared. Inf where
-    nearly all is noise.
+    def __init__(self, result: Result, typical: Mask) -> None:
+        self.typical = typical
+        path = result.true_path()[typical] / (result.scene.medium.pulse_speed * result.scene.gate.bin_width)
+        shift = np.rint(path - np.median(path)).astype(np.int64)[:, None]
+        self.bins = np.arange(result.scene.gate.bins) + shift
+        self.inside = (self.bins >= 0) & (self.bins < result.scene.gate.bins)
+
+    def __call__(self, light: NDArray[Any]) -> Floats:
+        own = light[self.typical].astype(np.float64)
+        return (np.take_along_axis(own, np.clip(self.bins, 0, own.shape[1] - 1), axis=1) * self.inside).mean(axis=0)
+
+
+def _bounds(result: Result, runs: tuple[Result, Result], pool: _Pool, device: str | None) -> tuple[float, float, float]:
+    """Bounds of depth for one pulse [m]: as the detector records it, and without background and pile-up; and the part
+    of the information that was noise of the runs, for which the bounds are larger.
+
+    From products of the slopes of both runs, which noise does not change in the mean. Inf where nearly all is noise.
     """
     scene = result.scene
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon
     signal, first, second = (
-        (run.component("ballistic") + run.component("forward_scattered")) * scale for run in (result, *runs)
+        pool(run.component("ballistic") + run.component("forward_scattered")) * scale for run in (result, *runs)
     )
-    background = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
+    light = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     options: dict[str, Any] = {
         "bin_width": scene.gate.bin_width,
         "irf": detector_response(scene.detector, scene.laser),
@@ -772,19 +816,17 @@ def _bounds(
         "device": device,
     }
     law: Any = "first_photon" if scene.detector.mode == "first_photon" else "poisson"
-    slope = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
+    slope = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))[pool.typical].mean()
 
     def bound(background: Any, law: Any) -> tuple[float, float]:
-        information, noise = information_from_histogram(signal, background, law=law, **options)
-        known = seen & (information > 0)
-        if not known.any():
+        information, noise = (float(x) for x in information_from_histogram(signal, background, law=law, **options))
+        if information <= 0.0:
             return math.inf, 1.0
-        part = float(np.median(noise[known]) / np.median(information[known]))
-        left = 1.0 - part if part < _MOST_NOISE else 0.0
-        with np.errstate(divide="ignore"):
-            return float(np.median(slope[known] / np.sqrt(left * information[known]))), part
+        part = noise / information
+        left = information - noise if part < _MOST_NOISE else 0.0
+        return float(slope) / math.sqrt(left) if left > 0.0 else math.inf, part
 
-    recorded, part = bound(background, law)
+    recorded, part = bound(pool(light), law)
     return recorded, bound(0.0, "poisson")[0], part
 
 

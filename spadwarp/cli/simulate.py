@@ -122,7 +122,7 @@ def simulate(
         return
     else:
         read = opt.read_scene(scene, overrides, mesh=mesh, photons=asked, seed=seed)
-    if reconstruct and not read.reconstructs:
+    if reconstruct and not read.has_straight_sight:
         wrong("knows neither [surface] nor scan.mode = 'trajectory'", "--reconstruct")
     if records:
         _check_records(read, whole=not (first_photon or shard))
@@ -152,7 +152,7 @@ def simulate(
             ),
         )
     device = opt.one_device(devices, engine)
-    automatic = reconstruct is None and read.transport.photons == "auto" and read.reconstructs
+    automatic = reconstruct is None and read.transport.photons == "auto" and read.has_straight_sight
     if (reconstruct or automatic) and result.batches > 1:
         note("the light is reconstructed")
         result = spadwarp.reconstruct(result, device=device)

@@ -97,10 +97,10 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
     if (version := manifest.get("format_version")) != FORMAT_VERSION:
         raise FileError(f"{path}: format_version = {shown(version)} is not {FORMAT_VERSION}")
     try:
-        _Manifest.model_validate(manifest)
+        whole = _Manifest.model_validate(manifest)
     except ValidationError as error:
         raise FileError(f"{path}: not a whole manifest: {_first_problem(error)}") from error
-    placed = {name for split in manifest["splits"].values() for name in split["targets"]}
+    placed = {*whole.splits.train.targets, *whole.splits.validation.targets, *whole.splits.test.targets}
     if lost := sorted(set(manifest["targets"]) - placed):
         raise FileError(f"{path}: not a whole manifest: the target {shown(lost[0])} is in no split")
     return manifest

@@ -215,7 +215,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     polarisation = degree_of_polarisation(result).astype(np.float16) if result.channels else None
     result = analyser_channel(result, plan.recipe.monte_carlo.channel)
     chosen = plan.recipe.monte_carlo
-    automatic = draw.photons == "auto" and chosen.channel == "I" and scene.reconstructs
+    automatic = draw.photons == "auto" and chosen.channel == "I" and scene.has_straight_sight
     if (automatic if chosen.reconstruct is None else chosen.reconstruct) and result.batches > 1:
         result = reconstruct(result, device=device)
     scale = scene.laser.photons_per_pulse * scene.detections_per_photon

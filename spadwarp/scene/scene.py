@@ -289,8 +289,8 @@ class Scene(Shown, Document):
         return get_args(Component)[: 3 if self.surface is None else 4]
 
     @property
-    def reconstructs(self) -> bool:
-        """Whether `spadwarp.reconstruct` knows the ways of unscattered light: not through waves or to a moving lens."""
+    def has_straight_sight(self) -> bool:
+        """Whether unscattered light has one known way, to a lens at rest: `spadwarp.reconstruct` and `plan` need it."""
         return self.surface is None and self.scan.mode != "trajectory"
 
     @property

@@ -32,7 +32,7 @@ from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport.model import build_model, trace_rays
 from spadwarp.values import ConfigError
 
-__all__ = ["reconstruct"]
+__all__ = ["known_light", "reconstruct"]
 
 Cube = NDArray[np.float32]
 
@@ -71,12 +71,12 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
     from scipy.ndimage import distance_transform_edt
 
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
-    if not scene.reconstructs:
+    if not scene.has_straight_sight:
         raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)
         focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None
-    direct, even, covered = _known_light(scene, focus, device)
+    direct, even, covered = known_light(scene, focus, device)
     fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
     ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
     # Scattered light of a pixel without a target is that of the nearest target.
@@ -103,7 +103,7 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
     return Reconstruction(histogram=found, error=np.sqrt(squares))
 
 
-def _known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
+def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
     """From truth rays: ballistic light and surfaces in even light, `[H, W, fine bin]`; the part of each pixel whose
     surface has light of a bin or of an earlier one, `[H, W, T]`."""
     camera, gate, count = scene.camera, scene.gate, scene.gate.bins * _FINE

@@ -130,8 +130,7 @@ def draw_result(
 
 _NOISY = "; hatched ({} % of the pixels): noise of the simulation, more than the photons have"
 _HATCHED = (
-    "hatched, {} % of the pixels: the brightest bin is not known to a third, what shows is noise of the simulation; "
-    "more photons or a reconstruction help"
+    "hatched, {} % of the pixels, the brightest bin not known to a third: noise of the simulation; more photons{} help"
 )
 
 
@@ -169,7 +168,8 @@ def _result_figure(
     panels = Panels(truth.depth.shape, count_of, width=width)
     panels.figure.caption(_caption(result))
     if unclear.any() and kind != "truth":
-        panels.figure.note(_HATCHED.format(percent(unclear.mean())))
+        more = result.scene.has_straight_sight and result.reconstruction is None
+        panels.figure.note(_HATCHED.format(percent(unclear.mean()), " or a reconstruction" if more else ""))
     if kind == "intensity":
         panels.unclear = unclear
         per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon

@@ -101,7 +101,7 @@ class PaperFigure(Figure):
     def caption(self, text: str) -> None:
         """Writes above it what it shows; items between commas and semicolons stay whole."""
         text = wrapped_items(text, self.get_figwidth() - 0.3)
-        self.grow(0.25 + 0.14 * text.count("\n"))
+        self.grow(0.35 + 0.14 * text.count("\n"))
         self.suptitle(text, color=TEXT)
 
     def note(self, text: str) -> None:

@@ -45,7 +45,7 @@ def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: i
             os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
         log.seek(0)
-        stderr = log.read()[-4000:].decode(errors="replace")
+        stderr = log.read().split(b"\nExtension modules")[0][-4000:].decode(errors="replace")
     if answer is None:
         return Outcome("hang", None, stderr, taken)
     if os.WIFSIGNALED(status):

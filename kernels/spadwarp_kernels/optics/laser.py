@@ -209,7 +209,8 @@ def make_sun(
     for a sun below the horizon.
     """
     height = max(_ABOVE, _ABOVE * abs(check_number("distance", distance, "(-inf, inf)")))
-    laser = make_laser("collimated", radius=0.0, axis=direction, position=[(distance - height) * x for x in normal])
+    position = (distance - height) * check_numbers("normal", normal, 1)
+    laser = make_laser("collimated", radius=0.0, axis=direction, position=position)
     indices = (1.0, 1.0, check_number("index", index, "[1, 1e3]"))
     laser.port = make_flat_port(
         distance=distance, normal=normal, index=indices, group_index=indices, origin=laser.position

@@ -11,7 +11,14 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_integer, check_number, check_vector
+from spadwarp_kernels.base.arguments import (
+    ArgumentError,
+    check_device,
+    check_integer,
+    check_number,
+    check_numbers,
+    check_vector,
+)
 
 __all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "Leg", "add_flux_collision", "add_flux_crossings"]
 __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume"]
@@ -204,22 +211,25 @@ def make_flux_volume(
     origin; where the `edge` of a voxel is infinite it has no bounds, and one voxel. Gates of `gate_path` follow each
     other from `gate_start` on. Lengths and paths in metres. Raises `ArgumentError`.
     """
-    widths = [min(x, 1e30) for x in edge]
-    for name, vector in (("shape", shape), ("lower", lower), ("edge", widths), ("origin", origin)):
+    for name, vector in (("shape", shape), ("lower", lower), ("origin", origin)):
         check_vector(name, vector)
     if estimator not in FLUX_KINDS[:2]:
         raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
     volume: Any = FluxVolume()
     rows, shift = [], []
-    for k, width in enumerate(edge):
-        check_number(f"edge[{k}]", widths[k], "(0, inf)")
+    edge, turn = check_numbers("edge", edge, 1), check_numbers("rotation", rotation, 2)
+    if edge.shape != (3,) or turn.shape != (3, 3):
+        raise ArgumentError(f"edge, rotation have shapes {edge.shape}, {turn.shape}; (3,), (3, 3) are needed")
+    for k, width in enumerate(edge.tolist()):
+        check_number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
         check_integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
-        rows += [x / width for x in rotation[k]]
+        rows += [x / width for x in turn[k].tolist()]
         shift.append((origin[k] - lower[k]) / width)
     volume.turn, volume.shift, volume.size = wp.mat33(*rows), wp.vec3(*shift), wp.vec3i(*shape)
+    gate_path = float(check_numbers("gate_path", gate_path, 0))
+    check_number("gate_path", min(gate_path, 1e30), "(0, inf)")
     volume.gates = check_integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
     volume.gate_start = check_number("gate_start", gate_start, "(-inf, inf)")
-    check_number("gate_path", min(gate_path, 1e30), "(0, inf)")
     volume.gates_per_metre, volume.by_collision = 1.0 / gate_path, int(estimator == "collision")
     volume.scale = check_number("scale", scale, "(0, inf)")
     return volume

@@ -529,5 +529,5 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
         values[name] <<= int(OUTSIDE_SHIFT)
     entries = (*LEDGER_ENTRIES, PORT_ENTRY) if values[PORT_ENTRY] else LEDGER_ENTRIES
     entries += SEA_ENTRIES if data.has_sea else ()
-    counters = COUNTERS + BOUNDARY_COUNTERS * data.reflecting + SEA_COUNTERS * data.has_sea
+    counters = COUNTERS + BOUNDARY_COUNTERS * bool(data.reflecting) + SEA_COUNTERS * bool(data.has_sea)
     return {name: values[name] for name in entries}, {name: values[name] for name in counters}
