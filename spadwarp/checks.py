@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic import PILE_UP, axis_fluence
+from spadwarp.device import pick_devices
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.mesh.targets import target_balls
@@ -83,7 +84,8 @@ class OnAxis:
 class Survey:
     """A scene's targets as the camera sees them and the beam illuminates them, shadows aside; and the findings."""
 
-    def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
+    def __init__(self, scene: Scene, mesh: TriangleMesh | None, device: str | None = "cpu") -> None:
+        self.device = pick_devices(device)[0]
         if mesh is None and scene.targets:
             mesh = build_mesh(scene)
         self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
@@ -146,7 +148,7 @@ class Survey:
         points = points_inside(triangles, np.concatenate(whole))
         if has_port and len(triangles):
             start, direction = self._rays()
-            hits = start + first_hits(triangles, start, direction)[:, None] * direction
+            hits = start + first_hits(triangles, start, direction, self.device)[:, None] * direction
             points = np.concatenate([points, hits[np.isfinite(hits).all(axis=1)]])
         for planes, port, _, origin in self._sides:
             if port is not None and len(points):
@@ -157,7 +159,8 @@ class Survey:
     def visible(self, points: Points) -> Points:
         """Those of the points of targets that nothing hides from the lens; all of them where there is none."""
         distance = np.linalg.norm(points, axis=1)
-        hit = first_hits(np.concatenate(self.targets), np.zeros(3), points / np.maximum(distance, 1e-30)[:, None])
+        directions = points / np.maximum(distance, 1e-30)[:, None]
+        hit = first_hits(np.concatenate(self.targets), np.zeros(3), directions, self.device)
         return points[seen] if (seen := hit >= 0.999 * distance).any() else points
 
     def _rays(self) -> tuple[Points, Points]:
@@ -213,14 +216,15 @@ class Survey:
         )
 
 
-def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
+def check(scene: SceneLike, mesh: TriangleMesh | None = None, *, device: str | None = "cpu") -> list[CheckMessage]:
     """Everything worth knowing about a scene, warnings first; shadows of the beam are not considered.
 
-    `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
-    for the tables of a phase function and a scattering matrix and the instrument response of the detector;
-    `ConfigError` for several points per flight with what they do not go with.
+    `mesh` is the scene's mesh if the caller has it; else it is built. `device` casts rays for what is hidden: that of a
+    run that follows, which needs the same kernels. Raises `MeshError`, `DeviceError`; `FileError` or `ConfigError` for
+    the tables of a phase function and a scattering matrix and the instrument response of the detector; `ConfigError`
+    for several points per flight with what they do not go with.
     """
-    survey = Survey(as_scene(scene), mesh)
+    survey = Survey(as_scene(scene), mesh, device)
     points_per_flight(survey.scene)
     try:  # read here, since only depth and counts need it: at the end of a run it would be too late
         detector_response(survey.scene.detector, survey.scene.laser)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from spadwarp import Result, Scene
     from spadwarp.cli.outputs import Report
     from spadwarp.files import RunFiles
+    from spadwarp.mesh import TriangleMesh
 
 
 @command()
@@ -104,6 +105,8 @@ def simulate(
         text = "cannot be combined with --trajectory"
         opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
         opt.refuse(text, "--records", "--relative-error", "--derivatives", "--reconstruct", "--time")
+    if ray is None:
+        spadwarp.device.start_gpus(devices)
     asked: Any = "auto" if photons is None and time is not None else photons
     earlier = None
     if resume is not None:
@@ -127,10 +130,11 @@ def simulate(
     if records:
         _check_records(read, whole=not (first_photon or shard))
     engine = opt.read_engine(ray, workers)
-    if engine is None:
-        spadwarp.transport.prepare_kernels(devices)
-    _warn(read, devices)
     names = _parameters(read, derivatives, earlier)
+    mesh = spadwarp.mesh.build_mesh(read)
+    if engine is None:
+        spadwarp.transport.prepare_kernels(read, mesh, devices, derivatives=names)
+    _warn(read, mesh, devices if engine is None else "cpu")
     _prepare_directory(out, read, earlier, scene, derivatives=len(names), records=records, checkpoint=checkpoint > 0)
     with _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
@@ -194,9 +198,9 @@ def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tupl
     return spadwarp.transport.resolve_derivatives(scene, plain, blocks)
 
 
-def _warn(scene: Scene, device: str | None) -> None:
+def _warn(scene: Scene, mesh: TriangleMesh | None, device: str | None) -> None:
     """Of what the scene's check finds, and of devices that are named twice."""
-    for message in spadwarp.check(scene):
+    for message in spadwarp.check(scene, mesh, device=device):
         if message.level == "warning":
             complain(str(message))
     names = (device or "").split(",")

@@ -56,7 +56,7 @@ def make_builtin(name: str) -> trimesh.Trimesh:
     """
     import trimesh
 
-    return trimesh.Trimesh(*_built(name), process=False)
+    return trimesh.Trimesh(*(part.copy() for part in _built(name)), process=False)
 
 
 @cache
@@ -297,6 +297,8 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
     matrix = placement(stretch * target.scale, target.rotation_deg, target.translation)
     if np.abs(matrix - np.eye(4)).max() >= 1e-8:
         vertices = np.dot(matrix, np.column_stack([vertices, np.ones(len(vertices))]).T).T[:, :3]
+        if np.linalg.det(matrix[:3, :3]) < 0.0:  # mirrored: normals stay outwards
+            faces = np.ascontiguousarray(faces[:, ::-1])
     with np.errstate(over="ignore"):  # becomes infinite, which is refused
         corners = np.asarray(vertices, dtype=np.float32)[faces].astype(np.float64)
     if not (inside := np.abs(corners) <= FARTHEST).all():
