@@ -158,9 +158,8 @@ class Survey:
 
     def visible(self, points: Points) -> Points:
         """Those of the points of targets that nothing hides from the lens; all of them where there is none."""
-        distance = np.linalg.norm(points, axis=1)
-        directions = points / np.maximum(distance, 1e-30)[:, None]
-        hit = first_hits(np.concatenate(self.targets), np.zeros(3), directions, self.device)
+        distance, targets = np.linalg.norm(points, axis=1), np.concatenate(self.targets)
+        hit = first_hits(targets, np.zeros(3), points / np.maximum(distance, 1e-30)[:, None], self.device)
         return points[seen] if (seen := hit >= 0.999 * distance).any() else points
 
     def _rays(self) -> tuple[Points, Points]:
@@ -219,10 +218,9 @@ class Survey:
 def check(scene: SceneLike, mesh: TriangleMesh | None = None, *, device: str | None = "cpu") -> list[CheckMessage]:
     """Everything worth knowing about a scene, warnings first; shadows of the beam are not considered.
 
-    `mesh` is the scene's mesh if the caller has it; else it is built. `device` casts rays for what is hidden: that of a
-    run that follows, which needs the same kernels. Raises `MeshError`, `DeviceError`; `FileError` or `ConfigError` for
-    the tables of a phase function and a scattering matrix and the instrument response of the detector; `ConfigError`
-    for several points per flight with what they do not go with.
+    `mesh` is the scene's mesh if the caller has it; else it is built. `device`, for rays, is best that of the run that
+    follows. Raises `MeshError`, `DeviceError`; `FileError` or `ConfigError` for the tables of a phase function and a
+    scattering matrix and the detector's response; `ConfigError` for points per flight that do not go with the rest.
     """
     survey = Survey(as_scene(scene), mesh, device)
     points_per_flight(survey.scene)

@@ -253,12 +253,12 @@ class _Loaded(NamedTuple):
     images: Images = ()  # of that file
 
 
-def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
-    """`load_target`, as arrays."""
-    images: Images = ()
+def _read(target: Target, field: str, wavelength_nm: float) -> tuple[str, _Loaded]:
+    """A target as errors name it, and in its own frame."""
     if target.mesh is not None:
         import trimesh
 
+        images: Images = ()
         name, path = f"{field}.mesh = {target.mesh!r}" if field else target.mesh, Path(target.mesh)
         if (problem := file_problem(path)) is not None:
             raise MeshError(f"{name}: {problem}{similar(path) if problem == 'no such file' else ''}")
@@ -268,20 +268,25 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
             mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
         else:
             mesh = _read_mesh(path, name)
-        surface = mesh.vertex_attributes.get("surface")
-        loaded = _Loaded(np.asarray(mesh.vertices), np.asarray(mesh.faces), surface, images)
-    else:
-        assert target.builtin is not None  # the one or the other, see `Target`
-        name = f"{field}.builtin = {target.builtin!r}"
-        try:
-            loaded = _Loaded(*_built(target.builtin), None)
-        except ArgumentError as error:
-            raise ConfigError(f"{field}.{error}") from error
-        if target.size is not None and target.builtin not in SIZED_BUILTINS:
-            raise ConfigError(
-                f"{field}.size = {list(target.size)} cannot be combined with builtin = {target.builtin!r}, which"
-                f" has its own; it is for {', '.join(SIZED_BUILTINS)}, and scale for all"
-            )
+        surface = mesh.vertex_attributes.get("surface") if target.reflectance == "from_file" else None
+        return name, _Loaded(np.asarray(mesh.vertices), np.asarray(mesh.faces), surface, images)
+    assert target.builtin is not None  # the one or the other, see `Target`
+    name = f"{field}.builtin = {target.builtin!r}"
+    try:
+        loaded = _Loaded(*_built(target.builtin), None)
+    except ArgumentError as error:
+        raise ConfigError(f"{field}.{error}") from error
+    if target.size is not None and target.builtin not in SIZED_BUILTINS:
+        raise ConfigError(
+            f"{field}.size = {list(target.size)} cannot be combined with builtin = {target.builtin!r}, which"
+            f" has its own; it is for {', '.join(SIZED_BUILTINS)}, and scale for all"
+        )
+    return name, loaded
+
+
+def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
+    """`load_target`, as arrays."""
+    name, loaded = _read(target, field, wavelength_nm)
     if (count := len(loaded.faces)) == 0:
         raise MeshError(f"{name}: the mesh has no faces")
     if count * 4**target.subdivisions > MAX_FACES:
@@ -293,7 +298,7 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
         loaded = _subdivided(loaded, target)
     size = target.size or (1.0,)  # one number for all axes, two for x and y, or three
     stretch = np.array([*size, 1.0] if len(size) == 2 else np.broadcast_to(size, 3))
-    vertices, faces, surface, _ = loaded
+    vertices, faces, surface, images = loaded
     matrix = placement(stretch * target.scale, target.rotation_deg, target.translation)
     if np.abs(matrix - np.eye(4)).max() >= 1e-8:
         vertices = np.dot(matrix, np.column_stack([vertices, np.ones(len(vertices))]).T).T[:, :3]
