@@ -85,18 +85,16 @@ class Survey:
     """A scene's targets as the camera sees them and the beam illuminates them, shadows aside; and the findings."""
 
     def __init__(self, scene: Scene, mesh: TriangleMesh | None, device: str | None = "cpu") -> None:
-        self.device = pick_devices(device)[0]
-        if mesh is None and scene.targets:
-            mesh = build_mesh(scene)
+        mesh = build_mesh(scene) if mesh is None and scene.targets else mesh
         self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
         self.moving = None if scene.scan.mode != "trajectory" else scene
         if self.moving is not None:  # all else is of one of its shots
             self.balls = target_balls(scene, mesh)
             scene = shot_at(scene, [middle for middle, _ in self.balls])
             mesh = build_mesh(scene) if scene.targets else None
-        self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
+        self.device, self.scene, self.messages, laser = pick_devices(device)[0], scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
-        # The faces of each target in the camera frame `[F, 3, 3]` [m].
+        # Faces by target, in the camera frame `[F, 3, 3]` [m].
         self.targets = [] if mesh is None else [triangles[mesh.target == i] for i in range(len(scene.targets))]
         self.reflectance = 0.0 if mesh is None else float(mesh.reflectance.max(initial=0.0))
         self.focus_distance = focus_distance(scene, mesh)  # [m]; None for a pinhole

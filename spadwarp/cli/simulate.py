@@ -18,10 +18,9 @@ from spadwarp.cli.outputs import answer, check_outputs, progress
 from spadwarp.values import ArgumentError, ConfigError, address_space, count
 
 if TYPE_CHECKING:
-    from spadwarp import Result, Scene
+    from spadwarp import Ray, Result, Scene
     from spadwarp.cli.outputs import Report
     from spadwarp.files import RunFiles
-    from spadwarp.mesh import TriangleMesh
 
 
 @command()
@@ -131,10 +130,7 @@ def simulate(
         _check_records(read, whole=not (first_photon or shard))
     engine = opt.read_engine(ray, workers)
     names = _parameters(read, derivatives, earlier)
-    mesh = spadwarp.mesh.build_mesh(read)
-    if engine is None:
-        spadwarp.transport.prepare_kernels(read, mesh, devices, derivatives=names)
-    _warn(read, mesh, devices if engine is None else "cpu")
+    _prepare(read, devices, engine, names)
     _prepare_directory(out, read, earlier, scene, derivatives=len(names), records=records, checkpoint=checkpoint > 0)
     with _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
@@ -198,8 +194,12 @@ def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tupl
     return spadwarp.transport.resolve_derivatives(scene, plain, blocks)
 
 
-def _warn(scene: Scene, mesh: TriangleMesh | None, device: str | None) -> None:
-    """Of what the scene's check finds, and of devices that are named twice."""
+def _prepare(scene: Scene, device: str | None, engine: Ray | None, derivatives: tuple[str, ...]) -> None:
+    """Begins to load kernels; warns of what the scene's check finds, and of devices that are named twice."""
+    mesh = spadwarp.mesh.build_mesh(scene)
+    if engine is None:
+        spadwarp.transport.prepare_kernels(scene, mesh, device, derivatives=derivatives)
+    device = "cpu" if engine is not None else device
     for message in spadwarp.check(scene, mesh, device=device):
         if message.level == "warning":
             complain(str(message))
