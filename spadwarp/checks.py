@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic import PILE_UP, axis_fluence
+from spadwarp.device import pick_devices
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.mesh.targets import target_balls
@@ -83,18 +84,17 @@ class OnAxis:
 class Survey:
     """A scene's targets as the camera sees them and the beam illuminates them, shadows aside; and the findings."""
 
-    def __init__(self, scene: Scene, mesh: TriangleMesh | None) -> None:
-        if mesh is None and scene.targets:
-            mesh = build_mesh(scene)
+    def __init__(self, scene: Scene, mesh: TriangleMesh | None, device: str | None = "cpu") -> None:
+        mesh = build_mesh(scene) if mesh is None and scene.targets else mesh
         self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
         self.moving = None if scene.scan.mode != "trajectory" else scene
         if self.moving is not None:  # all else is of one of its shots
             self.balls = target_balls(scene, mesh)
             scene = shot_at(scene, [middle for middle, _ in self.balls])
             mesh = build_mesh(scene) if scene.targets else None
-        self.scene, self.messages, laser = scene, list[CheckMessage](), scene.beam
+        self.device, self.scene, self.messages, laser = pick_devices(device)[0], scene, list[CheckMessage](), scene.beam
         triangles = np.zeros((0, 3, 3)) if mesh is None else mesh.vertices[mesh.faces].astype(np.float64)
-        # The faces of each target in the camera frame `[F, 3, 3]` [m].
+        # Faces by target, in the camera frame `[F, 3, 3]` [m].
         self.targets = [] if mesh is None else [triangles[mesh.target == i] for i in range(len(scene.targets))]
         self.reflectance = 0.0 if mesh is None else float(mesh.reflectance.max(initial=0.0))
         self.focus_distance = focus_distance(scene, mesh)  # [m]; None for a pinhole
@@ -146,7 +146,7 @@ class Survey:
         points = points_inside(triangles, np.concatenate(whole))
         if has_port and len(triangles):
             start, direction = self._rays()
-            hits = start + first_hits(triangles, start, direction)[:, None] * direction
+            hits = start + first_hits(triangles, start, direction, self.device)[:, None] * direction
             points = np.concatenate([points, hits[np.isfinite(hits).all(axis=1)]])
         for planes, port, _, origin in self._sides:
             if port is not None and len(points):
@@ -156,8 +156,8 @@ class Survey:
 
     def visible(self, points: Points) -> Points:
         """Those of the points of targets that nothing hides from the lens; all of them where there is none."""
-        distance = np.linalg.norm(points, axis=1)
-        hit = first_hits(np.concatenate(self.targets), np.zeros(3), points / np.maximum(distance, 1e-30)[:, None])
+        distance, targets = np.linalg.norm(points, axis=1), np.concatenate(self.targets)
+        hit = first_hits(targets, np.zeros(3), points / np.maximum(distance, 1e-30)[:, None], self.device)
         return points[seen] if (seen := hit >= 0.999 * distance).any() else points
 
     def _rays(self) -> tuple[Points, Points]:
@@ -213,14 +213,14 @@ class Survey:
         )
 
 
-def check(scene: SceneLike, mesh: TriangleMesh | None = None) -> list[CheckMessage]:
+def check(scene: SceneLike, mesh: TriangleMesh | None = None, *, device: str | None = "cpu") -> list[CheckMessage]:
     """Everything worth knowing about a scene, warnings first; shadows of the beam are not considered.
 
-    `mesh` is the scene's mesh if the caller has it; else it is built. Raises `MeshError`; `FileError` or `ConfigError`
-    for the tables of a phase function and a scattering matrix and the instrument response of the detector;
-    `ConfigError` for several points per flight with what they do not go with.
+    `mesh` is the scene's mesh if the caller has it; else it is built. `device`, for rays, is best that of the run that
+    follows. Raises `MeshError`, `DeviceError`; `FileError` or `ConfigError` for the tables of a phase function and a
+    scattering matrix and the detector's response; `ConfigError` for points per flight that do not go with the rest.
     """
-    survey = Survey(as_scene(scene), mesh)
+    survey = Survey(as_scene(scene), mesh, device)
     points_per_flight(survey.scene)
     try:  # read here, since only depth and counts need it: at the end of a run it would be too late
         detector_response(survey.scene.detector, survey.scene.laser)

@@ -7,18 +7,19 @@ import functools
 import json
 import os
 import platform
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spadwarp.values import DeviceError, guarded, need_memory, shown
+from spadwarp.values import DeviceError, address_space, guarded, need_memory, shown
 
 if TYPE_CHECKING:
     import warp as wp
 
 __all__ = ["core_count", "devices", "nvidia_driver", "physical_memory", "pick_device", "pick_devices"]
-__all__ += ["processor_name", "start_warp"]
+__all__ += ["processor_name", "start_gpus", "start_warp"]
 
 
 def pick_devices(names: str | None = None) -> list[wp.Device]:
@@ -94,13 +95,39 @@ def _cpu_name() -> str:
     return next(names, "") or platform.processor() or platform.machine()
 
 
-@functools.cache
+def start_gpus(names: str | None = None) -> None:
+    """Begins to start the devices of `pick_devices`, where there is a GPU; returns at once.
+
+    NVIDIA's driver takes half a second for it, in which a program can import the rest of what it needs. What fails
+    here fails again where a device is used.
+    """
+    if cuda_driver() is None or address_space() is not None:
+        return
+
+    def start() -> None:
+        with suppress(Exception):
+            for device in pick_devices(names):
+                if device.is_cuda:
+                    device.context  # noqa: B018, made when first read
+
+    threading.Thread(target=start, daemon=True).start()
+
+
+_starting = threading.Lock()
+
+
 def start_warp() -> None:
     """`wp.init()` without Warp's start-up text, nor its warning where there is no GPU.
 
     Raises `DeviceError` where the kernel cache cannot be used; so do kernels when they are loaded. Raises `MemoryError`
     where a limit leaves too little memory to compile kernels.
     """
+    with _starting:
+        _start_warp()
+
+
+@functools.cache
+def _start_warp() -> None:
     need_memory(1.0, "Warp")
     import warp as wp
 

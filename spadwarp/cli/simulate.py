@@ -18,7 +18,7 @@ from spadwarp.cli.outputs import answer, check_outputs, progress
 from spadwarp.values import ArgumentError, ConfigError, address_space, count
 
 if TYPE_CHECKING:
-    from spadwarp import Result, Scene
+    from spadwarp import Ray, Result, Scene
     from spadwarp.cli.outputs import Report
     from spadwarp.files import RunFiles
 
@@ -104,6 +104,8 @@ def simulate(
         text = "cannot be combined with --trajectory"
         opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
         opt.refuse(text, "--records", "--relative-error", "--derivatives", "--reconstruct", "--time")
+    if ray is None:
+        spadwarp.device.start_gpus(devices)
     asked: Any = "auto" if photons is None and time is not None else photons
     earlier = None
     if resume is not None:
@@ -127,10 +129,8 @@ def simulate(
     if records:
         _check_records(read, whole=not (first_photon or shard))
     engine = opt.read_engine(ray, workers)
-    if engine is None:
-        spadwarp.transport.prepare_kernels(devices)
-    _warn(read, devices)
     names = _parameters(read, derivatives, earlier)
+    _prepare(read, devices, engine, names)
     _prepare_directory(out, read, earlier, scene, derivatives=len(names), records=records, checkpoint=checkpoint > 0)
     with _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
@@ -194,9 +194,13 @@ def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tupl
     return spadwarp.transport.resolve_derivatives(scene, plain, blocks)
 
 
-def _warn(scene: Scene, device: str | None) -> None:
-    """Of what the scene's check finds, and of devices that are named twice."""
-    for message in spadwarp.check(scene):
+def _prepare(scene: Scene, device: str | None, engine: Ray | None, derivatives: tuple[str, ...]) -> None:
+    """Begins to load kernels; warns of what the scene's check finds, and of devices that are named twice."""
+    mesh = spadwarp.mesh.build_mesh(scene)
+    if engine is None:
+        spadwarp.transport.prepare_kernels(scene, mesh, device, derivatives=derivatives)
+    device = "cpu" if engine is not None else device
+    for message in spadwarp.check(scene, mesh, device=device):
         if message.level == "warning":
             complain(str(message))
     names = (device or "").split(",")

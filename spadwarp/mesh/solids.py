@@ -2,20 +2,16 @@
 
 Everything here is a `manifold3d.Manifold`: closed, oriented, and free of self-intersections after a boolean, so that
 the targets are watertight by construction. Shapes are modelled in a studio frame, +x right, +y up, +z towards the
-viewer, in metres; `to_trimesh` turns that into the camera frame. Angles are in degrees.
+viewer, in metres; `to_triangles` turns that into the camera frame. Angles are in degrees.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import permutations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from manifold3d import CrossSection, Manifold, Mesh64, OpType
-
-if TYPE_CHECKING:
-    import trimesh
 
 Point = Sequence[float] | np.ndarray
 """Three coordinates [m]."""
@@ -215,14 +211,13 @@ def smooth_union(fields: Iterable[np.ndarray], radius: float) -> np.ndarray:
     return joined
 
 
-def to_trimesh(solid: Manifold) -> trimesh.Trimesh:
-    """The solid as a mesh in the camera frame (+x right, +y down, +z away), its bounding box centred at the origin."""
-    import trimesh
-
+def to_triangles(solid: Manifold) -> tuple[np.ndarray, np.ndarray]:
+    """Corners `[V, 3]` in the camera frame (+x right, +y down, +z away), the bounding box centred at the origin, and
+    faces `[F, 3]` of the solid."""
     mesh = solid.to_mesh64()
     vertices = np.asarray(mesh.vert_properties, dtype=float)[:, :3] * (1, -1, -1)
     vertices -= (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return trimesh.Trimesh(vertices, np.asarray(mesh.tri_verts, dtype=np.int64), process=False)
+    return vertices, np.asarray(mesh.tri_verts, dtype=np.int64)
 
 
 def _counterclockwise(outline: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:

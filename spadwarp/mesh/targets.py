@@ -7,9 +7,11 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
+from itertools import product
+from operator import add
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,9 @@ __all__ += ["focus_distance", "guess_unit", "load_target", "make_builtin"]
 if TYPE_CHECKING:
     import trimesh
 
+Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""Corners `[V, 3]` [m] and faces `[F, 3]`: with them alone, scenes of built-ins do without trimesh, which takes most
+of a second to import."""
 
 BUILTINS = ("staircase", "plane", "box", "sphere")
 """The geometric built-ins."""
@@ -49,48 +54,61 @@ def make_builtin(name: str) -> trimesh.Trimesh:
 
     Raises `ArgumentError` for a name that is not among `builtin_names()`.
     """
-    if name not in (known := builtin_names()):
-        raise ArgumentError(f"builtin = {name!r} is not one of {', '.join(map(repr, known))}{suggestion(name, known)}")
-    return _built(name).copy()
+    import trimesh
+
+    return trimesh.Trimesh(*(part.copy() for part in _built(name)), process=False)
 
 
 @cache
-def _built(name: str) -> trimesh.Trimesh:
-    import trimesh
-
+def _built(name: str) -> Triangles:
     from spadwarp.mesh.shapes import SHAPES
-    from spadwarp.mesh.solids import to_trimesh
+    from spadwarp.mesh.solids import to_triangles
 
+    if name not in (known := builtin_names()):
+        raise ArgumentError(f"builtin = {name!r} is not one of {', '.join(map(repr, known))}{suggestion(name, known)}")
     match name:
         case "staircase":
             return _staircase()
         case "plane":  # at z = 0, facing −z
             corners = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
-            return trimesh.Trimesh(corners, [(0, 2, 1), (0, 3, 2)], process=False)
+            return np.array(corners), np.array([(0, 2, 1), (0, 3, 2)])
         case "box":
-            return trimesh.creation.box(extents=(1.0, 1.0, 1.0))
+            return _box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
         case "sphere":  # 1280 triangles with their corners on it
-            return trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    return to_trimesh(SHAPES[name]())
+            from trimesh.creation import icosphere
+
+            sphere = icosphere(subdivisions=3, radius=0.5)
+            return np.asarray(sphere.vertices), np.asarray(sphere.faces)
+    return to_triangles(SHAPES[name]())
 
 
-def _staircase() -> trimesh.Trimesh:
+def _box(low: Sequence[float], high: Sequence[float]) -> Triangles:
+    corners = np.array(list(product((0.0, 1.0), repeat=3))) * np.subtract(high, low) + low
+    faces = "130 410 032 240 173 514 571 372 642 276 654 756"  # wound outwards
+    return corners, np.array([[int(corner) for corner in face] for face in faces.split()])
+
+
+def _staircase() -> Triangles:
     """The paper's staircase (a 4 m plate with nine bars): one closed mesh, face at z = 0, bars towards −z.
 
     Seen from the camera. Left half: three vertical bars over the full height. Upper right quarter: three horizontal
     bars, the lowest ending at mid-height. Lower right quarter: three vertical bars. Where the bars leave 3 cm of a half
     free, the strip is at the middle of the plate, as in the depth maps that the paper's authors published.
     """
-    import trimesh
+    from manifold3d import Manifold, Mesh
 
     plate = ((-2.0, -2.0, 0.0), (2.0, 2.0, 0.1))
     left = [((x, -2.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((-2.0, 0.6), (-1.33, 0.5), (-0.66, 0.4))]
     upper = [((0.0, y, -proud), (2.0, y + 0.6, 0.1)) for y, proud in ((-2.0, 0.3), (-1.3, 0.2), (-0.6, 0.1))]
     lower = [((x, 0.0, -proud), (x + 0.63, 2.0, 0.1)) for x, proud in ((0.03, 0.3), (0.7, 0.2), (1.37, 0.1))]
-    boxes = [trimesh.creation.box(bounds=bounds) for bounds in (plate, *left, *upper, *lower)]
-    mesh = trimesh.boolean.union(boxes, engine="manifold")
-    mesh.vertices = np.round(mesh.vertices, 6)  # the union came back in float32
-    return mesh
+    parts = []
+    for low, high in (plate, *left, *upper, *lower):
+        corners, faces = _box(low, high)
+        parts.append(Manifold(Mesh(corners.astype(np.float32), faces.astype(np.uint32))))
+    while len(parts) > 1:  # in pairs: the order of the faces is that of earlier versions
+        parts = [reduce(add, parts[k : k + 2]) for k in range(0, len(parts), 2)]
+    mesh = parts[0].to_mesh()
+    return np.round(mesh.vert_properties.astype(np.float64), 6), mesh.tri_verts.astype(np.int64)
 
 
 # What trimesh says about a damaged file, with a stack, is for those who have set up logging; an error says the rest.
@@ -139,12 +157,12 @@ def build_mesh(scene: Scene) -> TriangleMesh | None:
     lobes = any(target.specular > 0 for target in scene.targets)
     for index, target in enumerate(scene.targets):
         field = f"targets[{index}]" if scene.source is None else f"{scene.source}: targets[{index}]"
-        mesh, images = _load(target, field, scene.laser.wavelength_nm)
-        faces, count = np.asarray(mesh.faces, dtype=np.int64) + vertex_count, len(mesh.faces)
+        mesh = _load(target, field, scene.laser.wavelength_nm)
+        faces, count = mesh.faces + vertex_count, len(mesh.faces)
         vertex_count, face_count = vertex_count + len(mesh.vertices), face_count + count
         if max(vertex_count, face_count) > MAX_FACES:
             raise MeshError(f"{field}: the targets have more than {MAX_FACES} faces or vertices together")
-        pattern = _pattern(mesh, images, target, field) if varied else None
+        pattern = _pattern(mesh, target, field) if varied else None
         parts.append(
             TriangleMesh(
                 vertices=to_camera(scene.camera, mesh.vertices).astype(np.float32),
@@ -167,13 +185,13 @@ def _constant(value: Any, count: int) -> NDArray[np.float32]:
     return np.full(count, value, dtype=np.float32)
 
 
-def _pattern(mesh: trimesh.Trimesh, images: Images, target: Target, field: str) -> Pattern:
+def _pattern(mesh: _Loaded, target: Target, field: str) -> Pattern:
     """The reflectance of a loaded target's faces."""
-    count = len(mesh.faces)
+    count, images = len(mesh.faces), mesh.images
     texture, coordinates = np.full(count, -1, dtype=np.int32), np.zeros((count, 3, 2), dtype=np.float32)
-    if target.reflectance != "from_file":
+    if mesh.surface is None:
         return Pattern(np.repeat(_constant(target.reflectance, count)[:, None], 3, axis=1), texture, coordinates, ())
-    surface: NDArray[np.float64] = np.asarray(mesh.vertex_attributes["surface"])[mesh.faces]
+    surface = mesh.surface[mesh.faces]
     corners = surface[:, :, 0] * target.reflectance_scale
     texture = surface[:, 0, 1].round().astype(np.int32)
     coordinates = np.ascontiguousarray(surface[:, :, 2:], dtype=np.float32)
@@ -221,15 +239,26 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     Raises `ConfigError`: an unknown built-in, or a size for one that has its own; `MeshError`: missing or unreadable
     file, or a mesh that is empty, not finite or has no area.
     """
-    return _load(target, field)[0]
-
-
-def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[trimesh.Trimesh, Images]:
-    """`load_target`, and the images of a file that gives the reflectance."""
     import trimesh
 
-    images: Images = ()
+    vertices, faces, surface, _ = _load(target, field)
+    attributes = {} if surface is None else {"surface": surface}
+    return trimesh.Trimesh(vertices, faces, vertex_attributes=attributes, process=False)
+
+
+class _Loaded(NamedTuple):
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    surface: NDArray[np.float64] | None  # what a file that gives the reflectance says of each vertex
+    images: Images = ()  # of that file
+
+
+def _read(target: Target, field: str, wavelength_nm: float) -> tuple[str, _Loaded]:
+    """A target as errors name it, and in its own frame."""
     if target.mesh is not None:
+        import trimesh
+
+        images: Images = ()
         name, path = f"{field}.mesh = {target.mesh!r}" if field else target.mesh, Path(target.mesh)
         if (problem := file_problem(path)) is not None:
             raise MeshError(f"{name}: {problem}{similar(path) if problem == 'no such file' else ''}")
@@ -239,50 +268,73 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> tuple[tri
             mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
         else:
             mesh = _read_mesh(path, name)
-    else:
-        assert target.builtin is not None  # the one or the other, see `Target`
-        name = f"{field}.builtin = {target.builtin!r}"
-        try:
-            mesh = make_builtin(target.builtin)
-        except ArgumentError as error:
-            raise ConfigError(f"{field}.{error}") from error
-        if target.size is not None and target.builtin not in SIZED_BUILTINS:
-            raise ConfigError(
-                f"{field}.size = {list(target.size)} cannot be combined with builtin = {target.builtin!r}, which"
-                f" has its own; it is for {', '.join(SIZED_BUILTINS)}, and scale for all"
-            )
-    if len(mesh.faces) == 0:
-        raise MeshError(f"{name}: the mesh has no faces")
-    if len(mesh.faces) * 4**target.subdivisions > MAX_FACES:
-        raise MeshError(
-            f"{field}.subdivisions = {target.subdivisions} makes {len(mesh.faces) * 4**target.subdivisions} faces"
-            f" of {len(mesh.faces)}; at most {MAX_FACES} are allowed"
+        surface = mesh.vertex_attributes.get("surface") if target.reflectance == "from_file" else None
+        return name, _Loaded(np.asarray(mesh.vertices), np.asarray(mesh.faces), surface, images)
+    assert target.builtin is not None  # the one or the other, see `Target`
+    name = f"{field}.builtin = {target.builtin!r}"
+    try:
+        loaded = _Loaded(*_built(target.builtin), None)
+    except ArgumentError as error:
+        raise ConfigError(f"{field}.{error}") from error
+    if target.size is not None and target.builtin not in SIZED_BUILTINS:
+        raise ConfigError(
+            f"{field}.size = {list(target.size)} cannot be combined with builtin = {target.builtin!r}, which"
+            f" has its own; it is for {', '.join(SIZED_BUILTINS)}, and scale for all"
         )
-    for _ in range(target.subdivisions):
-        mesh = mesh.subdivide()
-        if target.builtin == "sphere":  # new corners lie on chords
-            mesh.vertices *= 0.5 / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    return name, loaded
 
+
+def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
+    """`load_target`, as arrays."""
+    name, loaded = _read(target, field, wavelength_nm)
+    if (count := len(loaded.faces)) == 0:
+        raise MeshError(f"{name}: the mesh has no faces")
+    if count * 4**target.subdivisions > MAX_FACES:
+        raise MeshError(
+            f"{field}.subdivisions = {target.subdivisions} makes {count * 4**target.subdivisions} faces"
+            f" of {count}; at most {MAX_FACES} are allowed"
+        )
+    if target.subdivisions:
+        loaded = _subdivided(loaded, target)
     size = target.size or (1.0,)  # one number for all axes, two for x and y, or three
     stretch = np.array([*size, 1.0] if len(size) == 2 else np.broadcast_to(size, 3))
-    mesh.apply_transform(placement(stretch * target.scale, target.rotation_deg, target.translation))
+    vertices, faces, surface, images = loaded
+    matrix = placement(stretch * target.scale, target.rotation_deg, target.translation)
+    if np.abs(matrix - np.eye(4)).max() >= 1e-8:
+        vertices = np.dot(matrix, np.column_stack([vertices, np.ones(len(vertices))]).T).T[:, :3]
+        if np.linalg.det(matrix[:3, :3]) < 0.0:  # mirrored: normals stay outwards
+            faces = np.ascontiguousarray(faces[:, ::-1])
     with np.errstate(over="ignore"):  # becomes infinite, which is refused
-        corners = np.asarray(mesh.vertices, dtype=np.float32)[mesh.faces].astype(np.float64)
+        corners = np.asarray(vertices, dtype=np.float32)[faces].astype(np.float64)
     if not (inside := np.abs(corners) <= FARTHEST).all():
         bad = int((~inside).any(axis=(1, 2)).sum())
         raise MeshError(
-            f"{name}: {bad} of {len(mesh.faces)} faces have coordinates that are not finite, or beyond {FARTHEST:g} m"
+            f"{name}: {bad} of {len(faces)} faces have coordinates that are not finite, or beyond {FARTHEST:g} m"
         )
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     solid = (normals != 0.0).any(axis=1)
     if not solid.any():
-        raise MeshError(f"{name}: none of the {len(mesh.faces)} faces has an area")
+        raise MeshError(f"{name}: none of the {len(faces)} faces has an area")
     if not solid.all():
         if target.mesh is not None:  # that a built-in has slivers needs no warning
             warnings.warn(f"{name}: dropped {(~solid).sum()} of {len(solid)} faces, which have no area", stacklevel=2)
-        mesh.update_faces(solid)
-    mesh.remove_unreferenced_vertices()
-    return mesh, images
+        faces = faces[solid]
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    return _Loaded(vertices[used], (np.cumsum(used) - 1)[faces], None if surface is None else surface[used], images)
+
+
+def _subdivided(loaded: _Loaded, target: Target) -> _Loaded:
+    import trimesh
+
+    attributes = {} if loaded.surface is None else {"surface": loaded.surface}
+    mesh = trimesh.Trimesh(loaded.vertices, loaded.faces, vertex_attributes=attributes, process=False)
+    for _ in range(target.subdivisions):
+        mesh = mesh.subdivide()
+        if target.builtin == "sphere":  # new corners lie on chords
+            mesh.vertices *= 0.5 / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    surface = mesh.vertex_attributes.get("surface")
+    return _Loaded(np.asarray(mesh.vertices), np.asarray(mesh.faces), surface, loaded.images)
 
 
 def placement(

@@ -22,9 +22,12 @@ Vector = tuple[float, float, float]
 
 def rotation_matrix(rotation_deg: ArrayLike) -> NDArray[np.float64]:
     """Rx·Ry·Rz `[3, 3]`: rotations about x, then the new y, then the new z [°]."""
+    angles = np.asarray(rotation_deg, np.float64)
+    if angles.shape == (3,) and not angles.any():  # as in most scenes, which then do without scipy's import
+        return np.eye(3)
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_euler("XYZ", np.asarray(rotation_deg, np.float64), degrees=True).as_matrix()
+    return Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
 
 
 def rotation_angles(matrix: ArrayLike) -> Vector:

@@ -275,20 +275,47 @@ def beam_planes(laser: Laser) -> Floats:
 def points_inside(triangles: Floats, planes: Floats) -> Floats:
     """Points of the triangles that are inside all planes, or within 1 µm of it, `[N, 3]`: none if and only if no
     triangle reaches in."""
-    from trimesh.intersections import slice_faces_plane
-
     whole, outside = np.ones(len(triangles), dtype=bool), np.zeros(len(triangles), dtype=bool)
     for plane in planes:
         distance = triangles @ plane[:3] + plane[3]
         whole &= (distance >= 0.0).all(axis=1)
         outside |= (distance < 0.0).all(axis=1)
     cut = triangles[~whole & ~outside]
-    for plane in planes if len(cut) else ():
-        faces, normal = np.arange(3 * len(cut)).reshape(-1, 3), plane[:3] / np.linalg.norm(plane[:3])
-        origin = -(plane[3] / np.linalg.norm(plane[:3]) + 1e-6) * normal
-        vertices, faces, _ = slice_faces_plane(cut.reshape(-1, 3), faces, normal, origin)
-        cut = np.asarray(vertices)[faces]
+    for plane in planes:
+        cut = _cut(cut, plane / np.linalg.norm(plane[:3]) + [0.0, 0.0, 0.0, 1e-6])
     return np.concatenate([_spread(triangles[whole]), _spread(cut)])
+
+
+def _cut(triangles: Floats, plane: Floats) -> Floats:
+    """The part of the triangles inside a plane, as triangles."""
+    distance = triangles @ plane[:3] + plane[3]
+    inside = distance >= 0.0
+    count = inside.sum(axis=1)
+    parts = [triangles[count == 3]]
+    for number in (1, 2):
+        chosen = count == number
+        alone = (inside[chosen] == (number == 1)).argmax(axis=1)  # the corner on a side of its own, first
+        order = (alone[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(triangles[chosen], order[..., None], axis=1).swapaxes(0, 1)
+        of_a, of_b, of_c = np.take_along_axis(distance[chosen], order, axis=1).T[..., None]
+        to_b, to_c = a + (b - a) * (of_a / (of_a - of_b)), a + (c - a) * (of_a / (of_a - of_c))
+        found = [(a, to_b, to_c)] if number == 1 else [(to_b, b, to_c), (b, c, to_c)]
+        parts += [np.stack(corners, axis=1) for corners in found]
+    return np.concatenate(parts)
+
+
+def nearest_points(triangles: Floats, point: Floats) -> Floats:
+    """The point of each triangle that is nearest to a point, `[N, 3]`."""
+    corners = triangles - point
+    edges = np.roll(corners, -1, axis=1) - corners
+    along = -(corners * edges).sum(axis=2) / np.maximum((edges**2).sum(axis=2), 1e-300)
+    on_edges = corners + along.clip(0.0, 1.0)[..., None] * edges
+    nearest = (on_edges**2).sum(axis=2).argmin(axis=1)
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    foot = normal * ((normal * corners[:, 0]).sum(axis=1) / np.maximum((normal**2).sum(axis=1), 1e-300))[:, None]
+    sides = (np.cross(edges, foot[:, None] - corners) * normal[:, None]).sum(axis=2)
+    within = (sides > 0.0).all(axis=1, keepdims=True)
+    return np.where(within, foot, on_edges[np.arange(len(nearest)), nearest]) + point
 
 
 def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
@@ -310,9 +337,7 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
         planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), port.nearest - 2e-6]])
         inside = points_inside(triangles, planes)
     else:
-        from trimesh.triangles import closest_point
-
-        found = closest_point(triangles, np.broadcast_to(port.centre, (len(triangles), 3)))
+        found = nearest_points(triangles, port.centre)
         outer = (port.radius + port.thickness) * (1.0 - 1e-6)
         inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
     if not len(inside):

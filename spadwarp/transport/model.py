@@ -706,9 +706,11 @@ def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Trut
     return Truth(**dict(zip(("depth", "range", "normal", "reflectance"), values, strict=True)))
 
 
-def first_hits(triangles: NDArray[np.float64], start: Any, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def first_hits(
+    triangles: NDArray[np.float64], start: Any, direction: NDArray[np.float64], device: wp.Device
+) -> NDArray[np.float64]:
     """Distances [m] along rays `[N, 3]` of the nearest of triangles `[F, 3, 3]`; NaN: none."""
-    device, corners = wp.get_device("cpu"), triangles.reshape(-1, 3)
+    corners = triangles.reshape(-1, 3)
     faces: wp.array = wp.array(np.arange(len(corners)), dtype=int, device=device)
     mesh = wp.Mesh(wp.array(corners, dtype=wp.vec3, device=device), faces)
     model: Any = SimpleNamespace(device=device, camera=sk.Camera(), surfaces=sk.make_surfaces(mesh, 0.5), mesh=mesh)

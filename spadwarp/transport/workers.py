@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies, kernel_errors
 from spadwarp.device import core_count, pick_device, pick_devices, processor_name
+from spadwarp.mesh import TriangleMesh
 from spadwarp.parallel import Ray, Worker
 from spadwarp.parallel.ray import RayWorkers
 from spadwarp.parallel.worker import Event
@@ -352,16 +353,20 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_thread.cache_clear)  # a child has none of its parent's threads
 
 
-def prepare_kernels(device: str | None = None) -> None:
-    """Begins to load a kernel that all runs need, and with it the compiler; returns at once.
+def prepare_kernels(
+    scene: Scene, mesh: TriangleMesh | None, device: str | None = None, *, derivatives: Sequence[str] = ()
+) -> None:
+    """Begins to load the transport kernel of a run on CPUs, which takes longest where it must be compiled; returns at
+    once.
 
-    A run that follows has its kernels sooner where they must be compiled. `device`: as for `simulate`. Raises
-    `DeviceError` for one that does not exist.
+    `mesh`: that of `spadwarp.mesh.build_mesh`; `device`, `derivatives` (full names): as for `simulate`. Raises
+    `DeviceError` for a device that does not exist.
     """
     devices = pick_devices(device)
     if _beside(devices):
-        # What fails here fails again in the run.
-        _thread().submit(lambda: [sk.has_overflowed(wp.zeros(1, dtype=wp.int64, device=item)) for item in devices])
+        spec = transport_spec(scene, mesh, derivatives=derivatives)
+        for item in devices:  # what fails here fails again in the run
+            _thread().submit(sk.load_transport_kernel, spec, item)
 
 
 # Devices of this host

@@ -87,7 +87,18 @@ class PaperFigure(Figure):
 
     @paper()
     def savefig(self, fname: Any, **options: Any) -> None:
-        super().savefig(fname, **options)
+        # Matplotlib would draw the whole figure once more, to nowhere, only to lay it out.
+        engine, dpi = self.get_layout_engine(), self.dpi
+        if engine is not None:
+            self.dpi = options.get("dpi", matplotlib.rcParams["savefig.dpi"])
+            engine.execute(self)
+            with matplotlib.rc_context({"figure.constrained_layout.use": False}):
+                self.set_layout_engine(None)
+        try:
+            super().savefig(fname, **options)
+        finally:
+            self.dpi = dpi
+            self.set_layout_engine(engine)
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()

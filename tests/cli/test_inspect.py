@@ -118,3 +118,10 @@ def test_a_process_loads_nothing_heavy_and_keeps_stdout_for_the_answer():
     heavy = {"warp", "h5py", "matplotlib", "trimesh", "torch", "OpenEXR", "pydantic", "numpy", "scipy", "manifold3d"}
     assert heavy.isdisjoint(modules.split()) and "spadwarp.cli" in modules
     assert process.stderr == "" and "\n  cpu" in printed
+
+
+def test_scenes_of_built_ins_need_no_library_for_meshes():
+    """What is imported is waited for by every command that reads a scene."""
+    code = "import sys, spadwarp; spadwarp.check('configs/scenes/staircase_15m.toml'); print(*sys.modules)"
+    process = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert {"trimesh", "scipy", "matplotlib", "torch"}.isdisjoint(process.stdout.split())
