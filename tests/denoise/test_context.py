@@ -128,7 +128,7 @@ def test_few_photons_beside_an_edge_are_answered_better_with_the_wide_view(tmp_p
 
 
 def test_new_layers_change_nothing():
-    """A new wide view or selection answers nearly as the network did before, and the view leaves the target's logit."""
+    """A new wide view answers nearly as the network did before, and the view leaves the target's logit."""
     torch.manual_seed(1)
     features = torch.randn(1, FEATURES, 17, 24)
     features[:, -SIDES:] = torch.rand(1, SIDES, 17, 24)
