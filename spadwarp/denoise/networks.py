@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
-from spadwarp.denoise.histogram_features import LIGHT, LIKENESS, SEEN
+from spadwarp.denoise.histogram_features import LIGHT, SEEN
 from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, symmetric_mean, turned
 from spadwarp.values import ArgumentError
 
@@ -177,7 +177,7 @@ def selected(candidates: Tensor, scores: Tensor, spread: float | Tensor = _SPREA
     return (weight * candidates).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
 
 
-_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + LIKENESS + 3 + 3 + 2
+_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + 3 + 3 + 2
 _LEAST_WAY = 0.01  # added to the way between both sides
 _SURE = 12.0  # from such a highest log-likelihood of a pixel on, its answer is one surface [nats]
 
