@@ -126,8 +126,7 @@ def evaluate(
         bm3d_frames: Frames of each level for BM3D, up to a minute each.
         crop (WIDTH HEIGHT): Only the middle part of each frame [pixels]; 128 96 makes BM3D faster.
         report (DIR): Also write report.html, its pictures and scores.json there; for a result only photons.png.
-        weights: Weights of spadwarp train, compared with the others as "your weights"; with --fresh in place of the
-            package's.
+        weights: Weights of spadwarp train, compared as "your weights"; with --fresh in place of the package's.
         seed: Seed of the noise, except that of a dataset; by default 0. With --fresh also of the scenes; by default of
             the clock.
         fresh (N): Histograms of N fresh scenes; about 10 s each on two cores.
