@@ -20,7 +20,6 @@ from spadwarp.denoise.classical import (
     JUMPS,
     aggregate,
     beliefs,
-    counts_level,
     edge_penalties,
     guide_channels,
     highest,
@@ -108,65 +107,47 @@ def _around(image: Tensor, side: int) -> Tensor:
 REACHES = (2, 5)
 """Pixels up to which a side is looked for."""
 
-LIKENESS = 3 * len(REACHES)
-"""Channels that tell whose counts those of a pixel are like: for each reach the nearer side's, the farther one's."""
-
 _RIGID = 40.0  # penalty of a jump in semi-global matching that keeps to one of two returns [nats]
 
 
-def beside_edges(score: Tensor, usual: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
-    """`SIDES` depths over the gate, `[B, H, W, SIDES]`, and how like the counts are to those of both sides.
+def beside_edges(score: Tensor, usual: Tensor) -> Tensor:
+    """`SIDES` depths over the gate, `[B, H, W, SIDES]`.
 
     For each of `REACHES` the nearer and the farther surface; then, by the photons of the pixel, the most probable depth
     from the one to the other of the shorter reach, and the mean depth for each reach. Last, the depth of semi-global
-    matching with a penalty that keeps a pixel to one of its two returns. The likeness, `[B, H, W, LIKENESS]`: the
-    difference from the mean of the nearer side, from that of the farther one, and which of the two squares is larger.
-
-    `usual`: depth by belief propagation; `level`: counts of each pixel, with noise of deviation 1, `[B, H, W]`.
+    matching with a penalty that keeps a pixel to one of its two returns. `usual`: depth by belief propagation.
     """
-    found, like = _nearer_and_farther(usual, level)
+    found = _nearer_and_farther(usual)
     inside = [_between(score, *found[place : place + 2]) for place in range(0, len(found), 2)]
     rigid = aggregate(score, jump=score.new_full((len(score), 1, 1, 1), _RIGID))
-    depths = torch.stack([*found, inside[0][0], *(mean for _, mean in inside), highest(rigid)], dim=-1)
-    return depths, torch.stack(like, dim=-1)
+    return torch.stack([*found, inside[0][0], *(mean for _, mean in inside), highest(rigid)], dim=-1)
 
 
-def _nearer_and_farther(depth: Tensor, level: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-    """For each of `REACHES` the depths of the nearer and of the farther surface around a pixel, and the likeness.
+def _nearer_and_farther(depth: Tensor) -> list[Tensor]:
+    """For each of `REACHES` the depths of the nearer and of the farther surface around a pixel.
 
     The depths `depth` `[B, H, W]` of a window are parted at the middle between its least and its largest; each part has
     the mean of its depths, of which the next to the pixel count most.
     """
     height, width = depth.shape[-2:]
-    both, found, like = torch.stack([depth, level], dim=1), [], []
+    found = []
     for reach in REACHES:
-        image = F.pad(both, (reach,) * 4, mode="replicate")
+        places = F.pad(depth[:, None], (reach,) * 4, mode="replicate")
         side = 2 * reach + 1
-        places = image[:, :1]
         low = -F.max_pool2d(F.max_pool2d(-places, (side, 1), 1), (1, side), 1)
         middle = 0.5 * (low + F.max_pool2d(F.max_pool2d(places, (side, 1), 1), (1, side), 1))
-        # Sums of weights, weighted depths, weights and weighted counts; those of counts leave the pixel itself out.
-        nearer, farther = both.new_zeros(2, len(both), 4, height, width)
+        nearer, farther = depth.new_zeros(2, len(depth), 2, height, width)  # sums of weights, and of weighted depths
         unit = torch.ones_like(middle)
         for y in range(side):
             for x in range(side):
-                apart = (y - reach) ** 2 + (x - reach) ** 2
-                one = image[..., y : y + height, x : x + width]
-                near = (one[:, :1] <= middle).to(one.dtype)
-                wide = (apart > 0) / (1.0 + apart)
-                known = torch.cat([unit, one[:, :1], wide * unit, wide * one[:, 1:]], dim=1)
-                known[:, :2] *= (1.0 + apart) ** -2
-                nearer += near * known
-                farther += known - near * known
-        front, front_level = nearer[:, 1::2].div(nearer[:, ::2].clamp_min(1e-6)).unbind(dim=1)
-        back, back_level = farther[:, 1::2].div(farther[:, ::2].clamp_min(1e-6)).unbind(dim=1)
-        alone = farther[:, 0] <= 1e-6  # one depth everywhere
-        back, back_level = torch.where(alone, front, back), torch.where(alone, front_level, back_level)
-        found += [front, back]
-        from_front, from_back = level - front_level, level - back_level
-        like += [torch.asinh(0.3 * from_front), torch.asinh(0.3 * from_back)]
-        like.append(0.3 * torch.asinh(from_back.square() - from_front.square()))
-    return found, like
+                one = places[..., y : y + height, x : x + width]
+                known = torch.cat([unit, one], dim=1) * (1.0 + (y - reach) ** 2 + (x - reach) ** 2) ** -2
+                near = (one <= middle).to(one.dtype) * known
+                nearer += near
+                farther += known - near
+        front, back = (part[:, 1] / part[:, 0].clamp_min(1e-6) for part in (nearer, farther))
+        found += [front, torch.where(farther[:, 0] <= 1e-6, front, back)]  # or one depth everywhere
+    return found
 
 
 def _between(score: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
@@ -198,7 +179,7 @@ MOST = 20.0
 SEEN = POOLED + SCORED * POOLED + SCORED + len(EDGES) - 1 + 2 + GUIDES
 """Number of channels of `extract_features` that go through the network's layers."""
 
-FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES + LIKENESS + LIGHT
+FEATURES = SEEN + POOLED + (2 + SCORED) * SIDES + LIGHT
 """Number of channels that `extract_features` gives."""
 
 _LEAST_SIGNAL, _SIGNAL_STEP = 0.05, math.log(1.1)  # counts; step of its logarithm, to which it is rounded
@@ -232,7 +213,7 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
         background between `EDGES` around the depth of the largest window, as shares over 7 × 7 pixels; and how
         significant the excess is, in the pixel and in 7 × 7; and `GUIDES` channels of the counts. Last, beyond `SEEN`,
         the pixel's own scores at the depths, a tenth of them, which are not clipped; and of `beside_edges` the scores,
-        the likeness, `light_channels` and the depths.
+        `light_channels` and the depths.
     """
     total = counts.sum(dim=-1) if total is None else total
     merged, given = -(-counts.shape[-1] // _MOST_BINS), counts.shape[-1]
@@ -265,14 +246,14 @@ def extract_features(counts: Tensor, background: Tensor, response: Tensor, total
     scores = [0.1 * (one - top).clamp_min(-MOST) for one, top in zip(near, tops, strict=True)]
     peaks = [0.1 * top.clamp(0.0, MOST) for top in tops]
     shares = _shape(above, background, anchor)
-    sides, likeness = beside_edges(score, found[2], counts_level(total))
+    sides = beside_edges(score, found[2])
     beside = [_near(cube, sides) for cube in cubes]
     beside = [0.1 * beside[0], *(0.1 * (one - top).clamp_min(-MOST) for one, top in zip(beside, tops, strict=True))]
     scale = merged * bins / given  # the last of merged bins may reach beyond the gate
     guides = torch.stack(guide_channels(total), dim=-1)
     light = torch.stack(light_channels(above, background, found[2], response), dim=-1)
     return torch.cat(
-        [scale * places, *scores, *peaks, *shares, guides, 0.1 * near[0], *beside, likeness, light, scale * sides],
+        [scale * places, *scores, *peaks, *shares, guides, 0.1 * near[0], *beside, light, scale * sides],
         dim=-1,
     ).movedim(-1, 1)
 

@@ -189,18 +189,20 @@ def detected(
     level_known: bool = True,
 ) -> Estimate:
     """`found` with the significance of the counts, and neither depth nor target below the least; of rates as it is."""
-    from scipy.ndimage import convolve1d
-
     least = check_real("min_significance", min_significance, "[0, 1000]")
     if counts.dtype.kind not in "biu" and not np.array_equal(counts, np.rint(counts)):
         return found
-    window = np.ones(1 if model == "likelihood" else 7, np.int64)
+    side = 1 if model == "likelihood" else 7
 
     def summed(cube: NDArray[Any]) -> NDArray[Any]:  # over the pixels of a window that are in the frame
-        return convolve1d(convolve1d(cube, window, axis=0, mode="constant"), window, axis=1, mode="constant")
+        for axis in (0, 1):
+            width = [(side // 2 + 1, side // 2) if one == axis else (0, 0) for one in range(3)]
+            before = np.moveaxis(np.cumsum(np.pad(cube, width), axis=axis), axis, 0)
+            cube = np.moveaxis(before[side:] - before[:-side], 0, axis)
+        return cube
 
     frames = counts.reshape(-1, *counts.shape[-3:])
-    known = summed(np.broadcast_to(background, frames.shape[1:]))
+    known = np.maximum(summed(np.broadcast_to(background, frames.shape[1:]).astype(np.float64)), 0.0)
     significance = np.empty(frames.shape[:-1], np.float32)
     options: dict[str, Any] = {"background": known, "level_known": level_known, "device": "cpu"}
     options["irf"] = np.maximum(response, 0.0)  # which a convolution has rounded below

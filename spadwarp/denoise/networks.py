@@ -20,13 +20,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spadwarp.denoise.frames import POOLED, SCORED, SIDES
-from spadwarp.denoise.histogram_features import LIGHT, LIKENESS, MOST, SEEN
+from spadwarp.denoise.histogram_features import LIGHT, SEEN
 from spadwarp.denoise.layers import GROUP, SymmetricConv, SymmetricWindow, edge_padded, enlarged, symmetric_mean, turned
 from spadwarp.values import ArgumentError
-
-CHOICES = 1 + 2 + POOLED + 1
-"""Candidates of `Selection`: the network's answer, its medians over 3 × 3 and 5 × 5 pixels, the depths among the
-features, and the median of belief propagation over 3 × 3 pixels."""
 
 ANSWERS = 1 + POOLED + SIDES
 """Candidates of `Context`: the answer before, the depths among the features, and those of both sides."""
@@ -168,99 +164,9 @@ def _directions() -> tuple[tuple[int, int], ...]:
     return tuple(places)
 
 
-# Pixels that see the same two surfaces: the one that nearly all of them take is that of each.
+# The last choice of the network for histograms: its answer, or another depth that the photons make more probable.
 
-
-_VOTERS = 3  # pixels around that vote
-_ONE_SURFACE, _APART = 0.01, 0.05  # depths this near are one surface, this far apart two
-_ENOUGH, _TIMES = 4, 3.0  # votes for a surface, and how many times the pixels that took the other one, that move to it
-_RETURN = 4.0  # log-likelihood from which on a return is one [nats]
-_PHOTON = 5.0  # log-likelihood of a photon, about the highest [nats]
-_CHANCE = 2.0  # deviations by which the two returns may differ
-
-
-@torch.no_grad()
-def follow_the_others(found: Tensor, features: Tensor) -> Tensor:
-    """The answers `[B, 1, H, W]`, some of them moved to a return of their pixel that is far away."""
-    pair, order = (0.5 + features[:, :2]).sort(dim=1)  # the highest return of a pixel and the second, the nearer first
-    light = (10.0 * features[:, SEEN : SEEN + 2]).gather(1, order)
-    two = (light > _RETURN).all(dim=1, keepdim=True) & (pair.diff(dim=1) > _APART)
-    pair = torch.where(two, pair, torch.nan)  # near to none
-    height, width = found.shape[-2:]
-    around = F.pad(torch.cat([pair, found], dim=1), (_VOTERS,) * 4, value=torch.nan)
-    votes, taken = torch.zeros_like(pair), torch.zeros_like(pair)
-    for y in range(2 * _VOTERS + 1):
-        for x in range(2 * _VOTERS + 1):
-            if (y, x) != (_VOTERS, _VOTERS):
-                other, answer = around[..., y : y + height, x : x + width].split([2, 1], dim=1)
-                alike = ((pair - other).abs() < _ONE_SURFACE).all(dim=1, keepdim=True)
-                near = (answer - pair).abs() < _ONE_SURFACE
-                taken += near
-                votes += alike & near
-    more = light.flip(1) - light  # of the other return
-    by_chance = more <= _CHANCE * (_PHOTON * light.sum(dim=1, keepdim=True)).clamp_min(0.0).sqrt()
-    outvoted = (votes >= _ENOUGH) & (votes >= _TIMES * taken.flip(1))
-    moves = outvoted & by_chance & ((found - pair).abs() > _APART)
-    return torch.where(moves.any(dim=1, keepdim=True), torch.where(moves, pair, 0.0).sum(dim=1, keepdim=True), found)
-
-
-# The last choices of the network for histograms: its answer, or another depth that the photons make more probable.
-
-_REACH = 2  # pixels around a pixel that its choice depends on
-_PIXELS_AT_ONCE = 1 << 14  # of which candidates are held in memory
 _SPREAD = 0.004  # candidates this near to the one chosen count, too
-_OF_CHOICE = 19  # what is known of a candidate
-_OF_PIXEL = 2 * SCORED + (SEEN - POOLED - SCORED * POOLED - SCORED) + 3 + 2  # and of its pixel
-
-
-class Selection(nn.Module):
-    """Scores of `CHOICES` for every pixel. With new weights the network's own answer has the highest.
-
-    A few pixels with a wrong surface cost more than all the others together: a thin handle that its surroundings
-    outvote, a weaker second return that by chance has more photons. For each candidate a small network, the same for
-    all pixels, sees what speaks for it: the photons of the pixel and of those around it, how far it is from the other
-    candidates, and whether pixels around have the same depth.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        hidden = 24
-        self.choice, self.pixel = nn.Linear(_OF_CHOICE, hidden), nn.Linear(_OF_PIXEL, hidden, bias=False)
-        self.kind = nn.Parameter(0.3 * torch.randn(CHOICES, hidden))
-        self.middle, self.last = nn.Linear(hidden, hidden), nn.Linear(hidden, 1)
-        self.bias = nn.Parameter(torch.zeros(CHOICES))
-        with torch.no_grad():
-            self.bias[0] = 3.0
-            self.last.weight.mul_(0.3)
-
-    def forward(
-        self, found: Tensor, logits: Tensor, features: Tensor, typical: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Candidates over the gate and their scores, each `[B, CHOICES, H, W]`.
-
-        Of the network's answer `[B, 1, H, W]`, its three logits and the features; `typical`: of the whole frames that
-        these are parts of, `[B, 1 + SCORED, 1, 1]`.
-        """
-        typical = _typical(features) if typical is None else typical
-        candidates, of_choice, of_pixel = _evidence(found, logits, features, typical)
-        known = self.choice(of_choice.movedim(2, -1)) + self.pixel(of_pixel.movedim(1, -1))[:, None]
-        known = F.relu(known + self.kind[:, None, None])
-        return candidates, self.last(F.relu(self.middle(known)))[..., 0] + self.bias[:, None, None]
-
-
-def selected_depth(selection: Selection, found: Tensor, logits: Tensor, features: Tensor) -> Tensor:
-    """`selected` of frames, strip by strip, which takes less memory, `[B, 1, H, W]`."""
-    height, width = found.shape[-2:]
-    rows = max(1, _PIXELS_AT_ONCE // width)
-    answer = torch.empty_like(found)
-    for frame in range(len(found)):
-        whole = [image[frame : frame + 1] for image in (found, logits, features)]
-        typical = _typical(whole[2])
-        for top in range(0, height, rows):
-            first, last = max(0, top - _REACH), top + rows + _REACH
-            strip = selected(*selection(*(image[:, :, first:last] for image in whole), typical))
-            answer[frame, :, top : top + rows] = strip[0, :, top - first : top - first + rows]
-    return answer
 
 
 def selected(candidates: Tensor, scores: Tensor, spread: float | Tensor = _SPREAD) -> Tensor:
@@ -271,57 +177,7 @@ def selected(candidates: Tensor, scores: Tensor, spread: float | Tensor = _SPREA
     return (weight * candidates).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
 
 
-def _typical(features: Tensor) -> Tensor:
-    """Medians over a frame of the second return's log-likelihood and of the highest scores, `[B, 1 + SCORED, 1, 1]`."""
-    tops = features[:, POOLED + SCORED * POOLED : POOLED + SCORED * POOLED + SCORED]
-    values = torch.cat([features[:, SEEN + 1 : SEEN + 2], tops], dim=1)
-    return values.flatten(2).median(dim=2).values[:, :, None, None]
-
-
-def _evidence(found: Tensor, logits: Tensor, features: Tensor, typical: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates `[B, K, H, W]`, what is known of each `[B, K, C, H, W]`, and of the pixel `[B, P, H, W]`."""
-    depths, own = 0.5 + features[:, :POOLED], features[:, SEEN : SEEN + POOLED]
-    scores = features[:, POOLED : POOLED + SCORED * POOLED].unflatten(1, (SCORED, POOLED))
-    tops, rest = features[:, POOLED + SCORED * POOLED : SEEN].tensor_split([SCORED], dim=1)
-    near, wide = _around(found, 3), _around(found, 5)
-    matched, first, second = (_around(depths[:, place : place + 1], 3) for place in (2, 0, 1))
-    inner, outer = (around.median(dim=1, keepdim=True).values for around in (near, wide))
-    candidates = torch.cat([found, inner, outer, depths, matched.median(dim=1, keepdim=True).values], dim=1)
-    beside = (candidates[:, :, None] - depths[:, None]).abs() < CLOSE
-
-    def at(values: Tensor, otherwise: float) -> Tensor:
-        """The highest value of the pooled depths near each candidate."""
-        return torch.where(beside, values[:, None], otherwise).amax(dim=2)
-
-    def agreeing(around: Tensor, reach: float) -> Tensor:
-        """Part of the depths around that agree with each candidate."""
-        agreeing = torch.zeros_like(candidates)
-        for one in around.split(1, dim=1):
-            agreeing += (candidates - one).abs_().mul_(-1.0 / reach).exp_()
-        return agreeing / around.shape[1]
-
-    usual, top, mine = typical[:, :1], own[:, :1], at(own, -1.0)
-    apart = (candidates - found).abs()
-    of_choice = [
-        *(at(scores[:, window], -0.1 * MOST) for window in range(SCORED)),
-        torch.asinh(mine - usual), torch.asinh(top - usual).expand_as(mine),
-        *(torch.tanh(apart / reach) for reach in (0.003, 0.01, 0.1)),
-        agreeing(wide, 0.004), agreeing(wide, 0.02), agreeing(matched, 0.004),
-        agreeing(depths, 0.004), agreeing(depths, 0.02),
-        torch.asinh(top - mine), (at(own, 0.0) / top.clamp_min(0.05)).clamp(-1.0, 1.5),
-        agreeing(first, 0.006), agreeing(_around(depths[:, :1], 5), 0.006),
-        agreeing(torch.cat([first, second], dim=1), 0.006),
-    ]  # fmt: skip
-    rough = [20.0 * (around - one).abs().mean(dim=1, keepdim=True) for around, one in ((wide, outer), (near, inner))]
-    of_pixel = [tops, typical[:, 1:].expand_as(tops), rest, 0.25 * logits, *rough]
-    return candidates, torch.stack(of_choice, dim=2), torch.cat(of_pixel, dim=1)
-
-
-def _around(image: Tensor, side: int) -> Tensor:
-    return torch.cat(_windows(image, side, 1), dim=1)
-
-
-_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + LIKENESS + 3 + 3 + 2
+_SEEN = ANSWERS + 2 + (SEEN - POOLED) + POOLED + SIDES * (1 + SCORED) + 3 + 3 + 2
 _LEAST_WAY = 0.01  # added to the way between both sides
 _SURE = 12.0  # from such a highest log-likelihood of a pixel on, its answer is one surface [nats]
 
@@ -453,11 +309,10 @@ class PyramidNet(nn.Module):
     With `histograms` it sees the channels of `spadwarp.denoise.histogram_features`, not the votes. Each pixel then
     first gets a depth from the candidates among them, which replaces the reported one in all that follows: the most
     probable one, never the mean of two returns. The delay of scattered light, which the shape of the return shows, is
-    subtracted from the result. Last, `Selection` takes the answer or another candidate, and `Context` weighs them with
-    the view of a wide surrounding; then pixels with two returns follow those around that have the same two. A fifth
-    output is the depth of the candidates, and one for each candidate its logit. While it learns, there are also the
-    candidates of the selection and their scores, those of the wide view, its answer and its logit of "sees a target";
-    depth and logits are those before the selection.
+    subtracted from the result. Last, `Context` weighs the answer and the candidates with a view of what is around. A
+    fifth output is the depth of the candidates, and one for each candidate its logit. While it learns, there are also
+    the depths of `Context` and their scores, its answer and its logit of "sees a target"; depth and logits are those
+    before it.
     """
 
     stride = 16  # sizes are filled up to multiples of it
@@ -505,7 +360,7 @@ class PyramidNet(nn.Module):
             self.enter_features = SymmetricConv(SEEN, widths[0], 3, lifts=True, bias=False)
             self.choose = nn.Conv2d(last, 1 + POOLED + 1, 1)  # logits of the reported depth and the candidates; delay
             self.evidence = nn.Parameter(torch.tensor([0.5, 0.2, 0.1, 0.3]))  # weights of scores in these logits
-            self.select, self.context = Selection(), Context()
+            self.context = Context()
             with torch.no_grad():
                 assert self.choose.bias is not None
                 self.enter_features.weight.mul_(0.3)
@@ -543,21 +398,17 @@ class PyramidNet(nn.Module):
             if torch.is_grad_enabled():
                 extra += self._learnt(before, logits, features, delay.detach())
             else:
-                before = selected_depth(self.select, before, logits, features)
                 depths, scores, target = self.context(before, logits, features)
                 found = answer(depths, scores, features)
-                inside = ..., slice(height), slice(width)
-                found[inside] = follow_the_others(found[inside], features[inside])
                 others = torch.cat([others[:, :1] + target, others[:, 1:]], dim=1)
             found = found - delay
         return torch.cat([found, others, *extra], dim=1)[..., :height, :width]
 
     def _learnt(self, found: Tensor, logits: Tensor, features: Tensor, delay: Tensor) -> list[Tensor]:
-        """Candidates of the selection and their scores; those of the wide view, its answer and its logit "target"."""
-        candidates, scores = self.select(found, logits, features)
-        depths, weights, target = self.context(selected(candidates, scores).detach(), logits, features)
+        """Depths of the wide view and their scores, its answer and its logit "target"."""
+        depths, weights, target = self.context(found, logits, features)
         last = answer(depths, weights, features)
-        return [candidates - delay, scores, depths - delay, weights, last - delay, logits[:, :1] + target]
+        return [depths - delay, weights, last - delay, logits[:, :1] + target]
 
     def _features(self, frame: Tensor, votes: Votes | None) -> Tensor:
         """Features of every pixel, after a ReLU, `[B, 64, H, W]`."""

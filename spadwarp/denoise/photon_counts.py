@@ -1,15 +1,16 @@
 """RMSE against signal photons: denoisers on histograms of few photons.
 
-Of drawn scenes, which no training saw, beside the best tuned classical estimate of the same counts; or of a Monte Carlo
-result with its own backscatter profile, beside the Cramér–Rao bound. SBR: signal-to-background ratio, signal counts
+Of fresh scenes beside the best tuned classical estimate of the same counts; or of a Monte Carlo result with its own
+backscatter profile, beside the Cramér–Rao bound. SBR: signal-to-background ratio, signal counts
 over background counts in the gate.
 """
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.baselines import MEDIAN_WINDOWS, TUNINGS, classical_depth
-from spadwarp.denoise.evaluation_scenes import EvaluationScene, evaluation_scene
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.histograms import features_of_histograms
-from spadwarp.denoise.inference import METHODS, denoise_frames
+from spadwarp.denoise.inference import METHODS, denoise_frames, estimate, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.frames.cramer_rao import crlb_from_histogram
 from spadwarp.frames.depth import arrival_time
@@ -30,137 +30,139 @@ from spadwarp.values import SEED, SpadwarpError, check_choice, check_integer, ch
 from spadwarp.viz import evaluation as drawing
 
 if TYPE_CHECKING:
+    from spadwarp.denoise.fresh_scenes import FreshScene
     from spadwarp.result.result import Result
 
-__all__ = ["HistogramScores", "PhotonSweep", "draw_photon_sweep", "evaluate_histograms", "photon_sweep"]
-
-_BINS = 256
-_WIDTH = 1.0  # deviation of the response [bins]
+__all__ = ["FreshScores", "PhotonSweep", "draw_photon_sweep", "evaluate_fresh", "photon_sweep"]
 
 
-class Point(NamedTuple):
-    """Signal photons per pixel, SBR, "flat" or "decaying" background, and the number of returns in a pixel."""
+class FreshScore(NamedTuple):
+    """What methods make of one fresh scene."""
 
-    photons: float
-    sbr: float
-    background: str
-    returns: int
+    text: str  # of the scene
+    rmse: dict[str, float]
+    """[m] over the pixels that see a target, by "METHOD" or "METHOD TUNING"; "histograms": the network with the true
+    background, as all others, "histograms, own background": with the one estimated from the counts."""
+    invented: float  # part of the pixels of open water that the network gives a target; NaN without such pixels
+    invented_own: float  # the same with the estimated background
+    missed: float  # part of the pixels of the target that it leaves out
+
+    @property
+    def classical(self) -> dict[str, float]:
+        """RMSE of the classical variants alone."""
+        return {name: value for name, value in self.rmse.items() if not name.startswith("histograms")}
+
+    @property
+    def ratio(self) -> float:
+        """RMSE of the network over that of the classical variant that is best on this very scene."""
+        return self.rmse["histograms"] / min(self.classical.values())
 
 
 @dataclass(frozen=True, kw_only=True)
-class HistogramScores:
-    """RMSE [m] over the pixels that see a target, mean over scenes, by point and method."""
+class FreshScores:
+    """Scores of fresh scenes, and the seed that repeats them."""
 
-    rmse: dict[Point, dict[str, float]]
+    seed: int
+    scenes: tuple[FreshScore, ...]
 
-    def best(self, point: Point) -> tuple[str, float]:
-        """Name and RMSE [m] of the best classical estimate."""
-        classical = {name: value for name, value in self.rmse[point].items() if name != "histograms"}
-        return min(classical.items(), key=lambda item: item[1])
+    def fixed(self) -> tuple[str, NDArray[np.float64]]:
+        """The classical variant that most scenes prefer to the network, and the network's ratios to it."""
+        found = {
+            name: np.array([one.rmse["histograms"] / one.rmse[name] for one in self.scenes])
+            for name in self.scenes[0].classical
+        }
+        return max(found.items(), key=lambda item: (int((item[1] > 1).sum()), float(np.median(item[1]))))
 
-    def ratios(self) -> NDArray[np.float64]:
-        """RMSE of the network over that of the best classical estimate, of each point."""
-        return np.array([values["histograms"] / self.best(point)[1] for point, values in self.rmse.items()])
+    def summary(self) -> dict[str, Any]:
+        """The figures that count."""
+        ratio = np.array([one.ratio for one in self.scenes])
+        own = np.array([one.rmse["histograms, own background"] / one.rmse["histograms"] for one in self.scenes])
+        name, fixed = self.fixed()
+        invented = [[one.invented, one.invented_own] for one in self.scenes if one.invented == one.invented]
+        water = np.array(invented or [[np.nan, np.nan]])
+        return {
+            "seed": self.seed, "scenes": len(ratio), "better_than_tuned": int((ratio < 1).sum()),
+            "median_ratio": float(np.median(ratio)), "worst_ratio": float(ratio.max()),
+            "best_fixed": name, "better_than_fixed": int((fixed < 1).sum()),
+            "median_ratio_fixed": float(np.median(fixed)), "worst_ratio_fixed": float(fixed.max()),
+            "own_background_within_1.3": int((own <= 1.3).sum()), "own_background_median": float(np.median(own)),
+            "own_background_worst": float(own.max()),
+            "invented": float(water[:, 0].mean()), "invented_worst": float(water[:, 0].max()),
+            "invented_own_background": float(water[:, 1].mean()),
+            "missed": float(np.mean([one.missed for one in self.scenes])),
+        }  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers and names, for JSON."""
-        return {"points": [{**point._asdict(), "rmse_m": values} for point, values in self.rmse.items()]}
+        return {**self.summary(), "of_scenes": [one._asdict() for one in self.scenes]}
 
 
-def evaluate_histograms(
+def evaluate_fresh(
     *,
-    photons: Sequence[float] = (1, 3, 10, 30, 100),
-    sbr: Sequence[float] = (0.05, 0.3, 1.0, 5.0),
-    backgrounds: Sequence[str] = ("flat", "decaying"),
-    returns: Sequence[int] = (1, 2),
-    scenes: Sequence[EvaluationScene] | None = None,
-    seed: int = 0,
+    scenes: int = 20,
+    seed: int | None = None,
     weights: str | Path | None = None,
     device: str | None = None,
     progress: Callable[[str, int, int], None] | None = None,
-) -> HistogramScores:
-    """Scores the network for histograms and all classical estimates, with their best tuning, at every point.
+) -> FreshScores:
+    """Scores the network for histograms against classical variants on scenes that nobody has seen.
+
+    Every tuning of every classical method and of the median competes; the best of them on a scene is known only by its
+    truth. Half of the scenes are rendered by transport, a few seconds each on a CPU.
 
     Args:
-        photons, sbr, backgrounds, returns: See `Point`.
-        scenes: Default: stairs, rings and vase before a wall, 64 × 64 pixels.
-        seed: Of the counts.
+        scenes: Their number.
+        seed: Repeats a judgement; default: of the clock.
         weights: File of `spadwarp train` with weights of the network for histograms.
-        device: torch device.
-        progress: Called with ("points", done, total).
+        device: torch device; transport runs on the one of its kind.
+        progress: Called with ("scenes", done, total).
 
     Errors are those of `evaluate`.
     """
-    if scenes is None:
-        scenes = [evaluation_scene(shape, "wall", size=(64, 64)) for shape in ("stairs", "rings", "vase")]
-    points = [Point(*values) for values in product(photons, sbr, backgrounds, returns)]
-    rmse: dict[Point, dict[str, float]] = {}
-    for done, point in enumerate(points):
-        squares: dict[tuple[str, float], list[float]] = {}
-        for number, scene in enumerate(scenes):
-            for key, depth in _estimates(scene, point, seed + number, weights, device).items():
-                seen = np.isfinite(scene.clean)
-                squares.setdefault(key, []).append(float(np.mean((depth - scene.clean)[seen] ** 2)))
-        means = {key: float(np.sqrt(np.mean(values))) for key, values in squares.items()}
-        rmse[point] = {name: min(v for (n, _), v in means.items() if n == name) for name, _ in means}
+    from spadwarp.denoise.fresh_scenes import fresh_scene
+
+    scenes = check_integer("scenes", scenes, "[1, 10000]")
+    seed = time.time_ns() % 2**40 if seed is None else check_integer("seed", seed, SEED)
+    found = []
+    for number in range(scenes):
+        found.append(fresh_score(fresh_scene(seed, number, device=device), weights=weights, device=device))
         if progress is not None:
-            progress("points", done + 1, len(points))
-    return HistogramScores(rmse=rmse)
+            progress("scenes", number + 1, scenes)
+    return FreshScores(seed=seed, scenes=tuple(found))
 
 
-def draw_counts(
-    scene: EvaluationScene, point: Point, *, seed: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Counts `[H, W, T]`, expected background per bin `[T]`, and the response per bin.
-
-    Of two returns the weaker one has 35 % of the light, 25 cm before the scene, in half of the columns.
-    """
-    from scipy.special import ndtr
-
-    start, stop = scene.gate
-    generator = np.random.Generator(np.random.Philox(seed))
-    seen = np.isfinite(scene.clean)
-    place = (np.where(seen, scene.clean, start) - start) / (stop - start)
-    rows, columns = place.shape
-    shade = 1.0 + 0.5 * np.sin(np.arange(columns) / 5.0) * np.sin(np.arange(rows) / 7.0)[:, None]
-    signal = point.photons * shade * seen
-
-    def spread(depth: NDArray[Any]) -> NDArray[Any]:
-        return np.diff(ndtr((np.arange(_BINS + 1) - (depth * _BINS)[..., None]) / _WIDTH), axis=-1)
-
-    rate = spread(place) * signal[..., None]
-    if point.returns == 2:
-        veil = 0.35 * (np.arange(columns) % 32 < 16)[None, :, None]
-        rate = (1.0 - veil) * rate + veil * spread(place - 0.1) * signal[..., None]
-    centres = (np.arange(_BINS) + 0.5) / _BINS
-    profile = np.exp(-4.0 * centres) if point.background == "decaying" else np.ones(_BINS)
-    background = point.photons / point.sbr * profile / profile.sum() + 1e-6
-    response = np.exp(-0.5 * (np.arange(-5, 6) / _WIDTH) ** 2)
-    return generator.poisson(rate + background), background, response / response.sum()
-
-
-def _estimates(
-    scene: EvaluationScene, point: Point, seed: int, weights: str | Path | None, device: str | None
-) -> dict[tuple[str, float], NDArray[np.float32]]:
-    """Depth [m] by method and tuning."""
-    counts, background, response = draw_counts(scene, point, seed=seed)
-    given: dict[str, Any] = {"background": background, "response": response, "device": device}
-    start, stop = scene.gate
+def fresh_score(scene: FreshScene, *, weights: str | Path | None = None, device: str | None = None) -> FreshScore:
+    """The scores of one scene."""
+    seen, (start, stop) = np.isfinite(scene.clean), scene.gate
+    given: dict[str, Any] = {"background": scene.background, "response": scene.response, "device": device}
+    rmse: dict[str, float] = {}
 
     def metres(part: NDArray[Any]) -> NDArray[np.float32]:
         return (start + (stop - start) * part).astype(np.float32)
 
-    found: dict[tuple[str, float], NDArray[np.float32]] = {
-        (method, tuning): metres(classical_depth(counts, method=method, tuning=tuning, **given)[0])  # type: ignore[arg-type]
-        for method, tunings in TUNINGS.items()
-        for tuning in tunings
-    }
-    features = features_of_histograms(counts, to_depth=metres, **given)
-    frames = depth_frames(found["likelihood", 1], gate=scene.gate, profile=background, features=features)
+    def judge(name: str, depth: NDArray[np.float32]) -> None:
+        rmse[name] = float(np.sqrt(np.mean((np.nan_to_num(depth, nan=stop) - scene.clean)[seen] ** 2)))
+
+    for method, tunings in TUNINGS.items():
+        for tuning in tunings:
+            depth = metres(classical_depth(scene.counts, method=method, tuning=tuning, **given)[0])  # type: ignore[arg-type]
+            judge(f"{method} {tuning:g}", depth)
+            if method == "likelihood":
+                first = depth
     for window in MEDIAN_WINDOWS:
-        found["median", window] = denoise_frames(frames, model="median", window=window)[0][0]
-    found["histograms", 0] = denoise_frames(frames, model="histograms", weights=weights, device=device)[0][0]
-    return found
+        judge(
+            f"median {window}",
+            denoise_frames(depth_frames(first, gate=scene.gate), model="median", window=window)[0][0],
+        )
+    shares = []
+    for name, background in (("histograms", scene.background), ("histograms, own background", "decay")):
+        options = {**given, "background": background, "min_significance": 0.0, "weights": weights}
+        answer = estimate(first, gate=scene.gate, counts=scene.counts, **options)
+        assert answer.significance is not None
+        target = (answer.target_probability >= target_threshold("histograms")) & (answer.significance >= 4.0)
+        judge(name, answer.depth)
+        shares.append((float(target[~seen].mean()) if (~seen).any() else math.nan, float((~target)[seen].mean())))
+    return FreshScore(scene.text, rmse, shares[0][0], shares[1][0], shares[0][1])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -295,11 +297,11 @@ def photon_frame(
     background = np.broadcast_to(photons / sbr * profile + 1e-6, back.shape)
     smeared = convolve1d(signal, matrix, axis=-1, mode="constant")
     counts = np.random.Generator(np.random.Philox(seed)).poisson(smeared + background).astype(np.float32)
-    time = arrival_time(
+    arrival = arrival_time(
         counts, gate_start=gate.start, bin_width=gate.bin_width, method="likelihood",
         irf=response, background=background.astype(np.float32),
     )  # fmt: skip
-    depth = depth_from_time(time.reshape(seen.shape), scene=scene)
+    depth = depth_from_time(arrival.reshape(seen.shape), scene=scene)
     sigma = crlb_from_histogram(signal, background, bin_width=gate.bin_width, pulses=1.0, irf=response)
     index = scene.medium.group_index
     depth_gate = tuple(range_from_time(end, index) + port_advance(scene) for end in (gate.start, gate.stop))

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from spadwarp.denoise.frames import POOLED
 from spadwarp.denoise.layers import fixed_order
 from spadwarp.denoise.network_files import load_network, torch_device
-from spadwarp.denoise.networks import ANSWERS, CHOICES, CLOSE, build_network, reads_histograms
+from spadwarp.denoise.networks import ANSWERS, CLOSE, build_network, reads_histograms
 from spadwarp.denoise.recipe import LEAST_CROP, LEVELS, Noise, TrainingRecipe
 from spadwarp.denoise.samples import Samples, Sizes
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
@@ -74,10 +74,8 @@ def loss_of(output: Tensor, batch: Batch, *, kind: str) -> Tensor:
         candidates = torch.cat([batch.frame[:, :1], 0.5 + batch.frame[:, 3 : 3 + POOLED]], dim=1)
         square = (candidates - batch.clean).square() * torch.softmax(chosen[:, 1:], dim=1)
         error = error + 0.5 * error_of(square.sum(dim=1, keepdim=True))
-    if learnt.shape[1]:  # the same of the selection, and the wide view; neither changes what is before it
-        candidates, scores, depths, weights, last, target = learnt.split([CHOICES] * 2 + [ANSWERS] * 2 + [1, 1], dim=1)
-        square = (candidates - batch.clean).square() * torch.softmax(scores, dim=1)
-        error = error + 0.5 * error_of(square.sum(dim=1, keepdim=True))
+    if learnt.shape[1]:  # the same of the wide view, which does not change what is before it
+        depths, weights, last, target = learnt.split([ANSWERS] * 2 + [1, 1], dim=1)
         error = error + error_of((last - batch.clean).square()) + _CHOICE * _choice_error(depths, weights, batch)
         error = error + _TARGET * _target_error(target, batch)
     return error

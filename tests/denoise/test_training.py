@@ -90,15 +90,7 @@ def test_pyramid_takes_no_depth_from_pixels_that_report_nothing():
         assert torch.allclose(network(frame)[:, 0], torch.tensor(0.5), atol=1e-4)
 
 
-def test_the_selection_of_strips_is_that_of_whole_frames_and_never_the_mean_of_two_surfaces(monkeypatch):
-    generator = torch.Generator().manual_seed(7)
-    images = [torch.rand((2, channels, 23, 9), generator=generator) for channels in (1, 3, FEATURES)]
-    network = networks.Selection()
-    torch.nn.init.normal_(network.last.weight)  # all candidates are chosen
-    with torch.no_grad():
-        whole = networks.selected(*network(*images))
-        monkeypatch.setattr(networks, "_PIXELS_AT_ONCE", 5 * 9)
-        assert torch.allclose(networks.selected_depth(network, *images), whole, atol=1e-6)
+def test_the_answer_is_never_the_mean_of_two_surfaces():
     candidates, scores = torch.tensor([[0.2, 0.2, 0.7, 0.7]] * 2), torch.tensor([[0, 0, 0.1, 0], [0.1, 0, 0, 0]])
     found = networks.selected(candidates[:, :, None, None], scores[:, :, None, None])
     assert torch.allclose(found.flatten(), torch.tensor([0.7, 0.2]))
@@ -187,8 +179,8 @@ def test_the_chosen_depth_decides_what_counts_as_the_targets():
     assert loss_of(right, batch, kind="mse") + 0.2 < loss_of(wrong, batch, kind="mse")
 
 
-def test_the_wide_view_and_the_selection_learn_from_their_own_answers_alone():
-    """Their errors reach no layer before them, and those of the other layers not theirs."""
+def test_the_wide_view_learns_from_its_own_answers_alone():
+    """Its errors reach no layer before it, and those of the other layers not its."""
     torch.manual_seed(5)
     network = networks.build_network("histograms")
     frame = torch.rand(1, 3 + FEATURES, 32, 32)
@@ -200,7 +192,7 @@ def test_the_wide_view_and_the_selection_learn_from_their_own_answers_alone():
         rest = torch.cat([output[:, :first].detach(), part], dim=1) if own else part
         loss_of(rest, batch, kind="psnr").backward(retain_graph=True)
         for name, values in network.named_parameters():
-            late = name.startswith(("context.", "select."))
+            late = name.startswith("context.")
             learns = values.grad is not None and bool((values.grad != 0).any())
             assert not (learns and late != own), name
     assert learns  # the last of the wide view's

@@ -9,7 +9,7 @@ import torch
 
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
-from spadwarp.denoise import baselines, estimate, evaluate_histograms, inference, weights_metadata
+from spadwarp.denoise import baselines, estimate, inference, weights_metadata
 from spadwarp.denoise.backgrounds import bins_of_target, profile_of_depth
 from spadwarp.denoise.evaluation_scenes import evaluation_scene, noisy_depth, water_profile
 from spadwarp.denoise.frames import depth_frames, gates_of_target
@@ -302,10 +302,3 @@ def test_exports_of_an_engine_are_denoised_as_well_as_other_frames(name):
     noisy = noisy_frame(clean, 0.264)
     found, _ = found_by_pyramid(depth_frames(noisy, gate=GATE))
     assert scores(clean, found[0]).psnr > scores(clean, noisy).psnr + 18
-
-
-def test_where_pixels_see_two_surfaces_the_network_is_better_than_the_tuned_classical_estimates():
-    vase = evaluation_scene("vase", "wall", size=(64, 64))
-    case = {"photons": (3,), "sbr": (1.0,), "backgrounds": ("flat",), "returns": (2,)}
-    (rmse,) = evaluate_histograms(**case, scenes=[vase], device="cpu").rmse.values()
-    assert rmse["histograms"] < 0.8 * min(value for name, value in rmse.items() if name != "histograms")

@@ -26,7 +26,7 @@ from spadwarp.values import SpadwarpError, _fits, in_words
 
 # Those that run for minutes whatever they are given, end the process, or are no calls with one answer.
 LEFT_OUT = {
-    "benchmark.run", "benchmark.TransportRun", "denoise.evaluate", "denoise.evaluate_histograms", "doctor.diagnose",
+    "benchmark.run", "benchmark.TransportRun", "denoise.evaluate", "denoise.evaluate_fresh", "doctor.diagnose",
     "denoise.evaluate_scenes", "denoise.photon_sweep", "denoise.train", "device.devices", "device.start_warp",
     "io.parse_json", "parallel.Forked", "parallel.Ray", "viz.draw_targets",
     "viz.describe_targets",

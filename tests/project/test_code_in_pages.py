@@ -53,7 +53,7 @@ LEFT_OUT = {
     r"train configs/|\bruns/": "recipes for a GPU; tests/denoise trains the networks for a few steps",
     r"^python bench/peers": "needs networks of others",
     r"^python docs/figures/measured": "needs a published capture",
-    r"evaluate --(models histograms|report)": "take minutes; tests/denoise has them at a small size",
+    r"evaluate --(fresh|report)": "take minutes; tests/denoise has them at a small size",
     r"bm3d": "takes minutes; tests/denoise has it on a small frame",
 }
 
