@@ -56,7 +56,8 @@ def make_builtin(name: str) -> trimesh.Trimesh:
     """
     import trimesh
 
-    return trimesh.Trimesh(*(part.copy() for part in _built(name)), process=False)
+    vertices, faces = _built(name)
+    return trimesh.Trimesh(vertices.copy(), faces.copy(), process=False)
 
 
 @cache
@@ -242,7 +243,7 @@ def load_target(target: Target, *, field: str = "target") -> trimesh.Trimesh:
     import trimesh
 
     vertices, faces, surface, _ = _load(target, field)
-    attributes = {} if surface is None else {"surface": surface}
+    attributes: dict[str, Any] = {} if surface is None else {"surface": surface}
     return trimesh.Trimesh(vertices, faces, vertex_attributes=attributes, process=False)
 
 
@@ -268,7 +269,7 @@ def _read(target: Target, field: str, wavelength_nm: float) -> tuple[str, _Loade
             mesh, images = read_coloured_mesh(path, name, wavelength_nm=wavelength_nm, encoding=target.colour_encoding)
         else:
             mesh = _read_mesh(path, name)
-        surface = mesh.vertex_attributes.get("surface") if target.reflectance == "from_file" else None
+        surface: Any = mesh.vertex_attributes.get("surface") if target.reflectance == "from_file" else None
         return name, _Loaded(np.asarray(mesh.vertices), np.asarray(mesh.faces), surface, images)
     assert target.builtin is not None  # the one or the other, see `Target`
     name = f"{field}.builtin = {target.builtin!r}"
@@ -327,13 +328,13 @@ def _load(target: Target, field: str, wavelength_nm: float = 532.0) -> _Loaded:
 def _subdivided(loaded: _Loaded, target: Target) -> _Loaded:
     import trimesh
 
-    attributes = {} if loaded.surface is None else {"surface": loaded.surface}
+    attributes: dict[str, Any] = {} if loaded.surface is None else {"surface": loaded.surface}
     mesh = trimesh.Trimesh(loaded.vertices, loaded.faces, vertex_attributes=attributes, process=False)
     for _ in range(target.subdivisions):
         mesh = mesh.subdivide()
         if target.builtin == "sphere":  # new corners lie on chords
             mesh.vertices *= 0.5 / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
-    surface = mesh.vertex_attributes.get("surface")
+    surface: Any = mesh.vertex_attributes.get("surface")
     return _Loaded(np.asarray(mesh.vertices), np.asarray(mesh.faces), surface, loaded.images)
 
 

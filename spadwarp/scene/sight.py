@@ -337,7 +337,7 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
         planes = np.vstack([view_planes(camera), [*(-np.array(port.normal)), port.nearest - 2e-6]])
         inside = points_inside(triangles, planes)
     else:
-        found = nearest_points(triangles, port.centre)
+        found = nearest_points(triangles, np.array(port.centre))
         outer = (port.radius + port.thickness) * (1.0 - 1e-6)
         inside = found[np.linalg.norm(found - port.centre, axis=1) < outer]
     if not len(inside):
