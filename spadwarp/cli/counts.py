@@ -39,6 +39,7 @@ def detect(
     coates: bool = False,
     tags: bool = False,
     window: tuple[str, str] | None = None,
+    pixel: tuple[int, int] | None = None,
     channel: opt.Channel = "I",
     overrides: list[str] | None = None,
     device: str | None = None,
@@ -58,6 +59,7 @@ def detect(
         tags: Also keep the time tag of every detection.
         window (NS BINS): Start [ns] and bins of the detector's window, such as 10 512 or 10ns 512. By default the run's
             gate.
+        pixel (ROW COLUMN): Also draw the counts of this pixel.
 
     \b
     Example:
@@ -67,6 +69,8 @@ def detect(
     result = _with_detector(opt.load_run(run, channel), overrides)
     scene, methods = result.scene, list(dict.fromkeys(method or get_args(opt.Method)))
     bins = recorded[1] if recorded else scene.gate.bins
+    if pixel is not None and not (0 <= pixel[0] < scene.camera.height and 0 <= pixel[1] < scene.camera.width):
+        wrong(f"{pixel[0]} {pixel[1]} is outside 0 0 to {scene.camera.height - 1} {scene.camera.width - 1}", "--pixel")
     shots = scene.detector.pulses_per_frame if pulses is None else pulses
     told = result.scene.with_overrides(detector={"pulses_per_frame": shots})
     if problem := spadwarp.result.noise_problem(dataclasses.replace(result, scene=told)):
@@ -89,7 +93,7 @@ def detect(
     )
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
-    files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png")]
+    files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 

@@ -101,7 +101,7 @@ class PaperFigure(Figure):
     def caption(self, text: str) -> None:
         """Writes above it what it shows; items between commas and semicolons stay whole."""
         text = wrapped_items(text, self.get_figwidth() - 0.3)
-        self.grow(0.25 + 0.14 * text.count("\n"))
+        self.grow(0.3 + 0.14 * text.count("\n"))
         self.suptitle(text, color=TEXT)
 
     def note(self, text: str) -> None:
@@ -356,7 +356,12 @@ class Panels:
         """Positive values between their 5th and 95th percentile; on a logarithmic scale if these are far apart."""
         shown = np.where(np.isfinite(values) & (values > 0), values, np.nan)
         known = shown[np.isfinite(shown)]
-        low, high = map(float, np.percentile(known, (5.0, 95.0))) if known.size else (0.1, 1.0)
+        if not known.size:  # a colour bar would have no values
+            axis, bar = self.place(title)
+            axis.imshow(shown, cmap=colour_map(colours))
+            bar.axis("off")
+            return
+        low, high = map(float, np.percentile(known, (5.0, 95.0)))
         if high > 4.0 * low:
             self.show(shown, title, label, colours, (low, high), "log")
         else:  # a single value has no interval
