@@ -321,6 +321,7 @@ class Panels:
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
+        bar.set_visible(bool(np.isfinite(image).any()))  # it would have no values
         if scale == "log":
             log_ticks(bar.xaxis, self._line / 0.4)
         else:
@@ -356,12 +357,7 @@ class Panels:
         """Positive values between their 5th and 95th percentile; on a logarithmic scale if these are far apart."""
         shown = np.where(np.isfinite(values) & (values > 0), values, np.nan)
         known = shown[np.isfinite(shown)]
-        if not known.size:  # a colour bar would have no values
-            axis, bar = self.place(title)
-            axis.imshow(shown, cmap=colour_map(colours))
-            bar.axis("off")
-            return
-        low, high = map(float, np.percentile(known, (5.0, 95.0)))
+        low, high = map(float, np.percentile(known, (5.0, 95.0))) if known.size else (0.1, 1.0)
         if high > 4.0 * low:
             self.show(shown, title, label, colours, (low, high), "log")
         else:  # a single value has no interval
@@ -428,5 +424,4 @@ def median_pixel(values: NDArray[Any], among: NDArray[np.bool_]) -> tuple[int, i
     """Row and column of the median value among these pixels, or among all where there are none."""
     choice = np.flatnonzero(among | ~among.any())
     order = choice[np.argsort(values.ravel()[choice], kind="stable")]
-    row, column = divmod(int(order[(len(order) - 1) // 2]), values.shape[1])
-    return row, column
+    return divmod(int(order[(len(order) - 1) // 2]), values.shape[1])
