@@ -39,6 +39,7 @@ def detect(
     coates: bool = False,
     tags: bool = False,
     window: tuple[str, str] | None = None,
+    pixel: tuple[int, int] | None = None,
     channel: opt.Channel = "I",
     overrides: list[str] | None = None,
     device: str | None = None,
@@ -56,8 +57,8 @@ def detect(
         method: Estimator of depth; may be repeated. By default all four; the last is drawn.
         coates: Correct pile-up (Coates) before depth is estimated.
         tags: Also keep the time tag of every detection.
-        window (NS BINS): Start [ns] and bins of the detector's window, such as 10 512 or 10ns 512. By default the run's
-            gate.
+        window (NS BINS): Start [ns] and bins of the detector's window, such as 10 512. By default the run's gate.
+        pixel (ROW COLUMN): Also draw the counts of this pixel.
 
     \b
     Example:
@@ -67,9 +68,10 @@ def detect(
     result = _with_detector(opt.load_run(run, channel), overrides)
     scene, methods = result.scene, list(dict.fromkeys(method or get_args(opt.Method)))
     bins = recorded[1] if recorded else scene.gate.bins
+    if pixel is not None and not (0 <= pixel[0] < scene.camera.height and 0 <= pixel[1] < scene.camera.width):
+        wrong(f"{pixel[0]} {pixel[1]} is outside 0 0 to {scene.camera.height - 1} {scene.camera.width - 1}", "--pixel")
     shots = scene.detector.pulses_per_frame if pulses is None else pulses
-    told = result.scene.with_overrides(detector={"pulses_per_frame": shots})
-    if problem := spadwarp.result.noise_problem(dataclasses.replace(result, scene=told)):
+    if problem := spadwarp.result.noise_problem(_with_detector(result, [f"detector.pulses_per_frame={shots}"])):
         complain(problem, "note")
     counted = min(shots, bins) if scene.detector.mode == "first_photon" else bins
     needed = max(frames, 0) * scene.camera.width * scene.camera.height * (4 * counted + 4 * len(methods) + 8)
@@ -89,7 +91,7 @@ def detect(
     )
     for text in (*recording.file.notes, *_bound_noise(recording, result.photons)):
         complain(text, "note")
-    files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png")]
+    files = [recording.file.path, spadwarp.viz.draw(recording.file, out / "frame.png", pixel=pixel)]
     answer({**_recorded(recording, frames), "channel": channel, "files": files})
 
 

@@ -332,6 +332,7 @@ class Panels:
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
+        bar.set_visible(bool(np.isfinite(image).any()))  # it would have no values
         if scale == "log":
             log_ticks(bar.xaxis, self._line / 0.4)
         else:
@@ -434,5 +435,4 @@ def median_pixel(values: NDArray[Any], among: NDArray[np.bool_]) -> tuple[int, i
     """Row and column of the median value among these pixels, or among all where there are none."""
     choice = np.flatnonzero(among | ~among.any())
     order = choice[np.argsort(values.ravel()[choice], kind="stable")]
-    row, column = divmod(int(order[(len(order) - 1) // 2]), values.shape[1])
-    return row, column
+    return divmod(int(order[(len(order) - 1) // 2]), values.shape[1])
