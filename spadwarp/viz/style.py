@@ -185,9 +185,19 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 
 def wrapped(text: str, width: float, *, size: float = 8.0) -> str:
-    """The text in lines of this width [inch] at a size [pt]."""
-    letters = max(8, int(width * 72 / (0.53 * size)))
-    return "\n".join(textwrap.fill(line, letters, break_long_words=False) for line in text.split("\n"))
+    """The text in lines of at most this width [inch] at a size [pt], about as long as each other."""
+
+    def filled(line: str, letters: int) -> str:
+        return textwrap.fill(line, letters, break_long_words=False)
+
+    def evenly(line: str) -> str:
+        letters = max(8, int(width * 72 / (0.53 * size)))
+        breaks = filled(line, letters).count("\n")
+        while breaks and letters > 8 and filled(line, letters - 1).count("\n") == breaks:
+            letters -= 1
+        return filled(line, letters)
+
+    return "\n".join(map(evenly, text.split("\n")))
 
 
 def wrapped_items(text: str, width: float) -> str:

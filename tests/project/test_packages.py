@@ -116,7 +116,7 @@ LINES = {
     "scene": (3700, 4934),
     "transport": (2300, 3055),
     "validate": (750, 869),
-    "viz": (2200, 2466),
+    "viz": (2200, 2476),
     "water": (800, 860),
     "kernels/spadwarp_kernels": (50, 36),
     "kernels/analytic": (1650, 1630),
