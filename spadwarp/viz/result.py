@@ -128,7 +128,7 @@ def draw_result(
 
 # A result
 
-_NOISY = "; hatched ({} % of the pixels): noise of the simulation, more than the photons have"
+_NOISY = "; hatched ({} % of the pixels): more noise of the simulation than of the photons"
 _HATCHED = (
     "hatched, {} % of the pixels, the brightest bin not known to a third: noise of the simulation; more photons{} help"
 )
