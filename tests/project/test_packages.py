@@ -121,7 +121,7 @@ LINES = {
     "kernels/spadwarp_kernels": (50, 36),
     "kernels/analytic": (1650, 1630),
     "kernels/base": (950, 1213),
-    "kernels/detection": (1000, 1384),
+    "kernels/detection": (1000, 1385),
     "kernels/estimators": (1300, 1106),
     "kernels/optics": (1350, 2378),
     "kernels/photon": (850, 1254),
