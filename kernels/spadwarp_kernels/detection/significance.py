@@ -207,8 +207,8 @@ def _significance_kernel(dtype: Any) -> wp.Kernel:
 
 class DetectionTest:
     """Detection significance of the counts of every pixel: −log10 of the probability that background alone gives counts
-    as unlikely. Of background alone, a part 10^−s of the pixels has a significance of s or more; where its level is that
-    of the pixel's counts, 10^−s of those with a count.
+    as unlikely. Of background alone, a part 10^−s of the pixels has a significance of s or more; of those with a count,
+    where its level is that of the pixel's counts.
 
     Everything is prepared: a call allocates nothing and reads no value on the host.
 
