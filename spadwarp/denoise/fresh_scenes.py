@@ -224,7 +224,9 @@ def _sech(random: np.random.Generator) -> _Image:
 RESPONSES: dict[str, Callable[[np.random.Generator], _Image]] = {
     "late tail": _late,
     "two pulses": _double,
-    "box": lambda random: gaussian_filter1d(np.repeat([0.0, 1.0, 0.0], [9, 2 * random.integers(1, 4) + 1, 9]), 0.7),
+    "box": lambda random: gaussian_filter1d(
+        np.repeat([0.0, 1.0, 0.0], [9, 2 * int(random.integers(1, 4)) + 1, 9]), 0.7
+    ),
     "sech": _sech,
 }
 

@@ -10,6 +10,7 @@ from spadwarp.denoise.fresh_scenes import BACKGROUNDS, RESPONSES, SHAPES, TEXTUR
 PIXELS = np.mgrid[:40, :48].astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1], ids=["drawn", "rendered"])
 def test_counts_are_those_of_the_truth(number):
     scene = fresh_scene(11, number, device="cpu")
@@ -41,6 +42,7 @@ def test_every_family_gives_numbers():
         assert (background((np.arange(64) + 0.5) / 64, random) > 0).all()
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_the_estimates():
     found = evaluate_fresh(scenes=1, seed=11, device="cpu")
     scene, score = fresh_scene(11, 0, device="cpu"), found.scenes[0]
