@@ -26,27 +26,20 @@ from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
 from spadwarp.scene.medium import (
     NOTABLE_UNSEEN,
     WATER_INDICES,
-    Layer,
-    Medium,
+    Water,
     grid_cells,
+    natural_laws,
     phase_function,
     scattering_matrix,
 )
 from spadwarp.scene.port import Port
 from spadwarp.scene.scene import camera_port, laser_port, water_lines
 from spadwarp.scene.sections import field_unit
-from spadwarp.scene.sight import (
-    beam_planes,
-    lines_of_sight,
-    points_inside,
-    port_advance,
-    view_planes,
-    within_port,
-)
+from spadwarp.scene.sight import beam_planes, lines_of_sight, points_inside, port_advance, view_planes, within_port
 from spadwarp.transport import points_per_flight
 from spadwarp.transport.model import first_hits
 from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
-from spadwarp.water import group_index, molecular_density, pure_water_absorption, water_optics
+from spadwarp.water import group_index, molecular_density, pure_water_absorption
 
 __all__ = ["CheckMessage", "check", "summary"]
 
@@ -755,7 +748,7 @@ def _check_medium(survey: Survey) -> None:
     """The medium and its layers."""
     medium, laser = survey.scene.medium, survey.scene.laser
     pure = pure_water_absorption(laser.wavelength_nm) if laser.is_visible else 0.0
-    waters: dict[str, Medium | Layer] = {"medium": medium}
+    waters: dict[str, Water] = {"medium": medium}
     waters |= {f"medium.layers[{i}]": layer for i, layer in enumerate(medium.layers)}
     for name, water in waters.items():
         if water.absorption < 0.95 * pure:
@@ -772,19 +765,26 @@ def _check_medium(survey: Survey) -> None:
             text += f", where pure water absorbs {pure:.3g} 1/m and not {green:.3g}"
         survey.warn(f"{name}.preset", text, **values)
     for name, water in waters.items():
-        if not medium.layers or medium.phase_function != "henyey_greenstein" or water.chlorophyll is None:
-            continue
-        # Water molecules scatter little, but nearly evenly: the phase function of particles misses it straight back.
-        optics = water_optics(laser.wavelength_nm, chlorophyll=water.chlorophyll, **medium.state)
-        molecules = optics.water_scattering * float(molecular_density(np.array(2.0)))
-        g = medium.anisotropy if water.anisotropy is None else water.anisotropy
-        particles = (optics.scattering - optics.water_scattering) * (1.0 - g) / (4.0 * math.pi * (1.0 + g) ** 2)
-        if (missing := molecules / (molecules + particles)) > 0.1:
-            text = (
-                f"layers have the phase function of particles alone: {100.0 * missing:.2g} % of what would be "
-                "scattered straight back is the water's own and is missing"
-            )
-            survey.note(f"{name}.chlorophyll", text, missing=missing)
+        if medium.phase_function == "henyey_greenstein" and laser.is_visible and water.is_natural:
+            _check_backscatter(survey, name, water)
+
+
+def _check_backscatter(survey: Survey, name: str, water: Water) -> None:
+    """Natural water with Henyey–Greenstein's law, which falls towards 180°: molecules and real particles do not."""
+    used, fits = natural_laws(survey.scene.medium, water, survey.scene.laser.wavelength_nm)
+    back, (kept, natural) = float(fits.density(math.pi)), (used.backscatter_fraction, fits.backscatter_fraction)
+    if 0.9 < (ratio := back / float(used.density(math.pi))) < 1.1:
+        return
+    advice, own = "phase_function = 'fournier_forand' fits", fits.molecular_share
+    if used.molecular_share == 0.0 and own * float(molecular_density(np.array(2.0))) > 0.1 * back:
+        own *= water.scattering
+        advice = f"constituents fit: 'rayleigh' with scattering = {own:.2g} and 'fournier_forand' with the rest"
+    text = (
+        f"b_b/b of Henyey–Greenstein with g = {used.parameters['anisotropy']:g} is {kept:.3f}, of such water "
+        f"{natural:.3f}: straight back it is {max(ratio, 1.0 / ratio):.2g} times too "
+        f"{'weak' if ratio > 1.0 else 'strong'}; {advice}"
+    )
+    survey.note(f"{name}.anisotropy", text, used=kept, natural=natural, ratio=ratio)
 
 
 def _check_phase_table(survey: Survey) -> None:

@@ -152,7 +152,7 @@ def _list_presets(section: str | None) -> None:
         say("\n" * (number > 0) + source)
         for preset in presets:
             values = {name: f"{x:.5g}" if isinstance(x, float) else x for name, x in preset.values.items()}
-            say(f"  {preset.name:<28}  " + ", ".join(f"{name} {value}" for name, value in values.items()))
+            say(f"  {preset.name:<30}  " + ", ".join(f"{name} {value}" for name, value in values.items()))
     write_json({"presets": [dataclasses.asdict(preset) for preset in chosen]})
 
 

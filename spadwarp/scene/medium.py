@@ -212,6 +212,11 @@ class Water(Section):
         return False
 
     @property
+    def is_natural(self) -> bool:
+        """Whether chlorophyll or a preset says that it is of a sea or harbour, not of a tank or a paper's model."""
+        return self.chlorophyll is not None or (self.preset or "").startswith(("petzold-", "uwoc-", "jerlov-"))
+
+    @property
     def attenuation_length(self) -> float:
         """1/c [m]."""
         return 1.0 / self.extinction
@@ -603,6 +608,16 @@ def _law_of(medium: PhaseLaw, section: str, share: float = 0.0) -> PhaseFunction
         return (1.0 - share) * density(t) + share * molecular_density(t)
 
     return PhaseFunction(name, parameters, share, mixed if share > 0.0 else density, first_angle)
+
+
+def natural_laws(medium: Medium, water: Water, wavelength_nm: float) -> tuple[PhaseFunction, PhaseFunction]:
+    """Of the medium or one of its layers with Henyey–Greenstein's law: that law, and what natural water has, molecules
+    and Fournier–Forand's particles. Raises `ArgumentError` outside [400, 700] nm."""
+    own = water_optics(wavelength_nm, chlorophyll=0.0, **medium.state).water_scattering
+    g = getattr(water, "anisotropy", None)
+    used = _law_of(PhaseLaw(anisotropy=medium.anisotropy if g is None else g), "medium", medium.molecular_share)
+    share = min(own / water.scattering, 1.0) if water.scattering > 0.0 else 1.0
+    return used, _law_of(PhaseLaw(phase_function="fournier_forand"), "medium", share)
 
 
 Matrix = Callable[[Floats], Floats]

@@ -1,8 +1,11 @@
 """Presets: sourced, complete, and as published."""
 
+import re
+
 import pytest
 
-from spadwarp.scene import Camera, Medium, presets
+from helpers.pages import ROOT, text_of
+from spadwarp.scene import Camera, Medium, phase_function, presets
 from spadwarp.water import pure_water_absorption
 
 PUBLISHED = {
@@ -34,6 +37,29 @@ def test_extinctions_are_the_published_ones():
     for name, lengths in TANKS.items():
         distance = float(name.split("m-")[0])
         assert Medium(preset=f"maccarone-{name}").extinction * distance == pytest.approx(lengths, abs=0.01), name
+
+
+def test_backscatter_of_natural_waters_is_the_published_one():
+    """Mobley 1994, table 3.11, of 514 nm; the Ocean Optics Web Book's table of Fournier and Forand's law."""
+    page, found = text_of(ROOT / "docs" / "phase_functions.md"), set()
+    rows = re.findall(r"^\| `([\w-]+)`, ([^|]*) \| (0\.\d{4}) \| (0\.\d+)[^|]* \|", page, re.MULTILINE)
+    for name, what, computed, published in rows:
+        if name in presets("medium"):
+            medium = Medium(preset=name)
+        else:
+            numbers = [float(number) for number in re.findall(r"\d\.\d+", what)]
+            fields = dict(zip(("particle_index", "junge_slope"), numbers, strict=False))
+            medium = Medium(absorption=0.1, scattering=0.1, phase_function=name, **fields)
+        fraction = phase_function(medium).backscatter_fraction
+        assert fraction == pytest.approx(float(computed), abs=5.1e-5), name
+        assert fraction == pytest.approx(float(published), rel=0.07), name
+        found.add(name)
+    constituents = {name for name in presets("medium") if name.endswith("-constituents")}
+    assert len(rows) == 8 and constituents == {name for name in found if name.endswith("-constituents")}
+    for name in constituents:
+        both = (Medium(preset=name), Medium(preset=name.removesuffix("-constituents")))
+        sums = [(water.absorption, water.scattering, water.group_index) for water in both]
+        assert sums[0] == pytest.approx(sums[1], rel=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from helpers.minimal_scene import problems, scene
 from spadwarp.dataset.recipe import Recipe
 from spadwarp.denoise.recipe import TrainingRecipe
 from spadwarp.scene import Camera, Domain, Medium, Scene, parse_override, presets
+from spadwarp.scene.medium import Constituent
 from spadwarp.scene.sections import interval_of, models_of, parts_of
 from spadwarp.values import SPEED_OF_LIGHT, ConfigError
 
@@ -68,7 +69,8 @@ def test_a_preset_gives_its_fields_and_each_can_be_overridden(name):
     more |= {"point": [0.0, 1.0, 0.0]} if section == "surface" else {}
     base = scene(**{section: {"preset": preset, **more}})
     for field, value in presets(section)[preset].values.items():
-        assert getattr(getattr(base, section), field) == value
+        listed = tuple(Constituent(**one) for one in value) if field == "constituents" else value
+        assert getattr(getattr(base, section), field) == listed
         if isinstance(value, (int, float)):
             other = int(value * 2) if isinstance(value, int) else value * 0.75 + 0.1
             changed = base.with_overrides({f"{section}.{field}": other})

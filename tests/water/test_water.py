@@ -7,6 +7,8 @@ import pytest
 
 import spadwarp
 from helpers.scenes import scene as make_scene
+from reference import fournier_forand
+from reference.single_scatter import henyey_greenstein
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.medium import WATER_INDICES
 from spadwarp.water import group_index, pure_water_absorption, pure_water_scattering, refractive_index, water_optics
@@ -169,11 +171,30 @@ def test_light_is_scattered_by_the_water_itself(tmp_path):
     assert found > 1.5 * backscatter(**numbers)
 
 
-def test_what_layers_leave_out_is_told():
-    layers = {"chlorophyll": 0.05, "layers": [{"start": 2.0, "chlorophyll": 20.0}, {"start": 3.0, "chlorophyll": 0.5}]}
-    printed = [message for message in spadwarp.check(scene(layers)) if message.field.endswith("chlorophyll")]
-    assert [message.field for message in printed] == ["medium.chlorophyll", "medium.layers[1].chlorophyll"]
-    assert printed[0].values["missing"] == pytest.approx(0.7655, abs=0.002)
-    assert printed[1].values["missing"] == pytest.approx(0.363, abs=0.002)
-    assert scene(layers).medium.molecular_share == 0.0
-    assert not [m for m in spadwarp.check(scene({"chlorophyll": 0.05})) if m.field.endswith("chlorophyll")]
+def test_henyey_greenstein_in_natural_water_is_told():
+    """Against the laws' own formulas: molecules with a depolarisation of 0.039, Fournier and Forand."""
+    layers = {
+        "chlorophyll": 0.05,
+        "layers": [{"start": 2.0, "chlorophyll": 20.0}, {"start": 3.0, "preset": "uwoc-clear"}],
+    }
+    found = [one for one in spadwarp.check(scene(layers)) if one.field.endswith("anisotropy")]
+    assert [one.field for one in found] == [f"medium.{name}anisotropy" for name in ("", "layers[0].", "layers[1].")]
+    b_water, g = pure_water_scattering(532.0, salinity=35.0), 0.924
+    molecules, particles = 3 / (4 * math.pi) * 2 / (4 + 2 * 0.039), fournier_forand.density(2.0, 1.10, 3.5835)
+    backward = (1 - g) / (2 * g) * ((1 + g) / math.sqrt(1 + g * g) - 1)
+    for one, water in zip(found, scene(layers).medium.waters, strict=True):
+        share = b_water / water.scattering
+        ratio = (share * molecules + (1 - share) * particles) / henyey_greenstein(-1.0, g)
+        expected = {"used": backward, "natural": 0.5 * share + (1 - share) * 0.01831, "ratio": ratio}
+        assert one.values == pytest.approx(expected, rel=1e-3)
+    texts = [one.text.partition("; ")[2] for one in found]
+    assert texts[0].startswith("constituents fit: 'rayleigh' with scattering = 0.002 and")
+    assert texts[1] == "phase_function = 'fournier_forand' fits"
+    # With one water of chlorophyll, the molecules are there already, and particles alone fall short.
+    (one,) = [one for one in spadwarp.check(scene({"chlorophyll": 0.05})) if one.field == "medium.anisotropy"]
+    assert one.values["ratio"] < 1.2 < found[0].values["ratio"] and one.text.endswith(texts[1])
+    for silent in (
+        *({"preset": name} for name in ("lu2024", "maccarone-3m-7.5", "petzold-autec-8-constituents")),
+        *({"absorption": 0.1, "scattering": 0.2}, {"preset": "uwoc-clear", "phase_function": "fournier_forand"}),
+    ):
+        assert not [one for one in spadwarp.check(scene(silent)) if one.field.endswith("anisotropy")], silent
