@@ -669,6 +669,8 @@ def _short_names(names: Iterable[str]) -> list[str]:
 
 def unseen_warnings(result: Result) -> tuple[str, ...]:
     """Of `Result.warnings` that of a forward peak, which no number of batches tells."""
+    if result.unseen_share <= NOTABLE_UNSEEN:
+        return ()
     scattered, total = (float(part.sum(dtype=np.float64)) for part in (result.tallies[1:], result.tallies))
     if result.unseen_share * scattered <= NOTABLE_UNSEEN * total:
         return ()

@@ -328,7 +328,7 @@ class _Run:
         size = int(self._speed[worker] * _BLOCK_SECONDS) if worker in self._speed else first
         if workers > 1:
             size = min(size, max(self._waiting.left // (2 * workers), first // 16))
-        return max(1, size // unit) * unit
+        return -(-size // unit) * unit
 
     def _take(self, event: Event) -> None:
         """What a worker did; an event of one that has nothing to do is that it has joined, or was lost before."""

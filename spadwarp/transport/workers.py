@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
@@ -86,7 +89,7 @@ class _Histogram:
         """`[2, *shape]`, low and high halves; None without batches."""
         if self.batches is None:
             return None
-        words = np.empty((2, *shape), np.uint64)
+        words = _host_memory((2, *shape), np.uint64)
         for word, held in zip(self.batches.second_moment, words, strict=True):
             wp.copy(wp.array(held.reshape(-1), dtype=wp.uint64, device="cpu", copy=False), word)
         wp.synchronize_device(self.array.device)
@@ -99,7 +102,7 @@ class _Closed(NamedTuple):
     energy_balance: dict[str, int]
     counters: dict[str, int]
     batch_moments: dict[str, int]
-    batches: int = 1
+    batches: int
     half_photons: int = 0
 
     def plus(self, more: _Closed) -> _Closed:
@@ -148,30 +151,18 @@ class DeviceWorker:
             if self.data.flux is not None:
                 self._histograms.append(_Histogram(self.data.flux, 1, signed=False, batched=batched))
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
-            most = min(launch_size, batch_size or launch_size)
-            sk.load_transport_kernel(spec, model.device, model=model, photon_count=most)
+            self._most = min(launch_size, batch_size or launch_size)
+            sk.load_transport_kernel(spec, model.device, model=model, photon_count=self._most)
         self._closed: _Closed | None = None
+        self._unread = list[tuple[int, bool]]()  # batches closed on the device: photons, and whether in the half
+        self._running = deque[tuple[int, wp.Event]]()  # launches on a GPU: photons, and their end
 
-    def _launched(self, spans: Iterable[Range]) -> Iterator[Range]:
-        """Traces a launch for each span and yields it when that has ended; a GPU has the next before."""
-        device, running = self.model.device, list[tuple[Range, Any]]()
-        ahead = 1 if device.is_cuda else 0
-
-        def ended() -> Range:
-            span, end = running.pop(0)
-            if end is not None:
-                wp.synchronize_event(end)
-            return span
-
-        for first, stop in spans:
-            sk.launch_transport(
-                self._spec, self.model, self.data, seed=self._seed, first_id=first, photon_count=stop - first
-            )
-            running.append(((first, stop), device.stream.record_event() if device.is_cuda else None))
-            if len(running) > ahead:
-                yield ended()
-        while running:
-            yield ended()
+    def _wait(self, report: Callable[[int], None], ahead: int = 0) -> None:
+        """Reports launches on a GPU as they end, until so many are under way."""
+        while len(self._running) > ahead:
+            photons, end = self._running.popleft()
+            wp.synchronize_event(end)
+            report(photons)
 
     def trace(
         self, block: Range, *, stopped: threading.Event, report: Callable[[int], None] = lambda photons: None
@@ -183,13 +174,17 @@ class DeviceWorker:
         done, size = list[Range](), self._batch_size or block[1]
         edges = [block[0], *range((block[0] // size + 1) * size, block[1], size), block[1]]
         with device_errors(self.model.device):
+            most = min(self._most, block[1] - block[0])
+            launch = sk.prepare_transport(self._spec, self.model, self.data, seed=self._seed, photon_count=most)
             for part in itertools.pairwise(edges):
-                traced = self._trace(part, stopped, report)
+                traced = self._trace(part, launch, stopped, report)
                 if self._batch_size and traced:
                     self._close_batch(traced)
                 done += traced
                 if stopped.is_set():
                     break
+            self._wait(report)
+            self._read_closed()
             self._check_overflow()
         return joined(done)
 
@@ -198,9 +193,13 @@ class DeviceWorker:
         if any(histogram.has_overflowed() for histogram in self._histograms):
             raise SpadwarpError(OVERFLOW)
 
-    def _trace(self, ids: Range, stopped: threading.Event, report: Callable[[int], None]) -> Ranges:
+    def _trace(
+        self, ids: Range, launch: Callable[[int, int], None], stopped: threading.Event, report: Callable[[int], None]
+    ) -> Ranges:
+        """Traces the ids with all threads; on a GPU the last launch may still be under way."""
         waiting, done, lock = IdQueue([ids]), list[Range](), threading.Lock()
         failures: list[BaseException] = []
+        device: Any = self.model.device
 
         def spans() -> Iterator[Range]:
             while not (stopped.is_set() or failures):
@@ -214,10 +213,15 @@ class DeviceWorker:
 
         def work() -> None:
             try:
-                for span in self._launched(spans()):
+                for first, stop in spans():
+                    launch(first, stop - first)
                     with lock:
-                        done.append(span)
-                    report(span[1] - span[0])
+                        done.append((first, stop))
+                    if device.is_cuda:
+                        self._running.append((stop - first, device.stream.record_event()))
+                        self._wait(report, ahead=1)
+                    else:
+                        report(stop - first)
             except BaseException as error:
                 failures.append(error)
 
@@ -238,10 +242,21 @@ class DeviceWorker:
         for histogram in self._histograms:
             assert histogram.batches is not None
             histogram.batches.close(histogram.array, in_half=in_half, part=photons / size, threads=self._threads)
+        self._unread.append((photons, in_half))
+        if len(self._unread) == sk.Batches.MOST_SUMS:
+            self._read_closed()
+
+    def _read_closed(self) -> None:
+        """Adds up what batches left beside their arrays: few at a time, since a GPU is waited for."""
+        if not self._unread:
+            return
         assert self._histograms[0].batches is not None
-        moments = moments_of(self._names, self._histograms[0].batches.take_sums(), photons, size)
-        self._add_closed(_Closed(*sk.read_ledger(self.data), moments, half_photons=photons if in_half else 0))
+        unread, sums = self._unread, self._histograms[0].batches.take_sums()
+        each = [moments_of(self._names, s, n, self._batch_size) for s, (n, _) in zip(sums, unread, strict=True)]
+        half = sum(photons for photons, in_half in unread if in_half)
+        self._add_closed(_Closed(*sk.read_ledger(self.data), joined_moments(*each), len(unread), half))
         self.data.ledger.zero_()
+        self._unread = []
 
     def _add_closed(self, more: _Closed) -> None:
         self._closed = more if self._closed is None else self._closed.plus(more)
@@ -314,10 +329,38 @@ def _on_host(array: wp.array) -> NDArray[Any]:
     device: Any = array.device
     if not device.is_cuda:
         return np.asarray(array.numpy())
-    held = np.empty(array.shape, wp.dtype_to_numpy(array.dtype))
+    held = _host_memory(array.shape, wp.dtype_to_numpy(array.dtype))
     wp.copy(wp.array(held, dtype=array.dtype, device="cpu", copy=False), array)
     wp.synchronize_device(device)
     return held
+
+
+# Memory of arrays that are gone, oldest first, and its bytes at most: a GPU fills it much faster than new pages.
+_free = dict[int, NDArray[np.uint8]]()
+_MOST_FREE = 1 << 29
+
+
+class _Lent:
+    """The base of an array of NumPy in memory that is free again when the last view of it is gone."""
+
+    def __init__(self, memory: NDArray[np.uint8]) -> None:
+        self.__array_interface__ = memory.__array_interface__
+        weakref.finalize(self, _give_back, memory).atexit = False
+
+
+def _give_back(memory: NDArray[np.uint8]) -> None:
+    _free[id(memory)] = memory
+    while sum(each.nbytes for each in list(_free.values())) > _MOST_FREE:
+        _free.pop(next(iter(_free)), None)
+
+
+def _host_memory(shape: Sequence[int], dtype: Any) -> NDArray[Any]:
+    """As `np.empty`, in memory that was used before if some is free; any thread may give it back meanwhile."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    fitting = (_free.pop(key, None) for key, each in list(_free.items()) if each.nbytes == size)
+    memory = next((each for each in fitting if each is not None), None)
+    held = _Lent(np.empty(size, np.uint8) if memory is None else memory)
+    return np.asarray(held).view(dtype).reshape(shape)
 
 
 @contextmanager

@@ -97,6 +97,8 @@ def _valid_calls():
         "launch": (sk.launch_transport, dict(
             spec=sk.TransportSpec("next_event"), model=model, data=sk.make_data(model), seed=1, first_id=0,
             photon_count=20)),
+        "prepare": (sk.prepare_transport, dict(
+            spec=sk.TransportSpec("next_event"), model=model, data=sk.make_data(model), seed=1, photon_count=20)),
         "make_data": (sk.make_data, dict(model=model, tally=None, record_count=3, histogram=True)),
         "Model": (sk.Model, dict(device="cpu", mesh=mesh, surfaces=model.surfaces, scale=1.0, **lit_box())),
         "make_surfaces": (sk.make_surfaces, dict(

@@ -127,8 +127,8 @@ LINES = {
     "kernels/photon": (850, 1254),
     "kernels/riders": (750, 613),
     "kernels/surface": (1700, 1919),
-    "kernels/tally": (450, 935),
-    "kernels/transport": (1450, 1770),
+    "kernels/tally": (450, 941),
+    "kernels/transport": (1450, 1791),
     "kernels/water": (1350, 1646),
     "kernels/worlds": (1600, 2291),
 }

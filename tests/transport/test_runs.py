@@ -218,14 +218,19 @@ def test_wrong_use_is_named(arguments, text, whole):
 @pytest.mark.parametrize("device", ["cpu", "cpu,cpu"])
 def test_a_device_that_disappears_costs_what_was_not_in_a_checkpoint(device, whole, tmp_path, monkeypatch):
     """After 120 launches."""
-    place, launch, calls = tmp_path / "checkpoint.h5", sk.launch_transport, itertools.count()
+    place, prepare, calls = tmp_path / "checkpoint.h5", sk.prepare_transport, itertools.count()
 
-    def fail(*arguments, **options):
-        if next(calls) >= 120:
-            raise RuntimeError("CUDA error 719: unspecified launch failure")
-        launch(*arguments, **options)
+    def failing(*arguments, **options):
+        launch = prepare(*arguments, **options)
 
-    monkeypatch.setattr(sk, "launch_transport", fail)
+        def fail(first_id, photon_count):
+            if next(calls) >= 120:
+                raise RuntimeError("CUDA error 719: unspecified launch failure")
+            launch(first_id, photon_count)
+
+        return fail
+
+    monkeypatch.setattr(sk, "prepare_transport", failing)
     often = RunOptions(**SMALL_LAUNCHES, checkpoint=place, checkpoint_every=0.0)
     with pytest.raises(DeviceError) as caught:
         simulate(scene(), **RUN, device=device, run=often)
@@ -279,10 +284,13 @@ def test_squares_are_exact_to_128_bits(device):
     rows[0][:] = 0
     tally = wp.zeros(150, dtype=wp.int64, device=device)
     batches = sk.Batches(tally, 3)
-    for row in rows:
+    for k, row in enumerate(rows, 1):
         tally.assign(row.ravel() // 3)
         batches.close(tally)
         assert not tally.numpy().any()
+        if k % batches.MOST_SUMS == 0:
+            assert batches.take_sums() == [[sum(map(int, part // 3)) for part in row] for row in rows[k - 16 : k]]
+    assert len(batches.take_sums()) == 300 % 16 and batches.take_sums() == []
     sums = [[int(v) // 3 for v in row.ravel()] for row in rows]
     expected = [sum((row[i] + row[50 + i] + row[100 + i]) ** 2 for row in sums) for i in range(50)]
     low, high = (half.numpy() for half in batches.second_moment)

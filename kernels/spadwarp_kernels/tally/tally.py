@@ -278,6 +278,9 @@ class Batches:
         count: Batches closed.
     """
 
+    MOST_SUMS = 16
+    """Batches between two calls of `take_sums` at most."""
+
     def __init__(
         self,
         tally: wp.array,
@@ -295,9 +298,9 @@ class Batches:
             )
         if total is not None:
             check_array("total", total, wp.int64, tuple(tally.shape), tally.device, contiguous=True)
-        self._signed, self._least = signed, wp.int64(1 - (1 << 62) if signed else 0)
+        self._untaken, self._signed, self._least = 0, signed, wp.int64(1 - (1 << 62) if signed else 0)
         with wp.ScopedDevice(tally.device):
-            self._sums = wp.zeros(component_count * _SLOTS, dtype=wp.int64)
+            self._sums = wp.zeros((self.MOST_SUMS, component_count * _SLOTS), dtype=wp.int64)
             self._overflow = wp.zeros(1, dtype=int)
             self.total = wp.zeros(tally.size, dtype=wp.int64) if total is None else total
             self.half = wp.zeros(tally.size, dtype=wp.int64) if halved else None
@@ -315,10 +318,10 @@ class Batches:
         half = self.half if in_half and self.half is not None else self._no_half
         weight = wp.float64(1.0 / math.sqrt(check_number("part", part, "(0, 1]")))
         inputs = [self._component_count, self._least, run, weight, tally, self.total, half, *self.second_moment]
-        inputs += [self._sums, self._overflow]
+        inputs += [self._sums[self._untaken % self.MOST_SUMS], self._overflow]
         runs = -(-self.second_moment[0].size // run)  # a thread costs as much as some hundred
         launch_pixels(close_batch_kernel, runs, inputs, device=tally.device, threads=min(threads, 1 + runs // 256))
-        self.count += 1
+        self.count, self._untaken = self.count + 1, self._untaken + 1
 
     def add(self, other: "Batches") -> None:
         """Adds the batches of another tally of the same components, which may be on another device and must rest.
@@ -344,11 +347,14 @@ class Batches:
         """Whether a voxel of the total has left the range that `has_overflowed` allows; waits for the device."""
         return bool(self._overflow.numpy()[0])
 
-    def take_sums(self) -> list[int]:
-        """Each component of the batches closed since the last call, summed over voxels; waits for the device."""
-        sums = exact_sums(self._sums.numpy().reshape(self._component_count, _SLOTS))
-        self._sums.zero_()
-        return sums
+    def take_sums(self) -> list[list[int]]:
+        """Of each batch closed since the last call, `MOST_SUMS` at most: its components, summed over voxels; waits for
+        the device."""
+        rows, width = self._sums[: self._untaken], self._component_count
+        sums = exact_sums(rows.numpy().reshape(-1, _SLOTS))
+        rows.zero_()
+        self._untaken = 0
+        return [sums[first : first + width] for first in range(0, len(sums), width)]
 
 
 # ---- Tallies as rates on their device: sums over components in single precision.

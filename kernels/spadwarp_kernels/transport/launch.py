@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
 
@@ -70,7 +70,15 @@ from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
 
 from .loops import make_transport_kernel
 
-__all__ = ["Data", "Model", "launch_transport", "load_transport_kernel", "make_data", "read_ledger"]
+__all__ = [
+    "Data",
+    "Model",
+    "launch_transport",
+    "load_transport_kernel",
+    "make_data",
+    "prepare_transport",
+    "read_ledger",
+]
 
 # The structs of a model, by name.
 _STRUCTS = {name: var.type for name, var in World.vars.items() if name not in ("seed", "keys")}
@@ -455,34 +463,47 @@ def launch_transport(
             an array that is too short or on another device, or surfaces that the spec does not describe, see
             `surface_choices`.
     """
-    check_kind("model", model, Model)
-    check_kind("data", data, Data)
     photon_count = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
     first_id = check_integer("first_id", first_id, 0, 2**64 - photon_count)
+    launch = prepare_transport(spec, model, data, seed=seed, photon_count=photon_count, threads=threads)
+    launch(first_id, photon_count)
+
+
+def prepare_transport(
+    spec: TransportSpec, model: Model, data: Data, *, seed: int, photon_count: int, threads: int = CUDA_THREADS
+) -> Callable[[int, int], None]:
+    """Launches like `launch_transport`, of model and data as they are now, which are checked once.
+
+    Returns the launch, a function of `first_id` and of a `photon_count` of at most the one here, which it does not
+    check. Args and raises: as `launch_transport`.
+    """
+    check_kind("model", model, Model)
+    check_kind("data", data, Data)
+    most = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
     seed = check_seed(seed)
-    threads = check_integer("threads", threads, BLOCK_SIZE)
-    check_launch(spec, model, data, photon_count)
-    blocks = min(-(-photon_count // BLOCK_SIZE), threads // BLOCK_SIZE)
-    threads = blocks * BLOCK_SIZE if model.device.is_cuda else 1
-    if spec.blocks:
-        threads = threads_of_blocks(threads, model.derivatives.blocks)
-    data.cursor.zero_()
-    split_accumulators = _split_accumulators(spec, model, data, photon_count)
-    launch = Launch()
-    launch.first_id, launch.photon_count, launch.threads = first_id, photon_count, threads
-    launch.cursor, launch.offset = data.cursor, data.offset
+    blocks = check_integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE
+    check_launch(spec, model, data, most)
+    device, split_accumulators = model.device, _split_accumulators(spec, model, data, most)
+    kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators is not None)
     sink = Sink()
     sink.tally, sink.ledger, sink.scale, sink.records = data.tally, data.ledger, model.scale, data.records
     sink.gradients, sink.low, sink.flux = data.gradients, split_accumulators, data.flux
-    wp.launch(
-        make_transport_kernel(spec, model.device.is_cuda, split_accumulators is not None),
-        dim=threads,
-        inputs=[_make_world(spec, model, seed, threads), sink, launch],
-        device=model.device,
-        block_dim=BLOCK_SIZE,
-    )
-    if split_accumulators is not None:
-        fold_accumulators(split_accumulators, data.tally)
+    shared = None if spec.blocks else _make_world(spec, model, seed, 0)
+
+    def launch(first_id: int, photon_count: int) -> None:
+        threads = BLOCK_SIZE * min(-(-photon_count // BLOCK_SIZE), blocks) if device.is_cuda else 1
+        if spec.blocks:
+            threads = threads_of_blocks(threads, model.derivatives.blocks)
+        data.cursor.zero_()
+        part = Launch()
+        part.first_id, part.photon_count, part.threads = first_id, photon_count, threads
+        part.cursor, part.offset = data.cursor, data.offset
+        world = _make_world(spec, model, seed, threads) if shared is None else shared
+        wp.launch(kernel, dim=threads, inputs=[world, sink, part], device=device, block_dim=BLOCK_SIZE)
+        if split_accumulators is not None:
+            fold_accumulators(split_accumulators, data.tally)
+
+    return launch
 
 
 def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> wp.array | None:
