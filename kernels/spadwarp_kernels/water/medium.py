@@ -269,9 +269,9 @@ LAYERED = Water(layered_free_path, layered_extinction, layered_water, layered_mi
 def mixture_shares(shares: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Shares `[n, 4]` of the scattering, which add up to 1, from those of up to 4 constituents, `[*shape, count]`;
     none from none. Raises `ArgumentError`."""
-    if np.size(shares) == 0:
+    values = check_numbers("shares", shares)
+    if not values.size:
         return np.zeros((0, MOST_CONSTITUENTS), np.float32)
-    values = check_numbers("shares", shares, len(shape) + 1)
     if values.shape[:-1] != shape or values.shape[-1] > MOST_CONSTITUENTS:
         raise ArgumentError(f"shares {values.shape} are not those of up to {MOST_CONSTITUENTS} for each of {shape}")
     if not (values.min() >= 0.0 and np.allclose(values.sum(axis=-1), 1.0, atol=1e-5)):

@@ -14,7 +14,6 @@ from spadwarp_kernels.base.arguments import (
     ArgumentError,
     check_array,
     check_choice,
-    check_fields,
     check_integer,
     check_kind,
     check_number,
@@ -100,7 +99,8 @@ class SpadConfig:
         for name in ("width", "height", "bins"):
             check_integer(f"config.{name}", getattr(self, name), 1)
         check_integer("config.pulses", self.pulses, 0)
-        check_fields("config", self, _RANGES)
+        for name, within in _RANGES.items():
+            check_number(f"config.{name}", getattr(self, name), within)
         self._check_field_of_view()
         check_vector("config.gate_distance", self.gate_distance, size=2)
         check_number("config.gate_distance[0]", self.gate_distance[0], "[0, inf)")

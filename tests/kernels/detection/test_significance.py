@@ -43,8 +43,8 @@ def first_photons(rng, pixels, background, pulses):
     ids=["few counts", "wide", "many counts", "backscatter", "pile-up", "level unknown", "few counts, level unknown"],
 )
 def test_false_alarms_of_background_alone_are_as_many_as_asked_for(background, options, device):
-    """4 standard errors, and a tenth by which the bound on the union of windows may be above. A pixel without a count has
-    no alarm where the level is that of its own counts."""
+    """4 standard errors, and a tenth by which the bound on the union of windows may be above. A pixel without a count
+    has no alarm where the level is that of its own counts."""
     rng, pixels = np.random.default_rng(7), 150_000
     pulses = options.get("pulses", 0)
     counts = first_photons(rng, pixels, background, pulses) if pulses else rng.poisson(background, (pixels, BINS))
