@@ -351,21 +351,22 @@ def test_standard_error_is_the_spread_between_seeds(device):
 
 
 def test_moments_of_the_components_are_those_of_the_batches(device):
-    """A run of 32 batches against a run of each; merged runs have the same."""
-    size, options = 1024, {"seed": 5, "device": device}
-    whole = simulate(scene(), photons=32 * size, **options)
-    assert whole.batch_size == size
-    each = [simulate(scene(), photons=size, **options, run=RunOptions(first_photon=k * size)) for k in range(32)]
+    """A run of 8 or 32 batches against a run of each; merged runs have the same."""
+    options = {"seed": 5, "device": device}
+    whole = simulate(scene(), photons=32 * 1024, **options)
+    size, count = whole.batch_size, whole.batches
+    assert size * count == 32 * 1024 and count >= 8
+    each = [simulate(scene(), photons=size, **options, run=RunOptions(first_photon=k * size)) for k in range(count)]
     totals = np.array([run.tallies.sum(axis=(1, 2, 3)) for run in each])
     for name, total in zip(("ballistic", "forward_scattered", "backscatter"), totals.T.tolist(), strict=True):
         assert whole.batch_moments[f"{name}_squares"] == sum(x * x for x in total)
         assert whole.batch_moments[f"{name}_smallest"] == min(total)
         assert whole.batch_moments[f"{name}_largest"] == max(total)
         error, share = component_errors(whole)[name]
-        assert error == pytest.approx(np.std(total, ddof=1) / np.mean(total) / np.sqrt(32))
+        assert error == pytest.approx(np.std(total, ddof=1) / np.mean(total) / np.sqrt(count))
         squares = (np.array(total, float) - np.mean(total)) ** 2
-        assert share == pytest.approx(32 / 31 * squares.max() / squares.sum())
-    options |= {"photons": 32 * size}
+        assert share == pytest.approx(count / (count - 1) * squares.max() / squares.sum())
+    options |= {"photons": size * count}
     parts = [simulate(scene(), **options, run=RunOptions(shard=(k, 2))) for k in (1, 2)]
     assert merge(parts).batch_moments == whole.batch_moments
 
