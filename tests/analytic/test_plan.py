@@ -97,8 +97,8 @@ def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
     assert clear.pilot.floor == clear.pilot.unscattered_floor
     assert clear.pilot.floor["likelihood"] < 0.5 * bin_range and clear.limit in ("jitter", "shot noise")
     assert clear.pilot.backscatter == 0 and clear.terms["background"] < 0.2 * clear.terms["shot noise"]
-    # Light is spread evenly over a bin of the run, and then over one of the detector.
-    sigma = range_from_time(1e-12 * math.hypot(85 / 2.3548, 200 / 2.3548, 50 / math.sqrt(6.0)), 1.36)
+    # Light is spread evenly over a bin of the run, one of the detector, and one to which pixels are aligned.
+    sigma = range_from_time(1e-12 * math.hypot(85 / 2.3548, 200 / 2.3548, 50 / math.sqrt(4.0)), 1.36)
     assert clear.pilot.shot_noise == pytest.approx(sigma / math.sqrt(clear.pilot.target), rel=0.03)
 
 
