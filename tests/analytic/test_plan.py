@@ -143,7 +143,7 @@ def test_pulse_energy_keeps_the_limits():
 @pytest.mark.slow
 def test_largest_range_falls_with_the_extinction(monkeypatch):
     monkeypatch.setattr(planning, "_RESOLUTION", 1.2)
-    options = {"largest_range": True, "depth_error": 0.1, "photons": 60_000}
+    options = {"largest_range": True, "depth_error": 0.1, "photons": 400_000}
     clear, turbid = (proposal(make(medium={"extinction": c}), **options) for c in (0.15, 0.3))
     assert 0 < turbid.largest_range < clear.largest_range
     assert turbid.range_limit
