@@ -16,7 +16,8 @@ import numpy as np
 from spadwarp.analytic.model import Map, false_peaks, pixel_maps, response_sigma, warn_of_model
 from spadwarp.result import Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
-from spadwarp.scene.sight import LinesOfSight, lines_of_sight, pixel_directions
+from spadwarp.scene.camera import pixel_directions
+from spadwarp.scene.sight import LinesOfSight, lines_of_sight
 from spadwarp.transport import truth_maps
 from spadwarp.values import ArgumentError, ConfigError, check_integer, check_real, shown
 

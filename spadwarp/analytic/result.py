@@ -17,7 +17,8 @@ from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensi
 from spadwarp.result.file import as_result
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
-from spadwarp.scene.sight import gate_deviation, lines_of_sight, pixel_directions
+from spadwarp.scene.camera import pixel_directions
+from spadwarp.scene.sight import gate_deviation, lines_of_sight
 from spadwarp.transport import truth_maps
 from spadwarp.values import SEED, ArgumentError, ConfigError, Shown, check_integer
 

@@ -19,7 +19,8 @@ from spadwarp.frames import Frames, detect
 from spadwarp.frames.cramer_rao import bound_of_result
 from spadwarp.result import Result, Truth, analyser_channel, degree_of_polarisation
 from spadwarp.scene import Scene
-from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight, pixel_directions
+from spadwarp.scene.camera import pixel_directions
+from spadwarp.scene.sight import depth_from_time, depth_per_time, gate_deviation, lines_of_sight
 from spadwarp.transport import RunOptions, reconstruct, simulate, truth_maps
 from spadwarp.values import ConfigError, SpadwarpWarning, path_from_time
 

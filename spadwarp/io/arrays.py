@@ -177,7 +177,7 @@ def point_cloud(distance: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.
 
     Args:
         distance: Along the lines of sight `[H, W]` [m]; NaN where there is nothing.
-        directions: Unit vectors `[H, W, 3]`, such as `spadwarp.scene.geometry.pixel_directions` gives.
+        directions: Unit vectors `[H, W, 3]`, such as `spadwarp.scene.camera.pixel_directions` gives.
     """
     along, view = np.asarray(distance, np.float64), np.asarray(directions, np.float64)
     if along.ndim != 2 or view.shape != (*along.shape, 3):

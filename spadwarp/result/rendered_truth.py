@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.io.arrays import read_exr
 from spadwarp.result.result import Truth
-from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.values import ArgumentError, FileError, check_choice, check_real
 
 __all__ = ["load_truth_exr"]

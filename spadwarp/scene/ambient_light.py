@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.laser import filter_band, filter_transmission, widths_of
 from spadwarp.scene.medium import Medium, PhaseFunction, phase_function
 from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.scene import Scene, camera_port
-from spadwarp.scene.sight import pixel_directions
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, Interval
 from spadwarp.water import daylight as skylight
 from spadwarp.water.seawater import RANGES

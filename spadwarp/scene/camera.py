@@ -245,6 +245,13 @@ def image_tangents(camera: Camera, points: ArrayLike) -> Points:
     return tangents
 
 
+def pixel_directions(camera: Camera) -> Points:
+    """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
+    centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
+    rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
 def is_invertible(camera: Camera) -> bool:
     """Whether each point of the image belongs to one direction of the view.
 

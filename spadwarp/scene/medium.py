@@ -82,11 +82,11 @@ def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
     return {"absorption": a, "scattering": b, "extinction": c, "albedo": share}
 
 
-# Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and those
-# with a default, which phase functions may share.
 MOST_CONSTITUENTS = 4  # as many as the kernels take
 MIXTURE = "mixture"  # what `phase_function` reads with constituents, which each have their own
 
+# Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and those
+# with a default, which phase functions may share.
 PHASE_FIELDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "henyey_greenstein": ((), ("anisotropy",)),
     "two_term_henyey_greenstein": (("g1", "g2", "alpha"), ()),
@@ -342,18 +342,20 @@ class Medium(PhaseLaw, Water):
         own = getattr(water, "concentrations", None) or {}
         return [own.get(one.name, one.concentration) for one in self.constituents]
 
+    def scattering_in(self, water: Medium | Layer) -> list[float]:
+        """Of each constituent, in the medium or one of its layers [1/m]."""
+        return [n * one.scattering for n, one in zip(self.concentrations_in(water), self.constituents, strict=True)]
+
     def shares_in(self, water: Medium | Layer) -> list[float]:
         """Part of each constituent in the scattering of the medium or one of its layers; where nothing scatters, equal
         parts."""
-        parts = [n * one.scattering for n, one in zip(self.concentrations_in(water), self.constituents, strict=True)]
-        whole = math.fsum(parts)
+        whole = math.fsum(parts := self.scattering_in(water))
         return [part / whole if whole > 0.0 else 1.0 / len(parts) for part in parts]
 
     def _sum(self, water: Medium | Layer) -> tuple[float, float, float]:
         """a, b and c of the medium or a layer from constituents [1/m]."""
-        parts = list(zip(self.concentrations_in(water), self.constituents, strict=True))
-        a = math.fsum(n * one.absorption for n, one in parts)
-        b = math.fsum(n * one.scattering for n, one in parts)
+        numbers, b = self.concentrations_in(water), math.fsum(self.scattering_in(water))
+        a = math.fsum(n * one.absorption for n, one in zip(numbers, self.constituents, strict=True))
         return a, b, a + b
 
     @model_validator(mode="after")
@@ -502,8 +504,7 @@ def cell_shares(medium: Medium) -> Floats:
     """Part of each constituent in the scattering of the cells of a medium's grid, `[x, y, z, constituent]`. Raises what
     `grid_cells` raises."""
     cells, names = grid_cells(medium), [one.name for one in medium.constituents]
-    parts = [n * one.scattering for n, one in zip(medium.concentrations_in(medium), medium.constituents, strict=True)]
-    scattered = np.array(parts) + np.zeros((*cells.extinction.shape, 1))
+    scattered = np.array(medium.scattering_in(medium)) + np.zeros((*cells.extinction.shape, 1))
     # What the medium scatters without the cells is part of the cells' own.
     whole = np.maximum(cells.extinction.astype(np.float64) * cells.albedo, medium.scattering)
     scattered[..., names.index(str(medium.grid and medium.grid.constituent))] += whole - medium.scattering

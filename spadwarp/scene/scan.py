@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.scene.camera import image_tangents
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, vector_of
 from spadwarp.scene.scene import Scene, load_trajectory
 from spadwarp.values import ArgumentError, ConfigError, check_integer
@@ -71,13 +71,11 @@ def shots_of(scene: Scene) -> Shots:
         platform = np.broadcast_to(rotation_matrix(camera.rotation_deg), (count, 3, 3))
     else:
         position, platform = _platform(scene, time)
-    row = np.stack([np.arange(scene.receiver.width) + 0.5, np.full(scene.receiver.width, 0.5)], axis=1)
-    view = np.concatenate([image_tangents(scene.receiver, row), np.ones((len(row), 1))], axis=1)
     return Shots(
         time=time,
         position=position,
         rotation=platform @ _deflections(scene, count),
-        view=view / np.linalg.norm(view, axis=1, keepdims=True),
+        view=pixel_directions(scene.receiver)[0],
         shape=(camera.height, camera.width),
     )
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.scene.camera import Camera, image_tangents, to_camera
+from spadwarp.scene.camera import Camera, pixel_directions, to_camera
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix
@@ -32,13 +32,6 @@ _STEPS = 30
 
 
 _GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
-
-
-def pixel_directions(camera: Camera) -> Floats:
-    """Unit vectors from the lens centre through the pixel centres, float64 `[H, W, 3]`."""
-    centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
-    rays = np.concatenate([image_tangents(camera, centres), np.ones((camera.height, camera.width, 1))], axis=-1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 def view_directions(scene: Scene) -> Floats:

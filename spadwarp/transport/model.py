@@ -17,7 +17,7 @@ from spadwarp.device import physical_memory, pick_device
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import Truth
 from spadwarp.scene import Camera, Laser, Medium, Scene, SceneLike, as_scene, phase_function, scattering_matrix
-from spadwarp.scene.camera import pixel_views, to_camera, to_world, view_box
+from spadwarp.scene.camera import pixel_directions, pixel_views, to_camera, to_world, view_box
 from spadwarp.scene.flux import Sun, azimuth_zero
 from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.medium import cell_shares, grid_cells
@@ -26,7 +26,7 @@ from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.scan import Shots, shots_of
 from spadwarp.scene.scene import camera_port, laser_port, mean_plane
 from spadwarp.scene.sea import Surface
-from spadwarp.scene.sight import lines_of_sight, pixel_directions, scan_axes, view_directions, within_port
+from spadwarp.scene.sight import lines_of_sight, scan_axes, view_directions, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_scale
 from spadwarp.values import ConfigError, DeviceError
@@ -129,7 +129,8 @@ def _medium(scene: Scene, device: wp.Device) -> Any:
         law, order = phase_function(water), _constituent_order(scene)
         parts = [law.constituents[k].over_t for k in order]
         medium.phase = sk.make_phase_tables(law.over_t, constituents=parts, device=device)
-        medium.shares = wp.vec4(*[*(_shares(scene)[0] if order else ()), *[0.0] * sk.MOST_CONSTITUENTS][:4])
+        shares = _shares(scene)[0] if order else []
+        medium.shares = wp.vec4(*shares, *[0.0] * (sk.MOST_CONSTITUENTS - len(shares)))
     numbers = {"extinction": water.extinction, "albedo": _largest_albedo(water.albedo), "anisotropy": water.anisotropy}
     return _filled(medium, **numbers, axis_threshold=scene.transport.axis_threshold)
 

@@ -12,7 +12,7 @@ from helpers.scenes import scene
 from reference import crlb
 from spadwarp.analytic import simulate_analytic
 from spadwarp.result.result import Truth
-from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.values import ArgumentError, ConfigError
 
 MAPS = (

@@ -12,9 +12,10 @@ from spadwarp.analytic.eye_safety import as_if_bare
 from spadwarp.checks import summary
 from spadwarp.files.loader import gate_of, stored_depth
 from spadwarp.scene import Scene, daylight_rate
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.scene import camera_port
 from spadwarp.scene.scene import laser_port as laser_port_of
-from spadwarp.scene.sight import lines_of_sight, pixel_directions
+from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, ConfigError
 
 WATER = {"extinction": 0.3, "albedo": 0.8, "phase_index": "seawater", "group_index": "seawater"}

@@ -206,7 +206,7 @@ def test_sensor_fusion_as_its_loader_reads_it(frames, detection, result, tmp_pat
     assert "frames.txt" in printed
     items = list(read_as_lindell(tmp_path / "run" / "frames.txt", 1))
     assert len(items) == FRAMES
-    view = spadwarp.scene.sight.pixel_directions(result.scene.camera)
+    view = spadwarp.scene.camera.pixel_directions(result.scene.camera)
     light = -result.truth.reflectance * (result.truth.normal * view).sum(axis=-1)
     there = np.isfinite(light)
     for number, (spad, image, bins, fine_bins, sbr, photons) in enumerate(items):

@@ -13,9 +13,9 @@ from spadwarp.frames.depth import Reduction, arrival_time, depth_of
 from spadwarp.frames.measured import read_histograms
 from spadwarp.io.arrays import point_cloud, write_ply
 from spadwarp.scene import Camera
-from spadwarp.scene.camera import to_camera
+from spadwarp.scene.camera import pixel_directions, to_camera
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.scene.sight import lines_of_camera, pixel_directions
+from spadwarp.scene.sight import lines_of_camera
 
 GATE = dict(gate_start=100e-9, bin_width=50e-12)
 IRF = np.exp(-0.5 * ((np.arange(15) - 7) / 2.0) ** 2)

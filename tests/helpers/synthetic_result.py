@@ -5,7 +5,7 @@ import numpy as np
 from spadwarp.mesh import build_mesh
 from spadwarp.result.result import Result, Truth
 from spadwarp.scene import Scene
-from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.camera import pixel_directions
 
 UNIT = 2.0**-60
 

@@ -9,7 +9,7 @@ import pytest
 from helpers.scenes import scene
 from spadwarp.io.arrays import write_exr
 from spadwarp.result.rendered_truth import load_truth_exr
-from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.values import FileError
 
 CAMERA = scene(camera={"width": 4, "height": 3}).camera

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from helpers.synthetic_result import UNIT, make_result, make_scene
 from spadwarp.result import COMPONENTS
-from spadwarp.scene.sight import pixel_directions, range_from_path
+from spadwarp.scene.camera import pixel_directions
+from spadwarp.scene.sight import range_from_path
 
 SPEED = 299_792_458.0 / 1.3638
 

@@ -8,9 +8,16 @@ import pytest
 from helpers.opencv import project_points
 from spadwarp import load_scene
 from spadwarp.scene import Camera, look_at, opencv_pose, save_calibration
-from spadwarp.scene.camera import image_points, image_tangents, pixel_views, to_camera, to_world, view_box
+from spadwarp.scene.camera import (
+    image_points,
+    image_tangents,
+    pixel_directions,
+    pixel_views,
+    to_camera,
+    to_world,
+    view_box,
+)
 from spadwarp.scene.pose import rotation_angles, rotation_matrix
-from spadwarp.scene.sight import pixel_directions
 from spadwarp.values import ConfigError, FileError
 
 # Calibrations of a barrel, a pincushion and a decentred lens.

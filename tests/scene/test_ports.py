@@ -10,10 +10,11 @@ from helpers.scenes import WATER, scene
 from reference import refraction
 from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.scene import Scene
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.port import air_indices, window_indices
 from spadwarp.scene.scene import camera_port
 from spadwarp.scene.sections import PRESETS
-from spadwarp.scene.sight import depth_from_time, lines_of_sight, pixel_directions
+from spadwarp.scene.sight import depth_from_time, lines_of_sight
 
 SEAWATER = WATER | {"phase_index": "seawater", "group_index": "seawater"}
 WINDOW = {"distance": 0.05, "thickness": 0.01, "material": "BK7"}

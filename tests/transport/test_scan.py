@@ -124,7 +124,7 @@ def test_a_scan_survives_its_file_and_gives_depth(tmp_path):
 def test_beam_and_line_of_sight_cross_at_the_distance_of_the_scan():
     one = scene(scan={"mode": "confocal", "distance": 2.5}, laser={"position": [-0.3, 0.1, 0.0]})
     axes = scan_axes(one)
-    view = spadwarp.scene.sight.pixel_directions(one.camera)
+    view = spadwarp.scene.camera.pixel_directions(one.camera)
     np.testing.assert_allclose(np.cross(axes, 2.5 * view - np.array([-0.3, 0.1, 0.0])), 0.0, atol=1e-12)
     np.testing.assert_array_equal(scan_axes(scene(scan={"mode": "confocal"})), view)
     assert isinstance(one.camera, Camera)

@@ -16,7 +16,7 @@ from helpers.headless import BROWSER, Browser
 from helpers.synthetic_result import make_result, make_scene
 from spadwarp.frames import record_frames
 from spadwarp.result.result import COMPONENTS
-from spadwarp.scene.sight import pixel_directions
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.values import FileError
 from spadwarp.viz import viewer
 

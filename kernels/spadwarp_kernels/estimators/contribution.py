@@ -8,7 +8,7 @@ from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u0
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.optics.sea import passage_density
-from spadwarp_kernels.optics.visibility import Link
+from spadwarp_kernels.optics.visibility import Link, lens_in_air
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import SEA_FACE, SEA_SLOT, Contribution, PhotonState, World
@@ -185,8 +185,7 @@ def make_ask_at_sea() -> wp.Function:
     @wp.func
     def ask_at_sea(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
         q = Request()
-        lens_above = world.camera.port.index[2] > world.camera.port.index[0]
-        q.wanted = lens_above == s.above or s.collisions == 0
+        q.wanted = lens_in_air(world.camera) == s.above or s.collisions == 0
         q.x = s.x
         q.u = s.u
         q.weight = s.weight.value

@@ -428,7 +428,7 @@ def _lies_across(camera: Camera, x: wp.vec3) -> bool:
 
 
 @wp.func
-def _in_air(camera: Camera) -> bool:
+def lens_in_air(camera: Camera) -> bool:
     """Whether the lens is in the air: the other side of the surface is denser."""
     return camera.port.index[2] > camera.port.index[0]
 
@@ -442,7 +442,7 @@ def _make_sea_ways() -> tuple[wp.Function, ...]:
     @wp.func
     def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Link:
         link = Link()
-        in_air = _in_air(camera)
+        in_air = lens_in_air(camera)
         if not at_sea and _lies_across(camera, x):
             way = connect_sea(sea, camera.port, x, o, seed)
             link.to_lens = way.to_surface
@@ -475,7 +475,7 @@ def _make_sea_ways() -> tuple[wp.Function, ...]:
     @wp.func
     def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         seen = wp.vec3(o)
-        if _in_air(camera):
+        if lens_in_air(camera):
             seen = apparent_behind(camera, x, o)
         return seen
 
@@ -505,7 +505,7 @@ def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
     @wp.func
     def clip(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
         interval = wp.vec2()
-        if _in_air(camera):
+        if lens_in_air(camera):
             interval = clip_across(camera, view, x, u, o, limit)
         else:
             interval = clip_to_view(camera, view, x, u, o, limit)
@@ -516,14 +516,14 @@ def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
         shown = bool(True)
         if not _lies_across(camera, x):
             shown = shows(camera, view, x)
-        elif _in_air(camera):
+        elif lens_in_air(camera):
             shown = shows_across(camera, view, x)
         return shown
 
     @wp.func
     def gate_of(camera: Camera, gate: Gate) -> Gate:
         wide = gate
-        if _in_air(camera):
+        if lens_in_air(camera):
             wide = _gate_behind_port(camera, gate)
         return wide
 
