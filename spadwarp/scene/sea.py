@@ -1,20 +1,66 @@
-"""The table `surface`: the surface of the sea between air and water, by the statistics of its slopes."""
+"""The table `surface`: the surface of the sea between air and water, by the statistics of its slopes and by waves."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import ClassVar
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
+from spadwarp.io.paths import existing_file
 from spadwarp.scene.port import air_indices
-from spadwarp.scene.pose import unit_vector
-from spadwarp.scene.sections import Direction, Section, Vector, field
+from spadwarp.scene.pose import unit_vector, vector_of
+from spadwarp.scene.sections import Direction, FilePath, Section, Vector, Whole, field
+from spadwarp.values import FileError, SpadwarpError
 
 __all__: list[str] = []
 
+Floats = NDArray[np.float64]
+
 _LEAST_VARIANCE = 1e-9
+_GRAVITY = 9.81  # [m/s^2]
+
+# Of the variance of slopes on any axis, waves of a spectrum that goes on hold so much: the rest is left to facets.
+_RESOLVED = 0.75
+# The shortest waves have so many nodes: with fewer a bilinear field has less than 0.8 of their slopes' mean square.
+_NODES_OF_A_WAVE = 4.0
+
+
+class Waves(Section):
+    """Resolved waves: a periodic field of heights, drawn from a spectrum or read from a file."""
+
+    section: ClassVar[str] = "surface.waves"
+    size: float = field(
+        20.0, "period of the field along the waves, and across them unless heights has it [m]", "[0.1, 1e5]"
+    )
+    cells: Whole = Field(512, ge=8, le=8192)
+    """nodes of the field along each side, for a spectrum"""
+    spectrum: Literal["jonswap"] = field("jonswap", "of the waves that surface.wind makes (Hasselmann et al. 1973)")
+    fetch: float = field(10e3, "length of sea over which the wind blows [m]", "[10, 1e7]")
+    spreading: float = field(
+        10.0, "s of the distribution cos^2s(θ/2) of directions; large: one direction", "[0.5, 200]"
+    )
+    direction: Direction | None = field(None, "in which the waves go, in the world; default: surface.direction, or any")
+    shortest: float | None = Field(None, ge=1e-3, le=1e4)
+    """length of the shortest waves [m]; default: four nodes, or more until facets keep a quarter of the slopes"""
+    seed: Whole = Field(0, ge=0, le=2**63 - 1)
+    """of the phases and heights of the waves"""
+    time: float = field(0.0, "at which the waves are seen [s]", "[-1e9, 1e9]")
+    heights: Annotated[str | None, FilePath(".npy")] = field(None, "heights [rows, columns] in place of a spectrum [m]")
+
+    def _problems(self) -> Iterator[str]:
+        if self.heights is not None:
+            for name in ("cells", "fetch", "spreading", "shortest", "seed", "time"):
+                if getattr(self, name) != type(self).model_fields[name].default:
+                    yield f"{name} is of a spectrum, which heights takes the place of"
+        if self.shortest is not None and self.shortest < 2.0 * self.size / self.cells:
+            yield f"shortest = {self.shortest} m is less than two nodes, {2.0 * self.size / self.cells:.4g} m"
 
 
 class Surface(Section):
@@ -32,6 +78,8 @@ class Surface(Section):
     air_index: float | None = field(None, "phase index of the air; default: that of dry air", "[1, 1.2]")
     air_group_index: float | None = field(None, "group index of the air; default: dry air's, or air_index", "[1, 1.2]")
     air_extinction: float = field(0.0, "of the air, whose scattered light is lost [1/m]", "[0, 100]")
+    waves: Waves | None = None
+    """resolved waves; facets are about those then, with the slopes that they leave"""
 
     def _problems(self) -> Iterator[str]:
         if (self.wind is None) == (self.mean_square_slope is None):
@@ -42,6 +90,20 @@ class Surface(Section):
             cosine = np.dot(unit_vector(self.direction), unit_vector(self.up))
             if abs(cosine) > 0.999:
                 yield self._that("direction", "is that of up: a wind blows along the sea")
+        if self.waves is not None:
+            yield from self._problems_of_waves(self.waves)
+
+    def _problems_of_waves(self, waves: Waves) -> Iterator[str]:
+        if waves.direction is not None:
+            cosine = np.dot(unit_vector(waves.direction), unit_vector(self.up))
+            if abs(cosine) > 0.999:
+                yield f"waves.direction = {waves.direction} is that of up: waves go along the sea"
+        if self.wind == 0.0 or self.mean_square_slope == 0.0:
+            yield "waves need wind or mean_square_slope > 0"
+        elif waves.heights is None and self.wind is None:
+            yield "waves.spectrum needs wind, which raises its waves; mean_square_slope goes with waves.heights"
+        elif waves.heights is None and (longest := peak_length(self.wind or 0.0, waves.fetch)) > waves.size:
+            yield f"waves.size = {waves.size} m holds no wave of the peak, {longest:.4g} m long"
 
     @property
     def normal(self) -> tuple[float, float, float]:
@@ -70,6 +132,126 @@ class Surface(Section):
             return self.air_index, self.air_group_index or self.air_index
         return air_indices(wavelength_nm)
 
+    @property
+    def wave_axis(self) -> tuple[float, float, float]:
+        """Unit vector along the mean plane in which waves go, along a row of their field, in the world."""
+        direction = None if self.waves is None else self.waves.direction
+        up = np.array(self.normal)
+        along = np.array(direction or self.direction or np.eye(3)[np.argmin(np.abs(up))], np.float64)
+        return unit_vector(vector_of(along - (along @ up) * up))
+
+    @property
+    def wave_field(self) -> WaveField | None:
+        """The resolved waves; None: there are none. Raises `FileError`."""
+        waves = self.waves
+        if waves is None:
+            return None
+        if waves.heights is not None:
+            return _read_heights(waves.heights, waves.size)
+        total = self._slopes_along(self.wave_axis)
+        return _draw_waves(self.wind or 0.0, total, waves)
+
+    def _slopes_along(self, axis: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Variances of all slopes along an axis of the plane and across it, and their covariance."""
+        along, across = self.slope_variances
+        if self.direction is None:
+            return along, across, 0.0
+        up = np.array(self.normal)
+        wind = np.array(self.direction, np.float64)
+        wind -= (wind @ up) * up
+        wind /= np.linalg.norm(wind)
+        c, s = float(wind @ axis), float(wind @ np.cross(up, axis))
+        return along * c * c + across * s * s, along * s * s + across * c * c, (along - across) * c * s
+
     def height_of(self, point: tuple[float, float, float]) -> float:
         """Height of a point of the world above the mean plane [m]."""
         return math.fsum(n * (x - p) for n, x, p in zip(self.normal, point, self.point, strict=True))
+
+
+# Resolved waves
+
+
+@dataclass(frozen=True)
+class WaveField:
+    """A periodic field of heights above the mean plane; a row goes along `Surface.wave_axis`."""
+
+    heights: Floats  # of the nodes [m], `[rows, columns]`
+    size: tuple[float, float]  # length of a row and of a column [m]
+
+    @property
+    def amplitude(self) -> float:
+        """Largest height or depth [m]."""
+        return float(np.abs(self.heights).max())
+
+
+def _peak_frequency(wind: float, fetch: float) -> float:
+    """That of the spectrum's peak [rad/s] (Hasselmann et al. 1973)."""
+    return 22.0 * (_GRAVITY**2 / (wind * fetch)) ** (1.0 / 3.0)
+
+
+def peak_length(wind: float, fetch: float) -> float:
+    """Length of the waves of the spectrum's peak, in deep water [m]; wind > 0 [m/s], fetch [m]."""
+    return 2.0 * math.pi * _GRAVITY / _peak_frequency(wind, fetch) ** 2
+
+
+def jonswap(frequency: Floats, wind: float, fetch: float) -> Floats:
+    """Spectral density of heights [m^2 s/rad] at frequencies > 0 [rad/s]: JONSWAP (Hasselmann et al. 1973, γ = 3.3), for
+    a wind > 0 [m/s] and a fetch [m]."""
+    peak = _peak_frequency(wind, fetch)
+    alpha = 0.076 * (wind**2 / (fetch * _GRAVITY)) ** 0.22
+    width = np.where(frequency <= peak, 0.07, 0.09)
+    enhanced = 3.3 ** np.exp(-0.5 * ((frequency / peak - 1.0) / width) ** 2)
+    density: Floats = alpha * _GRAVITY**2 * frequency**-5.0 * np.exp(-1.25 * (peak / frequency) ** 4) * enhanced
+    return density
+
+
+@lru_cache(8)
+def _draw_waves(wind: float, slopes: tuple[float, float, float], waves: Waves) -> WaveField:
+    """Waves of deep water, ω² = g k, whose amplitudes are normal numbers about the spectrum."""
+    count, size = waves.cells, waves.size
+    k = 2.0 * math.pi * np.fft.fftfreq(count, size / count)
+    kx, ky = np.meshgrid(k, k)
+    length = np.hypot(kx, ky)
+    length[0, 0] = math.inf
+    frequency = np.sqrt(_GRAVITY * length)
+    frequency[0, 0] = 1.0
+    s = waves.spreading
+    of_direction = np.cos(0.5 * np.arctan2(ky, kx)) ** (2.0 * s)
+    of_direction /= 2.0 * math.sqrt(math.pi) * math.exp(math.lgamma(s + 0.5) - math.lgamma(s + 1.0))
+    density = jonswap(frequency, wind, waves.fetch) * 0.5 * _GRAVITY / frequency * of_direction / length
+    normal = np.random.default_rng(waves.seed).standard_normal((2, count, count))
+    amplitude = (normal[0] + 1j * normal[1]) * np.sqrt(density * (2.0 * math.pi / size) ** 2)
+    amplitude[length > 2.0 * math.pi / (waves.shortest or _NODES_OF_A_WAVE * size / count)] = 0.0
+    if waves.shortest is None:
+        amplitude[length > _largest_number(kx, ky, length, 0.5 * np.abs(amplitude) ** 2, slopes)] = 0.0
+    amplitude *= np.exp(-1j * frequency * waves.time)
+    heights = np.fft.ifft2(amplitude).real * count**2
+    return WaveField(heights, (size, size))
+
+
+def _largest_number(
+    kx: Floats, ky: Floats, length: Floats, variance: Floats, slopes: tuple[float, float, float]
+) -> float:
+    """The wave number up to which waves hold no more than `_RESOLVED` of the variance of slopes on any axis [1/m]."""
+    order = np.argsort(length, axis=None)[:-1]  # but the mean
+    xx, yy, xy = (np.cumsum((p * q * variance).ravel()[order]) for p, q in ((kx, kx), (ky, ky), (kx, ky)))
+    root = np.linalg.inv(np.linalg.cholesky([[slopes[0], slopes[2]], [slopes[2], slopes[1]]]))
+    part = np.linalg.eigvalsh(root @ np.moveaxis(np.array([[xx, xy], [xy, yy]]), -1, 0) @ root.T)[:, 1]
+    kept = int(np.searchsorted(part, _RESOLVED, side="right"))
+    return float(length.ravel()[order[kept - 1]]) if kept else 0.0
+
+
+def _read_heights(path: str, size: float) -> WaveField:
+    where = f"surface.waves.heights = {path!r}"
+    try:
+        heights = np.load(existing_file(Path(path)), allow_pickle=False)
+    except SpadwarpError as error:
+        raise FileError(f"{where}: {error}") from error
+    except Exception as error:  # a damaged header raises what it likes
+        raise FileError(f"{where}: damaged or not readable: {error}") from error
+    if heights.ndim != 2 or min(heights.shape) < 2 or heights.dtype.kind not in "iuf":
+        raise FileError(f"{where}: {heights.dtype} {heights.shape}; real numbers [rows, columns] are needed")
+    values = heights.astype(np.float64)
+    if not (np.abs(values) <= 1e4).all():
+        raise FileError(f"{where}: holds {values.min()} to {values.max()}; heights in [-1e4, 1e4] m are needed")
+    return WaveField(values - values.mean(), (size, size * heights.shape[0] / heights.shape[1]))

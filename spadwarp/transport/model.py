@@ -88,7 +88,7 @@ def build_model(
         grid = parts.get("layers", sk.Layers()).grid
         parts["derivatives"] = make_derivatives(scene, derivatives, mesh, scale, device, grid)
     if scene.surface is not None:
-        parts["sea"] = _sea(scene)
+        parts["sea"] = _sea(scene, device)
     if scene.polarised:
         parts |= _polarised(scene, mesh, scale, device)
     if camera and scene.flux:
@@ -296,7 +296,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         rotated_domain=_has_rotated_domain(scene),
         port=None if scene.surface else port_kind(camera_port(scene)),
         laser_port=sk.FLAT_PORT if scene.sun else None if scene.surface else port_kind(laser_port(scene)),
-        sea=scene.surface is not None,
+        sea=_sea_kind(scene),
         reflecting=bool(scene.domain.reflecting),
         grid=_grid_tracking(scene),
         derivatives=kinds,
@@ -447,22 +447,37 @@ def _plane_of_shots(scene: Scene, plane: PortGeometry, *lens: Any) -> Any:
     return _filled(ends[1], normal=wp.vec3(*plane.normal), distance=plane.distance, late=late)
 
 
-def _sea(scene: Scene) -> Any:
+def _sea_kind(scene: Scene) -> Any:
+    """The kernels' kind of the scene's surface; None: there is none."""
+    if scene.surface is None:
+        return None
+    return sk.FACETS if scene.surface.waves is None else sk.WAVES
+
+
+def _sea(scene: Scene, device: wp.Device) -> Any:
     """The surface of the sea as the kernels take it."""
-    surface, plane = scene.surface, mean_plane(scene)
+    surface, plane, rotation = scene.surface, mean_plane(scene), rotation_matrix(scene.camera.rotation_deg)
     assert surface is not None
-    along = None
+    along, waves = None, dict[str, Any]()
     if surface.direction is not None:
-        along = (np.array(surface.direction) @ rotation_matrix(scene.camera.rotation_deg)).tolist()
-    return sk.make_sea(
-        surface.slope_variances,
-        index=plane.index[2] / plane.index[0],
-        normal=tuple(-x for x in plane.normal),
-        height=-plane.distance,
-        along=along,
-        delay=plane.group_index[0] / plane.group_index[2],
-        extinction=surface.air_extinction,
-    )
+        along = (np.array(surface.direction) @ rotation).tolist()
+    if (field := surface.wave_field) is not None:
+        waves = {"heights": field.heights, "size": field.size, "device": device}
+        waves["columns"] = (np.array(surface.wave_axis) @ rotation).tolist()
+        waves["origin"] = to_camera(scene.camera, surface.point).tolist()
+    try:
+        return sk.make_sea(
+            surface.slope_variances,
+            index=plane.index[2] / plane.index[0],
+            normal=tuple(-x for x in plane.normal),
+            height=-plane.distance,
+            along=along,
+            delay=plane.group_index[0] / plane.group_index[2],
+            extinction=surface.air_extinction,
+            **waves,
+        )
+    except sk.ArgumentError as error:
+        raise ConfigError(f"surface.waves: {error}; a larger shortest or more wind", source=scene.source) from None
 
 
 def port_kind(port: PortGeometry | None) -> Any:
@@ -484,11 +499,20 @@ def port_parameters(
     choices |= {"origin": origin, "aperture_radius": aperture_radius, "largest_angle": min(angle, 1.55)}
     try:
         if port.shape == "flat":
-            variance = 0.0 if scene.surface is None else max(scene.surface.slope_variances)
-            return sk.make_flat_port(distance=port.distance, normal=port.normal, slope_variance=variance, **choices)
+            choices |= {"distance": port.distance, "normal": port.normal}
+            return sk.make_flat_port(**choices, **({} if scene.surface is None else _roughness(scene.surface)))
         return sk.make_dome_port(radius=port.radius, centre=port.centre, **choices)
     except sk.ArgumentError as error:
         raise ConfigError(f"camera.port or laser.port: {error}", source=scene.source) from None
+
+
+def _roughness(surface: Surface) -> dict[str, float]:
+    """What a port that stands for a sea's mean plane allows for."""
+    if (field := surface.wave_field) is None:
+        return {"slope_variance": max(surface.slope_variances)}
+    # Facets about waves hold no more than all slopes do; together with the steepest wave that is a bound.
+    steepest = sk.steepest_facet(field.heights, field.size)
+    return {"slope_variance": max(surface.slope_variances), "amplitude": field.amplitude, "steepest": steepest}
 
 
 def _lens(scene: Scene) -> Any:
@@ -579,6 +603,11 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
     if scene.surface is not None and scene.scan.mode == "trajectory":
         ends, camera = [], False  # the places are those of the shots
         _check_shots(scene, scene.surface)
+    elif scene.surface is not None and (waves := scene.surface.wave_field) is not None:
+        for section, place in {"camera": lens.position, "laser": vector_of(to_world(lens, beam.position))}.items():
+            if abs(height := scene.surface.height_of(place)) <= waves.amplitude:
+                text = f"{section}.position is {height:.4g} m from the mean plane of the surface"
+                raise ConfigError(f"{text}, whose waves are up to {waves.amplitude:.3g} m high", source=scene.source)
     if camera:
         radius, origin = 0.0 if lens.pinhole else lens.aperture_radius, (0.0, 0.0, 0.0)
         ends.append(("camera", camera_port(scene), origin, (0.0, 0.0, 1.0), "aperture_diameter", radius))
@@ -610,6 +639,7 @@ def _check_shots(scene: Scene, surface: Surface) -> None:
     does."""
     shots, beam, normal = shots_of(scene), scene.beam, np.array(surface.normal)
     tilt = np.sqrt(np.maximum(1.0 - (shots.rotation[:, :, 2] @ normal) ** 2, 0.0))
+    waves = 0.0 if (field := surface.wave_field) is None else field.amplitude
     ends = {"camera": ((0.0, 0.0, 0.0), scene.camera.aperture_radius)}
     ends["laser"] = beam.position, beam.beam_radius if beam.profile == "collimated" else 0.0
     for section, (place, radius) in ends.items():
@@ -617,8 +647,10 @@ def _check_shots(scene: Scene, surface: Surface) -> None:
         own = surface.height_of(vector_of(to_world(scene.camera, place)))
         height = (at - surface.point) @ normal * math.copysign(1.0, own)
         low = int((height - radius * tilt).argmin())
-        if height[low] <= radius * tilt[low]:
+        if height[low] <= radius * tilt[low] + waves:
             text = f"shot {low} is {height[low]:.4g} m from the surface, on the side where {section}.position is"
+            if waves:
+                text += f", and the waves are up to {waves:.3g} m high"
             raise ConfigError(f"scan: {text}; it must not reach it", source=scene.source)
 
 
@@ -686,14 +718,17 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
 
 
 def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Truth:
-    """Of what stands before the mean plane of the sea, and of what is seen through it."""
+    """Of what stands before the surface of the sea, and of what is seen through its waves, or its mean plane."""
     view = pixel_directions(scene.camera)
     origin, moving = np.zeros(view.shape), scene.scan.mode == "trajectory"
     if moving:
         shots, position, axes = shot_poses(scene)
         origin, view = dataclasses.replace(shots, position=position, rotation=axes).lines()
-    plane = camera_port(scene) or mean_plane(scene, from_below=True)
-    start, direction, lead, _ = plane.enter(origin, view)
+    if scene.surface is not None and scene.surface.waves is not None:
+        start, direction, lead = _through_waves(model, origin, view)
+    else:
+        plane = camera_port(scene) or mean_plane(scene, from_below=True)
+        start, direction, lead, _ = plane.enter(origin, view)
     near, far = (trace_rays(model, *rays, shape) for rays in ((origin, view), (start, direction)))
     if moving:  # in the frame of each pixel's shot
         turns, from_lens = axes[shots.number], start - origin
@@ -705,6 +740,14 @@ def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Trut
     before = near[1] < np.nan_to_num(lead, nan=np.inf)
     values = [np.where(before[..., None] if a.ndim == 3 else before, a, b) for a, b in zip(near, far, strict=True)]
     return Truth(**dict(zip(("depth", "range", "normal", "reflectance"), values, strict=True)))
+
+
+def _through_waves(model: sk.Model, origin: Any, view: Any) -> list[NDArray[np.float64]]:
+    """Of rays `[H, W, 3]` from the lens, where they meet the waves, how they go on, and their lengths up to there."""
+    rays: Any = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=model.device) for a in (origin, view)]
+    found: Any = [wp.empty_like(rays[0]), wp.empty_like(rays[0]), wp.empty(rays[0].shape, float, device=model.device)]
+    wp.launch(sk.see_through_waves_kernel, rays[0].shape, [model.sea, *rays], found, device=model.device)
+    return [array.numpy().astype(np.float64) for array in found]
 
 
 def first_hits(

@@ -4,10 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import spadwarp
+import spadwarp_kernels as sk
 from helpers.scenes import scene
 from spadwarp.scene.scene import mean_plane
+from spadwarp.scene.sea import jonswap, peak_length
 from spadwarp.scene.sight import depth_from_time
 from spadwarp.values import ConfigError
 
@@ -27,6 +30,10 @@ BOTTOM = {"builtin": "plane", "size": [40.0, 40.0], "translation": [0.0, 0.0, 8.
         ({**BAY, "medium": {"grid": {"shape": "plume", "extinction": 1.0, "size": 1.0}}}, "medium.grid, a table"),
         ({"surface": {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, 1.0], "preset": "calm"}}, "outside_index"),
         ({"surface": {**BAY["surface"], "direction": [0.0, 0.0, 1.0]}}, "a wind blows along the sea"),
+        ({"surface": {**BAY["surface"], "waves": {"size": 5.0}}}, "5.0 m holds no wave of the peak, 8.23 m long"),
+        ({"surface": {**BAY["surface"], "waves": {"shortest": 0.01}}}, "shortest = 0.01 m is less than two nodes"),
+        ({"surface": {**BAY["surface"], "waves": {"heights": "a.npy", "seed": 2}}}, "seed is of a spectrum"),
+        ({"surface": {**BAY["surface"], "wind": None, "mean_square_slope": 0.02, "waves": {}}}, "spectrum needs wind"),
     ],
 )
 def test_what_cannot_be(sections, text):
@@ -95,3 +102,84 @@ def test_check_counts_the_way_in_the_water_alone():
     assert not [m for m in messages if m.field == "laser.position"]
     depth = next(m for m in messages if "optical depth" in m.text)
     assert "optical depth to the nearest illuminated point 2.5" in depth.text  # 5 m at 0.5 1/m
+
+
+def waves_of(**waves):
+    return scene(surface={**BAY["surface"], "direction": [1.0, 0.0, 0.0], "waves": waves}).surface
+
+
+def test_waves_of_a_spectrum():
+    """Variances of heights and slopes are integrals of JONSWAP's spectrum; the mean over seeds, with its error."""
+    wind, fetch, longest, shortest = 5.0, 10e3, 40.0, 0.625
+    frequency = np.sqrt(9.81 * 2.0 * math.pi * np.array([1.0 / longest, 1.0 / shortest]))
+    w = np.linspace(*frequency, 20_001)
+    density = jonswap(w, wind, fetch)
+    expected = [np.trapezoid(density, w), np.trapezoid(density * w**4 / 9.81**2, w)]
+    found = []
+    for seed in range(12):
+        heights = waves_of(size=longest, cells=256, shortest=shortest, seed=seed).wave_field.heights
+        assert abs(heights.mean()) < 1e-12
+        k = 2.0 * math.pi * np.fft.fftfreq(256, longest / 256)
+        power = np.abs(np.fft.fft2(heights) / 256**2) ** 2
+        found.append([power.sum(), (power * (k**2 + k[:, None] ** 2)).sum()])
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / math.sqrt(12)
+    assert (error < 0.1 * mean).all()
+    np.testing.assert_array_less(np.abs(mean - expected), 4.0 * error)
+    # Up to 100 1/m, all slopes of Cox and Munk.
+    w = np.linspace(0.5, math.sqrt(981.0), 20_001)
+    assert np.trapezoid(jonswap(w, wind, fetch) * w**4 / 9.81**2, w) == pytest.approx(0.0289, abs=5e-5)
+    assert peak_length(wind, fetch) == pytest.approx(8.23, abs=0.01)
+
+
+def test_waves_go_with_the_wind():
+    """Each wave as fast as it is long, ω² = g k; almost all along the wind where they do not spread."""
+    one = {"size": 40.0, "cells": 128, "spreading": 200.0, "seed": 5}
+    heights = [waves_of(**one, time=time).wave_field.heights for time in (0.0, 0.05)]
+    transform = [np.fft.fft2(h)[0] for h in heights]
+    k = np.arange(4, 9)
+    # A wave cos(k x - ω t) has the phase -ω t where fft's frequency is k.
+    phase = np.angle(transform[1][k] / transform[0][k])
+    np.testing.assert_allclose(phase, -0.05 * np.sqrt(9.81 * 2.0 * math.pi * k / 40.0), rtol=1e-6)
+    along = sk.facet_covariance(heights[0], (40.0, 40.0))
+    assert along[0, 0] > 20.0 * along[1, 1]
+
+
+def test_facets_keep_a_quarter_of_the_slopes():
+    surface = waves_of(cells=256)
+    field = surface.wave_field
+    rest = sk.unresolved_covariance(surface.slope_variances, (1.0, 0.0), field.heights, field.size)
+    assert 0.2 < rest[0, 0] / surface.slope_variances[0] < 0.3
+
+
+def test_truth_goes_through_the_waves():
+    """By Snell's law at the facet that a pixel's ray meets, in NumPy; from the air and back into it."""
+    for camera, up in (([0.0, 0.0, 0.0], -1.0), ([0.0, 0.0, 0.0], 1.0)):
+        surface = {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, up], "wind": 5.0, "waves": {"cells": 128}}
+        one = scene(surface=surface, targets=[BOTTOM], camera={"position": camera}, medium={"phase_index": 1.34})
+        truth, field = spadwarp.truth_maps(one, device="cpu"), one.surface.wave_field
+        x_axis, normal = np.array(one.surface.wave_axis), np.array([0.0, 0.0, up])
+        y_axis, cell = np.cross(normal, x_axis), field.size[0] / 128
+        before, behind = mean_plane(one, from_below=up > 0.0).index[::2]
+        for row, column in np.ndindex(truth.depth.shape):
+            u = spadwarp.scene.camera.pixel_directions(one.camera)[row, column]
+
+            def at(t, u=u):
+                p = t * u - [0.0, 0.0, 3.0]
+                a, b = p @ x_axis / cell, p @ y_axis / cell
+                i, j = math.floor(a), math.floor(b)
+                h = [[field.heights[(j + r) % 128, (i + c) % 128] for c in (0, 1)] for r in (0, 1)]
+                a, b = a - i, b - j
+                z = (1 - b) * ((1 - a) * h[0][0] + a * h[0][1]) + b * ((1 - a) * h[1][0] + a * h[1][1])
+                slopes = ((1 - b) * (h[0][1] - h[0][0]) + b * (h[1][1] - h[1][0])) / cell
+                return p @ normal - z, slopes, ((1 - a) * (h[1][0] - h[0][0]) + a * (h[1][1] - h[0][1])) / cell
+
+            t = brentq(lambda t: at(t)[0], 2.0, 4.5)
+            _, p, q = at(t)
+            m = normal - p * x_axis - q * y_axis
+            m /= np.linalg.norm(m)
+            cosine = u @ m
+            across = (before / behind) * (u - cosine * m)
+            v = across + math.copysign(math.sqrt(1.0 - across @ across), cosine) * m
+            rest = (8.0 - t * u[2]) / v[2]
+            assert truth.range[row, column] == pytest.approx(t + rest, rel=2e-5)
+            assert truth.depth[row, column] == pytest.approx(8.0, rel=1e-5)

@@ -54,6 +54,9 @@ def sea_scene(place, *, wind=5.0, estimator="guided", **sections):
     return scene(**tables)
 
 
+# Waves of half a metre, by a wind over 300 m of sea.
+WAVES = {"size": 2.0, "cells": 64, "fetch": 300.0}
+
 CASES = [(place, 5.0) for place in PLACES] + [("both in air", 0.0), ("both in air", 12.0)]
 
 
@@ -115,6 +118,42 @@ def test_masking_is_an_entry_of_the_energy_balance():
         masked = result.energy_balance["surface_masking"] * result.energy_balance_unit / result.photons
         assert 0.0 < masked < most
         assert result.counters["crossings"] == pytest.approx(200_000, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+@pytest.mark.parametrize("place", PLACES)
+def test_estimators_agree_over_waves(place):
+    """In each bin of each component, over one field of waves: `analog` takes no way to the lens from the others."""
+    one = {name: sea_scene(place, estimator=name, surface={"waves": WAVES}) for name in ("guided", "analog")}
+    found = {name: cells(one[name], "cpu", photons, 10) for name, photons in (("guided", 15_000), ("analog", 50_000))}
+    assert equal_means_p(found["analog"], found["guided"]) > 1e-3
+    report = spadwarp.simulate(one["guided"], photons=10_000, seed=1, device="cpu").energy_report()
+    assert report["exact"]
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+def test_waves_without_height_are_the_mean_plane(tmp_path):
+    """A field of heights that are all 0 leaves all slopes to facets: totals of components as without it."""
+    np.save(tmp_path / "flat.npy", np.zeros((8, 8)))
+    runs = []
+    for surface in ({}, {"waves": {"heights": str(tmp_path / "flat.npy"), "size": 1.0}}):
+        runs.append(cells(sea_scene("both in air", surface=surface), "cpu", 20_000, 10))
+    assert equal_means_p(runs[1], runs[0]) > 1e-3
+    assert runs[1].sum(axis=1).mean() == pytest.approx(runs[0].sum(axis=1).mean(), rel=5e-3)
+
+
+def test_waves_stay_below_lens_and_laser():
+    steep = {"size": 40.0, "cells": 64}
+    with pytest.raises(spadwarp.ConfigError, match=r"camera\.position is 0\.1 m .* waves are up to 0\.\d+ m high"):
+        spadwarp.simulate(
+            sea_scene("both in air", surface={"point": [0.0, 0.0, 0.1], "waves": steep}, laser={"position": [0.0] * 3}),
+            photons=100,
+            device="cpu",
+        )
+    with pytest.raises(spadwarp.ConfigError, match=r"surface\.waves: heights: the waves hold .* outside \[0, 0\.9\]"):
+        spadwarp.simulate(sea_scene("both in air", surface={"waves": {**WAVES, "shortest": 0.0625}}), photons=100)
 
 
 def test_shots_stay_on_their_side():

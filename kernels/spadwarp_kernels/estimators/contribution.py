@@ -7,7 +7,7 @@ from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import lens_point
-from spadwarp_kernels.optics.sea import passage_density
+from spadwarp_kernels.optics.sea import FACETS
 from spadwarp_kernels.optics.visibility import Link, lens_in_air
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -178,14 +178,17 @@ class ScoredPoint:
 
 
 @memoised
-def make_ask_at_sea() -> wp.Function:
+def make_ask_at_sea(waves: bool) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of a photon at the surface of a sea, for all that the surface sends
-    to the lens, but for what `Sight.link` finds from the event before: transmitted light of events that scatter."""
+    to the lens, but for what `Sight.link` finds from the event before: transmitted light of events that scatter.
+    `waves`: the event before may have been at the surface, too."""
 
     @wp.func
     def ask_at_sea(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
         q = Request()
         q.wanted = lens_in_air(world.camera) == s.above or s.collisions == 0
+        if wp.static(waves):
+            q.wanted = q.wanted or s.bounces.leg > 1
         q.x = s.x
         q.u = s.u
         q.weight = s.weight.value
@@ -212,7 +215,7 @@ def sea_component(s: wp.ref[PhotonState], scatterings: int) -> int:
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
-    sea, ask_at_sea = spec.sight.sea, make_ask_at_sea()
+    sea, ask_at_sea = spec.sea is not None, make_ask_at_sea(spec.waves)
     tracks, rides, point_in = spec.water.profile is not None, make_rider(spec).rides, spec.sight.pose.point_in
     camera_at = spec.sight.camera_at
 
@@ -360,7 +363,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
     request scatters at x into the direction v."""
     water_at, phase_pdf, face_density = spec.water.at, spec.water.phase.pdf, spec.faces.density
-    sea = spec.sight.sea
+    sea, passage_density = spec.sea is not None, (spec.sea or FACETS).density
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
@@ -372,7 +375,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
             scattering = phase_pdf(one_minus_cosine(snapped, v), water_at(world.medium, world.layers, x))
         if wp.static(sea):
             if request.slot == SEA_SLOT:
-                scattering = passage_density(world.sea, request.u, v)
+                scattering = passage_density(world.sea, x, request.u, v)
         return scattering
 
     return scattering_density
@@ -387,8 +390,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     reflects, index_of = spec.domain.reflects, spec.tally_index
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    sight, sea = spec.sight, spec.sight.sea
+    sight, sea, waves = spec.sight, spec.sea is not None, spec.waves
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
+    is_clear = sight.clear or link_to  # any function: it is not called
     (point_in, _, point_out, turn_out), camera_at, sea_at = sight.pose, sight.camera_at, sight.sea_at
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
@@ -437,6 +441,11 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         found.behind = point_out(world.scan, request.target, lens)
         pixel = image_of(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)
+        if wp.static(waves):
+            if pixel >= 0 and scattering > 0.0 and link.gather > 0.0:
+                placed = sea_at(world.sea, world.scan, request.target)
+                if not is_clear(camera, placed, origin, lens, link):
+                    pixel = -1
         if pixel >= 0 and not scattering <= 0.0:
             seed = join_words(request.second, request.first)
             if wp.static(collides):

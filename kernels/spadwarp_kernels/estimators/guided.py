@@ -55,7 +55,7 @@ def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
     sight, varies, has_phase_guide = spec.sight, spec.varies, spec.water.phase.guide is not None
     view_of, clip_to_view, gate_of, sample_lens = sight.view, sight.clip, sight.gate, sight.sample_lens
-    within, sea = spec.domain.within, sight.sea
+    within, sea = spec.domain.within, sight.sea is not None
     point_in, turn_in, camera_at = sight.pose.point_in, sight.pose.turn_in, sight.camera_at
 
     @wp.func

@@ -36,6 +36,8 @@ class Port:
     turn: float  # bound of the sine of the angle by which a ray of the view is bent (dome)
     aside: float  # bound of a ray's distance from the centre, in the water [m] (dome)
     margin: float  # bound of how far a rough surface moves a line of sight aside, over the depth below it (sea)
+    amplitude: float  # bound of the height of resolved waves above the plane, and of their depth below it [m] (sea)
+    straight: float  # and of how far aside light gets on its way between them, without being refracted [m] (sea)
     early: float
     """The way through the port takes at most this much less than the straight line in water [m of water]."""
     late: float  # and at most this much more [m of water]
@@ -466,6 +468,8 @@ def make_flat_port(
     aperture_radius: float = 0.0,
     largest_angle: float = 1.5,
     slope_variance: float = 0.0,
+    amplitude: float = 0.0,
+    steepest: float = 0.0,
 ) -> Port:
     """The parameters of a plane window.
 
@@ -477,21 +481,25 @@ def make_flat_port(
         origin: The lens centre, or the position of a laser, which must be inside [m].
         aperture_radius: Of the camera [m]: all of the lens must be inside.
         largest_angle: Between the normal and any ray of the view, inside, in [0, pi/2) [rad].
-        slope_variance: Of a sea's surface in place of a window, along the axis where it is largest.
+        slope_variance: Of facets of a sea's surface in place of a window, along the axis where it is largest.
+        amplitude: Bound of the heights of resolved waves [m]; all of the lens must be farther away.
+        steepest: Bound of the slopes of resolved waves.
 
     Raises:
         ArgumentError: A number out of its range.
     """
     check_number("distance", distance, "(-inf, inf)")
     check_number("slope_variance", slope_variance, "[0, 0.5]")
+    check_range("[0, 1e4]", amplitude=amplitude, steepest=steepest)
     check_vector("normal", normal, unit=True)
     port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     tilt = aperture_radius * math.hypot(normal[0], normal[1])
     inside = distance - sum(x * n for x, n in zip(origin, normal, strict=True))
-    if tilt >= inside:
+    if tilt >= inside - amplitude:
+        waves = f", whose waves are up to {amplitude:.3g} m high" if amplitude > 0.0 else ""
         raise ArgumentError(
             f"distance = {distance} m: a lens or laser at {tuple(origin)} m of radius {aperture_radius} m reaches "
-            "through the port"
+            f"through the port{waves}"
         )
     port.normal, port.distance = wp.vec3(*normal), distance
     n = tuple(port.index)
@@ -500,7 +508,11 @@ def make_flat_port(
     steepest = max(math.tan(largest_angle), slopes[0][1] * math.tan(largest_angle))
     longest = min(math.hypot(1.0, steepest), _FAR)
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
-    _widen(port, slope_variance, largest_angle)
+    _widen(port, _STEEPEST * math.sqrt(slope_variance) + steepest, largest_angle)
+    if amplitude > 0.0:
+        between = 2.0 * amplitude / max(math.cos(largest_angle), 0.02)
+        port.amplitude, port.straight = amplitude, between * math.sin(largest_angle)
+        port.early, port.late = port.early + 2.0 * between, port.late + 2.0 * between
     return port
 
 
@@ -603,10 +615,9 @@ def _set_times(port: Port, lengths: Sequence[tuple[float, float]]) -> None:
 _STEEPEST = 5.5
 
 
-def _widen(port: Port, slope_variance: float, largest_angle: float) -> None:
-    """Fills what of a port, the mean plane of a sea as seen from the air, allows for its slopes: `margin`, and times.
-    `largest_angle`: as for `make_flat_port`."""
-    steepest = _STEEPEST * math.sqrt(slope_variance)
+def _widen(port: Port, steepest: float, largest_angle: float) -> None:
+    """Fills what of a port, the mean plane of a sea as seen from the air, allows for slopes up to the steepest:
+    `margin`, and times. `largest_angle`: as for `make_flat_port`."""
     ratio = port.index[2] / port.index[0]
     if ratio <= 1.0 or steepest == 0.0:
         return

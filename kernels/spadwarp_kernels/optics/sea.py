@@ -1,5 +1,5 @@
-"""The surface of the sea: facets with Gaussian slopes about a mean plane between air and water, and the ways of light
-by them.
+"""The surface of the sea: facets with Gaussian slopes about a mean plane between air and water, or about resolved waves,
+and the ways of light by them.
 
 Slopes after Cox & Munk 1954, masking after Smith 1967, reflection and refraction by rough interfaces after Walter et
 al. 2007. Directions of light are those in which it goes; densities are of power.
@@ -7,18 +7,30 @@ al. 2007. Directions of light are those in which it goes; densities are of power
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import check_number, check_range, check_vector
+from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_range, check_vector
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn
 from spadwarp_kernels.water.limits import fresnel_reflectance
 
-from .port import Port, connect_flat, refracted
+from .port import Connection, Port, connect_flat, refracted
+from .waves import Waves, facet_at, facet_covariance, facet_normal, height_above_waves, make_waves, waves_distance
 
-__all__ = ["Sea", "make_sea", "slope_variances"]
+__all__ = [
+    "FACETS",
+    "WAVES",
+    "Sea",
+    "SeaKind",
+    "make_sea",
+    "see_through_waves_kernel",
+    "slope_variances",
+    "unresolved_covariance",
+]
 
 _INV_PI = wp.constant(0.3183098861837907)
 _INV_SQRT_PI = wp.constant(0.5641895835477563)
@@ -42,20 +54,19 @@ class Sea:
     index: float  # phase index of the water over that of the air
     delay: float  # group index of the air over that of the water
     extinction: float  # of the air [1/m]; what it takes is absorbed
+    waves: Waves  # of a surface with resolved waves, see `WAVES`; its facets are then about those, else about the plane
 
 
 @wp.func
-def height_above(sea: Sea, x: wp.vec3) -> float:
-    """Height of a point above the mean plane [m]."""
+def _height_above(sea: Sea, x: wp.vec3) -> float:
     return wp.dot(x, sea.normal) - sea.height
 
 
 @wp.func
-def surface_distance(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool) -> float:
-    """Length of the flight from x along u to the mean plane [m], 1e30 if it leads away from it."""
+def _plane_distance(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, limit: float) -> float:
     climb = wp.dot(u, sea.normal)
     toward = wp.where(above, climb < 0.0, climb > 0.0)
-    return wp.where(toward, wp.max(-height_above(sea, x) / climb, 0.0), 1.0e30)
+    return wp.where(toward, wp.max(-_height_above(sea, x) / climb, 0.0), 1.0e30)
 
 
 # ---- Facets. Vectors in the frame of the plane: along and across the wind, and its normal on the side of the light.
@@ -214,8 +225,8 @@ def passage_density(sea: Sea, u: wp.vec3, v: wp.vec3) -> float:
 
 @wp.struct
 class SeaConnection:
-    """A way from a point on one side of the surface to one on the other, by a point S of the mean plane that was drawn;
-    or by that of the flat surface, the only one there is."""
+    """A way from a point on one side of the surface to one on the other, by a point S of it that was drawn; or by that
+    of the flat surface, the only one there is."""
 
     to_surface: wp.vec3  # unit direction at the point
     inside: wp.vec3  # unit direction from S to the other point
@@ -228,13 +239,50 @@ class SeaConnection:
 
 
 @wp.func
-def connect_sea(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -> SeaConnection:
-    """A way from x to o on the other side, which the port describes: the mean plane as o sees it. `seed`: 64 random
-    bits.
+def _draw_point(
+    port: Port, flat: Connection, behind: float, up: wp.vec3, along: wp.vec3, width: wp.vec2, seed: wp.uint64
+) -> wp.vec4:
+    """A point S of the mean plane by which light may go, and its density [1/m^2], drawn around that of the flat
+    surface, `behind` m before the end of the way, from a distribution of slopes: a slope moves it, to first order, by
+    the slope over J in the plane of incidence and across it."""
+    n = port.index
+    cos_x = -wp.dot(flat.to_port, port.normal)
+    cos_o = -wp.dot(flat.inside, port.normal)
+    gap = wp.abs(n[2] * cos_x - n[0] * cos_o)
+    across_j = (n[2] / flat.water + n[0] / behind) / gap
+    in_j = (n[2] * cos_x * cos_x / flat.water + n[0] * cos_o * cos_o / behind) / gap
+    state = step_sequence(begin_sequence(seed))
+    wide = wp.where(u01(sequence_word(state)) < _WIDE_PART, _WIDE, 1.0)
+    state = step_sequence(state)
+    r = wide * wp.sqrt(-wp.log(u01_open(sequence_word(state))))
+    state = step_sequence(state)
+    turn = cos_sin_turn(u01(sequence_word(state)))
+    slope = (r * width[0] * turn[0]) * along + (r * width[1] * turn[1]) * wp.cross(up, along)
+    plane = flat.to_port + cos_x * port.normal  # along the plane of incidence
+    length = wp.length(plane)
+    plane = wp.where(length > 1.0e-6, plane / wp.max(length, 1.0e-6), along)
+    across = wp.cross(port.normal, plane)
+    s = flat.exit + (wp.dot(slope, plane) / in_j) * plane + (wp.dot(slope, across) / across_j) * across
+    r2 = r * r
+    drawn = (1.0 - _WIDE_PART) * wp.exp(-r2) + _WIDE_PART / (_WIDE * _WIDE) * wp.exp(-r2 / (_WIDE * _WIDE))
+    drawn *= in_j * across_j * _INV_PI / (width[0] * width[1])
+    return wp.vec4(s[0], s[1], s[2], drawn)
 
-    S is drawn around the flat surface's from the distribution of slopes: a slope moves it, to first order, by the slope
-    over J in the plane of incidence and across it.
-    """
+
+@wp.func
+def _by_point(c: wp.ref[SeaConnection], s: wp.vec3, x: wp.vec3, o: wp.vec3):
+    """The way from x by s to o."""
+    c.surface = s
+    to_s = s - x
+    to_o = o - s
+    c.before = wp.length(to_s)
+    c.behind = wp.length(to_o)
+    c.to_surface = to_s / c.before
+    c.inside = to_o / c.behind
+
+
+@wp.func
+def _connect_by_plane(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -> SeaConnection:
     c = SeaConnection()
     flat = connect_flat(port, x, o)
     if flat.density <= 0.0:
@@ -247,38 +295,160 @@ def connect_sea(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -
     c.density = flat.transmission * flat.density
     if sea.slope[0] <= 0.0:
         return c
-    n = port.index
-    cos_x = -wp.dot(flat.to_port, port.normal)
-    cos_o = -wp.dot(flat.inside, port.normal)
-    gap = wp.abs(n[2] * cos_x - n[0] * cos_o)
-    across_j = (n[2] / c.before + n[0] / c.behind) / gap
-    in_j = (n[2] * cos_x * cos_x / c.before + n[0] * cos_o * cos_o / c.behind) / gap
-    state = step_sequence(begin_sequence(seed))
-    wide = wp.where(u01(sequence_word(state)) < _WIDE_PART, _WIDE, 1.0)
-    state = step_sequence(state)
-    r = wide * wp.sqrt(-wp.log(u01_open(sequence_word(state))))
-    state = step_sequence(state)
-    turn = cos_sin_turn(u01(sequence_word(state)))
-    slope = (r * sea.slope[0] * turn[0]) * sea.along + (r * sea.slope[1] * turn[1]) * wp.cross(sea.normal, sea.along)
-    plane = flat.to_port + cos_x * port.normal  # along the plane of incidence
-    length = wp.length(plane)
-    plane = wp.where(length > 1.0e-6, plane / wp.max(length, 1.0e-6), sea.along)
-    across = wp.cross(port.normal, plane)
-    s = flat.exit + (wp.dot(slope, plane) / in_j) * plane + (wp.dot(slope, across) / across_j) * across
-    c.surface = s
-    to_s = s - x
-    to_o = o - s
-    c.before = wp.length(to_s)
-    c.behind = wp.length(to_o)
-    c.to_surface = to_s / c.before
-    c.inside = to_o / c.behind
-    r2 = r * r
-    drawn = (1.0 - _WIDE_PART) * wp.exp(-r2) + _WIDE_PART / (_WIDE * _WIDE) * wp.exp(-r2 / (_WIDE * _WIDE))
-    drawn *= in_j * across_j * _INV_PI / (sea.slope[0] * sea.slope[1])  # density of S [1/m^2]
+    drawn = _draw_point(port, flat, c.behind, sea.normal, sea.along, sea.slope, seed)
+    _by_point(c, wp.vec3(drawn[0], drawn[1], drawn[2]), x, o)
     cosine = wp.abs(wp.dot(c.to_surface, port.normal))
     area = c.before * c.before * c.behind * c.behind
-    c.density = passage_density(sea, c.to_surface, c.inside) * cosine / (area * wp.max(drawn, 1.0e-30))
+    c.density = passage_density(sea, c.to_surface, c.inside) * cosine / (area * wp.max(drawn[3], 1.0e-30))
     return c
+
+
+# ---- Resolved waves: the surface is about the height field what it is else about the mean plane.
+
+
+@wp.func
+def _tilted(sea: Sea, x: wp.vec3) -> Sea:
+    """The surface at a point of the waves, as that of their facet there."""
+    normal = facet_normal(sea.waves, facet_at(sea.waves, x).slope)
+    local = sea
+    local.normal = normal
+    local.along = wp.normalize(sea.along - wp.dot(sea.along, normal) * normal)
+    return local
+
+
+@wp.func
+def _lifted(sea: Sea, port: Port, x: wp.vec3) -> Port:
+    """The mean plane at the height of the waves above or below x."""
+    plane = port
+    plane.distance += facet_at(sea.waves, x).height * wp.sign(wp.dot(port.normal, sea.normal))
+    return plane
+
+
+@wp.func
+def _connect_by_waves(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -> SeaConnection:
+    """S is drawn about the flat surface at the height of the waves near it, and put on them."""
+    c = SeaConnection()
+    plane = _lifted(sea, port, x)
+    flat = connect_flat(plane, x, o)
+    if flat.density <= 0.0:
+        return c
+    # At the height of the waves where the light leaves, unless that is at or beyond x.
+    there = _lifted(sea, port, flat.exit)
+    deep = wp.dot(x, port.normal) - plane.distance
+    if wp.dot(x, port.normal) - there.distance > 0.5 * deep:
+        nearer = connect_flat(there, x, o)
+        if nearer.density > 0.0:
+            flat = nearer
+    behind = wp.length(o - flat.exit)
+    drawn = _draw_point(port, flat, behind, sea.normal, sea.waves.spread_along, sea.waves.spread, seed)
+    s = wp.vec3(drawn[0], drawn[1], drawn[2])
+    local = _tilted(sea, s)
+    s -= height_above_waves(sea.waves, s) * sea.normal
+    _by_point(c, s, x, o)
+    cosine = wp.dot(c.to_surface, local.normal)
+    below = wp.dot(port.normal, sea.normal) < 0.0  # x is
+    # Facets that turn their backs on x or on o let nothing through.
+    if (cosine > 0.0) == below and (wp.dot(c.inside, local.normal) > 0.0) == below:
+        level = wp.dot(local.normal, sea.normal)
+        area = c.before * c.before * c.behind * c.behind * level
+        density = passage_density(local, c.to_surface, c.inside)
+        c.density = density * wp.abs(cosine) / (area * wp.max(drawn[3], 1.0e-30))
+    return c
+
+
+class SeaKind(NamedTuple):
+    """A kind of surface; its name identifies it in the kernel cache. Warp functions, in any one frame."""
+
+    name: str  # "facets" or "waves"
+    height_above: wp.Function  # ``(sea, x) -> float``, of a point above the surface [m]
+    # ``(sea, x, u, above, limit) -> float``: length of the flight from x along u, on the side `above` the surface or
+    # below it, to the surface [m]; 1e30 if it does not meet it, as a flight over waves may not beyond the limit [m]
+    distance: wp.Function
+    passage: wp.Function  # ``(sea, x, u, above, random) -> SeaPassage`` of light at a point x of the surface
+    density: wp.Function  # ``(sea, x, u, v) -> float``, `passage_density` there
+    # ``(sea, port, x, o, seed) -> SeaConnection``: a way from x to o on the other side, which the port describes: the
+    # mean plane as o sees it; `seed`: 64 random bits
+    connect: wp.Function
+    clear: wp.Function  # ``(sea, x, u, length, above) -> bool``: whether no wave stands in the way
+
+
+@wp.func
+def _passage_at_plane(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, random: wp.vec4ui) -> SeaPassage:
+    return sample_passage(sea, u, above, random)
+
+
+@wp.func
+def _density_at_plane(sea: Sea, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
+    return passage_density(sea, u, v)
+
+
+@wp.func
+def _always_clear(sea: Sea, x: wp.vec3, u: wp.vec3, length: float, above: bool) -> bool:
+    return True
+
+
+@wp.func
+def _height_above_waves(sea: Sea, x: wp.vec3) -> float:
+    return height_above_waves(sea.waves, x)
+
+
+@wp.func
+def _waves_distance(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, limit: float) -> float:
+    return waves_distance(sea.waves, x, u, above, limit)
+
+
+@wp.func
+def _passage_at_waves(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, random: wp.vec4ui) -> SeaPassage:
+    return sample_passage(_tilted(sea, x), u, above, random)
+
+
+@wp.func
+def _density_at_waves(sea: Sea, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
+    return passage_density(_tilted(sea, x), u, v)
+
+
+@wp.func
+def _clear_of_waves(sea: Sea, x: wp.vec3, u: wp.vec3, length: float, above: bool) -> bool:
+    return waves_distance(sea.waves, x, u, above, length) > length
+
+
+_AT_PLANE = (_height_above, _plane_distance, _passage_at_plane, _density_at_plane, _connect_by_plane, _always_clear)
+FACETS = SeaKind("facets", *_AT_PLANE)
+"""Facets about the mean plane: waves by the statistics of their slopes alone."""
+
+_AT_WAVES = (_height_above_waves, _waves_distance, _passage_at_waves, _density_at_waves)
+WAVES = SeaKind("waves", *_AT_WAVES, _connect_by_waves, _clear_of_waves)
+"""A height field of waves, and about it facets for what it does not resolve."""
+
+
+@wp.kernel(enable_backward=False)
+def see_through_waves_kernel(
+    sea: Sea,
+    origins: wp.array2d[wp.vec3],
+    directions: wp.array2d[wp.vec3],
+    start: wp.array2d[wp.vec3],
+    behind: wp.array2d[wp.vec3],
+    length: wp.array2d[float],
+):
+    """Rays [m] up to the waves, refracted there by the height field alone: where, in which unit direction they go on,
+    and how long they are; NaN for those that do not get through."""
+    i, j = wp.tid()
+    x = origins[i, j]
+    u = directions[i, j]
+    above = height_above_waves(sea.waves, x) > 0.0
+    distance = waves_distance(sea.waves, x, u, above, 1.0e9)
+    v = wp.vec3(0.0)
+    if distance < 1.0e30:
+        x += distance * u
+        v = refracted(
+            u, facet_normal(sea.waves, facet_at(sea.waves, x).slope), wp.where(above, 1.0 / sea.index, sea.index)
+        )
+    if wp.length_sq(v) == 0.0:
+        v = wp.vec3(wp.nan)
+        distance = wp.nan
+    start[i, j] = x
+    behind[i, j] = v
+    length[i, j] = distance
 
 
 # ---- Parameters.
@@ -294,6 +464,34 @@ def slope_variances(wind: float, *, by_direction: bool = False) -> tuple[float, 
     return even, even
 
 
+def unresolved_covariance(
+    variances: Sequence[float], along: Sequence[float], heights: ArrayLike, size: Sequence[float]
+) -> NDArray[np.float64]:
+    """Covariance of the slopes of a sea that a height field leaves to facets, along its rows and from row to row,
+    `[2, 2]`.
+
+    Args:
+        variances: Of all slopes, along and across the wind, see `slope_variances`.
+        along: Components of the wind's direction along the rows and from row to row; any length but 0.
+        heights, size: See `make_waves`.
+
+    Raises:
+        ArgumentError: Less than a tenth of the variance on an axis is left, or a number is out of its range.
+    """
+    resolved = facet_covariance(heights, size)
+    wind = np.array(along, np.float64) / math.hypot(*along)
+    turn = np.array([wind, [-wind[1], wind[0]]])
+    total = turn.T @ np.diag(np.maximum(np.array(variances, np.float64), 1e-30)) @ turn
+    part = turn @ resolved @ turn.T / np.sqrt(np.outer(variances, variances)) if min(variances) > 0.0 else np.eye(2)
+    if (most := float(np.linalg.eigvalsh(part)[-1])) > 0.9:
+        raise ArgumentError(
+            f"heights: the waves hold {most:.3g} of the variance of the sea's slopes on an axis, which is outside "
+            "[0, 0.9]: the rest is that of the waves between the nodes"
+        )
+    covariance: NDArray[np.float64] = total - resolved
+    return covariance
+
+
 def make_sea(
     variances: Sequence[float],
     *,
@@ -303,17 +501,28 @@ def make_sea(
     along: Sequence[float] | None = None,
     delay: float = 1.0,
     extinction: float = 0.0,
+    heights: ArrayLike | None = None,
+    size: Sequence[float] = (1.0, 1.0),
+    columns: Sequence[float] | None = None,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    device: wp.DeviceLike = None,
 ) -> Sea:
     """The surface of the sea.
 
     Args:
-        variances: Of the slopes along and across the wind, see `slope_variances`; both 0 for a flat surface.
+        variances: Of all slopes along and across the wind, see `slope_variances`; both 0 for a flat surface.
         index: Phase index of the water over that of the air, > 1.
         normal: Unit vector of the mean plane, upwards.
         height: Of the mean plane, x·normal of its points [m].
         along: Direction in which the wind blows, of any length, not along the normal.
         delay: Group index of the air over that of the water.
         extinction: Of the air [1/m].
+        heights: Of resolved waves, see `make_waves`, for `TransportSpec.sea` = WAVES. Facets about them then hold the
+            rest of the variances, see `unresolved_covariance`.
+        size: Length of a row of the heights and of a column [m].
+        columns: Direction along a row, of any length, not along the normal; default: that of the wind.
+        origin: A point above or below the first node [m].
+        device: Where the heights are stored.
 
     Raises:
         ArgumentError: A number out of its range.
@@ -327,12 +536,33 @@ def make_sea(
     check_number("height", height, "(-inf, inf)")
     check_number("delay", delay, "(0, 4]")
     up = np.array(normal, np.float64)
-    wind = np.eye(3)[np.argmin(np.abs(up))] if along is None else np.array(along, np.float64)
-    check_vector("along", wind.tolist())
-    level = wind - (wind @ up) * up
-    check_number("length of along in the plane", float(np.linalg.norm(level)), "(0, inf)")
+    wind = _level("along", np.eye(3)[np.argmin(np.abs(up))] if along is None else along, up)
     sea = Sea()
-    sea.normal, sea.height, sea.along = wp.vec3(*normal), height, wp.vec3(*(level / np.linalg.norm(level)))
+    sea.normal, sea.height, sea.along = wp.vec3(*normal), height, wp.vec3(*wind)
     sea.slope = wp.vec2(*(math.sqrt(2.0 * variance) for variance in variances))
     sea.index, sea.delay, sea.extinction = index, delay, extinction
+    if heights is not None:
+        check_vector("origin", origin)
+        first = wind if columns is None else _level("columns", columns, up)
+        second = np.cross(up, first)
+        sea.waves = make_waves(heights, size, device=device)
+        rest = unresolved_covariance(variances, (wind @ first, wind @ second), heights, size)
+        values, vectors = np.linalg.eigh(rest)
+        place = np.array(origin, np.float64)
+        place += (height - place @ up) * up
+        sea.waves.normal, sea.waves.origin = sea.normal, wp.vec3(*place)
+        sea.waves.columns, sea.waves.rows = wp.vec3(*first), wp.vec3(*second)
+        sea.waves.spread_along, sea.waves.spread = sea.along, sea.slope
+        sea.along = wp.vec3(*(vectors[0, 1] * first + vectors[1, 1] * second))
+        sea.slope = wp.vec2(math.sqrt(2.0 * values[1]), math.sqrt(2.0 * values[0]))
     return sea
+
+
+def _level(name: str, vector: ArrayLike, up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The unit vector of the mean plane that a vector lies above."""
+    direction = np.array(vector, np.float64)
+    check_vector(name, direction.tolist())
+    level = direction - (direction @ up) * up
+    check_number(f"length of {name} in the plane", float(np.linalg.norm(level)), "(0, inf)")
+    unit: NDArray[np.float64] = level / np.linalg.norm(level)
+    return unit

@@ -11,7 +11,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 from .camera import SCANNED, Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
 from .laser import Pose, Scan, make_pose
 from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay
-from .sea import Sea, connect_sea
+from .sea import WAVES, Sea, SeaKind
 
 __all__ = ["next_event_value"]
 
@@ -152,14 +152,17 @@ def _nearer(port: Port, beyond: float, end: int) -> float:
 
 
 @memoised
-def _make_flat_view(rough: bool) -> tuple[wp.Function, wp.Function]:
-    """`clip` and `shows` of a `Sight` behind a flat port; `rough`: it is the surface of a sea."""
+def _make_flat_view(rough: bool, waves: bool = False) -> tuple[wp.Function, wp.Function]:
+    """`clip` and `shows` of a `Sight` behind a flat port; `rough`: it is the surface of a sea; `waves`: with waves,
+    whose highest crest is then the port, down to whose deepest trough light may go straight on."""
 
     @wp.func
     def clip_to_flat_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
         """As `clip_to_view` behind a flat port: holds all that the lens point o sees."""
         port = camera.port
         beyond = wp.dot(x, port.normal) - port.distance - port.thickness
+        if wp.static(waves):
+            beyond += port.amplitude
         climb = wp.dot(u, port.normal)
         seen = _view_from(camera, view, o)
         interval = clip_half_space(beyond, climb, wp.vec2(0.0, limit))
@@ -174,6 +177,8 @@ def _make_flat_view(rough: bool) -> tuple[wp.Function, wp.Function]:
                 aside = port.margin * wp.length(side)
                 value += aside * beyond
                 rise += aside * climb
+            if wp.static(waves):
+                value += port.straight * wp.length(side)
             interval = clip_half_space(value, rise, interval)
         return interval
 
@@ -182,6 +187,8 @@ def _make_flat_view(rough: bool) -> tuple[wp.Function, wp.Function]:
         """As `in_view` behind a flat port; False is certain."""
         port = camera.port
         beyond = wp.dot(x, port.normal) - port.distance - port.thickness
+        if wp.static(waves):
+            beyond += port.amplitude
         shown = beyond > 0.0
         for k in range(4):
             side = _side(view, k)
@@ -193,6 +200,8 @@ def _make_flat_view(rough: bool) -> tuple[wp.Function, wp.Function]:
                 value = wp.max(value, blur - outward * near)
             if wp.static(rough):
                 value += port.margin * beyond * wp.length(side)
+            if wp.static(waves):
+                value += port.straight * wp.length(side)
             shown = shown and value > wp.dot(side, x)
         return shown
 
@@ -342,7 +351,9 @@ class Sight(NamedTuple):
     # of the water; and ``(sea, scan, target) -> Sea``
     camera_at: wp.Function
     sea_at: wp.Function
-    sea: bool  # whether there is a surface of a sea
+    sea: SeaKind | None  # what surface of a sea there is
+    # ``(camera, sea, x, o, link) -> bool``, whether no wave of it stands in the way of a link from x to o
+    clear: wp.Function | None
 
 
 @memoised
@@ -434,8 +445,45 @@ def lens_in_air(camera: Camera) -> bool:
 
 
 @memoised
-def _make_sea_ways() -> tuple[wp.Function, ...]:
+def _make_lies_across(sea: SeaKind) -> wp.Function:
+    """The Warp function ``(camera, sea, x) -> bool``: whether the surface is between x and the lens."""
+    waves, height_above = sea.name == WAVES.name, sea.height_above
+
+    @wp.func
+    def lies_across(camera: Camera, sea: Sea, x: wp.vec3) -> bool:
+        if wp.static(waves):
+            return (height_above(sea, x) > 0.0) != lens_in_air(camera)
+        return _lies_across(camera, x)
+
+    return lies_across
+
+
+@memoised
+def _make_clear(sea: SeaKind) -> wp.Function | None:
+    """See `Sight.clear`. A way by the surface is followed from there to both ends: to the surface it would end there by
+    rounding, or not."""
+    if sea.name != WAVES.name:
+        return None
+    clear_of = sea.clear
+
+    @wp.func
+    def clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
+        in_air = lens_in_air(camera)
+        rest = o - link.end
+        length = wp.length(rest)
+        if length > 0.0:
+            back = link.end - x
+            free = clear_of(sea, link.end, -link.to_lens, wp.length(back), not in_air)
+            return free and clear_of(sea, link.end, rest / length, length, in_air)
+        return clear_of(sea, x, link.to_lens, wp.length(o - x), in_air)
+
+    return clear
+
+
+@memoised
+def _make_sea_ways(sea: SeaKind) -> tuple[wp.Function, ...]:
     """As `_make_ways`, with the surface of a sea."""
+    connect, lies_across = sea.connect, _make_lies_across(sea)
     leave, _link, _value, _apparent, _toward, straight_to_centre = _make_ways(None)
     _leave, _link, _value, apparent_behind, toward_behind, toward_centre_behind = _make_ways(FLAT_PORT)
 
@@ -443,8 +491,8 @@ def _make_sea_ways() -> tuple[wp.Function, ...]:
     def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Link:
         link = Link()
         in_air = lens_in_air(camera)
-        if not at_sea and _lies_across(camera, x):
-            way = connect_sea(sea, camera.port, x, o, seed)
+        if not at_sea and lies_across(camera, sea, x):
+            way = connect(sea, camera.port, x, o, seed)
             link.to_lens = way.to_surface
             link.image = o - way.inside
             link.end = way.surface
@@ -497,10 +545,10 @@ def _make_sea_ways() -> tuple[wp.Function, ...]:
 
 
 @memoised
-def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
+def _make_sea_view(shows: wp.Function, waves: bool) -> tuple[wp.Function, ...]:
     """`clip`, `shows` and `gate` of a `Sight` with the surface of a sea, for flights in the water; `shows` of the
-    lens."""
-    clip_across, shows_across = _make_flat_view(True)
+    lens; `waves`: some of the water is above the mean plane."""
+    clip_across, shows_across = _make_flat_view(True, waves)
 
     @wp.func
     def clip(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
@@ -518,6 +566,9 @@ def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
             shown = shows(camera, view, x)
         elif lens_in_air(camera):
             shown = shows_across(camera, view, x)
+        if wp.static(waves):
+            if wp.abs(wp.dot(x, camera.port.normal) - camera.port.distance) < camera.port.amplitude:
+                shown = True
         return shown
 
     @wp.func
@@ -538,9 +589,9 @@ _VIEWS = {
 
 
 @memoised
-def _make_placed(pose: Pose, moves: bool) -> tuple[wp.Function, wp.Function]:
-    """`camera_at` and `sea_at` of a `Sight`; `moves`: the camera does, over a sea."""
-    turn_in = pose.turn_in
+def _make_placed(pose: Pose, moves: bool, waves: bool) -> tuple[wp.Function, wp.Function]:
+    """`camera_at` and `sea_at` of a `Sight`; `moves`: the camera does, over a sea; `waves`: with waves."""
+    turn_in, point_in = pose.turn_in, pose.point_in
 
     @wp.func
     def camera_at(camera: Camera, scan: Scan, target: int) -> Camera:
@@ -562,16 +613,26 @@ def _make_placed(pose: Pose, moves: bool) -> tuple[wp.Function, wp.Function]:
             sea.height = height
             sea.normal = normal
             sea.along = along
+            if wp.static(waves):
+                origin = point_in(scan, target, sea.waves.origin)
+                columns = turn_in(scan, target, sea.waves.columns)
+                rows = turn_in(scan, target, sea.waves.rows)
+                spread_along = turn_in(scan, target, sea.waves.spread_along)
+                sea.waves.normal = normal
+                sea.waves.origin = origin
+                sea.waves.columns = columns
+                sea.waves.rows = rows
+                sea.waves.spread_along = spread_along
         return sea
 
     return camera_at, sea_at
 
 
 @memoised
-def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: bool = False) -> Sight:
-    """For a way of imaging, a kind of port or None, and whether pixels are scanned; `sea`: there is the surface of a
-    sea, and no port."""
-    moves = lens.name == SCANNED.name
+def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind | None = None) -> Sight:
+    """For a way of imaging, a kind of port or None, and whether pixels are scanned; `sea`: the surface of a sea, and no
+    port."""
+    moves, waves = lens.name == SCANNED.name, sea is not None and sea.name == WAVES.name
 
     @wp.func
     def scan_view(camera: Camera, scan: Scan, target: int) -> wp.vec4:
@@ -583,12 +644,13 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: bool = Fa
     cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows, _same_gate)
     if port is not None:
         cosines, may_hide, view = port.cosines, _may_hide_anywhere, _VIEWS[port.name]
-    ways = _make_sea_ways() if sea else _make_ways(port)
+    ways = _make_sea_ways(sea) if sea else _make_ways(port)
     if sea:
-        view = _make_sea_view(lens.shows)
+        view = _make_sea_view(lens.shows, waves)
     if moves or sea:
         may_hide = _may_hide_anywhere
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
     pose = make_pose(moves)
-    placed = _make_placed(pose, moves and sea)
-    return Sight(cosines, *imaging, *view, may_hide, *ways, make_sample_lens(port), pose, *placed, sea)
+    placed = _make_placed(pose, moves and sea is not None, waves)
+    clear = _make_clear(sea) if sea else None
+    return Sight(cosines, *imaging, *view, may_hide, *ways, make_sample_lens(port), pose, *placed, sea, clear)

@@ -10,6 +10,7 @@ from spadwarp_kernels.optics.camera import PLAIN, SCANNED, Lens
 from spadwarp_kernels.optics.laser import Beam, make_beam
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
 from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
+from spadwarp_kernels.optics.sea import WAVES, SeaKind
 from spadwarp_kernels.optics.visibility import Sight, make_sight
 from spadwarp_kernels.surface.ray_cast import Faces, make_faces
 from spadwarp_kernels.tally.flux import FLUX_KINDS
@@ -27,6 +28,7 @@ MOST_POINTS = 3
 _WORDS = {
     bool: "True or False",
     PortKind | None: "a PortKind or None",
+    SeaKind | None: "FACETS, WAVES or None",
     Water | None: "REGULAR_TRACKING, DELTA_TRACKING or None",
 }
 
@@ -76,8 +78,8 @@ class TransportSpec(NamedTuple):
     """What the camera looks through, FLAT_PORT or DOME_PORT, as `Camera.port` describes it; None: it is in the
     water."""
     laser_port: PortKind | None = None  # the same of the laser and `Laser.port`
-    sea: bool = False
-    """The surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, in the
+    sea: SeaKind | None = None
+    """FACETS or WAVES: the surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, in the
     frame of the water and without a window, and there are no other ports. The tally has one more component, of light
     that met the surface alone."""
     grid: Water | None = None
@@ -107,6 +109,11 @@ class TransportSpec(NamedTuple):
     def signed(self) -> int:
         """Tallies of a voxel that have signs, beside the histogram's: of derivatives or of channels."""
         return len(self.derivatives) + self.channels
+
+    @property
+    def waves(self) -> bool:
+        """Whether the surface of the sea has resolved waves."""
+        return self.sea is not None and self.sea.name == WAVES.name
 
     @property
     def on_cpu(self) -> "TransportSpec":

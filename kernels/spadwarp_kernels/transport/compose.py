@@ -78,7 +78,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)
     meet = make_meet(estimator.meet)
-    deposit = make_deposit(spec.signed, len(spec.blocks), split, spec.sea)
+    deposit = make_deposit(spec.signed, len(spec.blocks), split, spec.sea is not None)
     memory, push, pop = make_queue(spec, flights, scores, two_requests, in_tree)
     serve = _make_serve(spec, split, deposit, waits=in_tree and not alone) if scores else push
     ask_flight, ask_event = _make_asks(spec, _make_serve_now(serve) if alone and scores else push)
@@ -93,7 +93,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
         collide=make_collide(spec, estimator.meet is not None, flies_on, make_flux_score(spec)),
         scatter=make_scatter(spec, estimator.direct, flies_on),
         finish=make_finish(spec.records, len(spec.derivatives)),
-        flush=make_flush(not cuda and estimator.scores, spec.reflecting, spec.sea),
+        flush=make_flush(not cuda and estimator.scores, spec.reflecting, spec.sea is not None),
         ask_flight=ask_flight,
         ask_event=ask_event,
         deposit=deposit,
@@ -168,7 +168,7 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
 def _make_serve(spec: TransportSpec, split: bool, deposit: wp.Function, waits: bool) -> wp.Function:
     """See `Stages.serve`; with `waits` a contribution behind which a tree must be walked is left in the state, else the
     ray is traced here, and what a face hides is set to 0."""
-    has_mesh, hides, reflects, sea = spec.mesh, spec.faces.hides, spec.reflecting, spec.sea
+    has_mesh, hides, reflects, sea = spec.mesh, spec.faces.hides, spec.reflecting, spec.sea is not None
     view_of, may_hide = spec.sight.view, spec.sight.may_hide
     score, score_images = make_estimator(spec).score, make_score_images(spec, split)
 

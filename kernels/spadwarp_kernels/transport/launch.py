@@ -251,11 +251,17 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
         yield "laser", _BEAM[check_integer("model.laser.profile", laser.profile, 0, len(LASER_PROFILES) - 1)]
     if spec.laser_port is not None:
         check_port("model.laser.port", laser.port, spec.laser_port)
-    if spec.sea != model.has_sea:
-        raise ArgumentError(f"spec.sea = {spec.sea} does not go with model.sea.index = {float(model.sea.index):g}")
+    if (spec.sea is not None) != model.has_sea:
+        raise ArgumentError(
+            f"spec.sea = {spec.sea and spec.sea.name} does not go with model.sea.index = {float(model.sea.index):g}"
+        )
     if spec.sea:
         yield "sea", {"normal": "unit", "along": "unit", "index": "(1, 4]", "delay": "(0, 4]"}
         yield "sea", {"height": "(-inf, inf)", "slope": "[0, 1]", "extinction": "[0, inf)"}
+        if spec.waves:
+            yield "sea.waves", {"heights": (None, None), "cell": "(0, inf)", "spread": "(0, inf)", "low": "(-inf, inf)"}
+            yield "sea.waves", dict.fromkeys(("normal", "columns", "rows", "spread_along"), "unit")
+            yield "sea", {"slope": "(0, 1]"}
         if model.medium.axis_threshold < 1.0:
             raise ArgumentError(f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.sea needs 1")
     if spec.confocal:
@@ -433,7 +439,7 @@ def splits_accumulators(spec: TransportSpec, model: Model, photon_count: int) ->
     """Whether a launch into a tally of the model keeps its low words apart; see `tally.split_accumulators`."""
     if not (model.split_accumulators and model.device.is_cuda and make_estimator(spec).scores):
         return False
-    voxels = model.tally_size // len(tally_components(spec.sea))
+    voxels = model.tally_size // len(tally_components(spec.sea is not None))
     return not (spec.signed or spec.blocks) and splitting_pays(voxels, photon_count)
 
 

@@ -18,7 +18,7 @@ from spadwarp_kernels.base.philox import (
 )
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
-from spadwarp_kernels.optics.sea import height_above, sample_passage, surface_distance
+from spadwarp_kernels.optics.sea import FACETS
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import (
     END,
@@ -90,7 +90,8 @@ def make_emit(spec: TransportSpec) -> wp.Function:
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
     scans, enter, begin_carried = spec.beam.scans, spec.beam.enter, make_rider(spec).begin
-    scan_view, has_port, sea = spec.sight.scan_view, enter is not None, spec.sight.sea
+    scan_view, has_port, sea = spec.sight.scan_view, enter is not None, spec.sea is not None
+    height_above = (spec.sea or FACETS).height_above
     point_out, turn_out = spec.beam.pose.point_out, spec.beam.pose.turn_out
 
     @wp.func
@@ -211,7 +212,7 @@ def make_fly(
     plans, water_free_path, tried = plan_flight is not None, spec.water.free_path, spec.faces.tried
     events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
-    has_bvh, sea = spec.faces.mesh and not tried, spec.sight.sea
+    has_bvh, sea, surface_distance = spec.faces.mesh and not tried, spec.sea is not None, (spec.sea or FACETS).distance
 
     @wp.func
     def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
@@ -228,7 +229,10 @@ def make_fly(
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
         s.flight.distance = water_free_path(world.medium, world.layers, s.x, s.u, xi, seed)
         if wp.static(sea):
-            s.flight.sea = surface_distance(world.sea, s.x, s.u, s.above)
+            limit = world.limits.max_path - s.path
+            if s.above:
+                limit /= world.sea.delay
+            s.flight.sea = surface_distance(world.sea, s.x, s.u, s.above, limit)
             s.flight.distance = wp.min(wp.where(s.above, 1.0e30, s.flight.distance), s.flight.sea)
         s.flight.reach = wp.min(s.flight.distance, world.limits.max_path - s.path)
         if wp.static(sea):
@@ -301,7 +305,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
     tallies_flux = score_flux is not None
     domain, local_albedo = spec.domain, spec.local_albedo
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
-    water_at, fly_carried, sea = spec.water.at, make_rider(spec).fly, spec.sight.sea
+    water_at, fly_carried, sea = spec.water.at, make_rider(spec).fly, spec.sea is not None
     outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
 
     @wp.func
@@ -524,16 +528,20 @@ def make_meet_sea(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Fun
     `directed`, `flies_on`: see `make_bounce`.
     """
     terminate, continues = make_terminate(spec), make_continues(flies_on)
+    passage_at, waves = (spec.sea or FACETS).passage, spec.waves
 
     @wp.func
     def meet_sea(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
-        passage = sample_passage(world.sea, s.u, s.above, draw)
+        passage = passage_at(world.sea, s.x, s.u, s.above, draw)
         new = Outcome()
         new.reason = s.reason
         new.weight = s.weight
         # The light of an event that was the last goes to the lens; what is reflected would come from an event here.
-        reweigh(new.weight, wp.where(s.reason >= 0 and passage.reflected, 0.0, passage.part))
+        scored_here = passage.reflected
+        if wp.static(waves):
+            scored_here = passage.reflected or s.bounces.leg > 1
+        reweigh(new.weight, wp.where(s.reason >= 0 and scored_here, 0.0, passage.part))
         book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.SURFACE_MASKING, s.reason))
         if s.reason < 0:
             new.analog_weight = wp.where(wp.static(directed), s.analog_weight * passage.part, new.weight.value)
@@ -556,7 +564,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     specular, reflects, directed = spec.faces.specular, spec.domain.reflects, direct is not None
     survival_of, sample_direction = spec.faces.survival, make_sample_direction(spec, direct)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
-    sea, meet_sea = spec.sight.sea, make_meet_sea(spec, directed, flies_on)
+    sea, meet_sea = spec.sea is not None, make_meet_sea(spec, directed, flies_on)
     continues, turn_carried = make_continues(flies_on), make_rider(spec).event
 
     @wp.func

@@ -10,9 +10,10 @@ from scipy.stats import chisquare
 import spadwarp_kernels as sk
 from helpers.launch import launched, unit
 from spadwarp_kernels.optics.port import Port
-from spadwarp_kernels.optics.sea import connect_sea, passage_density, sample_passage
+from spadwarp_kernels.optics.sea import passage_density, sample_passage
 
 INDEX = 1.34
+connect_sea = sk.FACETS.connect
 UP = (0.0, 0.0, 1.0)
 
 

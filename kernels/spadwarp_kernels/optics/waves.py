@@ -1,0 +1,225 @@
+"""Resolved waves: a periodic height field above a mean plane, and the ways of rays to it.
+
+Between its nodes the field is bilinear. What is on which side of it is decided by the one who asks: rounding leaves
+points that were put on the surface a little above or below.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_vector
+
+__all__ = ["Waves", "facet_covariance", "make_waves", "steepest_facet"]
+
+# Cells that a ray is followed through; a flight within the slab of the waves that is longer meets none.
+_MOST_CELLS = wp.constant(65536)
+_NOWHERE = wp.constant(1.0e30)
+
+
+@wp.struct
+class Waves:
+    """A height field over the mean plane of a sea, in the frame of the camera; made by `make_waves`, placed by
+    `make_sea`."""
+
+    heights: wp.array2d[float]  # of the nodes above the mean plane [m], along the rows' and the columns' direction
+    cell: wp.vec2  # distance of the nodes of a row, and of the rows [m]
+    low: float  # bounds of the heights, with a margin for rounding [m]
+    high: float
+    normal: wp.vec3  # of the mean plane, upwards
+    origin: wp.vec3  # the point of the mean plane at the first node [m]
+    columns: wp.vec3  # unit vector in the plane along a row
+    rows: wp.vec3  # and from row to row
+    spread_along: wp.vec3  # of the slopes of the sea as a whole: unit vector in the plane
+    spread: wp.vec2  # along it and across, the width of exp(-s^2/width^2)
+
+
+@wp.struct
+class Facet:
+    """The field about a point: its height above the mean plane there [m], and its slopes along `columns` and `rows`."""
+
+    height: float
+    slope: wp.vec2
+
+
+@wp.func
+def _node(waves: Waves, row: int, column: int) -> float:
+    """Height of a node of the field, periodic."""
+    r = row % waves.heights.shape[0]
+    c = column % waves.heights.shape[1]
+    return waves.heights[wp.where(r < 0, r + waves.heights.shape[0], r), wp.where(c < 0, c + waves.heights.shape[1], c)]
+
+
+@wp.func
+def _corners(waves: Waves, row: int, column: int) -> wp.vec4:
+    """Of a cell, as the polynomial of a and b in [0, 1] along columns and rows: of 1, a, b and a b."""
+    h = _node(waves, row, column)
+    right = _node(waves, row, column + 1) - h
+    below = _node(waves, row + 1, column) - h
+    return wp.vec4(h, right, below, _node(waves, row + 1, column + 1) - h - right - below)
+
+
+@wp.func
+def _in_cells(waves: Waves, v: wp.vec3) -> wp.vec2:
+    return wp.vec2(wp.dot(v, waves.columns) / waves.cell[0], wp.dot(v, waves.rows) / waves.cell[1])
+
+
+@wp.func
+def facet_at(waves: Waves, x: wp.vec3) -> Facet:
+    """The field above or below a point."""
+    p = _in_cells(waves, x - waves.origin)
+    column = wp.floor(p[0])
+    row = wp.floor(p[1])
+    a = p[0] - column
+    b = p[1] - row
+    k = _corners(waves, int(row), int(column))
+    facet = Facet()
+    facet.height = k[0] + k[1] * a + k[2] * b + k[3] * a * b
+    facet.slope = wp.vec2((k[1] + k[3] * b) / waves.cell[0], (k[2] + k[3] * a) / waves.cell[1])
+    return facet
+
+
+@wp.func
+def height_above_waves(waves: Waves, x: wp.vec3) -> float:
+    """Height of a point above the field [m]."""
+    return wp.dot(x - waves.origin, waves.normal) - facet_at(waves, x).height
+
+
+@wp.func
+def facet_normal(waves: Waves, slope: wp.vec2) -> wp.vec3:
+    """Unit normal of a facet, upwards."""
+    return wp.normalize(waves.normal - slope[0] * waves.columns - slope[1] * waves.rows)
+
+
+@wp.func
+def _first_rise(g0: float, g1: float, g2: float) -> float:
+    """The first s >= 0 at which g0 + g1 s + g2 s^2 rises through 0; 0 if it is positive and rises; else -1."""
+    if g0 > 0.0 and g1 > 0.0:
+        return 0.0
+    root = g1 * g1 - 4.0 * g2 * g0
+    if root < 0.0:
+        return -1.0
+    root = wp.sqrt(root)
+    if g1 > 0.0:
+        return -2.0 * g0 / (g1 + root)
+    if g2 > 0.0:
+        return 0.5 * (root - g1) / g2
+    return -1.0
+
+
+@wp.func
+def waves_distance(waves: Waves, x: wp.vec3, u: wp.vec3, above: bool, limit: float) -> float:
+    """Length of the flight from x along u to where it leaves its side of the field, `above` or below it [m]; 1e30 if
+    that is farther than the limit. 0 at a point beyond the field, by rounding, that leads farther away."""
+    z = wp.dot(x - waves.origin, waves.normal)
+    climb = wp.dot(u, waves.normal)
+    # The part of the flight between the planes that hold the waves.
+    begin = float(0.0)
+    end = float(limit)
+    flat = wp.abs(climb) < 1.0e-12
+    to_low = (waves.low - z) / wp.where(flat, 1.0, climb)
+    to_high = (waves.high - z) / wp.where(flat, 1.0, climb)
+    if flat:
+        if z < waves.low or z > waves.high:
+            return _NOWHERE
+    else:
+        begin = wp.max(wp.min(to_low, to_high), 0.0)
+        end = wp.min(wp.max(to_low, to_high), limit)
+    if begin > end:
+        return _NOWHERE
+    side = wp.where(above, -1.0, 1.0)  # times the height: positive on the wrong side
+    p = _in_cells(waves, x - waves.origin)
+    d = _in_cells(waves, u)
+    column = wp.floor(p[0] + begin * d[0])
+    row = wp.floor(p[1] + begin * d[1])
+    t = begin
+    for _ in range(_MOST_CELLS):
+        to_column = float(_NOWHERE)
+        if wp.abs(d[0]) > 1.0e-12:
+            to_column = (column + wp.where(d[0] > 0.0, 1.0, 0.0) - p[0]) / d[0]
+        to_row = float(_NOWHERE)
+        if wp.abs(d[1]) > 1.0e-12:
+            to_row = (row + wp.where(d[1] > 0.0, 1.0, 0.0) - p[1]) / d[1]
+        leave = wp.max(wp.min(wp.min(to_column, to_row), end), t)
+        k = _corners(waves, int(row), int(column))
+        a = p[0] + t * d[0] - column
+        b = p[1] + t * d[1] - row
+        value = z + t * climb - (k[0] + k[1] * a + k[2] * b + k[3] * a * b)
+        rise = climb - (k[1] + k[3] * b) * d[0] - (k[2] + k[3] * a) * d[1]
+        s = _first_rise(side * value, side * rise, -side * k[3] * d[0] * d[1])
+        if s >= 0.0 and s <= leave - t:
+            return t + s
+        if leave >= end:
+            return _NOWHERE
+        if to_column <= to_row:
+            column += wp.sign(d[0])
+        else:
+            row += wp.sign(d[1])
+        t = leave
+    return _NOWHERE
+
+
+# ---- Parameters.
+
+
+def facet_covariance(heights: ArrayLike, size: Sequence[float]) -> NDArray[np.float64]:
+    """Mean squares and product of the slopes of a periodic height field along its rows and from row to row, `[2, 2]`.
+
+    Args:
+        heights: Of the nodes [m], `[rows, columns]`, at least 2 of each.
+        size: Length of a row and of a column, the periods [m].
+
+    Raises:
+        ArgumentError: Heights that are no such array, or no numbers.
+    """
+    h = _checked(heights, size)
+    cell = [size[0] / h.shape[1], size[1] / h.shape[0]]
+    right, down = np.roll(h, -1, axis=1) - h, np.roll(h, -1, axis=0) - h
+    right_below, down_right = np.roll(right, -1, axis=0), np.roll(down, -1, axis=1)
+    squares = [(p * p + p * q + q * q).mean() / 3.0 for p, q in ((right, right_below), (down, down_right))]
+    product = (0.25 * (right + right_below) * (down + down_right)).mean() / (cell[0] * cell[1])
+    return np.array([[squares[0] / cell[0] ** 2, product], [product, squares[1] / cell[1] ** 2]])
+
+
+def steepest_facet(heights: ArrayLike, size: Sequence[float]) -> float:
+    """The largest slope of a periodic height field, of any direction; arguments: see `facet_covariance`."""
+    h = _checked(heights, size)
+    right, down = np.roll(h, -1, axis=1) - h, np.roll(h, -1, axis=0) - h
+    # Slopes are bilinear in a cell's corners: the largest are at its corners.
+    along = np.maximum(np.abs(right), np.abs(np.roll(right, -1, axis=0))) * (h.shape[1] / size[0])
+    across = np.maximum(np.abs(down), np.abs(np.roll(down, -1, axis=1))) * (h.shape[0] / size[1])
+    return float(np.hypot(along, across).max())
+
+
+def make_waves(heights: ArrayLike, size: Sequence[float], *, device: wp.DeviceLike = None) -> Waves:
+    """A height field, for `make_sea`.
+
+    Args:
+        heights: Of the nodes above the mean plane [m], `[rows, columns]`, at least 2 of each; the field is periodic.
+        size: Length of a row and of a column, the periods [m].
+        device: Where the heights are stored.
+
+    Raises:
+        ArgumentError: Heights that are no such array, or no numbers; a size out of range.
+    """
+    h = _checked(heights, size)
+    waves = Waves()
+    waves.heights = wp.array(h.astype(np.float32), dtype=float, device=device)
+    waves.cell = wp.vec2(size[0] / h.shape[1], size[1] / h.shape[0])
+    margin = 0.01 * float(np.ptp(h)) + 1e-4
+    waves.low, waves.high = float(h.min()) - margin, float(h.max()) + margin
+    return waves
+
+
+def _checked(heights: ArrayLike, size: Sequence[float]) -> NDArray[np.float64]:
+    h = np.asarray(heights, np.float64)
+    if h.ndim != 2 or min(h.shape) < 2:
+        raise ArgumentError(f"heights of shape {h.shape}: [rows, columns] are needed, at least 2 of each")
+    if not (np.abs(h) <= 1e4).all():
+        raise ArgumentError("heights are not all numbers in [-1e4, 1e4] m")
+    check_vector("size", size, size=2)
+    for k, length in enumerate(size):
+        check_number(f"size[{k}]", length, "[1e-3, 1e6]")
+    return h
