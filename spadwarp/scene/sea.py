@@ -195,8 +195,8 @@ def peak_length(wind: float, fetch: float) -> float:
 
 
 def jonswap(frequency: Floats, wind: float, fetch: float) -> Floats:
-    """Spectral density of heights [m^2 s/rad] at frequencies > 0 [rad/s]: JONSWAP (Hasselmann et al. 1973, γ = 3.3), for
-    a wind > 0 [m/s] and a fetch [m]."""
+    """Spectral density of heights [m^2 s/rad] at frequencies > 0 [rad/s]: JONSWAP (Hasselmann et al. 1973, γ = 3.3),
+    for a wind > 0 [m/s] and a fetch [m]."""
     peak = _peak_frequency(wind, fetch)
     alpha = 0.076 * (wind**2 / (fetch * _GRAVITY)) ** 0.22
     width = np.where(frequency <= peak, 0.07, 0.09)

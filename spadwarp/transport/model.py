@@ -506,7 +506,7 @@ def port_parameters(
         raise ConfigError(f"camera.port or laser.port: {error}", source=scene.source) from None
 
 
-def _roughness(surface: Surface) -> dict[str, float]:
+def _roughness(surface: Surface) -> dict[str, Any]:
     """What a port that stands for a sea's mean plane allows for."""
     if (field := surface.wave_field) is None:
         return {"slope_variance": max(surface.slope_variances)}

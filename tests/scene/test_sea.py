@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 import spadwarp
 import spadwarp_kernels as sk
 from helpers.scenes import scene
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.scene import mean_plane
 from spadwarp.scene.sea import jonswap, peak_length
 from spadwarp.scene.sight import depth_from_time
@@ -151,35 +152,33 @@ def test_facets_keep_a_quarter_of_the_slopes():
     assert 0.2 < rest[0, 0] / surface.slope_variances[0] < 0.3
 
 
-def test_truth_goes_through_the_waves():
+def height_above_waves(surface, point):
+    """Of a point of the world, and the slopes of the field below it along its rows and from row to row."""
+    field, p = surface.wave_field, point - np.array(surface.point)
+    count, normal = len(field.heights), np.array(surface.normal)
+    axes = [np.array(surface.wave_axis), np.cross(normal, surface.wave_axis)]
+    cell = field.size[0] / count
+    (i, a), (j, b) = (divmod(p @ axis / cell, 1.0) for axis in axes)
+    h = [[field.heights[int(j + r) % count, int(i + c) % count] for c in (0, 1)] for r in (0, 1)]
+    height = (1 - b) * ((1 - a) * h[0][0] + a * h[0][1]) + b * ((1 - a) * h[1][0] + a * h[1][1])
+    along = ((1 - b) * (h[0][1] - h[0][0]) + b * (h[1][1] - h[1][0])) / cell
+    across = ((1 - a) * (h[1][0] - h[0][0]) + a * (h[1][1] - h[0][1])) / cell
+    m = normal - along * axes[0] - across * axes[1]
+    return p @ normal - height, m / np.linalg.norm(m)
+
+
+@pytest.mark.parametrize("up", [-1.0, 1.0])
+def test_truth_goes_through_the_waves(up):
     """By Snell's law at the facet that a pixel's ray meets, in NumPy; from the air and back into it."""
-    for camera, up in (([0.0, 0.0, 0.0], -1.0), ([0.0, 0.0, 0.0], 1.0)):
-        surface = {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, up], "wind": 5.0, "waves": {"cells": 128}}
-        one = scene(surface=surface, targets=[BOTTOM], camera={"position": camera}, medium={"phase_index": 1.34})
-        truth, field = spadwarp.truth_maps(one, device="cpu"), one.surface.wave_field
-        x_axis, normal = np.array(one.surface.wave_axis), np.array([0.0, 0.0, up])
-        y_axis, cell = np.cross(normal, x_axis), field.size[0] / 128
-        before, behind = mean_plane(one, from_below=up > 0.0).index[::2]
-        for row, column in np.ndindex(truth.depth.shape):
-            u = spadwarp.scene.camera.pixel_directions(one.camera)[row, column]
-
-            def at(t, u=u):
-                p = t * u - [0.0, 0.0, 3.0]
-                a, b = p @ x_axis / cell, p @ y_axis / cell
-                i, j = math.floor(a), math.floor(b)
-                h = [[field.heights[(j + r) % 128, (i + c) % 128] for c in (0, 1)] for r in (0, 1)]
-                a, b = a - i, b - j
-                z = (1 - b) * ((1 - a) * h[0][0] + a * h[0][1]) + b * ((1 - a) * h[1][0] + a * h[1][1])
-                slopes = ((1 - b) * (h[0][1] - h[0][0]) + b * (h[1][1] - h[1][0])) / cell
-                return p @ normal - z, slopes, ((1 - a) * (h[1][0] - h[0][0]) + a * (h[1][1] - h[0][1])) / cell
-
-            t = brentq(lambda t: at(t)[0], 2.0, 4.5)
-            _, p, q = at(t)
-            m = normal - p * x_axis - q * y_axis
-            m /= np.linalg.norm(m)
-            cosine = u @ m
-            across = (before / behind) * (u - cosine * m)
-            v = across + math.copysign(math.sqrt(1.0 - across @ across), cosine) * m
-            rest = (8.0 - t * u[2]) / v[2]
-            assert truth.range[row, column] == pytest.approx(t + rest, rel=2e-5)
-            assert truth.depth[row, column] == pytest.approx(8.0, rel=1e-5)
+    surface = {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, up], "wind": 5.0, "waves": {"cells": 128}}
+    one = scene(surface=surface, targets=[BOTTOM], medium={"phase_index": 1.34})
+    truth = spadwarp.truth_maps(one, device="cpu")
+    before, behind = mean_plane(one, from_below=up > 0.0).index[::2]
+    for pixel in np.ndindex(truth.depth.shape):
+        u = pixel_directions(one.camera)[pixel]
+        t = brentq(lambda t, u=u: height_above_waves(one.surface, t * u)[0], 2.0, 4.5)
+        m = height_above_waves(one.surface, t * u)[1]
+        across = (before / behind) * (u - (u @ m) * m)
+        v = across + math.copysign(math.sqrt(1.0 - across @ across), u @ m) * m
+        assert truth.range[pixel] == pytest.approx(t + (8.0 - t * u[2]) / v[2], rel=2e-5)
+        assert truth.depth[pixel] == pytest.approx(8.0, rel=1e-5)

@@ -6,7 +6,7 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
-from spadwarp_kernels.optics.camera import lens_point
+from spadwarp_kernels.optics.camera import Camera, lens_point
 from spadwarp_kernels.optics.sea import FACETS
 from spadwarp_kernels.optics.visibility import Link, lens_in_air
 from spadwarp_kernels.photon.queue import Request
@@ -382,6 +382,22 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
 
 
 @memoised
+def _make_hidden_by_waves(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(camera, x, o, link, target, world) -> bool``: whether waves stand in the way of a link from
+    x to o, in the frame of the camera."""
+    waves, sea_at = spec.waves, spec.sight.sea_at
+    is_clear = spec.sight.clear or sea_at  # any function: it is not called
+
+    @wp.func
+    def hidden_by_waves(camera: Camera, x: wp.vec3, o: wp.vec3, link: Link, target: int, world: wp.ref[World]) -> bool:
+        if wp.static(waves):
+            return link.gather > 0.0 and not is_clear(camera, sea_at(world.sea, world.scan, target), x, o, link)
+        return False
+
+    return hidden_by_waves
+
+
+@memoised
 def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(request, world) -> Scored`` of next events, with what rides along.
 
@@ -390,9 +406,8 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     reflects, index_of = spec.domain.reflects, spec.tally_index
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    sight, sea, waves = spec.sight, spec.sea is not None, spec.waves
+    sight, sea, is_hidden = spec.sight, spec.sea is not None, _make_hidden_by_waves(spec)
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
-    is_clear = sight.clear or link_to  # any function: it is not called
     (point_in, _, point_out, turn_out), camera_at, sea_at = sight.pose, sight.camera_at, sight.sea_at
     rider = make_rider(spec)
     rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
@@ -441,12 +456,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         found.behind = point_out(world.scan, request.target, lens)
         pixel = image_of(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)
-        if wp.static(waves):
-            if pixel >= 0 and scattering > 0.0 and link.gather > 0.0:
-                placed = sea_at(world.sea, world.scan, request.target)
-                if not is_clear(camera, placed, origin, lens, link):
-                    pixel = -1
-        if pixel >= 0 and not scattering <= 0.0:
+        if pixel >= 0 and not scattering <= 0.0 and not is_hidden(camera, origin, lens, link, request.target, world):
             seed = join_words(request.second, request.first)
             if wp.static(collides):
                 # The flight up to the point and the way to the lens by one loop: the code is long.

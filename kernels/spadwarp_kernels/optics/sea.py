@@ -1,5 +1,5 @@
-"""The surface of the sea: facets with Gaussian slopes about a mean plane between air and water, or about resolved waves,
-and the ways of light by them.
+"""The surface of the sea: facets with Gaussian slopes between air and water, about a mean plane or about waves, and the
+ways of light by them.
 
 Slopes after Cox & Munk 1954, masking after Smith 1967, reflection and refraction by rough interfaces after Walter et
 al. 2007. Directions of light are those in which it goes; densities are of power.

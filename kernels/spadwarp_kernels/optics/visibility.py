@@ -567,8 +567,8 @@ def _make_sea_view(shows: wp.Function, waves: bool) -> tuple[wp.Function, ...]:
         elif lens_in_air(camera):
             shown = shows_across(camera, view, x)
         if wp.static(waves):
-            if wp.abs(wp.dot(x, camera.port.normal) - camera.port.distance) < camera.port.amplitude:
-                shown = True
+            near = wp.abs(wp.dot(x, camera.port.normal) - camera.port.distance)
+            shown = shown or near < camera.port.amplitude
         return shown
 
     @wp.func

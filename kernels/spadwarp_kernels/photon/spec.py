@@ -79,9 +79,9 @@ class TransportSpec(NamedTuple):
     water."""
     laser_port: PortKind | None = None  # the same of the laser and `Laser.port`
     sea: SeaKind | None = None
-    """FACETS or WAVES: the surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens sees it, in the
-    frame of the water and without a window, and there are no other ports. The tally has one more component, of light
-    that met the surface alone."""
+    """FACETS or WAVES: the surface `Model.sea` parts air from water. `Camera.port` is then its mean plane as the lens
+    sees it, in the frame of the water and without a window, and there are no other ports. The tally has one more
+    component, of light that met the surface alone."""
     grid: Water | None = None
     """The water in a box is that of the cells of `Layers.grid`, tracked by REGULAR_TRACKING or DELTA_TRACKING; None:
     there is no grid."""
