@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,7 +55,8 @@ def dataset(
         wrong(f"{running.json} is in the dataset's folder", "--json")
     check_outputs(inputs=(recipe,))
     common: dict[str, Any] = {"device": devices, "processes": processes, "engine": engine, "part": part or (1, 1)}
-    found = spadwarp.dataset.make_dataset(read, out, progress=progress("frames"), **common)
+    with redirect_stdout(sys.stderr):  # where Ray reports the loss of a worker: stdout is for results
+        found = spadwarp.dataset.make_dataset(read, out, progress=progress("frames"), **common)
     summary = {"folder": found.folder, "frames": found.frames, "made": list(found.made), "kept": len(found.kept)}
     summary |= {"broken": list(found.broken), "missing": len(found.missing)}
     answer(summary, shown={**summary, "made": f"{count(len(found.made))} shards"})

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -132,7 +133,8 @@ def simulate(
     names = _parameters(read, derivatives, earlier)
     _prepare(read, devices, engine, names)
     _prepare_directory(out, read, earlier, scene, derivatives=len(names), records=records, checkpoint=checkpoint > 0)
-    with _while_pictures_load(progress(), read) as report:
+    # Ray reports the loss of a worker on stdout, which is for results.
+    with redirect_stdout(sys.stderr), _while_pictures_load(progress(), read) as report:
         result = spadwarp.simulate(
             read,
             photons=None if earlier is None or asked is None else read.transport.photons,

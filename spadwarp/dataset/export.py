@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,7 +133,8 @@ class _Source:
         """The frames of a split, all columns of each."""
         reader = FrameReader(self.folder, split, fields=[name for name in self.fields if name not in _OF_HISTOGRAMS])
         cubes = reader.with_fields("counts")
-        for index, item in enumerate(reader):
+        for index in range(len(reader)):
+            item = cast(dict[str, Any], reader[index])
             scene = int(item["scene"])
             row: dict[str, Any] = {name: item[name] if name == "normal" else item[name][0] for name in reader.fields}
             for name in (name for name in self.fields if name in _OF_HISTOGRAMS):
@@ -150,7 +151,7 @@ class _Source:
             return np.full(self.columns[name].shape, np.nan, np.float32)
         if name == "features":
             return histogram_features(cubes[index]["counts"], cubes.scene(index))
-        return cubes.with_fields(name)[index][name]
+        return cast(dict[str, Any], cubes.with_fields(name)[index])[name]
 
     def files(self, size: int) -> Iterator[tuple[str, int, int, Iterator[dict[str, Any]]]]:
         """Split, number of the file in it, files of the split, and rows of each file with at most so many."""

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Generic, Self, TypedDict, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,49 @@ from spadwarp.dataset.shards import FIELDS, HistogramFile, ShardFile, frame_coun
 from spadwarp.scene import Scene
 from spadwarp.values import SEED, ArgumentError, FileError, check_choice, check_integer
 
-__all__ = ["FIELDS", "FrameReader", "SpadDataset", "iterate_dataset"]
+if TYPE_CHECKING:
+    from torch import Tensor  # noqa: F401, in the text of `TensorItem`
+
+__all__ = ["FIELDS", "FrameItem", "FrameReader", "SpadDataset", "TensorItem", "iterate_dataset"]
+
+Integer = TypeVar("Integer")
+Real = TypeVar("Real")
+Array = TypeVar("Array")
+
+
+class Numbers(TypedDict, Generic[Integer, Real, Array]):
+    """What every item has."""
+
+    sample: Integer
+    scene: Integer
+    target: Integer
+    backscatter_fraction: Real
+    attenuation_lengths: Real
+    distance: Real
+    gate: Array
+
+
+class Item(Numbers[Integer, Real, Array], Generic[Integer, Real, Array], total=False):
+    """Besides those images of `FIELDS` that a reader was asked for, `[C, H, W]`."""
+
+    noisy: Array
+    clean: Array
+    label: Array
+    intensity: Array
+    bound: Array
+    normal: Array
+    reflectance: Array
+    prior: Array
+    counts: Array
+    expected: Array
+    polarisation: Array
+
+
+FrameItem = Item[int, np.float32, NDArray[np.float32]]
+"""An item of `FrameReader` for type checkers."""
+
+TensorItem = Item["Tensor", "Tensor", "Tensor"]
+"""An item of `SpadDataset` for type checkers."""
 
 
 class FrameReader:
@@ -111,7 +153,7 @@ class FrameReader:
         """Crops and rotations differ from epoch to epoch."""
         self.epoch = epoch
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
+    def __getitem__(self, index: int) -> FrameItem:
         if not -len(self) <= index < len(self):
             raise IndexError(f"index = {index} is outside [{-len(self)}, {len(self)})")
         index %= len(self)
@@ -126,7 +168,7 @@ class FrameReader:
             for _ in range(turns):  # np.rot90: what pointed right (+x) points up (−y)
                 x, y = y, -x
             item["normal"] = np.stack([-x if mirrored else x, y, z])
-        return item | shard.numbers(row)
+        return cast(FrameItem, item | shard.numbers(row))
 
     def scene(self, index: int) -> Scene:
         """The scene of a frame, given by its index."""
@@ -174,7 +216,7 @@ class FrameReader:
             mirrored = bool(generator.integers(2))
         return (slice(top, top + height), slice(left, left + width)), turns, mirrored
 
-    def __iter__(self) -> Iterator[dict[str, Any]]:
+    def __iter__(self) -> Iterator[FrameItem]:
         for index in range(len(self)):
             yield self[index]
 
@@ -196,14 +238,15 @@ class SpadDataset(FrameReader):
     fields and errors are those of `FrameReader`; NaN marks what is not there.
     """
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
+    def __getitem__(self, index: int) -> TensorItem:  # type: ignore[override]  # tensors where the other has arrays
         import torch
 
         _collate_ours()
-        return SpadItem(
+        tensors = SpadItem(
             (name, torch.from_numpy(value) if isinstance(value, np.ndarray) else torch.tensor(value))
             for name, value in super().__getitem__(index).items()
         )
+        return cast(TensorItem, tensors)
 
 
 class SpadItem(dict[str, Any]):
@@ -242,7 +285,7 @@ def iterate_dataset(
     *,
     fields: Sequence[str] = ("noisy", "clean", "label", "intensity"),
     shuffle: int | None = None,
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[FrameItem]:
     """The frames of a split, one dict of NumPy arrays each, as `FrameReader` has them.
 
     `shuffle`: seed of a random order; in their own order if None. Raises as `FrameReader`, before the first frame.

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.dataset import FrameReader, read_manifest
+from spadwarp.dataset import FrameItem, FrameReader, read_manifest
 from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, denoise_frames
@@ -301,7 +301,7 @@ class _Comparison:
         self.samples: dict[tuple[str, str], Sample] = {}
         self.windows = self._best_windows() if "median" in methods else {}
 
-    def _frame(self, index: int) -> tuple[dict[str, Any], DepthFrames, NDArray[np.float32], NDArray[np.bool_] | None]:
+    def _frame(self, index: int) -> tuple[FrameItem, DepthFrames, NDArray[np.float32], NDArray[np.bool_] | None]:
         """The item, its noisy frame, true depth where its light is within the gate, and which pixels see the target."""
         item = self.reader[index]
         noisy, prior, bound, clean = (item[name][0][self.part] for name in ("noisy", "prior", "bound", "clean"))

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,7 +190,7 @@ def _of_dataset(reader: FrameReader) -> FrameSequence:
     photons, pulses, backscatter = map(depth.scene_numbers, ("photons", "pulses", "backscatter"))
 
     def frame(number: int) -> SequenceFrame:
-        item, scene = depth[number], depth.scene(number)
+        item, scene = cast(dict[str, Any], depth[number]), depth.scene(number)
         row = int(item["scene"])
         common: dict[str, Any] = {
             "images": {name: item[field][0] for name, field in _DATASET_IMAGES.items()},

@@ -98,9 +98,6 @@ class RayWorkers:
             raise ConfigError("engine = Ray needs the package ray: pip install 'spadwarp[ray]'") from error
         self._ray = ray
         self._started = not ray.is_initialized()
-        # Ray reports the loss of a worker on stdout, which is for results, and has no option to leave that out.
-        self._print = getattr(ray._private.worker, "print_to_stdstream", None)
-        ray._private.worker.print_to_stdstream = lambda *_, **__: None
         try:
             if self._started:
                 _start(ray, self._engine, self._value_bytes)
@@ -119,8 +116,6 @@ class RayWorkers:
                 self._ray.kill(worker.actor)
         if self._started:
             self._ray.shutdown()
-        if self._print is not None:
-            self._ray._private.worker.print_to_stdstream = self._print
 
     def _actors(self) -> tuple[dict[str, Any], int]:
         """Options of an actor, and the number of workers."""
@@ -211,7 +206,7 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
     address = engine.address or os.environ.get("RAY_ADDRESS")
     options: dict[str, Any] = {"address": address}
     if address is None:
-        _require_token()
+        _require_token(ray)
         # For a value of each worker and what is being written; a third of the memory is Ray's own default.
         reserve = max(256 << 20, int(1.25 * value_bytes * ((engine.workers or 8) + 2)))
         reserve = min(reserve, (physical_memory() or 3 * reserve) // 3)
@@ -234,20 +229,16 @@ def _start(ray: Any, engine: Ray, value_bytes: int) -> None:
             signal.signal(number, handler)
 
 
-def _require_token() -> None:
+def _require_token(ray: Any) -> None:
     """Lets nobody reach the Ray that is started here without a token: it listens on every interface of the machine.
 
-    The user's own setting and token hold where there are any.
+    Ray asks for one by itself since 2.60. The user's own setting and token hold where there are any.
     """
-    os.environ.setdefault("RAY_AUTH_MODE", "token")
+    if tuple(map(int, ray.__version__.split(".")[:2])) < (2, 60):
+        raise ConfigError(f"Ray is started on this machine with a token, which needs ray ≥ 2.60, not {ray.__version__}")
     own = "RAY_AUTH_TOKEN" in os.environ or "RAY_AUTH_TOKEN_PATH" in os.environ
     if not own and not Path("~/.ray/auth_token").expanduser().exists():
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)  # kept: Ray reads it once a process
-    try:
-        from ray._raylet import Config  # type: ignore[attr-defined]
-    except ImportError as error:
-        raise ConfigError("Ray is started on this machine with a token, which needs ray 2.60 or newer") from error
-    Config.initialize("")  # Ray has read its settings when it was imported
 
 
 def _description(worker: RayWorker) -> str:

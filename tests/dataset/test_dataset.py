@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 import tomllib
+import typing
 
 import h5py
 import numpy as np
@@ -19,10 +20,12 @@ from helpers.datasets import FRACTIONS, TABLES, checksums, make, making, recipe,
 from spadwarp.dataset import (
     FIELDS,
     SPLITS,
+    FrameItem,
     FrameReader,
     Plan,
     Recipe,
     SpadDataset,
+    TensorItem,
     iterate_dataset,
     load_recipe,
     verify_dataset,
@@ -158,6 +161,20 @@ def test_parts_make_one_dataset(small, whole, tmp_path):
         report = make(small, out, part=(part, 2))
         assert len(report.made) == 3 and len(report.missing) == (3 if part == 2 else 0)
     assert checksums(out) == checksums(whole)
+
+
+def test_items_hold_what_their_types_promise(folder):
+    pytest.importorskip("torch")
+    images = [name for name in FIELDS if name not in HISTOGRAM_FIELDS]
+    for reader, items in ((FrameReader, FrameItem), (SpadDataset, TensorItem)):
+        item, declared = reader(folder, "train", fields=images)[0], typing.get_origin(items)
+        assert declared.__optional_keys__ == set(FIELDS)
+        assert item.keys() == declared.__required_keys__ | set(images)
+        kinds = dict(zip(declared.__parameters__, typing.get_args(items), strict=True))
+        for name, variable in typing.get_type_hints(declared).items():
+            kind = kinds[variable]
+            names = {one.__name__ for one in type(item.get(name)).__mro__}
+            assert name not in item or getattr(kind, "__forward_arg__", getattr(kind, "__name__", "")) in names, name
 
 
 def test_readers_agree_and_augmented_items_are_parts_of_frames(folder):

@@ -11,6 +11,7 @@ import pytest
 
 import spadwarp
 from helpers import parallel_jobs
+from helpers.cli import run
 from helpers.datasets import checksums, recipe
 from helpers.runs import PHOTONS, RUN, same
 from helpers.scenes import scene
@@ -115,6 +116,16 @@ def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, who
     kept = spadwarp.load(kept)
     assert kept.partial and 0 < kept.photons < PHOTONS and kept.energy_report()["exact"]
     same(simulate(scene(), device="cpu", run=RunOptions(resume=kept)), whole)
+
+
+@pytest.mark.slow
+def test_what_ray_says_of_a_lost_worker_is_not_among_the_results(cluster, tmp_path, monkeypatch):
+    killer, file = Killer(1, seed=3), tmp_path / "scene.toml"
+    file.write_text(scene().to_toml())
+    monkeypatch.setattr(spadwarp.cli.simulate, "progress", lambda: killer)
+    options = ("--ray", "start", "--workers", 2, "--photons", PHOTONS, "--set", "output.png=false")
+    found = run("simulate", file, "--out", tmp_path / "out", *options)
+    assert killer.lost == 1 and "died" in found.stderr and "died" not in found.stdout
 
 
 def test_a_run_can_be_resumed_over_ray(cluster, whole):

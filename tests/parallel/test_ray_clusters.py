@@ -1,5 +1,6 @@
 """Ray over two nodes, one of which is lost, and Ray that spadwarp starts on this machine."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -54,7 +55,8 @@ def lose_a_node():
             cluster.remove_node(second, allow_graceful=False)
 
     run = {"photons": 1_500_000, "seed": 5}
-    found = spadwarp.simulate(scene(), **run, engine=Ray(cluster.address, workers=2), progress=progress)
+    with contextlib.redirect_stdout(sys.stderr):  # Ray reports the lost node there
+        found = spadwarp.simulate(scene(), **run, engine=Ray(cluster.address, workers=2), progress=progress)
     cluster.shutdown()
     alone = spadwarp.simulate(scene(), **run, device="cpu")
     assert removed and any(remark.startswith("lost the worker") for remark in remarks), remarks

@@ -65,6 +65,9 @@ frames = spadwarp.detect(result, pulses=1000, frames=[1], seed=1)  # wrong
 counts = spadwarp.detect(result, pulses=1000, frames=2, seed=1).counts
 reader = spadwarp.dataset.FrameReader("data", split=3)  # wrong
 plan: int = spadwarp.plan(scene)  # wrong
+item = spadwarp.dataset.FrameReader("data")[0]
+depth, label = item["noisy"] + item["distance"], item["lable"]  # wrong
+target: str = item["target"]  # wrong
 """
 
 
