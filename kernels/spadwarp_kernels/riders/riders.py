@@ -150,8 +150,8 @@ def _make_event(spec: TransportSpec) -> wp.Function:
 
 def _make_add_concentrations(spec: TransportSpec, parameters: int) -> wp.Function:
     """Of an event in the water that turns light by t = 1 - cos(theta), where the parameters `here` are of the water."""
-    count, water_at, mixed = len(spec.derivatives), spec.water.at, spec.phase.part is not None
-    part_of = spec.phase.part or spec.phase.pdf  # any: it is not called
+    count, water_at, mixed = len(spec.derivatives), spec.water.at, spec.water.phase.part is not None
+    part_of = spec.water.phase.part or spec.water.phase.pdf  # any: it is not called
 
     @wp.func
     def add_concentrations(d: LogDerivatives, world: WorldRef, x: wp.vec3, t: float, here: int) -> LogDerivatives:
