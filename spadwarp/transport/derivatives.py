@@ -166,9 +166,9 @@ def _full_name(scene: Scene, name: Any, known: dict[str, Parameter]) -> str:
     """Of a parameter that has a derivative."""
     if not isinstance(name, str):
         raise ArgumentError(f"derivatives: {shown(name)} is not a name")
-    names = [one.name for one in scene.medium.constituents]
-    if name in names:
-        name = f"medium.constituents[{names.index(name)}].concentration"
+    parts = [one.name for one in scene.medium.constituents]
+    if name in parts:
+        name = f"medium.constituents[{parts.index(name)}].concentration"
     if name not in known:
         if (scaled := f"{name}_scale") in known:
             raise ConfigError(f"derivatives: {name} is from the file; {scaled}, the factor on it, has a derivative")
