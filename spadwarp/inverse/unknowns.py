@@ -20,7 +20,9 @@ __all__ = ["Unknown", "read_unknowns"]
 
 DEPTH, BACKGROUND = "depth", "detector.ambient_rate"
 _SHORT = {name: f"medium.{name}" for name in ("absorption", "scattering", "anisotropy")} | {"background": BACKGROUND}
-_FIELD = re.compile(r"medium\.(absorption|scattering|anisotropy)|targets\[(\d+)\]\.reflectance")
+_FIELD = re.compile(
+    r"medium\.(?:absorption|scattering|anisotropy|constituents\[(\d+)\]\.concentration)|targets\[(\d+)\]\.reflectance"
+)
 _UNITS = {"absorption": "1/m", "scattering": "1/m", DEPTH: "m", "ambient_rate": "1/s"}
 
 
@@ -29,8 +31,8 @@ class Unknown:
     """One unknown."""
 
     name: str
-    """"medium.absorption", "medium.scattering", "medium.anisotropy", "targets[k].reflectance", "detector.ambient_rate",
-    or "depth": where the targets are along the optical axis."""
+    """"medium.absorption", "medium.scattering", "medium.anisotropy", "medium.constituents[k].concentration",
+    "targets[k].reflectance", "detector.ambient_rate", or "depth": where the targets are along the optical axis."""
     per_pixel: bool = False  # whether each pixel has a value of its own
 
     @property
@@ -60,8 +62,9 @@ class Unknown:
 def read_unknowns(scene: Scene, names: str | Sequence[str]) -> tuple[Unknown, ...]:
     """Unknowns from names: "medium.absorption,depth:pixel", or a list of them.
 
-    `absorption`, `scattering`, `anisotropy`, `background` and, with one target, `reflectance` are short for the fields.
-    ":pixel" behind depth, a reflectance or the background gives each pixel its own value.
+    `absorption`, `scattering`, `anisotropy`, `background` and, with one target, `reflectance` are short for the fields,
+    and a constituent's name for its concentration. ":pixel" behind depth, a reflectance or the background gives each
+    pixel its own value.
 
     Raises:
         ArgumentError: No name, an unknown one, or one twice.
@@ -86,6 +89,8 @@ def _read(scene: Scene, word: Any) -> Unknown:
     if spread not in ("", "pixel"):
         raise ArgumentError(f"unknown: {shown(word)} ends neither with a name nor with ':pixel'")
     name = _SHORT.get(name, name)
+    parts = {one.name: f"medium.constituents[{k}].concentration" for k, one in enumerate(scene.medium.constituents)}
+    name = parts.get(name, name)
     own = [f"targets[{k}].reflectance" for k in range(len(scene.targets))]
     if name == "reflectance" and len(own) == 1:
         name = own[0]
@@ -97,19 +102,25 @@ def _read(scene: Scene, word: Any) -> Unknown:
         name = BACKGROUND
     field = _FIELD.fullmatch(name)
     if field is None and name not in (DEPTH, BACKGROUND):
-        known = [*_SHORT, *_SHORT.values(), *own, DEPTH]
+        known = [*_SHORT, *_SHORT.values(), *parts, *parts.values(), *own, DEPTH]
         raise ArgumentError(f"unknown: {shown(name)} is not one of {', '.join(known)}{suggestion(name, known)}")
     if spread and name.startswith("medium."):
         raise ArgumentError(f"unknown: {name} is one of the whole water, not of a pixel")
-    if problem := _without_derivative(scene, name, field[2] if field else None):
+    if problem := _without_derivative(scene, name, field):
         raise ConfigError(f"unknown: {name}{problem}")
     return Unknown(name, bool(spread))
 
 
-def _without_derivative(scene: Scene, name: str, target: str | None) -> str:
+def _without_derivative(scene: Scene, name: str, field: re.Match[str] | None) -> str:
     """Why the scene has no derivative by an unknown; empty where it has."""
+    constituent, target = field.groups() if field else (None, None)
     if name == DEPTH and not scene.targets:
         return ", but the scene has no targets"
+    if constituent is not None:
+        if int(constituent) >= (count := len(scene.medium.constituents)):
+            return f", but medium has {count} constituents"
+        value = scene.medium.constituents[int(constituent)].concentration
+        return "" if value > 0.0 else " is 0; start from a little of it"
     if target is not None:
         if int(target) >= len(scene.targets):
             return f", but the scene has {len(scene.targets)} targets"
@@ -119,7 +130,7 @@ def _without_derivative(scene: Scene, name: str, target: str | None) -> str:
         if scene.medium.albedo == "lu2024":
             return ", but medium.albedo is 'lu2024', random at each collision"
         if scene.medium.is_mixture:
-            return ", but medium has constituents, whose concentrations have no derivatives"
+            return ", but medium has constituents; name those whose concentrations are unknown"
         law = scene.medium.phase_function
         if name == "medium.anisotropy" and law != "henyey_greenstein":
             return f" goes with phase_function = 'henyey_greenstein', not {law!r}"
@@ -133,6 +144,8 @@ def scene_value(scene: Scene, unknown: Unknown) -> float:
     section, _, field = unknown.name.rpartition(".")
     if section.startswith("targets"):
         return float(scene.targets[int(section[8:-1])].reflectance)
+    if section.startswith("medium.constituents"):
+        return scene.medium.constituents[int(section[20:-1])].concentration
     return float(getattr(scene.medium if section == "medium" else scene.detector, field))
 
 

@@ -83,7 +83,7 @@ def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
 
 
 MOST_CONSTITUENTS = 4  # as many as the kernels take
-MIXTURE = "mixture"  # what `phase_function` reads with constituents, which each have their own
+MIXTURE = "mixture"  # what `phase_function` reads with several constituents, which each have their own
 
 # Fields of `medium` that belong to a phase function: those that it needs and no other takes, None by default, and those
 # with a default, which phase functions may share.
@@ -150,6 +150,11 @@ class Constituent(PhaseLaw):
         yield from super()._problems()
         if not self.name.isidentifier():
             yield self._that("name", "is not a word of letters, digits and _")
+
+    @property
+    def extinction(self) -> float:
+        """Absorption and scattering at concentration 1 [1/m]."""
+        return self.absorption + self.scattering
 
 
 class Water(Section):
@@ -367,7 +372,9 @@ class Medium(PhaseLaw, Water):
         """Sets what depends on the wavelength."""
         self.__dict__["layers"] = tuple(layer.model_copy() for layer in self.layers)
         if self.is_mixture:
-            self.__dict__["phase_function"] = MIXTURE
+            one = self.constituents[0]  # of one alone the medium scatters by its law, as if that were the medium's
+            own = {name: getattr(one, name) for name in _LAW_FIELDS}
+            self.__dict__.update(own if len(self.constituents) == 1 else {"phase_function": MIXTURE})
             for water in self.waters:
                 a, b, c = self._sum(water)
                 pair = {"absorption": a, "scattering": b, "extinction": c, "albedo": b / c}
@@ -408,7 +415,7 @@ class Medium(PhaseLaw, Water):
     def phase_functions(self) -> list[PhaseFunction]:
         """Those of the medium and, with constituents, of its layers and of those that cells have shares of. Raises what
         `phase_function` raises."""
-        layers = self.layers if self.is_mixture else ()
+        layers = self.layers if self.phase_function == MIXTURE else ()
         of_cells = phase_function(self).constituents if self.grid is not None else ()
         return [phase_function(self), *(phase_function(self, layer) for layer in layers), *of_cells]
 
@@ -495,8 +502,8 @@ def grid_cells(medium: Medium) -> GridCells:
         status = Path(grid.file or "").stat()
         stamp = status.st_mtime_ns, status.st_size
     if part := next((one for one in medium.constituents if one.name == grid.constituent), None):
-        c = part.absorption + part.scattering
-        grid = grid.model_copy(update={"extinction": c, "albedo": part.scattering / c if c > 0.0 else 0.0})
+        albedo = part.scattering / part.extinction if part.extinction > 0.0 else 0.0
+        grid = grid.model_copy(update={"extinction": part.extinction, "albedo": albedo})
     return cells_of(grid, (medium.extinction, albedo, medium.anisotropy), medium.has_phase_table, stamp)
 
 
@@ -567,14 +574,16 @@ def _sphere_integral(density: Callable[[Floats], Floats]) -> float:
 
 
 def phase_function(medium: Medium, layer: Layer | None = None) -> PhaseFunction:
-    """The phase function of a scene's medium, `phase_function(scene.medium)`; of constituents the sum of theirs by
-    their shares in the scattering, of the medium or of one of its layers.
+    """The phase function of a scene's medium, `phase_function(scene.medium)`; of several constituents the sum of theirs
+    by their shares in the scattering, of the medium or of one of its layers.
 
     Raises `FileError` if its table cannot be read, `ConfigError` if the table is not a phase function.
     """
     if not medium.is_mixture:
         return _law_of(medium, "medium", medium.molecular_share)
     laws = tuple(_law_of(one, f"medium.constituents[{k}]") for k, one in enumerate(medium.constituents))
+    if len(laws) == 1:
+        return laws[0]
     shares = medium.shares_in(layer or medium)
 
     def summed(t: Floats) -> Floats:
@@ -582,6 +591,14 @@ def phase_function(medium: Medium, layer: Layer | None = None) -> PhaseFunction:
 
     first_angle = max(law.first_angle for law in laws)
     return PhaseFunction(MIXTURE, {}, 0.0, summed, first_angle, laws)
+
+
+def constituent_order(medium: Medium) -> list[int]:
+    """Several constituents in the order of the kernels' tables: that with the sharpest forward peak first."""
+    if medium.phase_function != MIXTURE:
+        return []
+    forward = [float(law.over_t(np.array(1e-9))) for law in phase_function(medium).constituents]
+    return sorted(range(len(forward)), key=lambda k: -forward[k])
 
 
 def _law_of(medium: PhaseLaw, section: str, share: float = 0.0) -> PhaseFunction:

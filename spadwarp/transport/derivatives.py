@@ -12,7 +12,7 @@ import numpy as np
 
 import spadwarp_kernels as sk
 from spadwarp.scene import Scene
-from spadwarp.scene.medium import grid_cells
+from spadwarp.scene.medium import constituent_order, grid_cells
 from spadwarp.values import ArgumentError, ConfigError, shown, suggestion
 
 if TYPE_CHECKING:
@@ -27,7 +27,8 @@ _BLOCK_NAME = re.compile(r"medium\.grid\.(\w+)(?:\[(\d+),(\d+),(\d+)\])?")
 
 
 class Parameter(NamedTuple):
-    """A number of a scene, of waters or of a target (-1: of none), or a coefficient of a grid's cells (without value).
+    """A number of a scene, of waters, of a target or a constituent (-1: of none), or a coefficient of a grid's cells
+    (without value).
 
     Its kind is one of the kernels' `DERIVATIVES` or `BLOCK_DERIVATIVES`; `problem` says why there is no derivative.
     """
@@ -37,6 +38,7 @@ class Parameter(NamedTuple):
     problem: str
     waters: tuple[int, ...] = ()
     target: int = -1
+    constituent: int = -1
 
 
 def _parameters(scene: Scene) -> dict[str, Parameter]:
@@ -49,7 +51,7 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
         everywhere = "derivatives cannot be combined with surface; take differences of two runs with one seed"
     in_water = everywhere
     if medium.is_mixture and not everywhere:
-        in_water = "the water is a sum of constituents; take differences of two runs with one seed"
+        in_water = "the water is a sum of constituents; their concentrations have derivatives"
     if medium.grid is not None and not everywhere:
         in_water = "the grid's water differs from cell to cell; medium.grid.absorption and others go by block of cells"
     of_table = ""
@@ -70,9 +72,28 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
         problem = everywhere or ("its value is 0" if value <= 0.0 else "")
         name = f"targets[{k}].reflectance{'_scale' if from_file else ''}"
         found[name] = Parameter("reflectance", value, problem, target=k)
+    found |= _concentrations(scene, everywhere)
     return found | {
         f"{_GRID}{kind}": Parameter(kind, None, _cells_problem(scene, kind)) for kind in sk.BLOCK_DERIVATIVES
     }
+
+
+def _concentrations(scene: Scene, everywhere: str) -> dict[str, Parameter]:
+    """Of the constituents: of all water but the layers that give their own, and of each of those."""
+    medium, found = scene.medium, dict[str, Parameter]()
+    if medium.grid is not None and not everywhere:
+        everywhere = "the grid's water differs from cell to cell; take differences of two runs with one seed"
+    for i, one in enumerate(medium.constituents):
+        own = [k for k, layer in enumerate(medium.layers, 1) if one.name in (layer.concentrations or {})]
+        shared = tuple(k for k in range(len(medium.waters)) if k not in own)
+        places = {f"medium.constituents[{i}].concentration": shared}
+        places |= {f"medium.layers[{k - 1}].concentrations.{one.name}": (k,) for k in own}
+        for name, waters in places.items():
+            value = medium.concentrations_in(medium.waters[waters[0]])[i]
+            dark = "its value is 0, where light that is scattered has no slope"
+            problem = everywhere or (dark if value <= 0.0 < one.scattering else "")
+            found[name] = Parameter("concentration", value, problem, waters, constituent=i)
+    return found
 
 
 def _cells_problem(scene: Scene, kind: str) -> str:
@@ -100,7 +121,8 @@ def derivative_names(scene: Scene) -> tuple[str, ...]:
 def resolve_derivatives(scene: Scene, names: Iterable[str], blocks: Sequence[int] | None = None) -> tuple[str, ...]:
     """The full names of parameters.
 
-    A short name, "absorption", stands for "medium.absorption" where no other parameter of the scene ends with it.
+    A short name, "absorption", stands for "medium.absorption" where no other parameter of the scene ends with it; a
+    constituent's name for its concentration.
     "medium.grid.absorption", ".scattering" and ".extinction" stand for those of all blocks, of which `blocks` gives the
     number along the edges of the box, by default one: "medium.grid.absorption[0,0,0]", ..., behind all others.
 
@@ -144,6 +166,9 @@ def _full_name(scene: Scene, name: Any, known: dict[str, Parameter]) -> str:
     """Of a parameter that has a derivative."""
     if not isinstance(name, str):
         raise ArgumentError(f"derivatives: {shown(name)} is not a name")
+    parts = [one.name for one in scene.medium.constituents]
+    if name in parts:
+        name = f"medium.constituents[{parts.index(name)}].concentration"
     if name not in known:
         if (scaled := f"{name}_scale") in known:
             raise ConfigError(f"derivatives: {name} is from the file; {scaled}, the factor on it, has a derivative")
@@ -244,10 +269,17 @@ def make_derivatives(
         means = {kind: getattr(cells, kind).mean() if kind != "absorption" else 0.0 for kind in of_blocks.kinds}
         scales = tuple(_coarser(scale, kind, float(mean), path) for kind, mean in means.items())
         blocks = sk.make_blocks(grid, of_blocks.shape, scales)
+    order, parts = constituent_order(scene.medium), scene.medium.constituents
+    part = [None if one.constituent < 0 else parts[one.constituent] for one in chosen]
     return sk.make_derivatives(
         [parameter.kind for parameter in chosen],
-        [parameter.value or 0.0 for parameter in chosen],
-        [_coarser(scale, parameter.kind, parameter.value or 0.0, scene.path_limit) for parameter in chosen],
+        [parameter.value or 0.0 if of is None else of.scattering for parameter, of in zip(chosen, part, strict=True)],
+        [
+            _coarser(scale, parameter.kind, parameter.value or 0.0, scene.path_limit * (of.extinction if of else 1.0))
+            for parameter, of in zip(chosen, part, strict=True)
+        ],
+        extinction=[of.extinction if of else 0.0 for of in part],
+        constituent=[order.index(one.constituent) if one.constituent in order else 0 for one in chosen],
         waters=[bits(lambda parameter, k=k: k in parameter.waters) for k in range(len(scene.medium.waters))],
         faces=() if mesh is None else np.array(of_targets, dtype=np.int32)[mesh.target],
         blocks=blocks,

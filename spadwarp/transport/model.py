@@ -20,7 +20,7 @@ from spadwarp.scene import Camera, Laser, Medium, Scene, SceneLike, as_scene, ph
 from spadwarp.scene.camera import pixel_directions, pixel_views, to_camera, to_world, view_box
 from spadwarp.scene.flux import Sun, azimuth_zero
 from spadwarp.scene.laser import load_profile, profile_extent
-from spadwarp.scene.medium import cell_shares, grid_cells
+from spadwarp.scene.medium import MIXTURE, cell_shares, constituent_order, grid_cells
 from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.scan import Shots, shots_of
@@ -126,7 +126,7 @@ def _largest_albedo(albedo: float | str) -> float:
 def _medium(scene: Scene, device: wp.Device) -> Any:
     water, medium = scene.medium, sk.Medium()
     if water.has_phase_table:
-        law, order = phase_function(water), _constituent_order(scene)
+        law, order = phase_function(water), constituent_order(scene.medium)
         parts = [law.constituents[k].over_t for k in order]
         medium.phase = sk.make_phase_tables(law.over_t, constituents=parts, device=device)
         shares = _shares(scene)[0] if order else []
@@ -135,16 +135,10 @@ def _medium(scene: Scene, device: wp.Device) -> Any:
     return _filled(medium, **numbers, axis_threshold=scene.transport.axis_threshold)
 
 
-def _constituent_order(scene: Scene) -> list[int]:
-    """The constituents in the order of the kernels' tables: that with the sharpest forward peak first."""
-    forward = [float(law.over_t(np.array(1e-9))) for law in phase_function(scene.medium).constituents]
-    return sorted(range(len(forward)), key=lambda k: -forward[k])
-
-
 def _shares(scene: Scene) -> list[list[float]]:
     """Of the constituents in that order, in the medium and its layers."""
-    medium, order = scene.medium, _constituent_order(scene)
-    if not medium.is_mixture:
+    medium, order = scene.medium, constituent_order(scene.medium)
+    if not order:
         return []
     return [[medium.shares_in(water)[k] for k in order] for water in medium.waters]
 
@@ -251,7 +245,7 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
     medium, camera = scene.medium, scene.camera
     rotation = rotation_matrix(camera.rotation_deg)
     if medium.grid is not None:
-        cells, layers = grid_cells(medium), sk.Layers()
+        cells, layers, order = grid_cells(medium), sk.Layers(), constituent_order(scene.medium)
         layers.grid = sk.make_grid(
             cells.extinction,
             np.clip(cells.albedo, 0.0, 1.0),
@@ -259,7 +253,7 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
             size=cells.size,
             centre=tuple(to_camera(camera, cells.centre).tolist()),
             rotation=rotation.T @ cells.rotation,
-            shares=cell_shares(medium)[..., _constituent_order(scene)] if medium.is_mixture else (),
+            shares=cell_shares(medium)[..., order] if order else (),
             device=device,
         )
         return layers
@@ -313,7 +307,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
 
 def _phase(medium: Medium) -> Any:
     """How the kernels draw the directions of scattered light."""
-    if medium.is_mixture:
+    if medium.phase_function == MIXTURE:
         return sk.make_mixture(len(medium.constituents))
     return sk.TABULATED if medium.has_phase_table else sk.HENYEY_GREENSTEIN
 

@@ -50,6 +50,22 @@ def test_estimates_are_within_their_errors(light, detector):
 
 
 @pytest.mark.slow
+def test_concentrations_of_two_constituents_from_one_exposure():
+    parts = [
+        {"name": "molecules", "absorption": 0.05, "scattering": 0.3, "phase_function": "rayleigh"},
+        {"name": "algae", "absorption": 0.2, "scattering": 0.5, "phase_function": "fournier_forand"},
+    ]
+    own = dict.fromkeys(("absorption", "scattering", "anisotropy"))
+    true = plate({"medium": {**own, "constituents": parts}})
+    frames = exposure(spadwarp.simulate(true, photons=1_000_000, seed=1, device="cpu"))
+    start = {f"medium.constituents[{k}].concentration": value for k, value in enumerate((0.5, 2.0))}
+    found = fit(frames, true, "molecules,algae", photons=200_000, seed=5, initial_guess=start)
+    assert found.converged
+    for one in found.estimates.values():
+        assert abs(one.value - 1.0) < 5 * one.standard_error < 0.1
+
+
+@pytest.mark.slow
 def test_depth_is_not_that_of_the_centroid(light):
     """Light that is scattered forward comes late; the model knows, the centroid does not."""
     wrong = plate({"targets[0].translation": [0.0, 0.0, 1.51]})

@@ -6,7 +6,7 @@ import pytest
 import spadwarp
 from helpers.inverse import plate
 from spadwarp.inverse import read_exposure, read_unknowns
-from spadwarp.inverse.unknowns import moved, with_values
+from spadwarp.inverse.unknowns import moved, scene_value, with_values
 
 
 def test_short_names_stand_for_fields():
@@ -32,6 +32,21 @@ def test_short_names_stand_for_fields():
 def test_other_names_are_refused(names, words):
     with pytest.raises(spadwarp.SpadwarpError, match=f"unknown: .*{words}"):
         read_unknowns(plate(), names)
+
+
+def test_concentrations_are_unknowns_by_the_names_of_constituents():
+    parts = [{"name": "algae", "scattering": 0.5, "concentration": n} for n in (0.5, 0.0)]
+    law = dict.fromkeys(("absorption", "scattering", "anisotropy"))
+    one = plate({"medium": {**law, "constituents": [parts[0], {**parts[1], "name": "sand"}]}})
+    (found,) = read_unknowns(one, "algae")
+    assert found.name == "medium.constituents[0].concentration" and found.is_positive and found.is_light
+    assert scene_value(one, found) == 0.5
+    assert with_values(one, {found.name: 0.7}).medium.scattering == pytest.approx(0.35)
+    for name, words in (("sand", "is 0"), ("scattering", "medium has constituents")):
+        with pytest.raises(spadwarp.SpadwarpError, match=f"unknown: .*{words}"):
+            read_unknowns(one, name)
+    with pytest.raises(spadwarp.SpadwarpError, match="has 0 constituents"):
+        read_unknowns(plate(), "medium.constituents[0].concentration")
 
 
 def test_what_has_no_derivative_is_refused():

@@ -1,16 +1,22 @@
-"""Water of several constituents: against one phase function that is their sum, in layers too; the estimators."""
+"""Water of several constituents: against one phase function that is their sum, in layers too; the estimators; and the
+derivatives by their concentrations."""
 
 import math
 
 import numpy as np
 import pytest
 
+import spadwarp
 import spadwarp_kernels as sk
 from helpers.estimators import agreeing_cells, cells
-from helpers.scenes import scene
+from helpers.runs import of_seeds, same
+from helpers.scenes import scene, single_scatter_case
 from helpers.statistics_of_samples import equal_means_p
+from reference.single_scatter import Lidar, single_scatter
 from spadwarp.scene import phase_function
 from spadwarp.scene.medium import MOST_CONSTITUENTS, cell_shares, grid_cells
+from spadwarp.transport import derivative_names
+from spadwarp.transport.model import transport_spec
 from spadwarp.values import ConfigError
 
 pytestmark = pytest.mark.physics
@@ -49,6 +55,18 @@ def test_coefficients_add_up_by_concentration():
     law = phase_function(one.medium)
     assert law.mean_cosine == pytest.approx(0.8 * 0.5 / 0.65, rel=1e-5)
     assert type(one).from_dict(one.to_dict()) == one
+
+
+@pytest.mark.parametrize("law", [{"anisotropy": 0.8}, {"phase_function": "fournier_forand", "particle_index": 1.06}])
+def test_one_constituent_is_the_water_spelt_out_to_the_bit(law, device):
+    part = {"name": "algae", "absorption": 0.1, "scattering": 0.25}
+    far = [{"start": 1.2, "concentrations": {"algae": 2.0}}]
+    one = scene(medium=mixed({**part, **law}, layers=far))
+    coefficients = [{name: n * part[name] for name in ("absorption", "scattering")} for n in (1.0, 2.0)]
+    layers = [{"start": 1.2, **coefficients[1]}]
+    plain = scene(medium={**NO_LAW, **coefficients[0], **law, "layers": layers})
+    assert transport_spec(one, None) == transport_spec(plain, None)
+    same(*(spadwarp.simulate(each, photons=5_000, device=device) for each in (one, plain)))
 
 
 @pytest.mark.parametrize("estimator", ["next_event", "guided"])
@@ -120,3 +138,59 @@ def test_estimators_agree(device):
 def test_what_excludes_constituents_is_named(medium, text):
     with pytest.raises(ConfigError, match=text):
         scene(medium=medium)
+
+
+# Derivatives
+
+
+LIDAR, ONCE = single_scatter_case(10.0, 2.5)
+NAMES = ["medium.constituents[0].concentration", "medium.constituents[1].concentration"]
+
+
+def thinner(molecules=1.0, algae=0.6, **sections):
+    parts = [{**MOLECULES, "concentration": molecules}, {**ALGAE, "concentration": algae}]
+    return scene(**sections | {"medium": mixed(*parts, **sections.get("medium", {}))})
+
+
+def test_derivatives_of_single_scatter_are_those_of_its_quadrature(device):
+    one = thinner(**ONCE | {"medium": {"group_index": 1.0}})
+    found = spadwarp.simulate(one, photons=400_000, device=device, derivatives=["molecules", "algae"])
+    light = found.histogram.sum(axis=(0, 1))
+
+    def expected(molecules=1.0, algae=0.6):
+        water = thinner(molecules, algae).medium
+        law = phase_function(water)
+        own = {"extinction": water.extinction, "albedo": water.albedo, "phase_function": lambda mu: law.over_t(1 - mu)}
+        return single_scatter(Lidar(**{**vars(LIDAR), **own})).sum(axis=(0, 1))
+
+    assert list(found.derivatives) == NAMES
+    for name, step in zip(NAMES, np.eye(2) * 1e-3, strict=True):
+        higher, lower = (expected(1.0 + side * step[0], 0.6 + side * step[1]) for side in (1, -1))
+        slope = (higher - lower) / 2e-3 / expected()
+        values = found.derivatives[name].sum(axis=(0, 1, 2))
+        np.testing.assert_allclose(values / light, slope, atol=2e-3, err_msg=name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["analog", "guided"])
+def test_derivatives_are_differences_of_runs(estimator, device):
+    """With the same photons, and in layers: of which one has a concentration of its own."""
+    far = [{"start": 1.0, "concentrations": {"algae": 2.0}}]
+    names, step = [*NAMES, "medium.layers[0].concentrations.algae"], 0.1
+    one = thinner(medium={"layers": far}, transport={"estimator": estimator})
+    assert set(names) <= set(derivative_names(one))
+    photons, seeds = {"analog": 40_000, "guided": 20_000}[estimator], range(16)
+    found = np.array([run.signed.sum(axis=(2, 3)) for run in of_seeds(one, device, photons, seeds, names)])
+    for p, (name, value) in enumerate(zip(names, (1.0, 0.6, 2.0), strict=True)):
+        ends = [one.with_overrides({name: value + side * step}) for side in (1, -1)]
+        far, near = (np.array([r.light.sum(axis=(1, 2)) for r in of_seeds(e, device, photons, seeds)]) for e in ends)
+        difference = (far - near) / (2 * step)
+        assert equal_means_p(found[:, p].reshape(16, -1), difference.reshape(16, -1), 0.3) > 1e-3, name
+
+
+def test_what_has_no_derivative_is_named():
+    one = thinner(algae=0.0)
+    assert NAMES[1] not in derivative_names(one) and NAMES[0] in derivative_names(one)
+    for name, text in (("algae", "its value is 0"), ("absorption", "their concentrations have derivatives")):
+        with pytest.raises(ConfigError, match=text):
+            spadwarp.simulate(one, photons=1, device="cpu", derivatives=[name])

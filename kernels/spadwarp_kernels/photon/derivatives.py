@@ -20,7 +20,7 @@ from spadwarp_kernels.base.arguments import (
     check_numbers,
     check_struct,
 )
-from spadwarp_kernels.water.medium import Grid
+from spadwarp_kernels.water.medium import MOST_CONSTITUENTS, Grid
 
 __all__ = [
     "BLOCK_DERIVATIVES",
@@ -34,8 +34,15 @@ __all__ = [
 ]
 
 # What a derivative may be with respect to, and the range of such a parameter: a at fixed b, b at fixed a, the mean
-# cosine g of Henyey and Greenstein's phase function, and a reflectance or a factor on one that varies.
-DERIVATIVES = {"absorption": "[0, inf)", "scattering": "(0, inf)", "anisotropy": "(-1, 1)", "reflectance": "(0, inf)"}
+# cosine g of Henyey and Greenstein's phase function, a reflectance or a factor on one that varies, and the
+# concentration of a constituent, of which the value is its scattering at concentration 1.
+DERIVATIVES = {
+    "absorption": "[0, inf)",
+    "scattering": "(0, inf)",
+    "anisotropy": "(-1, 1)",
+    "reflectance": "(0, inf)",
+    "concentration": "[0, inf)",
+}
 
 # What one by block may be: a at fixed b, b at fixed a, or c at fixed albedo, the same addition [1/m] to every cell.
 BLOCK_DERIVATIVES = ("absorption", "scattering", "extinction")
@@ -72,7 +79,9 @@ class Blocks:
 class Derivatives:
     """The parameters of a spec with derivatives, in its order, or of its channels; made by `make_derivatives`."""
 
-    value: LogDerivatives  # of each parameter
+    value: LogDerivatives  # of each parameter; of a concentration the scattering at concentration 1 [1/m]
+    extinction: LogDerivatives  # of a concentration the extinction at concentration 1 [1/m]
+    constituent: wp.types.vector(length=MOST_DERIVATIVES, dtype=int)  # likewise its row in the tables of the mixture
     scale: LogDerivatives  # tally units of its derivative per emitted photon
     waters: wp.array[int]  # by layer, bit p set: parameter p is of this layer; not read without layers
     faces: wp.array[int]  # by face, bit p set: parameter p is this face's reflectance, or a factor on it
@@ -85,13 +94,15 @@ def make_derivatives(
     scale: Sequence[float],
     *,
     channels: int = 0,
+    extinction: Sequence[float] = (),
+    constituent: Sequence[int] = (),
     waters: Sequence[int] = (),
     faces: Any = (),
     blocks: Any = None,
     device: wp.DeviceLike = None,
 ) -> Derivatives:
     """The parameters of a spec whose `derivatives` are `kinds`; see `Derivatives` for the others. Of one with
-    `channels` so many, which have scales alone.
+    `channels` so many, which have scales alone. `extinction` and `constituent`, read of concentrations: by parameter.
 
     `blocks`: from `make_blocks`, of a spec with blocks; without them, one kind at least. Raises `ArgumentError` for a
     kind that is not one of DERIVATIVES, or a number out of range.
@@ -112,7 +123,15 @@ def make_derivatives(
         check_number(f"value[{p}], {kind},", value[p], DERIVATIVES[kind])
     for p, one in enumerate(scale):
         check_number(f"scale[{p}]", one, "(0, inf)")
+    if len(extinction) != len(constituent) or ("concentration" in kinds and len(extinction) != count):
+        raise ArgumentError(
+            f"{count} derivatives, {len(extinction)} extinctions, {len(constituent)} constituents: of concentrations "
+            "each needs both"
+        )
     derivatives = Derivatives()
+    for p, (one, row) in enumerate(zip(extinction, constituent, strict=True)):
+        derivatives.extinction[p] = check_number(f"extinction[{p}]", one, "[0, inf)")
+        derivatives.constituent[p] = check_integer(f"constituent[{p}]", row, 0, MOST_CONSTITUENTS - 1)
     derivatives.value = LogDerivatives(*value, *[0.0] * (MOST_DERIVATIVES - count))
     derivatives.scale = LogDerivatives(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
     for name, parts in (("waters", waters), ("faces", faces)):

@@ -1,7 +1,9 @@
 """The riders of a spec; derivatives of the logarithm of what light has met, and of that by block of a grid's cells.
 
 Derivatives are by the water's coefficients and the surfaces' reflectances: per flight -length for absorption and
-scattering; per event 1/b, the derivative of the phase function, and the part of the Lambertian reflectance.
+scattering; per event 1/b, the derivative of the phase function, and the part of the Lambertian reflectance. By the
+concentration n of a constituent with coefficients a' and b' at n = 1, per flight -(a' + b') length, and per event, as
+b p = sum n b' p', b' p' / (b p): whichever constituent the angle was drawn from.
 
 Those by block are by the same addition to a coefficient of all its cells. Per block -L for absorption, n/b - L for
 scattering at fixed absorption and n/c - L for extinction at fixed albedo: L the path in the block, and over n, the
@@ -67,19 +69,23 @@ def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3,
 
 def _make_fly(spec: TransportSpec) -> wp.Function:
     count, layered = len(spec.derivatives), spec.water.layered
-    on_path = _bits(spec.derivatives, "absorption", "scattering")
+    by_concentration = _bits(spec.derivatives, "concentration")
+    on_path = _bits(spec.derivatives, "absorption", "scattering") | by_concentration
 
     @wp.func
-    def shorter(d: LogDerivatives, parameters: int, length: float) -> LogDerivatives:
+    def shorter(d: LogDerivatives, world: WorldRef, parameters: int, length: float) -> LogDerivatives:
         for p in range(wp.static(count)):
             if (parameters >> p) & 1 == 1:
-                d[p] = d[p] - length
+                if (wp.static(by_concentration) >> p) & 1 == 1:
+                    d[p] = d[p] - world.derivatives.extinction[p] * length
+                else:
+                    d[p] = d[p] - length
         return d
 
     @wp.func
     def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
         if wp.static(not layered):
-            c.log_derivatives = shorter(c.log_derivatives, wp.static(on_path), length)
+            c.log_derivatives = shorter(c.log_derivatives, world, wp.static(on_path), length)
         else:
             d = c.log_derivatives
             along = wp.dot(world.layers.axis, x)
@@ -89,21 +95,22 @@ def _make_fly(spec: TransportSpec) -> wp.Function:
             begin = float(0.0)
             boundary = boundary_ahead(world.layers, layer, step, along, slope)
             while boundary < length:
-                d = shorter(d, world.derivatives.waters[layer] & wp.static(on_path), boundary - begin)
+                d = shorter(d, world, world.derivatives.waters[layer] & wp.static(on_path), boundary - begin)
                 layer += step
                 begin = boundary
                 boundary = boundary_ahead(world.layers, layer, step, along, slope)
-            c.log_derivatives = shorter(d, world.derivatives.waters[layer] & wp.static(on_path), length - begin)
+            c.log_derivatives = shorter(d, world, world.derivatives.waters[layer] & wp.static(on_path), length - begin)
 
     return fly
 
 
 def _make_event(spec: TransportSpec) -> wp.Function:
     count, layered, shares = len(spec.derivatives), spec.water.layered, spec.faces.shares
-    by_scattering, by_anisotropy, by_reflectance = (
-        _bits(spec.derivatives, kind) for kind in ("scattering", "anisotropy", "reflectance")
+    by_scattering, by_anisotropy, by_reflectance, by_concentration = (
+        _bits(spec.derivatives, kind) for kind in ("scattering", "anisotropy", "reflectance", "concentration")
     )
-    in_water = by_scattering | by_anisotropy
+    in_water = by_scattering | by_anisotropy | by_concentration
+    add_concentrations = _make_add_concentrations(spec, by_concentration)
 
     @wp.func
     def in_the_water(d: LogDerivatives, world: WorldRef, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
@@ -117,6 +124,8 @@ def _make_event(spec: TransportSpec) -> wp.Function:
             if (wp.static(by_anisotropy) >> p) & 1 == 1:
                 slope = henyey_greenstein_log_derivative(t, world.derivatives.value[p])
                 d[p] = d[p] + wp.where((here >> p) & 1 == 1, slope, 0.0)
+        if wp.static(by_concentration > 0):
+            d = add_concentrations(d, world, x, t, here)
         return d
 
     @wp.func
@@ -137,6 +146,25 @@ def _make_event(spec: TransportSpec) -> wp.Function:
             c.log_derivatives = in_the_water(c.log_derivatives, world, x, u, v)
 
     return event
+
+
+def _make_add_concentrations(spec: TransportSpec, parameters: int) -> wp.Function:
+    """Of an event in the water that turns light by t = 1 - cos(theta), where the parameters `here` are of the water."""
+    count, water_at, mixed = len(spec.derivatives), spec.water.at, spec.water.phase.part is not None
+    part_of = spec.water.phase.part or spec.water.phase.pdf  # any: it is not called
+
+    @wp.func
+    def add_concentrations(d: LogDerivatives, world: WorldRef, x: wp.vec3, t: float, here: int) -> LogDerivatives:
+        water = water_at(world.medium, world.layers, x)
+        for p in range(wp.static(count)):
+            if (wp.static(parameters) >> p) & 1 == 1:
+                slope = world.derivatives.value[p] / (water.extinction * water.albedo)
+                if wp.static(mixed):
+                    slope *= part_of(t, water, world.derivatives.constituent[p])
+                d[p] = d[p] + wp.where((here >> p) & 1 == 1, slope, 0.0)
+        return d
+
+    return add_concentrations
 
 
 # ---- Derivatives by block.

@@ -339,6 +339,8 @@ def _rider_needs(spec: TransportSpec, model: Model) -> Needs:
     derivatives, faces = model.derivatives, (model.surfaces.reflectance.size,) if spec.mesh else ()
     for p, kind in enumerate(spec.derivatives):
         check_number(f"model.derivatives.value[{p}]", derivatives.value[p], DERIVATIVES[kind])
+        last = max(spec.phase.constituents - 1, 0)
+        check_integer(f"model.derivatives.constituent[{p}]", derivatives.constituent[p], 0, last)
     for p in range(spec.signed):
         check_number(f"model.derivatives.scale[{p}]", derivatives.scale[p], "(0, inf)")
     if spec.blocks:

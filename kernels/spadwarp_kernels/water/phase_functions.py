@@ -207,6 +207,8 @@ class PhaseFunction(NamedTuple):
     guide makes it wrong, a poor one makes it noisy."""
     constituents: int = 0
     """Of a mixture, from `make_mixture`: how many phase functions it has, weighted by the shares at the point."""
+    part: wp.Function | None = None
+    """Of a mixture ``(t: float, medium: Medium, constituent: int) -> float``: the density of one of them over `pdf`."""
 
 
 # ---- The phase function of Henyey and Greenstein.
@@ -420,7 +422,12 @@ def _mixture(count: int) -> PhaseFunction:
         part = wp.clamp((xi - below) / wp.max(share, 1.0e-30), 0.0, 0.99999994)
         return _one_minus_cosine(table_sample(medium.phase, _OWN_ROWS + chosen, part))
 
-    return PhaseFunction(f"mixture_{count}", pdf, sample, TABULATED.guide, count)
+    @wp.func
+    def part(t: float, medium: Medium, constituent: int) -> float:
+        own = _INV_4PI * table_density(medium.phase, _OWN_ROWS + constituent, fold(0.5 * t))
+        return own / wp.max(pdf(t, medium), 1.0e-30)
+
+    return PhaseFunction(f"mixture_{count}", pdf, sample, TABULATED.guide, count, part)
 
 
 def make_phase_tables(
