@@ -85,12 +85,15 @@ class LinesOfSight:
     laser_port: PortGeometry | None = None  # what it shines through
     pose: tuple[Floats, Floats] | None = None
     """By the sea, of the shot of each pixel of a scan: axes `[..., 3, 3]`, position [m] in the frame of that port."""
+    open: bool = False
+    """Whether light comes back from before the start as well, straight on: above the sea, of lens and laser in the
+    air."""
 
     def __getitem__(self, index: Any) -> LinesOfSight:
         """The lines of some pixels."""
         lines = (self.start[index], self.direction[index], self.lead[index], self.delay[index])
         pose = None if self.pose is None else (self.pose[0][index], self.pose[1][index])
-        return LinesOfSight(*lines, self.laser, self.laser_port, pose)
+        return LinesOfSight(*lines, self.laser, self.laser_port, pose, self.open)
 
     def flat(self) -> LinesOfSight:
         """The lines of all pixels in one row, `[P, 3]`."""
@@ -98,7 +101,12 @@ class LinesOfSight:
 
     def points(self, distance: ArrayLike) -> Floats:
         """Points in the camera frame at ranges [m]."""
-        return self.start + (np.asarray(distance, np.float64) - self.lead)[..., None] * self.direction
+        distance = np.asarray(distance, np.float64)
+        points: Floats = self.start + (distance - self.lead)[..., None] * self.direction
+        if self.open:
+            before = (distance / self.lead)[..., None] * self.start
+            points = np.where((distance < self.lead)[..., None], before, points)
+        return points
 
     def directions_to(self, distance: Floats) -> Floats:
         """Vectors that, times a range, are the point there: unit vectors without a port."""
@@ -108,16 +116,26 @@ class LinesOfSight:
 
     def depth_from_range(self, distance: Any) -> Any:
         """Depth z [m]."""
-        return self.start[..., 2] + (distance - self.lead) * self.direction[..., 2]
+        depth = self.start[..., 2] + (distance - self.lead) * self.direction[..., 2]
+        if self.open:
+            depth = np.where(distance < self.lead, distance / self.lead * self.start[..., 2], depth)
+        return depth
 
     def range_from_depth(self, depth: Any) -> Any:
         """Range [m] at planar depths."""
-        return self.lead + (depth - self.start[..., 2]) / self.direction[..., 2]
+        distance = self.lead + (depth - self.start[..., 2]) / self.direction[..., 2]
+        if self.open:
+            distance = np.where(depth < self.start[..., 2], depth / self.start[..., 2] * self.lead, distance)
+        return distance
 
     def path_from_range(self, distance: ArrayLike) -> Floats:
         """Path [m] at ranges."""
-        along = np.asarray(distance, np.float64) - self.lead
-        return self.light_at(self.points(distance))[2] + along + self.delay
+        distance = np.asarray(distance, np.float64)
+        path = self.light_at(points := self.points(distance))[2] + (distance - self.lead) + self.delay
+        if self.open:
+            straight = np.linalg.norm(points - self.laser, axis=-1) + distance
+            path = np.where(distance <= self.lead, straight * self.delay / self.lead, path)
+        return path
 
     def range_from_path(self, path: ArrayLike) -> Floats:
         """Range [m] at which light has gone a path; NaN where it is too short."""
@@ -132,7 +150,12 @@ class LinesOfSight:
             # The path rises with the range by 1 + the cosine between both directions of light.
             slope = np.maximum(1.0 + (light * self.direction).sum(axis=-1), 1e-3)
             along = np.maximum(along - (way + along - left) / slope, _LEAST)
-        return np.where(left > least, along, np.nan) + self.lead
+        distance = np.where(left > least, along, np.nan) + self.lead
+        if self.open:
+            straight = np.asarray(path, np.float64) * self.lead / self.delay
+            before = range_from_path(straight, self.start / self.lead[..., None], self.laser)
+            distance = np.where(left > least, distance, np.minimum(before, self.lead))
+        return distance
 
     def light_at(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Of the light of a laser that is a point, at points in the camera frame: unit vectors, the length of its way
@@ -173,7 +196,8 @@ def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
         return _lines_of_shots(scene, port, laser)
     view = view_directions(scene) if view is None else view
     lines = _in_water(view) if port is None else port.enter(np.zeros(3), view)
-    return LinesOfSight(*lines, laser, laser_port(scene))
+    beyond = laser_port(scene)
+    return LinesOfSight(*lines, laser, beyond, open=scene.surface is not None and None not in (port, beyond))
 
 
 def _lines_of_shots(scene: Scene, port: PortGeometry | None, laser: Floats) -> LinesOfSight:
@@ -185,7 +209,8 @@ def _lines_of_shots(scene: Scene, port: PortGeometry | None, laser: Floats) -> L
     if port is not None:
         start, along, *lengths = port.enter(position, np.einsum("hwij,hwj->hwi", axes, view))
         lines = _turned_in(axes, start - position), _turned_in(axes, along), lengths[0], lengths[1]
-    return LinesOfSight(*lines, laser, laser_port(scene), (axes, position))
+    beyond = laser_port(scene)
+    return LinesOfSight(*lines, laser, beyond, (axes, position), None not in (port, beyond))
 
 
 def _turned_in(axes: Floats, vectors: Floats) -> Floats:
