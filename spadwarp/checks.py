@@ -232,7 +232,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     along the axis through their box, None without a grid. `focus_distance` is the depth that the lens images sharply,
     None for a pinhole. `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected
     number of unscattered target photons that one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how
-    many it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered.
+    many it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered,
+    None where their number is "auto".
     `irradiance` is that of unscattered light at the nearest visible point's range on the beam's axis, mean over time
     [W/m²]. `histogram_bytes` is one set of tallies.
     Raises `MeshError`.
@@ -243,6 +244,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     axis = dict.fromkeys(field.name for field in dataclasses.fields(OnAxis))
     axis |= {} if survey.on_axis is None else vars(survey.on_axis)
     del axis["distance"]
+    if axis["samples_per_pixel"] == math.inf:  # of as many photons as it takes
+        axis["samples_per_pixel"] = None
     waters = [
         {"attenuation_length": water.attenuation_length, "albedo": water.scattering / water.extinction}
         for water in medium.waters

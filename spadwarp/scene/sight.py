@@ -131,7 +131,9 @@ class LinesOfSight:
             light, _, way = self.light_at(self.start + along[..., None] * self.direction)
             # The path rises with the range by 1 + the cosine between both directions of light.
             slope = np.maximum(1.0 + (light * self.direction).sum(axis=-1), 1e-3)
-            along = np.maximum(along - (way + along - left) / slope, _LEAST)
+            before, along = along, np.maximum(along - (way + along - left) / slope, _LEAST)
+            if not (np.abs(along - before) > 1e-9 * along).any():
+                break
         return np.where(left > least, along, np.nan) + self.lead
 
     def light_at(self, points: Floats) -> tuple[Floats, Floats, Floats]:
