@@ -232,7 +232,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     along the axis through their box, None without a grid. `focus_distance` is the depth that the lens images sharply,
     None for a pinhole. `optical_depth` is one-way to the nearest visible point. `signal_per_pulse` is the expected
     number of unscattered target photons that one pixel on the beam's axis detects from a pulse, `photons_per_pixel` how
-    many it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered.
+    many it receives; `samples_per_pixel` how many of the traced photons reach a pixel's part of the target unscattered,
+    None where their number is "auto".
     `irradiance` is that of unscattered light at the nearest visible point's range on the beam's axis, mean over time
     [W/m²]. `histogram_bytes` is one set of tallies.
     Raises `MeshError`.
@@ -243,6 +244,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     axis = dict.fromkeys(field.name for field in dataclasses.fields(OnAxis))
     axis |= {} if survey.on_axis is None else vars(survey.on_axis)
     del axis["distance"]
+    if axis["samples_per_pixel"] == math.inf:  # of as many photons as it takes
+        axis["samples_per_pixel"] = None
     waters = [
         {"attenuation_length": water.attenuation_length, "albedo": water.scattering / water.extinction}
         for water in medium.waters
@@ -283,12 +286,13 @@ _MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
 def _check_plausible(survey: Survey) -> None:
     """Values of the scene outside what is plausible, with the unit that was probably meant."""
     scene, laser = survey.scene, survey.scene.laser
+    aloft = ("horizontal_fov_deg", "half_angle_deg", "start_ns")[: 3 if scene.surface else int(survey.moving)]
     ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
     for section, fields in _PLAUSIBLE.items():
         for place, model in (ports if section == "port" else {section: getattr(scene, section)}).items():
-            for name, plausible in fields.items():  # scanners, and lidars in the air, may see less than a degree
-                if name != "horizontal_fov_deg" or not (survey.moving or scene.surface):
+            for name, plausible in fields.items():
+                if name not in aloft:
                     _check_value(survey, f"{place}.{name}", model, *plausible)
     if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
         energy, rate = with_prefix(laser.pulse_energy, "J"), with_prefix(laser.repetition_rate, "Hz")
@@ -296,7 +300,7 @@ def _check_plausible(survey: Survey) -> None:
         survey.warn("laser.pulse_energy", text, average_power=laser.average_power)
     places = {"laser.position": laser.position, "camera.position": scene.camera.position}
     places |= {f"targets[{i}].translation": target.translation for i, target in enumerate(scene.targets)}
-    for name, point in places.items():
+    for name, point in places.items() if scene.surface is None else ():
         if (farthest := max(map(abs, point))) > _FARTHEST:
             text = f"{list(point)} m is {farthest:.4g} m away; in mm it would be {[1e-3 * x for x in point]} m"
             survey.warn(name, text, farthest=farthest)
@@ -311,7 +315,7 @@ def _check_value(survey: Survey, field: str, model: Any, low: float, high: float
     if not isinstance(value, float) or value == 0.0 or low <= value <= high:
         return
     unit_of_field = field_unit(type(model).model_fields[name]) or "1"
-    unit = "" if unit_of_field == "1" else f" {unit_of_field}"
+    unit = f" {unit_of_field}".removesuffix(" 1")
     text = f"{value:g}{unit} is not plausible ({low:g} to {high:g}{unit} is)"
     meant = {other: quantity(f"{value!r} {other}", unit_of_field) for other in units}
     meant = {other: number for other, number in meant.items() if low <= number <= high}
@@ -856,11 +860,8 @@ def _check_grid(survey: Survey) -> None:
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     corners = to_camera(scene.camera, (signs * 0.5 * np.array(cells.size)) @ cells.rotation.T + cells.centre)
     # Whether one plane of the view, and one of the beam, has the whole box behind it.
-    misses = [
-        (((corners @ planes[:, :3].T + planes[:, 3]) < 0.0).all(axis=0).any())
-        for planes in (view, beam_planes(scene.beam) if scene.scan_positions == 1 else view)
-    ]
-    if all(misses):
+    both = (view, beam_planes(scene.beam) if scene.scan_positions == 1 else view)
+    if all((((corners @ planes[:, :3].T + planes[:, 3]) < 0.0).all(axis=0).any()) for planes in both):
         survey.warn("medium.grid", "lies beside the view and the beam: single scattering does not show it")
     else:
         begin, end = (0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * scene.path_limit if axis is None else axis.distance)

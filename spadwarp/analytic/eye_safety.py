@@ -213,8 +213,10 @@ def _share(laser: Laser, distance: float, densest: float) -> float:
 
 
 def _first(is_reached: Callable[[float], bool], high: float) -> float:
-    """The least distance from 1e-6 m to `high` [m] from which on something is reached."""
+    """The least distance from 1e-6 m to `high` [m] from which on something is reached; 0 where it is there."""
     low = 1e-6
+    if is_reached(low):
+        return 0.0
     for _ in range(80):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if is_reached(middle) else (middle, high)

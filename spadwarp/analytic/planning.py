@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-import time as clock
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -211,8 +210,8 @@ def plan(
         eye_distance: An eye at this distance from the laser limits the pulse energy [m]; default: reported for 0.1 m,
             and no limit.
         eye_exposure: For which it looks into the beam [s].
-        photons: Of the Monte Carlo run; "auto": until they judge, or for 60 s. Numbers that the photons do not tell are
-            not judged.
+        photons: Of the Monte Carlo run; "auto": until they judge, or traced for 60 s. Numbers that the photons do not
+            tell are not judged.
         seed: Of it.
         largest_range: Whether to look for the largest range, which takes several shorter runs.
         channel: Light that counts, of a camera with an analyser; see `spadwarp.result.analyser_channel`.
@@ -352,14 +351,15 @@ class _Planner:
         _refuse_hopeless(scene, span[0], self.time)
         small, asked = window(scene, self.device), scene
         typical = typical_pixels(small, self.device)
-        budget, begin = _SECONDS * (_PART if even else 1.0), clock.monotonic()
+        budget = _SECONDS * (_PART if even else 1.0)
         runs: tuple[Result, ...] = ()
         while True:
             report = None if even else self.progress
             runs = trace(
                 small, photons or max(_FEWEST, sum(run.photons for run in runs)), self.seed, self.device, report, runs
             )
-            traced, elapsed = sum(run.photons for run in runs), clock.monotonic() - begin
+            traced = sum(run.photons for run in runs)
+            elapsed = sum(run.timing.get("trace", 0.0) for run in runs)  # not what compiles, or judges
             last = photons is not None or 2.0 * elapsed > budget or traced > _MOST
             try:
                 scene, energy_limit, piled, eye, pilot = self._settle(asked, runs, typical, even)
@@ -408,7 +408,7 @@ class _Planner:
             reached=purpose in _ENOUGH and frame_time <= self.time,
             terms=terms,
             limit=" or ".join(limits),
-            advice=self._advice(limit, purpose, frame_time, rate, largest_rate),
+            advice=self._advice(limit, purpose, frame_time, rate, largest_rate, pilot.floor),
             pilot=pilot,
             photons_needed=traced * factor,
             seconds_needed=sum(run.timing.get("trace", math.nan) for run in runs) * factor,
@@ -466,9 +466,13 @@ class _Planner:
         digits = 10.0 ** max(0, math.floor(math.log10(max(wanted, 1.0))) - 1)
         return int(min(max(1.0, math.ceil(wanted / digits) * digits), _MOST_PULSES)), purpose
 
-    def _advice(self, limit: str, purpose: str, frame_time: float, rate: float, largest: float) -> str:
+    def _advice(
+        self, limit: str, purpose: str, frame_time: float, rate: float, largest: float, floor: dict[str, float]
+    ) -> str:
         """What would help: time, where the pulses reach the depth error but take too long."""
-        advice = _ADVICE[limit]
+        advice, best = _ADVICE[limit], min(floor, key=floor.__getitem__)
+        if limit == "forward scattering" and floor[best] < 0.7 * floor[self.method]:
+            advice += f", or --method {best}, whose floor is {with_prefix(floor[best], 'm')}, at more noise"
         if purpose not in ("depth error", "false peaks"):
             return advice + ("; more pulses do not help" if limit == "forward scattering" else "")
         if frame_time <= self.time:

@@ -81,7 +81,14 @@ class _Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         with warnings.catch_warnings(), _resources:
-            warnings.showwarning = lambda message, *_, **__: complain(str(message), "warning")
+            said = set[str]()
+
+            def show(message: Warning | str, *_: Any, **__: Any) -> None:
+                if str(message) not in said:  # once, however often a command reads a mesh
+                    said.add(str(message))
+                    complain(str(message), "warning")
+
+            warnings.showwarning = show
             warnings.filterwarnings("default", category=SpadwarpWarning)
             try:
                 answer = super().invoke(ctx)

@@ -102,7 +102,7 @@ def plan(
         full_power: Take the largest pulse energy within the limits.
         eye_distance (LENGTH): Also keep the pulse energy safe for an eye at this distance from the laser [m].
         eye_exposure (TIME): How long the eye looks into the beam [s].
-        photons (N|auto): Photons of the Monte Carlo run. By default auto: as many as judge, or 60 s.
+        photons (N|auto): Photons of the Monte Carlo run. By default auto: as many as judge, or 60 s of tracing.
         no_range: Do not look for the largest range.
         write: Scene file to write with the proposed values.
 
@@ -139,7 +139,9 @@ def plan(
     say(_verdict(found))
     hidden = ["pilot", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
     hidden += [] if found.judged else ["pulses", "pulses_for", "frame_time", "reached", "pile_up_energy"]
-    values = {name: value for name, value in found.to_dict().items() if name not in hidden}
+    told = {name: value for name, value in found.to_dict().items() if value == value and value != ""}
+    values = {name: value for name, value in told.items() if name not in hidden}
+    values["eye"] = {name: value for name, value in values["eye"].items() if value == value}
     if not found.judged:
         del values["values"]["detector.pulses_per_frame"]
     say(readable(values))

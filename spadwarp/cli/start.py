@@ -148,8 +148,12 @@ def _list_presets(section: str | None) -> None:
         wrong(f"{section!r} is not one of {', '.join(sections)}", "NAME")
     chosen = [preset for preset in everything.values() if section in (None, preset.section)]
     groups = itertools.groupby(chosen, lambda preset: f"[{preset.section}] {preset.source}")
+    before: list[str] = []
     for number, (source, presets) in enumerate(groups):
-        say("\n" * (number > 0) + source)
+        parts = source.split("; ")
+        own = [part for k, part in enumerate(parts) if parts[: k + 1] != before[: k + 1]]  # not said above
+        say("\n" * (number > 0 and own == parts) + "; ".join(own))
+        before = parts
         for preset in presets:
             values = {name: f"{x:.5g}" if isinstance(x, float) else x for name, x in preset.values.items()}
             say(f"  {preset.name:<30}  " + ", ".join(f"{name} {value}" for name, value in values.items()))

@@ -55,8 +55,10 @@ def example_or_path(path: str | os.PathLike[str], kind: str) -> Path:
 
 def similar(path: str | os.PathLike[str]) -> str:
     """Addition to an error about a missing file, `; did you mean 'planned.toml'?`: one beside it, of that ending if
-    there are some."""
+    there are some, or that of its name in the current folder."""
     place = Path(path)
+    if place.is_absolute() and Path(place.name).is_file():
+        return f"; there is a {place.name} in the current folder: the paths in a file begin at that file's folder"
     try:
         beside = os.listdir(place.parent)
     except (OSError, ValueError):

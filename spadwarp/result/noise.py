@@ -142,7 +142,7 @@ def noise_problem(result: Result) -> str:
     photons, seconds = photons_needed(result)
     time = f", {_duration(seconds)} here" if math.isfinite(seconds) else ""
     return (
-        f"not enough photons: the picture is noise of the simulation, {ratio:.2g} times the variance of a frame's "
+        f"not enough photons: the simulation's noise shows, {ratio:.2g} times the variance of a frame's "
         f"photons in the median pixel; about {photons:.1e} photons instead of {result.photons:.1e} would make it "
         f"{NOISE_GOAL:g} times{time}"
     )

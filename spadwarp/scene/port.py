@@ -24,8 +24,8 @@ __all__: list[str] = []
 
 Floats = NDArray[np.float64]
 
-# Steps of Newton's method: it has converged after 4 to 12.
-_STEPS = 30
+# Steps of Newton's method, which has converged after 4 to 12, and the last: the error is its square.
+_STEPS, _CONVERGED = 30, 1e-9
 
 
 MATERIALS = tomllib.loads((files("spadwarp.scene") / "materials.toml").read_text(encoding="utf-8"))
@@ -258,7 +258,10 @@ class PortGeometry:
             roots = [np.sqrt(k * k + (k - m) * (k + m) * t * t) for k in n]
             value = np.sum([m * t * d / root for d, root in zip(h, roots, strict=True)], axis=0)
             slope = np.sum([m * d * k * k / root**3 for d, k, root in zip(h, n, roots, strict=True)], axis=0)
-            t = t + (aside - value) / slope
+            step = (aside - value) / slope
+            t = t + step
+            if not (np.abs(step) > _CONVERGED * (1.0 + t)).any():
+                break
         sine = m / n[0] * t / np.sqrt(1.0 + t * t)
         sideways = across / np.maximum(aside, 1e-300)[..., None]
         return sine[..., None] * sideways + np.sqrt(1.0 - sine * sine)[..., None] * normal
@@ -285,7 +288,10 @@ class PortGeometry:
             for size, sign in faces:
                 angle = angle + sign * np.arcsin(p / size)
                 slope = slope + sign / np.sqrt(size * size - p * p)
-            i = i + (beta - angle) / (1.0 + n[0] * d * np.cos(i) * slope)
+            step = (beta - angle) / (1.0 + n[0] * d * np.cos(i) * slope)
+            i = i + step
+            if not (np.abs(step) > _CONVERGED).any():
+                break
         sideways = across / np.maximum(sine, 1e-300)[..., None]
         return np.cos(i)[..., None] * e + np.sin(i)[..., None] * sideways
 

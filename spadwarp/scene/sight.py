@@ -149,12 +149,14 @@ class LinesOfSight:
             light, _, way = self.light_at(self.start + along[..., None] * self.direction)
             # The path rises with the range by 1 + the cosine between both directions of light.
             slope = np.maximum(1.0 + (light * self.direction).sum(axis=-1), 1e-3)
-            along = np.maximum(along - (way + along - left) / slope, _LEAST)
+            before, along = along, np.maximum(along - (way + along - left) / slope, _LEAST)
+            if not (np.abs(along - before) > 1e-9 * along).any():
+                break
         distance = np.where(left > least, along, np.nan) + self.lead
         if self.open:
             straight = np.asarray(path, np.float64) * self.lead / self.delay
-            before = range_from_path(straight, self.start / self.lead[..., None], self.laser)
-            distance = np.where(left > least, distance, np.minimum(before, self.lead))
+            in_air = range_from_path(straight, self.start / self.lead[..., None], self.laser)
+            distance = np.where(left > least, distance, np.minimum(in_air, self.lead))
         return distance
 
     def light_at(self, points: Floats) -> tuple[Floats, Floats, Floats]:
