@@ -291,9 +291,8 @@ def _check_plausible(survey: Survey) -> None:
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
     for section, fields in _PLAUSIBLE.items():
         for place, model in (ports if section == "port" else {section: getattr(scene, section)}).items():
-            for name, plausible in fields.items():
-                if name not in aloft:
-                    _check_value(survey, f"{place}.{name}", model, *plausible)
+            for name in (field for field in fields if field not in aloft):
+                _check_value(survey, f"{place}.{name}", model, *fields[name])
     if laser.average_power > _MOST_POWER and not any(item.field.startswith("laser.") for item in survey.messages):
         energy, rate = with_prefix(laser.pulse_energy, "J"), with_prefix(laser.repetition_rate, "Hz")
         text = f"{energy} at {rate} are {with_prefix(laser.average_power, 'W')} on average"
@@ -315,7 +314,7 @@ def _check_value(survey: Survey, field: str, model: Any, low: float, high: float
     if not isinstance(value, float) or value == 0.0 or low <= value <= high:
         return
     unit_of_field = field_unit(type(model).model_fields[name]) or "1"
-    unit = f" {unit_of_field}".removesuffix(" 1")
+    unit = "" if unit_of_field == "1" else f" {unit_of_field}"
     text = f"{value:g}{unit} is not plausible ({low:g} to {high:g}{unit} is)"
     meant = {other: quantity(f"{value!r} {other}", unit_of_field) for other in units}
     meant = {other: number for other, number in meant.items() if low <= number <= high}

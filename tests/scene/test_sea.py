@@ -12,7 +12,7 @@ from helpers.scenes import scene
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.scene import mean_plane
 from spadwarp.scene.sea import jonswap, peak_length
-from spadwarp.scene.sight import depth_from_time
+from spadwarp.scene.sight import depth_from_time, lines_of_sight
 from spadwarp.values import ConfigError
 
 BAY = {"surface": {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, -1.0], "wind": 5.0}}
@@ -103,6 +103,26 @@ def test_check_counts_the_way_in_the_water_alone():
     assert not [m for m in messages if m.field == "laser.position"]
     depth = next(m for m in messages if "optical depth" in m.text)
     assert "optical depth to the nearest illuminated point 2.5" in depth.text  # 5 m at 0.5 1/m
+
+
+@pytest.mark.parametrize("scan", [{}, {"mode": "trajectory", "pattern": "conical", "half_angle_deg": 9.0}])
+def test_times_before_the_surface_are_depths_in_the_air(scan):
+    """Of lens and laser in the air: there light goes straight on, and its times join those of light that enters."""
+    one = scene(
+        **BAY, laser={"position": [-0.5, 0.0, 0.5]}, medium={"group_index": 1.3638, "phase_index": 1.34}, scan=scan
+    )
+    lines = lines_of_sight(one)
+    for beyond in (-2.0, -1e-3, 0.0, 1e-3, 4.0):
+        distance = lines.lead + beyond
+        path = lines.path_from_range(distance)
+        np.testing.assert_allclose(lines.range_from_path(path), distance, rtol=1e-9)
+        np.testing.assert_allclose(lines.range_from_depth(lines.depth_from_range(distance)), distance, rtol=1e-12)
+        if beyond <= 0.0:
+            view = lines.start / lines.lead[..., None]
+            np.testing.assert_allclose(lines.points(distance), distance[..., None] * view, rtol=1e-12)
+            way = distance + np.linalg.norm(distance[..., None] * view - lines.laser, axis=-1)
+            air = one.surface.air(one.laser.wavelength_nm)[1] / 1.3638
+            np.testing.assert_allclose(path, way * air, rtol=1e-12)
 
 
 def waves_of(**waves):
