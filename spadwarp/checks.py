@@ -778,10 +778,10 @@ def _check_backscatter(survey: Survey, name: str, water: Water) -> None:
     back, (kept, natural) = float(fits.density(math.pi)), (used.backscatter_fraction, fits.backscatter_fraction)
     if 0.9 < (ratio := back / float(used.density(math.pi))) < 1.1:
         return
-    advice, own = "phase_function = 'fournier_forand' fits", fits.molecular_share
+    law = "'fournier_forand' with " + ", ".join(f"{name} = {value:g}" for name, value in fits.parameters.items())
+    advice, own = f"phase_function = {law} fits", fits.molecular_share
     if used.molecular_share == 0.0 and own * float(molecular_density(np.array(2.0))) > 0.1 * back:
-        own *= water.scattering
-        advice = f"constituents fit: 'rayleigh' with scattering = {own:.2g} and 'fournier_forand' with the rest"
+        advice = f"constituents fit: 'rayleigh' with scattering = {own * water.scattering:.2g} and {law} for the rest"
     text = (
         f"b_b/b of Henyey–Greenstein with g = {used.parameters['anisotropy']:g} is {kept:.3f}, of such water "
         f"{natural:.3f}: straight back it is {max(ratio, 1.0 / ratio):.2g} times too "

@@ -100,7 +100,7 @@ _OWN_FIELDS = tuple(name for needed, _ in PHASE_FIELDS.values() for name in need
 _LAW_FIELDS = ("phase_function", "anisotropy", *_OWN_FIELDS, "particle_index", "junge_slope")
 
 # Tabulated phase functions: name → file in spadwarp/water/tables, whose head has the source.
-PHASE_TABLES = {"petzold-average-particle": "petzold_average_particle.csv"}
+PHASE_TABLES = {"petzold-average-particle": "petzold_average_particle.csv", "clean-bubbles": "clean_bubbles.csv"}
 
 
 class PhaseLaw(Section):
@@ -117,7 +117,8 @@ class PhaseLaw(Section):
     particle_index: float = field(1.10, "fournier_forand: index n of the particles over that of the water", "(1, 1.35]")
     junge_slope: float = field(3.5835, "fournier_forand: slope µ of the size distribution", "[3.05, 5)")
     phase_table: Annotated[str | None, FilePath(".csv", tuple(PHASE_TABLES))] = None
-    """tabulated: "petzold-average-particle", or the path of a .csv file of angle [°] and value of any scale"""
+    """tabulated: "petzold-average-particle", "clean-bubbles", or the path of a .csv file of angle [°] and value of any
+    scale"""
     depolarisation_ratio: float = Field(WATER_DEPOLARISATION, **bounds(RANGES["depolarisation_ratio"]))
     """rayleigh, of both: of unpolarised light scattered by 90°, light in the plane of scattering over light across"""
 
@@ -630,12 +631,18 @@ def _law_of(medium: PhaseLaw, section: str, share: float = 0.0) -> PhaseFunction
 
 def natural_laws(medium: Medium, water: Water, wavelength_nm: float) -> tuple[PhaseFunction, PhaseFunction]:
     """Of the medium or one of its layers with Henyey–Greenstein's law: that law, and what natural water has, molecules
-    and Fournier–Forand's particles. Raises `ArgumentError` outside [400, 700] nm."""
+    and Fournier–Forand's particles: of a preset those that fit its b_b/b, else average ones. Raises `ArgumentError`
+    outside [400, 700] nm."""
     own = water_optics(wavelength_nm, chlorophyll=0.0, **medium.state).water_scattering
+    particles = PhaseLaw(phase_function="fournier_forand")
+    name = water.preset or ""
+    like = {"uwoc-coastal": "petzold-haoce-11", "petzold-nuc-2240": "petzold-nuc-2040"}.get(name, name)
+    if (measured := PRESETS["medium"].get(f"{like}-constituents")) is not None:
+        particles = Medium(preset=measured.name).constituents[1]
     g = getattr(water, "anisotropy", None)
     used = _law_of(PhaseLaw(anisotropy=medium.anisotropy if g is None else g), "medium", medium.molecular_share)
     share = min(own / water.scattering, 1.0) if water.scattering > 0.0 else 1.0
-    return used, _law_of(PhaseLaw(phase_function="fournier_forand"), "medium", share)
+    return used, _law_of(particles, "medium", share)
 
 
 Matrix = Callable[[Floats], Floats]

@@ -96,7 +96,7 @@ def port(*names, **fields):
         (medium(phase_function="tabulated"), "medium needs phase_table with phase_function = 'tabulated'"),
         (medium(phase_function="two_term_henyey_greenstein", g1=0.9), "medium needs g2, alpha with phase_function = "),
         (medium(phase_table="a.csv"), "medium.phase_table = 'a.csv' goes with phase_function = 'tabulated' only"),
-        (medium(phase_table="petzold"), "phase_table = 'petzold' is not one of 'petzold-average-particle', the pa"),
+        (medium(phase_table="petzold"), "phase_table = 'petzold' is not one of 'petzold-average-particle', 'clean-bub"),
         (medium(phase_function="fournier_forand", junge_slope=5.5), "medium.junge_slope = 5.5 is outside [3.05, 5)"),
         # Cells of water
         (medium(grid={}), "medium.grid needs either file or shape"),

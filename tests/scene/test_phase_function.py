@@ -82,7 +82,9 @@ def test_a_check_warns_of_a_peak_narrower_than_the_near_axis_rule():
 def test_shipped_tables_are_sourced_and_offered(name):
     table = Path(spadwarp.water.__file__).parent / "tables" / PHASE_TABLES[name]
     assert "tabulated by" in table.read_text().partition("angle_deg")[0]
-    assert any(preset.values.get("phase_table") == name for preset in spadwarp.scene.presets("medium").values())
+    media = [preset.values for preset in spadwarp.scene.presets("medium").values()]
+    laws = [law for medium in media for law in (medium, *medium.get("constituents", ()))]
+    assert any(law.get("phase_table") == name for law in laws)
     assert law_of(phase_function="tabulated", phase_table=name).mean_cosine > 0
 
 

@@ -1,5 +1,6 @@
 """Presets: sourced, complete, and as published."""
 
+import math
 import re
 
 import pytest
@@ -60,6 +61,21 @@ def test_backscatter_of_natural_waters_is_the_published_one():
         both = (Medium(preset=name), Medium(preset=name.removesuffix("-constituents")))
         sums = [(water.absorption, water.scattering, water.group_index) for water in both]
         assert sums[0] == pytest.approx(sums[1], rel=1e-12)
+
+
+def test_bubbles_are_those_of_geometric_optics():
+    """Spheres far larger than the wavelength scatter twice their section; light that meets them flatly is reflected
+    totally, up to a scattering angle of 180° - 2 arcsin(1/1.34); p(180°) after Churnside 2010."""
+    bubbles = Medium(preset="petzold-autec-8-bubbles").constituents[2]
+    small, large, ppm = 20e-6, 300e-6, 1e-6
+    section = 3.0 * ppm * (1.0 / small - 1.0 / large) / math.log(large / small)
+    assert bubbles.scattering == pytest.approx(section, rel=0.02)
+    law = phase_function(Medium(preset="petzold-autec-8-bubbles")).constituents[2]
+    critical = math.pi - 2.0 * math.asin(1.0 / 1.34)
+    below, above = (float(law.density(critical + math.radians(side))) for side in (-5.0, 5.0))
+    assert below > 2.5 * above
+    assert float(law.density(math.pi)) * bubbles.scattering / ppm == pytest.approx(233.0, rel=0.15)
+    assert law.backscatter_fraction == pytest.approx(0.0120, abs=5e-5)
 
 
 @pytest.mark.parametrize(
