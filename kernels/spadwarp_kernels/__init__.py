@@ -4,33 +4,51 @@ Functions marked `wp.func` go into the caller's own kernels; `launch_transport` 
 `wp.Mesh`. A folder for each topic; what is not listed here is in its folder's `__all__`.
 """
 
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from .analytic import *
-from .base import *
-from .detection import *
-from .estimators import *
-from .optics import *
-from .photon import *
-from .surface import *
-from .tally import *
-from .transport import *
-from .water import *
-from .worlds import *
+# In the order in which they build on each other. Loaded when a name is first asked for: a kernel that only traces
+# photons needs no camera and no estimator of depth.
+_PACKAGES = (
+    "base",
+    "tally",
+    "water",
+    "optics",
+    "surface",
+    "photon",
+    "estimators",
+    "transport",
+    "detection",
+    "analytic",
+    "worlds",
+)
 
-if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = (
-        analytic.__all__
-        + base.__all__
-        + detection.__all__
-        + estimators.__all__
-        + optics.__all__
-        + photon.__all__
-        + surface.__all__
-        + tally.__all__
-        + transport.__all__
-        + water.__all__
-        + worlds.__all__
-    )
+if TYPE_CHECKING:  # type checkers follow the stars
+    from .analytic import *
+    from .base import *
+    from .detection import *
+    from .estimators import *
+    from .optics import *
+    from .photon import *
+    from .surface import *
+    from .tally import *
+    from .transport import *
+    from .water import *
+    from .worlds import *
+else:
+
+    def __getattr__(name: str) -> Any:
+        if name in _PACKAGES:
+            return import_module(f"{__name__}.{name}")
+        if name == "__all__":
+            return [public for package in _PACKAGES for public in __getattr__(package).__all__]
+        for package in () if name.startswith("_") else map(__getattr__, _PACKAGES):
+            if name in package.__all__:
+                return getattr(package, name)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__getattr__("__all__")})
+
 
 __version__ = "0.1.0"
