@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 # In the order in which they build on each other. Loaded when a name is first asked for: a kernel that only traces
 # photons needs no camera and no estimator of depth.
-_PACKAGES = "base tally water optics surface photon estimators transport detection analytic worlds".split()
+_PACKAGES = (
+    "base", "tally", "water", "optics", "surface", "photon", "estimators", "transport",
+    "detection", "analytic", "worlds",
+)  # fmt: skip
 
 if TYPE_CHECKING:  # type checkers follow the stars
     from .analytic import *

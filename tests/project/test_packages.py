@@ -118,7 +118,7 @@ LINES = {
     "validate": (750, 869),
     "viz": (2200, 2476),
     "water": (800, 860),
-    "kernels/spadwarp_kernels": (50, 42),
+    "kernels/spadwarp_kernels": (50, 45),
     "kernels/analytic": (1650, 1630),
     "kernels/base": (950, 1213),
     "kernels/detection": (1000, 1385),
