@@ -44,6 +44,7 @@ def test_an_error_of_a_job_is_raised_as_it_is(options):
         list(run_jobs(parallel_jobs.fails, [0], **options))
 
 
+@pytest.mark.slow
 def test_a_job_whose_worker_was_killed_runs_again(cluster, tmp_path):
     notes = []
     jobs = [(number, str(tmp_path)) for number in range(7)]
@@ -52,6 +53,7 @@ def test_a_job_whose_worker_was_killed_runs_again(cluster, tmp_path):
     assert sum(note.startswith("lost the worker") for note in notes) == 3
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_every_worker_is_given_up(cluster):
     with pytest.raises(spadwarp.DeviceError, match="4 workers were lost"):
         list(run_jobs(parallel_jobs.always_dies, [0], engine=Ray(workers=1)))
@@ -128,6 +130,7 @@ def test_what_ray_says_of_a_lost_worker_is_not_among_the_results(cluster, tmp_pa
     assert killer.lost == 1 and "died" in found.stderr and "died" not in found.stdout
 
 
+@pytest.mark.slow
 def test_a_run_can_be_resumed_over_ray(cluster, whole):
     parts = [simulate(scene(), **RUN, device="cpu", run=RunOptions(shard=(n, 5))) for n in (5, 1)]
     gaps = spadwarp.merge(parts)
@@ -135,6 +138,7 @@ def test_a_run_can_be_resumed_over_ray(cluster, whole):
     assert gaps.photons < PHOTONS / 2  # untouched
 
 
+@pytest.mark.slow
 def test_the_stopping_rule_is_the_same_over_ray(cluster):
     options = {"photons": 2**20, "seed": 1, "relative_error": 0.1}
     same(simulate(scene(), **options, engine=Ray(workers=1)), simulate(scene(), **options, device="cpu"))

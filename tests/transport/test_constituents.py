@@ -69,7 +69,7 @@ def test_one_constituent_is_the_water_spelt_out_to_the_bit(law, device):
     same(*(spadwarp.simulate(each, photons=5_000, device=device) for each in (one, plain)))
 
 
-@pytest.mark.parametrize("estimator", ["next_event", "guided"])
+@pytest.mark.parametrize("estimator", [pytest.param("next_event", marks=pytest.mark.slow), "guided"])
 def test_molecules_and_algae_are_their_summed_table(estimator, tmp_path, device):
     one = scene(medium=mixed(MOLECULES, ALGAE), transport={"estimator": estimator})
     table = scene(medium={**NO_LAW, **summed(tmp_path / "sum.csv", one)}, transport={"estimator": estimator})
@@ -86,6 +86,7 @@ def test_two_of_a_kind_are_one(device):
     assert equal_means_p(*(cells(each, device, 20_000) for each in (two, one)), 0.2) > 1e-3
 
 
+@pytest.mark.slow
 def test_layers_in_which_one_kind_scatters_are_layers_of_its_water(device):
     """Of Henyey and Greenstein's law, whose layers have an anisotropy each."""
     others = {**ALGAE, "name": "others", "scattering": 0.15, "concentration": 0.5}
@@ -99,6 +100,7 @@ def test_layers_in_which_one_kind_scatters_are_layers_of_its_water(device):
     assert equal_means_p(*(cells(each, device, 20_000) for each in (found, expected)), 0.2) > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracking", ["regular", "delta"])
 def test_cells_of_one_more_constituent_are_cells_of_suspended_matter(tracking, device):
     """Of Henyey and Greenstein's law with one g; and the shares of a cell's light are those of its coefficients."""

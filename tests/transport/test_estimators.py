@@ -162,7 +162,12 @@ def test_estimators_agree_under_a_cap_on_events(events, device):
 
 
 @pytest.mark.parametrize(
-    "end", [{"max_collisions": 3}, {"weight_cutoff": 0.5}, {"max_collisions": 4, "termination": "roulette"}]
+    "end",
+    [
+        {"max_collisions": 3},
+        {"weight_cutoff": 0.5},
+        pytest.param({"max_collisions": 4, "termination": "roulette"}, marks=pytest.mark.slow),
+    ],
 )
 def test_estimators_share_one_ledger(end, device):
     """Without directed directions to the unit, seed by seed; guided in its mean over seeds."""

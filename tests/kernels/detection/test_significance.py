@@ -33,10 +33,10 @@ def first_photons(rng, pixels, background, pulses):
     ("background", "options"),
     [
         (np.full(BINS, 0.2 / BINS), {}),
-        (np.full(BINS, 20.0 / BINS), {"width": 10.0}),
-        (np.full(BINS, 2e4 / BINS), {}),
+        pytest.param(np.full(BINS, 20.0 / BINS), {"width": 10.0}, marks=pytest.mark.slow),
+        pytest.param(np.full(BINS, 2e4 / BINS), {}, marks=pytest.mark.slow),
         (DECAY, {}),
-        (100.0 * DECAY, {"pulses": 20_000}),  # which leaves 2 of 3 pulses
+        pytest.param(100.0 * DECAY, {"pulses": 20_000}, marks=pytest.mark.slow),  # which leaves 2 of 3 pulses
         (20.0 * DECAY, {"profile": 3.0 * DECAY}),
         (np.full(BINS, 0.3 / BINS), {"profile": np.ones(BINS)}),
     ],

@@ -102,6 +102,7 @@ def test_frames_name_one_pose(device):
     assert floor[:, 2] == pytest.approx(-1.0, abs=1e-4) and (floor[:, 0] > 0).all()
 
 
+@pytest.mark.slow
 def test_images_of_the_simulator(device):
     """Depth, normals and reflectance from elsewhere give the rates of the camera's own rays."""
     config = sk.SpadConfig(**SMALL)
