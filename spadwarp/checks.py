@@ -286,7 +286,7 @@ _MESH_SIDES = (0.01, 100.0)  # longest side of a mesh file's target [m]
 def _check_plausible(survey: Survey) -> None:
     """Values of the scene outside what is plausible, with the unit that was probably meant."""
     scene, laser = survey.scene, survey.scene.laser
-    aloft = ("horizontal_fov_deg", "half_angle_deg", "start_ns")[: 3 if scene.surface else int(survey.moving is not None)]
+    aloft = ("horizontal_fov_deg", "half_angle_deg", "start_ns")[: 3 if scene.surface else int(bool(survey.moving))]
     ports = {"camera.port": scene.camera.port, "laser.port": laser.port}
     ports = {name: port for name, port in ports.items() if isinstance(port, Port) and port.thickness > 0.0}
     for section, fields in _PLAUSIBLE.items():

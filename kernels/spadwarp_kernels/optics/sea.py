@@ -19,7 +19,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 from spadwarp_kernels.water.limits import fresnel_reflectance
 
 from .port import Connection, Port, connect_flat, refracted
-from .waves import Waves, facet_at, facet_covariance, facet_normal, height_above_waves, make_waves, waves_distance
+from .waves import Facet, Waves, facet_at, facet_covariance, facet_normal, is_above_waves, make_waves, waves_distance
 
 __all__ = [
     "FACETS",
@@ -60,6 +60,11 @@ class Sea:
 @wp.func
 def _height_above(sea: Sea, x: wp.vec3) -> float:
     return wp.dot(x, sea.normal) - sea.height
+
+
+@wp.func
+def _is_above_plane(sea: Sea, x: wp.vec3) -> bool:
+    return _height_above(sea, x) > 0.0
 
 
 @wp.func
@@ -307,9 +312,9 @@ def _connect_by_plane(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uin
 
 
 @wp.func
-def _tilted(sea: Sea, x: wp.vec3) -> Sea:
+def _tilted(sea: Sea, facet: Facet) -> Sea:
     """The surface at a point of the waves, as that of their facet there."""
-    normal = facet_normal(sea.waves, facet_at(sea.waves, x).slope)
+    normal = facet_normal(sea.waves, facet.slope)
     local = sea
     local.normal = normal
     local.along = wp.normalize(sea.along - wp.dot(sea.along, normal) * normal)
@@ -317,36 +322,34 @@ def _tilted(sea: Sea, x: wp.vec3) -> Sea:
 
 
 @wp.func
-def _lifted(sea: Sea, port: Port, x: wp.vec3) -> Port:
-    """The mean plane at the height of the waves above or below x."""
-    plane = port
-    plane.distance += facet_at(sea.waves, x).height * wp.sign(wp.dot(port.normal, sea.normal))
-    return plane
-
-
-@wp.func
 def _connect_by_waves(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -> SeaConnection:
     """S is drawn about the flat surface at the height of the waves near it, and put on them."""
     c = SeaConnection()
-    plane = _lifted(sea, port, x)
+    below = wp.dot(port.normal, sea.normal) < 0.0  # x is
+    side = wp.where(below, -1.0, 1.0)
+    # The flat surface above or below x, by which there is a way; of an x that is far from waves the mean plane.
+    depth = wp.dot(x, port.normal) - port.distance
+    near = depth < wp.max(sea.waves.high, -sea.waves.low)
+    plane = port
+    if near:
+        plane.distance += side * facet_at(sea.waves, x).height
     flat = connect_flat(plane, x, o)
     if flat.density <= 0.0:
         return c
-    # At the height of the waves where the light leaves, unless that is at or beyond x.
-    there = _lifted(sea, port, flat.exit)
-    deep = wp.dot(x, port.normal) - plane.distance
-    if wp.dot(x, port.normal) - there.distance > 0.5 * deep:
-        nearer = connect_flat(there, x, o)
-        if nearer.density > 0.0:
-            flat = nearer
+    if not near:
+        # And from there on to the height of the waves: about, for a lens that is much farther than x.
+        across = flat.to_port + wp.dot(-flat.to_port, port.normal) * port.normal
+        lower = side * facet_at(sea.waves, flat.exit).height / wp.max(-wp.dot(flat.to_port, port.normal), 0.1)
+        flat.exit -= lower * across
+        flat.water -= wp.min(lower, 0.5 * flat.water)
     behind = wp.length(o - flat.exit)
     drawn = _draw_point(port, flat, behind, sea.normal, sea.waves.spread_along, sea.waves.spread, seed)
     s = wp.vec3(drawn[0], drawn[1], drawn[2])
-    local = _tilted(sea, s)
-    s -= height_above_waves(sea.waves, s) * sea.normal
+    facet = facet_at(sea.waves, s)
+    local = _tilted(sea, facet)
+    s += (facet.height - wp.dot(s - sea.waves.origin, sea.normal)) * sea.normal
     _by_point(c, s, x, o)
     cosine = wp.dot(c.to_surface, local.normal)
-    below = wp.dot(port.normal, sea.normal) < 0.0  # x is
     # Facets that turn their backs on x or on o let nothing through.
     if (cosine > 0.0) == below and (wp.dot(c.inside, local.normal) > 0.0) == below:
         level = wp.dot(local.normal, sea.normal)
@@ -360,7 +363,7 @@ class SeaKind(NamedTuple):
     """A kind of surface; its name identifies it in the kernel cache. Warp functions, in any one frame."""
 
     name: str  # "facets" or "waves"
-    height_above: wp.Function  # ``(sea, x) -> float``, of a point above the surface [m]
+    is_above: wp.Function  # ``(sea, x) -> bool``, whether a point is in the air
     # ``(sea, x, u, above, limit) -> float``: length of the flight from x along u, on the side `above` the surface or
     # below it, to the surface [m]; 1e30 if it does not meet it, as a flight over waves may not beyond the limit [m]
     distance: wp.Function
@@ -388,8 +391,8 @@ def _always_clear(sea: Sea, x: wp.vec3, u: wp.vec3, length: float, above: bool) 
 
 
 @wp.func
-def _height_above_waves(sea: Sea, x: wp.vec3) -> float:
-    return height_above_waves(sea.waves, x)
+def _is_above_waves(sea: Sea, x: wp.vec3) -> bool:
+    return is_above_waves(sea.waves, x)
 
 
 @wp.func
@@ -399,12 +402,12 @@ def _waves_distance(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, limit: float)
 
 @wp.func
 def _passage_at_waves(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, random: wp.vec4ui) -> SeaPassage:
-    return sample_passage(_tilted(sea, x), u, above, random)
+    return sample_passage(_tilted(sea, facet_at(sea.waves, x)), u, above, random)
 
 
 @wp.func
 def _density_at_waves(sea: Sea, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
-    return passage_density(_tilted(sea, x), u, v)
+    return passage_density(_tilted(sea, facet_at(sea.waves, x)), u, v)
 
 
 @wp.func
@@ -412,11 +415,11 @@ def _clear_of_waves(sea: Sea, x: wp.vec3, u: wp.vec3, length: float, above: bool
     return waves_distance(sea.waves, x, u, above, length) > length
 
 
-_AT_PLANE = (_height_above, _plane_distance, _passage_at_plane, _density_at_plane, _connect_by_plane, _always_clear)
+_AT_PLANE = (_is_above_plane, _plane_distance, _passage_at_plane, _density_at_plane, _connect_by_plane, _always_clear)
 FACETS = SeaKind("facets", *_AT_PLANE)
 """Facets about the mean plane: waves by the statistics of their slopes alone."""
 
-_AT_WAVES = (_height_above_waves, _waves_distance, _passage_at_waves, _density_at_waves)
+_AT_WAVES = (_is_above_waves, _waves_distance, _passage_at_waves, _density_at_waves)
 WAVES = SeaKind("waves", *_AT_WAVES, _connect_by_waves, _clear_of_waves)
 """A height field of waves, and about it facets for what it does not resolve."""
 
@@ -435,7 +438,7 @@ def see_through_waves_kernel(
     i, j = wp.tid()
     x = origins[i, j]
     u = directions[i, j]
-    above = height_above_waves(sea.waves, x) > 0.0
+    above = is_above_waves(sea.waves, x)
     distance = waves_distance(sea.waves, x, u, above, 1.0e9)
     v = wp.vec3(0.0)
     if distance < 1.0e30:

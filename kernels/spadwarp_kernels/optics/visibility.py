@@ -447,12 +447,12 @@ def lens_in_air(camera: Camera) -> bool:
 @memoised
 def _make_lies_across(sea: SeaKind) -> wp.Function:
     """The Warp function ``(camera, sea, x) -> bool``: whether the surface is between x and the lens."""
-    waves, height_above = sea.name == WAVES.name, sea.height_above
+    waves, is_above = sea.name == WAVES.name, sea.is_above
 
     @wp.func
     def lies_across(camera: Camera, sea: Sea, x: wp.vec3) -> bool:
         if wp.static(waves):
-            return (height_above(sea, x) > 0.0) != lens_in_air(camera)
+            return is_above(sea, x) != lens_in_air(camera)
         return _lies_across(camera, x)
 
     return lies_across

@@ -88,6 +88,16 @@ def height_above_waves(waves: Waves, x: wp.vec3) -> float:
 
 
 @wp.func
+def is_above_waves(waves: Waves, x: wp.vec3) -> bool:
+    """Whether a point is above the field."""
+    z = wp.dot(x - waves.origin, waves.normal)
+    above = z > waves.high
+    if z >= waves.low and not above:
+        above = z > facet_at(waves, x).height
+    return above
+
+
+@wp.func
 def facet_normal(waves: Waves, slope: wp.vec2) -> wp.vec3:
     """Unit normal of a facet, upwards."""
     return wp.normalize(waves.normal - slope[0] * waves.columns - slope[1] * waves.rows)

@@ -91,7 +91,7 @@ def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
     scans, enter, begin_carried = spec.beam.scans, spec.beam.enter, make_rider(spec).begin
     scan_view, has_port, sea = spec.sight.scan_view, enter is not None, spec.sea is not None
-    height_above = (spec.sea or FACETS).height_above
+    is_above = (spec.sea or FACETS).is_above
     point_out, turn_out = spec.beam.pose.point_out, spec.beam.pose.turn_out
 
     @wp.func
@@ -115,7 +115,7 @@ def make_begin(spec: TransportSpec) -> wp.Function:
         s.x = point_out(world.scan, s.target, s.x)
         s.u = turn_out(world.scan, s.target, s.u)
         if wp.static(sea):
-            s.above = height_above(world.sea, s.x) > 0.0
+            s.above = is_above(world.sea, s.x)
         s.analog_weight = s.weight.value
         s.collisions = 0
         s.surface_count = 0
