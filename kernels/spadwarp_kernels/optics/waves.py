@@ -28,6 +28,7 @@ class Waves:
     cell: wp.vec2  # distance of the nodes of a row, and of the rows [m]
     low: float  # bounds of the heights, with a margin for rounding [m]
     high: float
+    steepest: float  # bound of the slopes
     normal: wp.vec3  # of the mean plane, upwards
     origin: wp.vec3  # the point of the mean plane at the first node [m]
     columns: wp.vec3  # unit vector in the plane along a row
@@ -45,20 +46,32 @@ class Facet:
 
 
 @wp.func
-def _node(waves: Waves, row: int, column: int) -> float:
-    """Height of a node of the field, periodic."""
-    r = row % waves.heights.shape[0]
-    c = column % waves.heights.shape[1]
-    return waves.heights[wp.where(r < 0, r + waves.heights.shape[0], r), wp.where(c < 0, c + waves.heights.shape[1], c)]
+def _wrapped(k: int, count: int) -> int:
+    """A number of a node within the period."""
+    r = k % count
+    return wp.where(r < 0, r + count, r)
+
+
+@wp.func
+def _next(k: int, count: int) -> int:
+    return wp.where(k + 1 == count, 0, k + 1)
+
+
+@wp.func
+def _after(k: int, toward: float, count: int) -> int:
+    return wp.where(toward > 0.0, _next(k, count), wp.where(k == 0, count, k) - 1)
 
 
 @wp.func
 def _corners(waves: Waves, row: int, column: int) -> wp.vec4:
-    """Of a cell, as the polynomial of a and b in [0, 1] along columns and rows: of 1, a, b and a b."""
-    h = _node(waves, row, column)
-    right = _node(waves, row, column + 1) - h
-    below = _node(waves, row + 1, column) - h
-    return wp.vec4(h, right, below, _node(waves, row + 1, column + 1) - h - right - below)
+    """Of a cell within the period, as the polynomial of a and b in [0, 1] along columns and rows: of 1, a, b and
+    a b."""
+    row_after = _next(row, waves.heights.shape[0])
+    column_after = _next(column, waves.heights.shape[1])
+    h = waves.heights[row, column]
+    right = waves.heights[row, column_after] - h
+    below = waves.heights[row_after, column] - h
+    return wp.vec4(h, right, below, waves.heights[row_after, column_after] - h - right - below)
 
 
 @wp.func
@@ -74,7 +87,7 @@ def facet_at(waves: Waves, x: wp.vec3) -> Facet:
     row = wp.floor(p[1])
     a = p[0] - column
     b = p[1] - row
-    k = _corners(waves, int(row), int(column))
+    k = _corners(waves, _wrapped(int(row), waves.heights.shape[0]), _wrapped(int(column), waves.heights.shape[1]))
     facet = Facet()
     facet.height = k[0] + k[1] * a + k[2] * b + k[3] * a * b
     facet.slope = wp.vec2((k[1] + k[3] * b) / waves.cell[0], (k[2] + k[3] * a) / waves.cell[1])
@@ -125,6 +138,9 @@ def waves_distance(waves: Waves, x: wp.vec3, u: wp.vec3, above: bool, limit: flo
     that is farther than the limit. 0 at a point beyond the field, by rounding, that leads farther away."""
     z = wp.dot(x - waves.origin, waves.normal)
     climb = wp.dot(u, waves.normal)
+    side = wp.where(above, -1.0, 1.0)  # times the height: positive on the wrong side
+    if side * climb < 0.0 and climb * climb > 1.001 * waves.steepest * waves.steepest * (1.0 - climb * climb):
+        return _NOWHERE  # no wave is as steep
     # The part of the flight between the planes that hold the waves.
     begin = float(0.0)
     end = float(limit)
@@ -139,11 +155,12 @@ def waves_distance(waves: Waves, x: wp.vec3, u: wp.vec3, above: bool, limit: flo
         end = wp.min(wp.max(to_low, to_high), limit)
     if begin > end:
         return _NOWHERE
-    side = wp.where(above, -1.0, 1.0)  # times the height: positive on the wrong side
     p = _in_cells(waves, x - waves.origin)
     d = _in_cells(waves, u)
     column = wp.floor(p[0] + begin * d[0])
     row = wp.floor(p[1] + begin * d[1])
+    i = _wrapped(int(row), waves.heights.shape[0])
+    j = _wrapped(int(column), waves.heights.shape[1])
     t = begin
     for _ in range(_MOST_CELLS):
         to_column = float(_NOWHERE)
@@ -153,7 +170,7 @@ def waves_distance(waves: Waves, x: wp.vec3, u: wp.vec3, above: bool, limit: flo
         if wp.abs(d[1]) > 1.0e-12:
             to_row = (row + wp.where(d[1] > 0.0, 1.0, 0.0) - p[1]) / d[1]
         leave = wp.max(wp.min(wp.min(to_column, to_row), end), t)
-        k = _corners(waves, int(row), int(column))
+        k = _corners(waves, i, j)
         a = p[0] + t * d[0] - column
         b = p[1] + t * d[1] - row
         value = z + t * climb - (k[0] + k[1] * a + k[2] * b + k[3] * a * b)
@@ -165,8 +182,10 @@ def waves_distance(waves: Waves, x: wp.vec3, u: wp.vec3, above: bool, limit: flo
             return _NOWHERE
         if to_column <= to_row:
             column += wp.sign(d[0])
+            j = _after(j, d[0], waves.heights.shape[1])
         else:
             row += wp.sign(d[1])
+            i = _after(i, d[1], waves.heights.shape[0])
         t = leave
     return _NOWHERE
 
@@ -220,6 +239,7 @@ def make_waves(heights: ArrayLike, size: Sequence[float], *, device: wp.DeviceLi
     waves.cell = wp.vec2(size[0] / h.shape[1], size[1] / h.shape[0])
     margin = 0.01 * float(np.ptp(h)) + 1e-4
     waves.low, waves.high = float(h.min()) - margin, float(h.max()) + margin
+    waves.steepest = steepest_facet(h, size)
     return waves
 
 
