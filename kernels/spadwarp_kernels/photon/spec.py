@@ -15,7 +15,7 @@ from spadwarp_kernels.optics.visibility import Sight, make_sight
 from spadwarp_kernels.surface.ray_cast import Faces, make_faces
 from spadwarp_kernels.tally.flux import FLUX_KINDS
 from spadwarp_kernels.water.limits import Domain, make_domain
-from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
+from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, MOST_LINES, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
 
 from .derivatives import BLOCK_DERIVATIVES, DERIVATIVES, MOST_DERIVATIVES
@@ -93,6 +93,9 @@ class TransportSpec(NamedTuple):
     BLOCK_DERIVATIVES; the blocks are those of `Derivatives.blocks`."""
     polarised: bool = False
     """Photons carry a Stokes vector, and scores are of the light that it stands for, see `Model.polarisation`."""
+    inelastic: bool = False
+    """Photons carry what has become light of other wavelengths, see `Model.inelastic`, of which each of `channels` is
+    one; in homogeneous water."""
     points: int = 1
     """At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`, `blocks`
     and DELTA_TRACKING, three with up to 4 derivatives."""
@@ -102,8 +105,8 @@ class TransportSpec(NamedTuple):
     sun: bool = False
     """The light is that of sun and sky, see `make_sun`, through a calm surface, FLAT_PORT as `laser_port`."""
     channels: int = 0
-    """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, each with a tally of its
-    own."""
+    """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, or lines of inelastic
+    scattering, at most MOST_LINES, each with a tally of its own."""
 
     @property
     def signed(self) -> int:
@@ -195,7 +198,8 @@ def check_spec(spec: Any) -> None:
             check_choice(f"spec.{name}[{index}]", kind, allowed)
     # A block has 48 KiB of shared memory for queues.
     check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
-    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
+    most = MOST_CHANNELS if spec.polarised else MOST_LINES if spec.inelastic else 0
+    check_integer("spec.channels", spec.channels, 0, most)
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
         (spec.sea and spec.confocal and spec.lens.name != SCANNED.name, "sea: a scan needs spec.lens = SCANNED"),
@@ -244,6 +248,11 @@ def check_spec(spec: Any) -> None:
         (
             spec.polarised and (spec.derivatives or spec.blocks),
             "polarised cannot be combined with spec.derivatives and spec.blocks",
+        ),
+        (
+            spec.inelastic and (spec.polarised or spec.derivatives or spec.varies or spec.random_albedo or spec.sea),
+            "inelastic cannot be combined with spec.polarised, spec.derivatives, spec.layered, spec.grid, "
+            "spec.random_albedo and spec.sea",
         ),
         (
             spec.flux and (spec.estimator in ("analog", "guided") or spec.polarised or spec.random_albedo),
