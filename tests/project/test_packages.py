@@ -124,7 +124,7 @@ LINES = {
     "kernels/detection": (1000, 1385),
     "kernels/estimators": (1300, 1124),
     "kernels/optics": (1350, 2908),
-    "kernels/photon": (850, 1297),
+    "kernels/photon": (850, 1285),
     "kernels/riders": (750, 683),
     "kernels/surface": (1700, 1919),
     "kernels/tally": (450, 941),

@@ -32,18 +32,11 @@ _WORDS = {
     Water | None: "REGULAR_TRACKING, DELTA_TRACKING or None",
 }
 
-# What light through the surface of a sea cannot be combined with.
-_NOT_BY_SEA = (
-    "port",
-    "laser_port",
-    "reflecting",
-    "grid",
-    "merged",
-    "signed",
-    "blocks",
-    "polarised",
-    "flux",
-)
+# What light through the surface of a sea, and light of other wavelengths, cannot be combined with.
+_EXCLUDED = {
+    "sea": ("port", "laser_port", "reflecting", "grid", "merged", "signed", "blocks", "polarised", "flux"),
+    "inelastic": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
+}
 
 
 class TransportSpec(NamedTuple):
@@ -198,8 +191,7 @@ def check_spec(spec: Any) -> None:
             check_choice(f"spec.{name}[{index}]", kind, allowed)
     # A block has 48 KiB of shared memory for queues.
     check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
-    most = MOST_CHANNELS if spec.polarised else MOST_LINES if spec.inelastic else 0
-    check_integer("spec.channels", spec.channels, 0, most)
+    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS * spec.polarised + MOST_LINES * spec.inelastic)
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
         (spec.sea and spec.confocal and spec.lens.name != SCANNED.name, "sea: a scan needs spec.lens = SCANNED"),
@@ -207,9 +199,10 @@ def check_spec(spec: Any) -> None:
             spec.lens.name == SCANNED.name and (not spec.confocal or spec.polarised or spec.reflecting),
             "lens = SCANNED needs spec.confocal = True, and cannot be combined with spec.polarised and spec.reflecting",
         ),
-        (
-            spec.sea and any(getattr(spec, name) for name in _NOT_BY_SEA),
-            "sea cannot be combined with spec." + ", spec.".join(_NOT_BY_SEA),
+        *(
+            (any(getattr(spec, x) for x in others), f"{one} cannot be combined with spec." + ", spec.".join(others))
+            for one, others in _EXCLUDED.items()
+            if getattr(spec, one)
         ),
         (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
         (
@@ -248,11 +241,6 @@ def check_spec(spec: Any) -> None:
         (
             spec.polarised and (spec.derivatives or spec.blocks),
             "polarised cannot be combined with spec.derivatives and spec.blocks",
-        ),
-        (
-            spec.inelastic and (spec.polarised or spec.derivatives or spec.varies or spec.random_albedo or spec.sea),
-            "inelastic cannot be combined with spec.polarised, spec.derivatives, spec.layered, spec.grid, "
-            "spec.random_albedo and spec.sea",
         ),
         (
             spec.flux and (spec.estimator in ("analog", "guided") or spec.polarised or spec.random_albedo),
