@@ -26,7 +26,7 @@ from spadwarp.device import pick_device
 from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, Method, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.result import CHANNELS, Channel, analyser_channel, merge
+from spadwarp.result import CHANNELS, POLARISED, Channel, analyser_channel, merge
 from spadwarp.scene import SceneLike, Transport, as_scene, noise_rate
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
@@ -239,8 +239,8 @@ def plan(
         progress=progress,
     )
     problem = ""
-    if channel != "I" and not scene.camera.channels:
-        problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes'"
+    if channel != "I" and not (scene.camera.channels if channel in POLARISED else channel in scene.tallied_channels):
+        problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes', or medium.inelastic"
     elif not scene.has_straight_sight:
         problem = "plan knows neither [surface] nor scan.mode = 'trajectory'; simulate and detect do"
     elif ranges is None:

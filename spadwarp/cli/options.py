@@ -29,7 +29,7 @@ __all__ += ["read_scene", "real_number", "refuse", "whole_number"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 """`spadwarp.frames.METHODS`, known without loading it."""
-Channel = Literal["I", "co", "cross"]
+Channel = Literal["I", "co", "cross", "raman", "fluorescence"]
 """`spadwarp.result.CHANNELS`, known without loading it."""
 
 SHARED = tomllib.loads((files("spadwarp.cli") / "options.toml").read_text(encoding="utf-8"))

@@ -213,7 +213,7 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     photons = result.photons
     if result.partial:
         raise KeyboardInterrupt
-    polarisation = degree_of_polarisation(result).astype(np.float16) if result.channels else None
+    polarisation = degree_of_polarisation(result).astype(np.float16) if result.scene.camera.channels else None
     result = analyser_channel(result, plan.recipe.monte_carlo.channel)
     chosen = plan.recipe.monte_carlo
     automatic = draw.photons == "auto" and chosen.channel == "I" and scene.has_straight_sight

@@ -172,7 +172,7 @@ def remove_checkpoint(out: str | Path) -> None:
 
 def bytes_needed(scene: Scene, *, records: bool = False, checkpoint: bool = False, derivatives: int = 0) -> int:
     """Upper bound of what a run with so many derivatives writes [bytes]; compression takes off most of it."""
-    signed = derivatives + len(scene.camera.tallied_channels)
+    signed = derivatives + len(scene.tallied_channels)
     # Tallies and squares by bin; of light the tallies of one half of the photons, and its reconstruction in float32.
     tallies = (10 + 5 * signed) * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
     photons = scene.transport.photons if records and scene.transport.photons != "auto" else 0

@@ -107,8 +107,9 @@ def to_xarray(result: Result) -> xarray.Dataset:
 
     `histogram` has the dimensions (component, y, x, time); `.sum("component")` is all light, `.sel(component=
     "backscatter")` a part of it. Coordinates: time of flight [s] at the bins' centres, `path` [m] along it, pixels.
-    `derivative`, of results that have some, has the dimension parameter before these, and `polarisation` the dimension
-    channel. Sections of flux are such as `around_fluence`, with dimensions of their own.
+    `derivative`, of results that have some, has the dimension parameter before these, and `polarisation`, or
+    `other_wavelengths`, the dimension channel. Sections of flux are such as `around_fluence`, with dimensions of their
+    own.
     Attributes: photons, seed, partial and the scene as TOML.
 
     Raises `FileError`: xarray is not installed.
@@ -128,7 +129,8 @@ def to_xarray(result: Result) -> xarray.Dataset:
         variables["derivative"] = (("parameter", *cube), slopes, "1", "of the histogram, per unit of the parameter")
     if result.channels:
         channels = np.stack([*result.channels.values()])
-        variables["polarisation"] = (("channel", *cube), channels, "1", "fraction of the emitted photons in a channel")
+        name = "polarisation" if result.scene.camera.channels else "other_wavelengths"
+        variables[name] = (("channel", *cube), channels, "1", "fraction of the emitted photons in a channel")
     known = coordinates_of(result)
     for name, array in flux_arrays(result.scene).items():
         section, _, kind = name.partition("/")

@@ -25,15 +25,18 @@ from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_
 if TYPE_CHECKING:
     from spadwarp.scene import Scene
 
-__all__ = ["CHANNELS", "COMPONENTS", "Channel", "Component", "Half", "Reconstruction", "Result", "Truth"]
+__all__ = ["CHANNELS", "COMPONENTS", "POLARISED", "Channel", "Component", "Half", "Reconstruction", "Result", "Truth"]
 __all__ += ["analyser_channel", "component_errors", "degree_of_polarisation"]
 
 COMPONENTS: tuple[Component, ...] = get_args(Component)[:3]
 """Those of every result; `Scene.components` are those of a scene."""
 
-Channel = Literal["I", "co", "cross"]
+Channel = Literal["I", "co", "cross", "raman", "fluorescence"]
 CHANNELS: tuple[Channel, ...] = get_args(Channel)
-"""What a camera may record of polarised light: all of it, or what an analyser passes at its angle or across it."""
+"""What a receiver may record: light of the laser's wavelength, all of it or what an analyser passes at its angle or
+across it; or light of other wavelengths."""
+POLARISED: tuple[Channel, ...] = ("co", "cross")
+"""Those of an analyser."""
 
 Floats = NDArray[np.float64]
 
@@ -177,7 +180,7 @@ class Result(Shown, ResultHead, Tallies):
             raise ArgumentError(f"batches = {self.batches} of {self.batch_size} photons cannot be those of the run")
         if not 0 <= self.half_photons <= self.photons:
             raise ArgumentError(f"half_photons = {self.half_photons} is outside [0, {self.photons}]")
-        signed, expected = signed_of(self), self.scene.camera.tallied_channels
+        signed, expected = signed_of(self), self.scene.tallied_channels
         channels = signed["channels"].names if "channels" in signed else ()
         if channels != expected:
             text = f"channels are {', '.join(channels) or 'none'}; those of the scene's camera are"
@@ -268,8 +271,8 @@ class Result(Shown, ResultHead, Tallies):
 
     @property
     def channels(self) -> Mapping[str, Floats]:
-        """Channel of the camera, "co" and "cross" of an analyser or "I", "Q", "U" and "V", → what it gets, as
-        `derivatives`; the histogram is of light without an analyser."""
+        """Channel: "co" and "cross" of an analyser, "I", "Q", "U" and "V", or "raman" and "fluorescence" → its light,
+        as `derivatives`; the histogram is of light without an analyser."""
         return _SignedValues(self, "channels")
 
     @cached_property
@@ -538,7 +541,7 @@ def coordinates_of(result: Result) -> dict[str, Coordinate]:
         **image_coordinates(*result.truth.depth.shape),
         "time": (result.bin_centres, "s", "time of flight at the centre of the bin"),
         "parameter": (list(result.derivatives), "1", "by which the histogram is differentiated"),
-        "channel": (list(result.scene.camera.tallied_channels), "1", "of the receiver of polarised light"),
+        "channel": (list(result.scene.tallied_channels), "1", "of the receiver"),
     }
 
 
@@ -609,7 +612,21 @@ def _cubes_of(result: Result, group: str) -> dict[str, _Cube]:
         moments = [None] * len(found.names) if found.second_moment is None else found.second_moment.swapaxes(0, 1)
         parts = zip(found.names, found.tallies, found.units, moments, strict=True)
         cubes |= {name: _Cube(*cube) for name, *cube in parts}
+    for one in result.scene.medium.inelastic if group == "channels" else ():
+        if one.decay_time_ns > 0.0 and one.process in cubes:
+            cubes[one.process] = _decayed(cubes[one.process], one.decay_time_ns * 1e-9 / result.scene.gate.bin_width)
     return cubes
+
+
+def _decayed(cube: _Cube, bins: float) -> _Cube:
+    """Light given off after an exponential time, `bins` on average, if all bins are lit evenly."""
+    from scipy.signal import lfilter
+
+    rest = math.exp(-1.0 / bins)
+    first = 1.0 - bins * (1.0 - rest)  # what is left in its own bin; of each later one `rest` of that before
+    later = bins * (1.0 - rest) ** 2
+    light = lfilter([first, later - first * rest], [1.0, -rest], cube.tallies.astype(np.float64), axis=-1)
+    return _Cube(np.rint(light).astype(np.int64), cube.unit, None)
 
 
 class _SignedValues(Mapping[str, Floats]):
@@ -618,7 +635,8 @@ class _SignedValues(Mapping[str, Floats]):
 
     def __init__(self, result: Result, group: str, *, errors: bool = False) -> None:
         self._result, self._group, self._errors = result, group, errors
-        self._cubes = _cubes_of(result, group)
+        cubes = _cubes_of(result, group)
+        self._cubes = {name: one for name, one in cubes.items() if not errors or one.second_moment is not None}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._cubes)
@@ -760,6 +778,9 @@ def _threshold(batches: int) -> float:
 def analyser_channel(result: Result, channel: Channel) -> Result:
     """The result with the light of one channel alone, for all that takes a result: counts, depth, bounds, pictures.
 
+    "raman" and "fluorescence" are light of other wavelengths, for a receiver with a filter that passes them alone; the
+    detector is taken as it is given, so that its efficiency is to be that at their wavelength.
+
     "I" is the result itself, without an analyser; "co" passes an analyser at `camera.analyser_angle_deg` of the
     camera's `analyser_extinction_ratio`, "cross" one across it. A camera of four Stokes cubes has both. Ambient light
     counts as unpolarised: ½(1 + 1/E) of it passes, of `detector.ambient_rate` and of daylight.
@@ -770,16 +791,18 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
     """
     if check_choice("channel", channel, CHANNELS) == "I":
         return result
-    if not result.channels:
-        own = result.provenance.get("channel")
-        problem = f"the result holds {own!r} alone; take that of the run" if own else f"the result has none; {_CAMERAS}"
+    of_polarisation = channel in POLARISED
+    if not (result.scene.camera.channels if of_polarisation else channel in result.channels):
+        own, lines = result.provenance.get("channel"), f"give medium.inelastic with process = {channel!r}"
+        problem = f"the result has none; {_CAMERAS if of_polarisation else lines}"
+        problem = f"the result holds {own!r} alone; take that of the run" if own else problem
         raise ConfigError(f"channel = {channel!r}: {problem}", source=result.scene.source)
     tallies, unit = _channel_tallies(result, channel)
     cube = _cubes_of(result, "channels").get(channel)
     moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
     return replace(
         result,
-        scene=_behind_analyser(result.scene),
+        scene=_behind_analyser(result.scene) if of_polarisation else _behind_filter(result.scene),
         tallies=tallies,
         unit=unit,
         half=None,
@@ -823,7 +846,7 @@ def degree_of_polarisation(result: Result, *, gated: bool = False) -> Floats:
 
     Raises `ConfigError` where the result was simulated without channels.
     """
-    if not result.channels:
+    if not result.scene.camera.channels:
         raise ConfigError(f"the degree of polarisation needs channels; {_CAMERAS}")
     return _degree(result, _sums(result, (0, 3) if gated else (0,)))
 
@@ -836,8 +859,10 @@ def _polarisation_summary(result: Result) -> dict[str, Any]:
     if not result.channels:
         return {}
     sums = _sums(result, (0, 1, 2, 3))
-    degree = float(_degree(result, sums))
     light = {name: float(total) / result.photons for name, total in sums.items()}
+    if not result.scene.camera.channels:
+        return {"channels": light}
+    degree = float(_degree(result, sums))
     return {"channels": light, "degree_of_polarisation": degree if math.isfinite(degree) else None}
 
 
@@ -855,6 +880,11 @@ def _degree(result: Result, sums: dict[str, Floats]) -> Floats:
         ratio = (sums["co"] - sums["cross"]) / (sums["co"] + sums["cross"])
         degree: Floats = np.clip(ratio * np.divide(1.0 + leak, 1.0 - leak), -1.0, 1.0)
         return degree
+
+
+def _behind_filter(scene: Scene) -> Scene:
+    """The scene of a receiver that light of another wavelength alone reaches."""
+    return scene.with_overrides({"medium.inelastic": []})
 
 
 def _behind_analyser(scene: Scene) -> Scene:

@@ -158,6 +158,43 @@ class Constituent(PhaseLaw):
         return self.absorption + self.scattering
 
 
+RAMAN_SHIFT = 3400.0  # wavenumber of water's band, less at the new wavelength [1/cm]
+_RAMAN_DEPOLARISATION = 0.17
+
+
+class Inelastic(Section):
+    """Light of the laser that the water gives off at another wavelength, as a channel of the result by this name."""
+
+    process: Literal["raman", "fluorescence"] = "raman"
+    """scattering by water, or light of chlorophyll, in all directions"""
+    coefficient: float | None = field(
+        None, "what becomes such light, in photons [1/m]; raman: default by wavelength", "[0, 1e6]"
+    )
+    absorption: float = field(..., "of the water at the new wavelength [1/m]", "[0, 1e6]")
+    scattering: float | None = field(None, "likewise; default: that at the laser's [1/m]", "[0, 1e6]")
+    passed: float = field(1.0, "part of the new light that the receiver's filter for it passes", "[0, 1]")
+    decay_time_ns: float = field(0.0, "fluorescence: after which 1/e of the light is still to come [ns]", "[0, 1e6]")
+
+    def _problems(self) -> Iterator[str]:
+        yield from super()._problems()
+        fluoresces = self.process == "fluorescence"
+        if fluoresces and self.coefficient is None:
+            yield "needs coefficient with process = 'fluorescence': absorption by chlorophyll times its quantum yield"
+        if not fluoresces and self.decay_time_ns > 0.0:
+            yield self._that("decay_time_ns", "goes with process = 'fluorescence' only")
+
+    def source(self, wavelength_nm: float) -> float:
+        """`coefficient`, or that of Raman scattering by water, 2.7e-4 1/m at 488 nm, falling with the power 5.3 of the
+        wavelength in photons (Bartlett, Voss, Sathyendranath & Vodacek, Appl. Opt. 37, 3324, 1998)."""
+        return 2.7e-4 * (488.0 / wavelength_nm) ** 5.3 if self.coefficient is None else self.coefficient
+
+    @property
+    def anisotropy(self) -> float:
+        """A of the phase function, ~ 1 + A cos²θ: of Raman scattering (1 − ρ)/(1 + 3ρ), ρ its depolarisation, 0.17."""
+        rho = _RAMAN_DEPOLARISATION
+        return (1.0 - rho) / (1.0 + 3.0 * rho) if self.process == "raman" else 0.0
+
+
 class Water(Section):
     """Coefficients of water: two of four coefficients, or chlorophyll, from which they follow."""
 
@@ -270,6 +307,8 @@ class Medium(PhaseLaw, Water):
     constituents: Annotated[tuple[Constituent, ...], BeforeValidator(listed), Field(max_length=MOST_CONSTITUENTS)] = ()
     """what the water is made of, in place of coefficients and phase function: their coefficients add up, those of pure
     water among them; at most 4"""
+    inelastic: Annotated[tuple[Inelastic, ...], BeforeValidator(listed), Field(max_length=2)] = ()
+    """light of other wavelengths, one of each process, which the absorption has lost; not with layers and grid"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
@@ -305,6 +344,11 @@ class Medium(PhaseLaw, Water):
             own = PRESETS["medium"][layer.preset].values.get("anisotropy") if layer.preset else None
             if law != "henyey_greenstein" and layer.anisotropy not in (None, own):
                 yield f"layers[{i}].anisotropy = {layer.anisotropy} {own_law}; layers share any other"
+        processes = [one.process for one in self.inelastic]
+        if len(set(processes)) < len(processes):
+            yield f"inelastic: {', '.join(processes)} are not different processes"
+        if self.inelastic and (self.layers or self.grid is not None or self.albedo == "lu2024"):
+            yield "inelastic goes neither with layers, grid nor albedo = 'lu2024': it takes one water"
         if self.grid is not None and self.layers:
             yield f"grid does not go with layers, {len(self.layers)} given; cells can repeat them, from a file"
         if self.grid is not None and self.albedo == "lu2024":

@@ -100,6 +100,14 @@ class Scene(Shown, Document):
                 f"transport.axis_threshold = {transport.axis_threshold} {goes} polarised light: leave it out, or set "
                 "it to 1, for directions without the near-axis rule"
             )
+        if medium.inelastic and (self.polarised or self.surface is not None):
+            yield f"medium.inelastic {goes} polarised light and surface: leave one of them out"
+        lost = math.fsum(one.source(self.laser.wavelength_nm) for one in medium.inelastic)
+        if medium.inelastic and (lost > medium.absorption or medium.scattering <= 0.0):
+            yield (
+                f"medium.inelastic takes {lost:g} 1/m from absorption = {medium.absorption:g}, beside scattering = "
+                f"{medium.scattering:g}: it can take no more than that, in water that scatters"
+            )
         for k, target in enumerate(self.targets if self.polarised else ()):
             if target.specular > 0.0 and abs(target.specular_index / medium.phase_index - 1.0) < 1e-3:
                 yield (
@@ -292,6 +300,11 @@ class Scene(Shown, Document):
     def has_straight_sight(self) -> bool:
         """Whether unscattered light has one known way, to a lens at rest: `spadwarp.reconstruct` and `plan` need it."""
         return self.surface is None and self.scan.mode != "trajectory"
+
+    @property
+    def tallied_channels(self) -> tuple[str, ...]:
+        """Channels with tallies of their own: of polarised light, or of light at other wavelengths."""
+        return (*self.camera.tallied_channels, *(one.process for one in self.medium.inelastic))
 
     @property
     def polarised(self) -> bool:

@@ -47,6 +47,8 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
     everywhere = 'albedo = "lu2024" draws the scattering anew at every collision' if medium.albedo == "lu2024" else ""
     if scene.polarised:
         everywhere = "light is polarised, whose matrices have no derivatives; simulate the scene without polarisation"
+    if medium.inelastic:
+        everywhere = "light of other wavelengths has no derivatives; leave out medium.inelastic"
     if scene.surface is not None:
         everywhere = "derivatives cannot be combined with surface; take differences of two runs with one seed"
     in_water = everywhere

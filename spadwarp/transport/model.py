@@ -91,6 +91,8 @@ def build_model(
         parts["sea"] = _sea(scene, device)
     if scene.polarised:
         parts |= _polarised(scene, mesh, scale, device)
+    if scene.medium.inelastic:
+        parts |= _inelastic(scene, scale, device)
     if camera and scene.flux:
         parts["flux"] = _flux(scene, device)
     model = sk.Model(
@@ -107,7 +109,7 @@ def build_model(
         **parts,
     )
     if camera:
-        spare = _check_size(scene, model, copies, len(derivatives) + len(scene.camera.tallied_channels))
+        spare = _check_size(scene, model, copies, len(derivatives) + len(scene.tallied_channels))
         model = dataclasses.replace(model, split_accumulators=spare)
     return model
 
@@ -296,9 +298,10 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         derivatives=kinds,
         blocks=by_block,
         polarised=scene.polarised,
+        inelastic=bool(scene.medium.inelastic),
         # Those of a scene go with its own estimator.
         points=1 if "estimator" in choices else points_per_flight(scene, kinds, by_block),
-        channels=len(scene.camera.tallied_channels),
+        channels=len(scene.tallied_channels),
         flux=() if "estimator" in choices else tuple(dict.fromkeys(section.kind for section in scene.flux)),
         sun=scene.sun is not None,
     )
@@ -556,6 +559,25 @@ def _polarised(scene: Scene, mesh: TriangleMesh | None, scale: float, device: wp
         return {"polarisation": light}
     tallies = sk.make_derivatives([], [], [scale] * len(rows), channels=len(rows), device=device)
     return {"polarisation": light, "derivatives": tallies}
+
+
+def _inelastic(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
+    """Lines of inelastic scattering, and a tally of each, finer than the histogram by as much as it holds less: at most
+    as much as inelastic scattering is of elastic by any one angle."""
+    water, wavelength = scene.medium, scene.laser.wavelength_nm
+    lines, least = water.inelastic, float(phase_function(water).density(np.linspace(0.01, math.pi, 500)).min())
+    scattering = [water.scattering if one.scattering is None else one.scattering for one in lines]
+    found = sk.make_inelastic(
+        [one.source(wavelength) for one in lines],
+        [one.anisotropy for one in lines],
+        [one.absorption + b for one, b in zip(lines, scattering, strict=True)],
+        scattering,
+        [one.passed for one in lines],
+        medium=_medium(scene, device),
+    )
+    parts = [one.passed * one.source(wavelength) / (4.0 * math.pi * water.scattering * least) for one in lines]
+    scales = [scale / 2.0 ** math.floor(math.log2(max(part, 1e-12))) for part in parts]
+    return {"inelastic": found, "derivatives": sk.make_derivatives([], [], scales, channels=len(lines), device=device)}
 
 
 def _emitted_stokes(laser: Laser) -> tuple[float, float, float, float]:

@@ -238,7 +238,7 @@ def _check_resumed(resume: Result, run: RunOptions, seed: int | None) -> None:
     if seed not in (None, resume.seed):
         raise ConfigError(f"seed = {seed} is not {resume.seed}, the seed of the run to resume")
     if channel := resume.provenance.get("channel"):
-        raise ConfigError(f"resume: the result holds {channel}-polarised light alone; resume the run that it is of")
+        raise ConfigError(f"resume: the result holds light of channel {channel} alone; resume the run that it is of")
 
 
 # The unit of the tallies, between the brightest bin that they hold and the faintest light that they resolve

@@ -277,6 +277,8 @@ class DeviceWorker:
         with device_errors(self.model.device):
             closed = self._closed or _Closed(*sk.read_ledger(self.data), {}, batches=0)
             signed, histogram = self._signed_tallies(), self._histograms[0]
+            if self._spec.inelastic:
+                closed = closed._replace(energy_balance=self._with_shifted(closed.energy_balance))
             return Tallies(
                 tallies=_on_host(histogram.total).reshape(self._shape),
                 **closed._asdict(),
@@ -295,6 +297,16 @@ class DeviceWorker:
         values, moments = histogram.total.numpy().reshape(shape), histogram.second_moment(shape[1:])
         moments = None if moments is None else np.ascontiguousarray(np.moveaxis(moments, -1, 1))
         return SignedTallies(self._signed, np.moveaxis(values, -1, 0), self.signed_units, moments)
+
+    def _with_shifted(self, energy_balance: dict[str, int]) -> dict[str, int]:
+        """Of what the water has absorbed, the part that is scattered inelastically in entries of its own: at every
+        collision it is the same."""
+        medium, source, balance = self.model.medium, self.model.inelastic.source, dict(energy_balance)
+        absorption, lost = medium.extinction * (1.0 - medium.albedo), balance["absorbed_water"]
+        for k, name in enumerate(self._signed):
+            balance[name] = round(lost * min(float(source[k]) / absorption, 1.0))
+            balance["absorbed_water"] -= balance[name]
+        return balance
 
     def _flux_tallies(self) -> FluxTallies | None:
         if self.data.flux is None:
@@ -463,7 +475,7 @@ class LocalWorkers:
             for kernel in loading:
                 kernel.result()
         settings: Any = {"seed": plan.seed, "launch_size": size, "threads": threads, "batch_size": plan.batch_size}
-        signed = plan.derivatives or plan.scene.camera.tallied_channels
+        signed = plan.derivatives or plan.scene.tallied_channels
         self.tracers = [DeviceWorker(model, spec, signed=signed, tallies=tallies, **settings) for model in models]
         self.timing = {"setup": built - began, "compile": time.perf_counter() - traced, "truth": traced - built}
         self.first_block = threads * size
@@ -549,7 +561,7 @@ class ClusterWorkers(RayWorkers):
     ) -> None:
         camera = plan.scene.camera
         voxels = camera.width * camera.height * plan.scene.gate.bins
-        histograms = 1 + len(plan.derivatives) + len(camera.tallied_channels)
+        histograms = 1 + len(plan.derivatives) + len(plan.scene.tallied_channels)
         components = len(plan.scene.components)
         size = 8 * (components + (2 + components if plan.batch_size else 0)) * histograms * voxels
         size += 24 * sum(section.size for section in plan.scene.flux)

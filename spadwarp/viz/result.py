@@ -18,7 +18,7 @@ from spadwarp.frames import Frames, FramesFile, Method, first_photon_probabiliti
 from spadwarp.frames.spad import noise_caption
 from spadwarp.inverse import Fit
 from spadwarp.result import (
-    CHANNELS,
+    POLARISED,
     Channel,
     Result,
     analyser_channel,
@@ -163,7 +163,7 @@ def _result_figure(
     if kind == "flux":
         return flux_figure(result, _caption(result), width)
     truth, unclear = result.truth, unclear_pixels(result)
-    shown_channels = CHANNELS[1:] if result.channels else ()
+    shown_channels = POLARISED if result.scene.camera.channels else ()
     count_of = 2 + len(shown_channels) + bool(shown_channels) if kind == "intensity" else 3
     panels = Panels(truth.depth.shape, count_of, width=width)
     panels.figure.caption(_caption(result))
@@ -275,7 +275,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
         lower, upper = (np.maximum(merged_means(total, edges) + sign * spread, 0.01 * bottom) for sign in (-1, 1))
         label = "all light ± standard error"
         axis.stairs(upper, time[edges], baseline=lower, fill=True, color="0.75", zorder=1, label=label)
-    for channel, line in _CHANNEL_LINES.items() if result.channels else ():
+    for channel, line in _CHANNEL_LINES.items() if result.scene.camera.channels else ():
         seen = pixel_channel(result, channel, row, column).sum(axis=0) * per_pulse
         curves.append((merged_means(seen, edges), edges, {"label": style.CHANNEL_NAMES[channel], **line}))
     for heights, own, drawn in curves:  # zeros lie below the axis, so that a single bin still shows as a spike

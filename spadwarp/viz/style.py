@@ -50,8 +50,9 @@ COMPONENTS = {
     "surface": ("surface of the sea", PURPLE),
 }
 """Label and colour of the components of a result."""
-CHANNEL_NAMES: dict[Channel, str] = {"co": "co-polarised", "cross": "cross-polarised"}
-"""Words for the channels of an analyser."""
+CHANNEL_NAMES: dict[Channel, str] = {"co": "co-polarised", "cross": "cross-polarised", "raman": "Raman-scattered"}
+CHANNEL_NAMES |= {"fluorescence": "fluorescent"}
+"""Words for light of a channel."""
 
 DEPTH_MAP, INTENSITY_MAP = "viridis_r", "cividis"
 BOUND_MAP, PROBABILITY_MAP, LIGHT_MAP = "magma_r", "inferno_r", "inferno"

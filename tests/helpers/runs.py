@@ -39,7 +39,7 @@ def of_seeds(one, device, photons, seeds, derivatives=(), blocks=None):
     which takes ten times as long as so few. No light is lost from the ledger or clipped."""
     target, mesh, names = pick_device(device), build_mesh(one), resolve_derivatives(one, derivatives, blocks)
     model = build_model(one, target, mesh, derivatives=names)
-    spec, signed = transport_spec(one, mesh, derivatives=names), names or one.camera.tallied_channels
+    spec, signed = transport_spec(one, mesh, derivatives=names), names or one.tallied_channels
     for seed in seeds:
         worker = DeviceWorker(model, spec, seed=seed, launch_size=1 << 20, signed=signed)
         worker.trace((0, photons), stopped=threading.Event())

@@ -150,7 +150,7 @@ def test_channels_that_are_not_there_are_refused(analysed):
 
 def test_a_channel_is_not_added_to_other_light(light):
     cross = light["cross"]
-    with pytest.raises(ConfigError, match="resume: the result holds cross-polarised light alone"):
+    with pytest.raises(ConfigError, match="resume: the result holds light of channel cross alone"):
         spadwarp.simulate(cross.scene, photons=2 * cross.photons, device="cpu", run=spadwarp.RunOptions(resume=cross))
     with pytest.raises(ConfigError, match="merge: the channel of the results differs"):
         spadwarp.merge([cross, light["co"]])

@@ -15,7 +15,7 @@ from spadwarp_kernels.optics.visibility import Sight, make_sight
 from spadwarp_kernels.surface.ray_cast import Faces, make_faces
 from spadwarp_kernels.tally.flux import FLUX_KINDS
 from spadwarp_kernels.water.limits import Domain, make_domain
-from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, Water
+from spadwarp_kernels.water.medium import HOMOGENEOUS, LAYERED, MOST_LINES, Water
 from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, PhaseFunction
 
 from .derivatives import BLOCK_DERIVATIVES, DERIVATIVES, MOST_DERIVATIVES
@@ -32,18 +32,11 @@ _WORDS = {
     Water | None: "REGULAR_TRACKING, DELTA_TRACKING or None",
 }
 
-# What light through the surface of a sea cannot be combined with.
-_NOT_BY_SEA = (
-    "port",
-    "laser_port",
-    "reflecting",
-    "grid",
-    "merged",
-    "signed",
-    "blocks",
-    "polarised",
-    "flux",
-)
+# What light through the surface of a sea, and light of other wavelengths, cannot be combined with.
+_EXCLUDED = {
+    "sea": ("port", "laser_port", "reflecting", "grid", "merged", "signed", "blocks", "polarised", "flux"),
+    "inelastic": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
+}
 
 
 class TransportSpec(NamedTuple):
@@ -93,6 +86,9 @@ class TransportSpec(NamedTuple):
     BLOCK_DERIVATIVES; the blocks are those of `Derivatives.blocks`."""
     polarised: bool = False
     """Photons carry a Stokes vector, and scores are of the light that it stands for, see `Model.polarisation`."""
+    inelastic: bool = False
+    """Photons carry what has become light of other wavelengths, see `Model.inelastic`, of which each of `channels` is
+    one; in homogeneous water."""
     points: int = 1
     """At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`, `blocks`
     and DELTA_TRACKING, three with up to 4 derivatives."""
@@ -102,8 +98,8 @@ class TransportSpec(NamedTuple):
     sun: bool = False
     """The light is that of sun and sky, see `make_sun`, through a calm surface, FLAT_PORT as `laser_port`."""
     channels: int = 0
-    """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, each with a tally of its
-    own."""
+    """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, or lines of inelastic
+    scattering, at most MOST_LINES, each with a tally of its own."""
 
     @property
     def signed(self) -> int:
@@ -195,7 +191,7 @@ def check_spec(spec: Any) -> None:
             check_choice(f"spec.{name}[{index}]", kind, allowed)
     # A block has 48 KiB of shared memory for queues.
     check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
-    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS if spec.polarised else 0)
+    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS * spec.polarised + MOST_LINES * spec.inelastic)
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
         (spec.sea and spec.confocal and spec.lens.name != SCANNED.name, "sea: a scan needs spec.lens = SCANNED"),
@@ -203,9 +199,10 @@ def check_spec(spec: Any) -> None:
             spec.lens.name == SCANNED.name and (not spec.confocal or spec.polarised or spec.reflecting),
             "lens = SCANNED needs spec.confocal = True, and cannot be combined with spec.polarised and spec.reflecting",
         ),
-        (
-            spec.sea and any(getattr(spec, name) for name in _NOT_BY_SEA),
-            "sea cannot be combined with spec." + ", spec.".join(_NOT_BY_SEA),
+        *(
+            (any(getattr(spec, x) for x in others), f"{one} cannot be combined with spec." + ", spec.".join(others))
+            for one, others in _EXCLUDED.items()
+            if getattr(spec, one)
         ),
         (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
         (

@@ -19,7 +19,7 @@ from spadwarp_kernels.tally.flux import Flux
 from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
 from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64, tally_components
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Layers, Medium
+from spadwarp_kernels.water.medium import Inelastic, Layers, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 from .derivatives import Derivatives, LogDerivatives, met_count, met_entry, score_entry
@@ -42,6 +42,7 @@ class World:
     scan: Scan
     derivatives: Derivatives
     polarisation: Polarisation
+    inelastic: Inelastic
     flux: Flux
     sea: Sea
     seed: wp.uint64
@@ -153,6 +154,7 @@ class Carried:
 
     log_derivatives: LogDerivatives  # of what the light has met, by the parameters of the spec; 0 without them
     stokes: wp.vec4  # of weight 1 when emitted, with respect to `orthonormal_basis` of the light's direction
+    shifted: wp.vec2  # light at the lines of inelastic scattering, for each unit of that of the laser's wavelength
     half: int  # of `Blocks.memory`: 0 for the history of a photon, 1 for a contribution
 
 

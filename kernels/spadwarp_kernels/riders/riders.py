@@ -36,11 +36,53 @@ def make_rider(spec: TransportSpec) -> Rider:
     rider = NOTHING
     if spec.polarised:
         rider = make_polarisation_rider(spec)
+    if spec.inelastic:
+        rider = _make_inelastic_rider(spec)
     if spec.derivatives:
         rider = _make_derivatives_rider(spec)
     if spec.blocks:
         rider = _make_blocks_rider(spec, rider)
     return rider
+
+
+# ---- Light of other wavelengths.
+
+
+def _make_inelastic_rider(spec: TransportSpec) -> Rider:
+    """What has become light of other wavelengths, by one inelastic scattering at any of the events so far.
+
+    Photons fly and scatter as light of the laser does; what would have been scattered inelastically at an event, in
+    place of elastically, is carried on with the coefficients of its own wavelength over those. Thus no photon is spent
+    on what few of them do, and each brings light of all wavelengths.
+    """
+    channels, water_at, phase_pdf = spec.channels, spec.water.at, spec.water.phase.pdf
+
+    @wp.func
+    def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
+        c.shifted = wp.vec2()
+
+    @wp.func
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
+        for k in range(2):
+            c.shifted[k] = c.shifted[k] * wp.exp(-world.inelastic.more[k] * length)
+
+    @wp.func
+    def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
+        if slot < 0:
+            water = water_at(world.medium, world.layers, x)
+            t = one_minus_cosine(snap_from(u, world.medium.axis_threshold), v)
+            elastic = wp.max(water.extinction * water.albedo * phase_pdf(t, water), 1.0e-30)
+            square = (1.0 - t) * (1.0 - t)
+            for k in range(2):
+                turned = world.inelastic.source[k] * (world.inelastic.even[k] + world.inelastic.squared[k] * square)
+                c.shifted[k] = c.shifted[k] * world.inelastic.again[k] + turned / elastic
+
+    @wp.func
+    def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
+        for channel in range(wp.static(channels)):
+            k.factors[channel] = world.inelastic.passed[channel] * c.shifted[channel]
+
+    return NOTHING._replace(begin=begin, fly=fly, event=event, deliver=deliver)
 
 
 # ---- Derivatives.

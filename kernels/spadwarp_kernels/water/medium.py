@@ -25,9 +25,11 @@ from spadwarp_kernels.base.arguments import (
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
-__all__ = ["MOST_CONSTITUENTS", "Grid", "Layers", "Medium", "free_path", "make_layers", "make_medium"]
+__all__ = ["MOST_CONSTITUENTS", "MOST_LINES", "Grid", "Inelastic", "Layers", "Medium", "free_path", "make_inelastic"]
+__all__ += ["make_layers", "make_medium"]
 
 MOST_CONSTITUENTS = 4  # of a mixture
+MOST_LINES = 2  # of inelastic scattering
 
 
 @wp.struct
@@ -85,6 +87,58 @@ def free_path(xi: float, extinction: float) -> float:
 def ready_free_path(xi: float, medium: Medium) -> float:
     """`free_path` in a medium from `ready_medium`."""
     ...
+
+
+# ---- Inelastic scattering.
+
+
+@wp.struct
+class Inelastic:
+    """Lines at other wavelengths that the water gives off, made by `make_inelastic`; numbers by line."""
+
+    source: wp.vec2  # coefficient of what becomes light of the line [1/m]
+    even: wp.vec2  # its phase function is even + squared cos^2(theta) [1/sr]
+    squared: wp.vec2
+    more: wp.vec2  # extinction at the line less that of the medium [1/m]
+    again: wp.vec2  # scattering at the line over that of the medium
+    passed: wp.vec2  # part of the line that the receiver's filter passes
+
+
+def make_inelastic(
+    source: Sequence[float],
+    anisotropy: Sequence[float],
+    extinction: Sequence[float],
+    scattering: Sequence[float],
+    passed: Sequence[float],
+    *,
+    medium: Medium,
+) -> Inelastic:
+    """Up to MOST_LINES lines, with the phase function of the medium for what is scattered later.
+
+    Args:
+        source: Coefficients of the inelastic scattering [1/m], >= 0; the medium's absorption has it.
+        anisotropy: A of its phase function, ~ 1 + A cos^2(theta), 0 or more: 0 of fluorescence.
+        extinction, scattering: Of the water at the line [1/m].
+        passed: Part of the line that the receiver's filter passes.
+        medium: Of the light that is scattered; its own scattering is above 0.
+
+    Raises:
+        ArgumentError: A number out of range, or lists of several lengths.
+    """
+    given = {"source": source, "anisotropy": anisotropy, "extinction": extinction, "scattering": scattering}
+    given["passed"] = passed
+    lines, numbers = Inelastic(), {name: [float(x) for x in check_numbers(name, v, 1)] for name, v in given.items()}
+    count = check_integer("number of lines", len(numbers["source"]), 1, MOST_LINES)
+    if any(len(values) != count for values in numbers.values()):
+        raise ArgumentError(f"lines: {', '.join(f'{name} {len(v)}' for name, v in numbers.items())} entries differ")
+    b = check_number("scattering of the medium", medium.extinction * medium.albedo, "(0, inf)")
+    for k in range(count):
+        row = {name: check_number(f"{name}[{k}]", values[k], "[0, inf)") for name, values in numbers.items()}
+        lines.source[k], lines.passed[k] = row["source"], row["passed"]
+        lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + row["anisotropy"] / 3.0))
+        lines.squared[k] = row["anisotropy"] * lines.even[k]
+        lines.more[k], lines.again[k] = row["extinction"] - medium.extinction, row["scattering"] / b
+    return lines
 
 
 # ---- Layers.
