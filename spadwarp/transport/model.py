@@ -34,7 +34,7 @@ from spadwarp.values import ConfigError, DeviceError
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
 
-__all__ = ["points_per_flight", "target_map", "truth_maps"]
+__all__ = ["points_per_flight", "target_map", "truth_maps", "wave_errors"]
 
 # The albedo of Lu et al. 2024 is uniform in (0, 0.97).
 _LU2024_ALBEDO = 0.97
@@ -735,18 +735,10 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
 
 def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Truth:
     """Of what stands before the surface of the sea, and of what is seen through its waves, or its mean plane."""
-    view = pixel_directions(scene.camera)
-    origin, moving = np.zeros(view.shape), scene.scan.mode == "trajectory"
-    if moving:
-        shots, position, axes = shot_poses(scene)
-        origin, view = dataclasses.replace(shots, position=position, rotation=axes).lines()
-    if scene.surface is not None and scene.surface.waves is not None:
-        start, direction, lead = _through_waves(model, origin, view)
-    else:
-        plane = camera_port(scene) or mean_plane(scene, from_below=True)
-        start, direction, lead, _ = plane.enter(origin, view)
+    (origin, view), (start, direction, lead) = _rays_by_sea(scene, model)
     near, far = (trace_rays(model, *rays, shape) for rays in ((origin, view), (start, direction)))
-    if moving:  # in the frame of each pixel's shot
+    if scene.scan.mode == "trajectory":  # in the frame of each pixel's shot
+        shots, _, axes = shot_poses(scene)
         turns, from_lens = axes[shots.number], start - origin
         for found, begin, along in ((near, np.zeros(3), view), (far, from_lens, direction)):
             depth = np.einsum("hwi,hwi->hw", turns[..., 2], begin + found[1][..., None] * along)
@@ -758,12 +750,41 @@ def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Trut
     return Truth(**dict(zip(("depth", "range", "normal", "reflectance"), values, strict=True)))
 
 
-def _through_waves(model: sk.Model, origin: Any, view: Any) -> list[NDArray[np.float64]]:
-    """Of rays `[H, W, 3]` from the lens, where they meet the waves, how they go on, and their lengths up to there."""
+def _rays_by_sea(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[Any, Any, Any]]:
+    """Rays of pixels `[H, W, 3]`: begin and direction at the lens; and where they meet the surface of the sea, how they
+    go on, and their lengths up to there."""
+    view = pixel_directions(scene.camera)
+    origin = np.zeros(view.shape)
+    if scene.scan.mode == "trajectory":
+        shots, position, axes = shot_poses(scene)
+        origin, view = dataclasses.replace(shots, position=position, rotation=axes).lines()
+    if scene.surface is None or scene.surface.waves is None:
+        plane = camera_port(scene) or mean_plane(scene, from_below=True)
+        return (origin, view), plane.enter(origin, view)[:3]
     rays: Any = [wp.array(a.astype(np.float32), dtype=wp.vec3, device=model.device) for a in (origin, view)]
     found: Any = [wp.empty_like(rays[0]), wp.empty_like(rays[0]), wp.empty(rays[0].shape, float, device=model.device)]
     wp.launch(sk.see_through_waves_kernel, rays[0].shape, [model.sea, *rays], found, device=model.device)
-    return [array.numpy().astype(np.float64) for array in found]
+    start, direction, lead = (array.numpy().astype(np.float64) for array in found)
+    return (origin, view), (start, direction, lead)
+
+
+def wave_errors(scene: SceneLike, *, device: str | None = None) -> NDArray[np.float64]:
+    """By how much depths by the mean plane of the sea are too large, `[H, W]` [m]: of light that goes from the lens by
+    the waves before each pixel to a target and back; NaN where none is seen below them.
+
+    Raises `ConfigError`: a scene without `surface.waves`, or with a camera in the water.
+    """
+    scene = as_scene(scene)
+    plane = camera_port(scene)
+    if scene.surface is None or scene.surface.waves is None or plane is None:
+        raise ConfigError("surface.waves, and a camera in the air above them, are needed", source=scene.source)
+    model = build_model(scene, pick_device(device), build_mesh(scene), camera=False)
+    truth, lead = trace_truth(scene, model), _rays_by_sea(scene, model)[1][2]
+    in_water = truth.range - lead
+    path = 2.0 * (lead * plane.group_index[0] / plane.group_index[2] + in_water)
+    lines = dataclasses.replace(lines_of_sight(scene), laser=np.zeros(3), laser_port=plane)
+    depth = lines.depth_from_range(lines.range_from_path(np.where(in_water > 0.0, path, np.nan)))
+    return np.asarray(depth - truth.depth, np.float64)
 
 
 def first_hits(

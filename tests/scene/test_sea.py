@@ -13,6 +13,7 @@ from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.scene import mean_plane
 from spadwarp.scene.sea import jonswap, peak_length
 from spadwarp.scene.sight import depth_from_time, lines_of_sight
+from spadwarp.transport import wave_errors
 from spadwarp.values import ConfigError
 
 BAY = {"surface": {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, -1.0], "wind": 5.0}}
@@ -202,3 +203,20 @@ def test_truth_goes_through_the_waves(up):
         v = across + math.copysign(math.sqrt(1.0 - across @ across), u @ m) * m
         assert truth.range[pixel] == pytest.approx(t + (8.0 - t * u[2]) / v[2], rel=2e-5)
         assert truth.depth[pixel] == pytest.approx(8.0, rel=1e-5)
+
+
+def test_depths_by_the_mean_plane_are_wrong_by_the_waves(tmp_path):
+    """Straight above a crest of height h, where nothing is bent, light takes h/n_a more of water: h (1 - n_a/n_w)."""
+    heights = 0.1 * np.cos(2.0 * math.pi * np.arange(64) / 64.0) * np.ones((64, 1))
+    np.save(tmp_path / "swell.npy", heights)
+    waves = {"heights": str(tmp_path / "swell.npy"), "size": 16.0, "direction": [1.0, 0.0, 0.0]}
+    one = scene(
+        surface={"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, -1.0], "mean_square_slope": 0.02, "waves": waves},
+        targets=[BOTTOM],
+        medium={"phase_index": 1.34, "group_index": 1.3638},
+        camera={"width": 1, "height": 1, "horizontal_fov_deg": 0.1},
+    )
+    expected = 0.1 * (1.0 - one.surface.air(532.0)[1] / 1.3638)
+    assert wave_errors(one, device="cpu")[0, 0] == pytest.approx(expected, rel=2e-3)
+    with pytest.raises(ConfigError, match=r"surface\.waves, and a camera in the air"):
+        wave_errors(scene(**BAY, targets=[BOTTOM]), device="cpu")
