@@ -121,13 +121,13 @@ def start_devices(names: str | None = None) -> None:
             devices = pick_devices(names)
             import warp as wp
 
-            from spadwarp_kernels.tally.tally import find_overflow_kernel
+            import spadwarp_kernels.tally
 
             for device in devices:
                 if device.is_cuda:
                     device.context  # noqa: B018, made when first read
                 else:
-                    wp.load_module(find_overflow_kernel.module, device=device)
+                    wp.load_module(f"{spadwarp_kernels.tally.__name__}.tally", device=device)
 
     kernel_thread().submit(start)
 
