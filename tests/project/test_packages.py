@@ -114,7 +114,7 @@ LINES = {
     "parallel": (600, 583),
     "result": (1500, 2220),
     "scene": (3700, 5270),
-    "transport": (2300, 3204),
+    "transport": (2300, 3309),
     "validate": (750, 869),
     "viz": (2200, 2477),
     "water": (800, 860),
