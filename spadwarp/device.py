@@ -9,6 +9,7 @@ import os
 import platform
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     import warp as wp
 
 __all__ = ["core_count", "devices", "nvidia_driver", "physical_memory", "pick_device", "pick_devices"]
-__all__ += ["processor_name", "start_gpus", "start_warp"]
+__all__ += ["processor_name", "start_devices", "start_warp"]
 
 
 def pick_devices(names: str | None = None) -> list[wp.Device]:
@@ -95,22 +96,40 @@ def _cpu_name() -> str:
     return next(names, "") or platform.processor() or platform.machine()
 
 
-def start_gpus(names: str | None = None) -> None:
-    """Begins to start the devices of `pick_devices`, where there is a GPU; returns at once.
+@functools.cache
+def kernel_thread() -> ThreadPoolExecutor:
+    """The thread that loads kernels beside others. One for all: in each thread that compiles Warp first prepares its
+    headers, 1.5 s on a CPU."""
+    return ThreadPoolExecutor(1, "spadwarp-kernels")
 
-    NVIDIA's driver takes half a second for it, in which a program can import the rest of what it needs. What fails
-    here fails again where a device is used.
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=kernel_thread.cache_clear)  # a child has none of its parent's threads
+
+
+def start_devices(names: str | None = None) -> None:
+    """Begins to start the devices of `pick_devices`; returns at once.
+
+    NVIDIA's driver takes half a second for it, and on a CPU what is compiled first takes the time of Warp's headers, in
+    which a program can import the rest of what it needs. What fails here fails again where a device is used.
     """
-    if cuda_driver() is None or address_space() is not None:
+    if address_space() is not None:
         return
 
     def start() -> None:
         with suppress(Exception):
-            for device in pick_devices(names):
+            devices = pick_devices(names)
+            import warp as wp
+
+            import spadwarp_kernels.tally
+
+            for device in devices:
                 if device.is_cuda:
                     device.context  # noqa: B018, made when first read
+                else:
+                    wp.load_module(f"{spadwarp_kernels.tally.__name__}.tally", device=device)
 
-    threading.Thread(target=start, daemon=True).start()
+    kernel_thread().submit(start)
 
 
 _starting = threading.Lock()

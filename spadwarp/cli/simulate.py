@@ -106,7 +106,7 @@ def simulate(
         opt.refuse(text, "--resume", "--ray", "--workers", "--threads", "--shard", "--first-photon")
         opt.refuse(text, "--records", "--relative-error", "--derivatives", "--reconstruct", "--time")
     if ray is None:
-        spadwarp.device.start_gpus(devices)
+        spadwarp.device.start_devices(devices)
     asked: Any = "auto" if photons is None and time is not None else photons
     earlier = None
     if resume is not None:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import os
 import queue
 import threading
 import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
@@ -22,7 +20,7 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies, kernel_errors
-from spadwarp.device import core_count, pick_device, pick_devices, processor_name
+from spadwarp.device import core_count, kernel_thread, pick_device, pick_devices, processor_name
 from spadwarp.mesh import TriangleMesh
 from spadwarp.parallel import Ray, Worker
 from spadwarp.parallel.ray import RayWorkers
@@ -393,19 +391,9 @@ def device_errors(device: wp.Device) -> Iterator[None]:
 # (https://github.com/NVIDIA/warp/issues/1491).
 
 
-@functools.cache
-def _thread() -> ThreadPoolExecutor:
-    # One for all runs: in each thread that compiles Warp first prepares its headers, 1.5 s on a CPU.
-    return ThreadPoolExecutor(1, "spadwarp-kernels")
-
-
 def _beside(devices: Sequence[wp.Device]) -> bool:
     # Where memory is limited, two threads that compile may be too many.
     return address_space() is None and not any(device.is_cuda for device in devices)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_thread.cache_clear)  # a child has none of its parent's threads
 
 
 def prepare_kernels(
@@ -421,7 +409,7 @@ def prepare_kernels(
     if _beside(devices):
         spec = transport_spec(scene, mesh, derivatives=derivatives)
         for item in devices:  # what fails here fails again in the run
-            _thread().submit(sk.load_transport_kernel, spec, item)
+            kernel_thread().submit(sk.load_transport_kernel, spec, item)
 
 
 # Devices of this host
@@ -463,7 +451,7 @@ class LocalWorkers:
         began = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
         # On GPUs `DeviceWorker` loads the kernel, which may be another one for a large histogram.
-        loading = [_thread().submit(sk.load_transport_kernel, spec, item) for item in devices if _beside(devices)]
+        loading = [kernel_thread().submit(sk.load_transport_kernel, spec, item) for item in devices if _beside(devices)]
         models = []
         for device in devices:
             with device_errors(device):

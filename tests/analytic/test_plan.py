@@ -102,6 +102,7 @@ def test_clear_water_leaves_no_floor_and_its_bound_is_that_of_a_gaussian():
     assert clear.pilot.shot_noise == pytest.approx(sigma / math.sqrt(clear.pilot.target), rel=0.03)
 
 
+@pytest.mark.slow
 def test_more_error_takes_fewer_pulses_and_the_floor_cannot_be_passed(found):
     first = proposal(depth_error=0.05)
     least = math.hypot(first.terms["forward scattering"], first.terms["pile-up"])

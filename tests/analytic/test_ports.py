@@ -224,6 +224,7 @@ def test_what_has_no_model_behind_a_port_is_refused_by_name():
     assert spadwarp.budget(ported({"distance": 2.0}), device="cpu")[0].range == 3.0
 
 
+@pytest.mark.slow
 @few_units
 @pytest.mark.physics
 def test_a_collimated_beam_behind_a_window_stays_one():

@@ -72,6 +72,7 @@ def test_of_a_pixels_depth_know_of_the_water():
     assert found.bounds["depth"].per_pixel and found.names == list(found.bounds)[:3]
 
 
+@pytest.mark.slow
 def test_bins_much_wider_than_the_response_are_named():
     """Where in its bin a return lies is not in the counts."""
     wide = plate({"gate.bin_width_ps": 1000.0, "gate.bins": 20})

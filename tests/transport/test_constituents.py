@@ -77,6 +77,7 @@ def test_molecules_and_algae_are_their_summed_table(estimator, tmp_path, device)
     assert equal_means_p(found, expected, 0.2) > 1e-3
 
 
+@pytest.mark.slow
 def test_two_of_a_kind_are_one(device):
     half = {**ALGAE, "concentration": 0.5}
     two, one = (

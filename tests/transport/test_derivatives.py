@@ -144,6 +144,7 @@ def test_light_by_way_of_mirrors(device):
 
 
 @pytest.mark.filterwarnings("ignore:.*rounding to the histogram:RuntimeWarning")  # of what the water scatters
+@pytest.mark.slow
 def test_behind_a_port_the_path_is_that_in_water_and_lambertian_bounces_are_counted(device):
     """Γ ∂h/∂Γ is the ballistic light of each target without a lobe, and a part of that of one with."""
     distance = 0.5

@@ -64,7 +64,7 @@ WATERS = {
         ("one", "guided"),
         ("layers", "next_event"),
         ("layers", "guided"),
-        ("cells", "guided"),
+        pytest.param("cells", "guided", marks=pytest.mark.slow),
         ("cells by delta tracking", "next_event"),
     ],
 )

@@ -27,6 +27,8 @@ from spadwarp_kernels.base.native import bits_of, from_bits
 from .patches import SAME, join_faces, shared_corner
 from .triangle import box_padding, face_in, load_plane, meet_planes, number_in, set_rows
 
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
+
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
@@ -390,7 +392,8 @@ def pack_bvh(mesh: wp.Mesh, extent: float, join: bool = True) -> tuple[wp.array,
     return packed, rows, order, levels
 
 
-@wp.kernel(enable_backward=False, module="unique")  # not compiled where nothing moves
+# Not compiled where nothing moves.
+@wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
 def _refit_kernel(
     mesh: wp.uint64, padding: float, level: int, depth: wp.array[int], order: wp.array[int], nodes: wp.array[wp.vec4]
 ):

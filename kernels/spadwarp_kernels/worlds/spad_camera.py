@@ -374,7 +374,7 @@ def _depth_kernel(
             status[i] = OUTSIDE_GATE
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
 def _points_kernel(
     distance: wp.array3d[float], view: wp.array[wp.vec3], pose: wp.transform, points: wp.array3d[wp.vec3]
 ):
@@ -666,7 +666,7 @@ _IMAGES = ("true_distance", "normal", "reflectance", "counts", "significance", "
 # ---- The fast camera.
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
 def _images_kernel(
     view: wp.array[wp.vec3],
     # In, [cameras, height, width]; those that are None have no entries:

@@ -1,0 +1,58 @@
+"""Runs at several wavelengths with the same photons, and their sum over a spectrum."""
+
+import numpy as np
+import pytest
+
+import spadwarp
+from helpers.scenes import scene
+from spadwarp.scene import spectral_lines
+from spadwarp.transport import simulate_spectrum
+from spadwarp.values import ArgumentError, ConfigError
+
+SEA = {"extinction": None, "albedo": None, "group_index": None, "chlorophyll": 0.5}
+
+
+def broad(**laser):
+    """A laser of 540 nm, 60 nm wide, behind a filter, in water that follows the wavelength."""
+    laser = {"wavelength_nm": 540.0, "linewidth_nm": 60.0, **laser}
+    return scene(medium=SEA, laser=laser, detector={"filter_fwhm_nm": 40.0})
+
+
+def test_each_line_is_its_own_run_to_the_bit(device):
+    found = simulate_spectrum(broad(), [600.0, 480.0], photons=5_000, device=device)
+    assert found.wavelengths == (480.0, 600.0)
+    for wavelength, one in found.results.items():
+        own = scene(medium=SEA, laser={"wavelength_nm": wavelength}, detector={"filter_fwhm_nm": 40.0})
+        assert (spadwarp.simulate(own, photons=5_000, device=device).tallies == one.tallies).all()
+        filtered = one.scene.detections_per_photon / one.scene.detector.pde
+        assert filtered == pytest.approx(0.5 ** ((wavelength - 540.0) / 20.0) ** 2)
+
+
+def test_the_sum_over_the_spectrum_is_that_of_its_lines(device):
+    one = broad(linewidth_nm=4.0)
+    found = simulate_spectrum(one, photons=2_000, device=device)
+    lines = spectral_lines(one.laser, one.detector)
+    assert found.wavelengths == tuple(line.wavelength_nm for line in lines) and len(lines) > 8
+    expected = sum(line.share * found.results[line.wavelength_nm].histogram for line in lines)
+    combined = found.combined()
+    passed = combined.scene.detections_per_photon / one.detector.pde
+    np.testing.assert_allclose(combined.histogram * passed, expected, rtol=1e-4, atol=1e-4 * expected.max())
+    # In 4 nm water hardly changes, and what is left of the noise is shared.
+    alone = spadwarp.simulate(broad(linewidth_nm=0.0), photons=2_000, device=device)
+    assert combined.histogram.sum() == pytest.approx(alone.histogram.sum(), rel=5e-3)
+    assert combined.batches == 0 and combined.scene == one
+
+
+def test_lines_have_an_axis():
+    pytest.importorskip("xarray")
+    data = simulate_spectrum(broad(), [480.0, 500.0], photons=500, device="cpu").to_xarray()
+    assert data["histogram"].dims[0] == "wavelength" and data["wavelength"].values.tolist() == [480.0, 500.0]
+    assert (data["histogram"].sel(wavelength=480.0) != data["histogram"].sel(wavelength=500.0)).any()
+
+
+def test_wavelengths_that_cannot_be_are_named():
+    for given, text in (([], "0 given"), ([500.0, 500.0], "2 given"), ([0.0], "outside")):
+        with pytest.raises(ArgumentError, match=text):
+            simulate_spectrum(broad(), given, photons=500, device="cpu")
+    with pytest.raises(ConfigError, match="1 wavelengths are not the 32 lines"):
+        simulate_spectrum(broad(), [500.0], photons=500, device="cpu").combined()
