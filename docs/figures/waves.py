@@ -32,7 +32,7 @@ def main() -> None:
     for row, (wind, fetch) in zip(rows, ((5.0, 10e3), (12.0, 2e3)), strict=True):
         bay = spadwarp.load_scene(ROOT / "configs/scenes/bay_200m.toml")
         sea = bay.with_overrides({**VIEW, "surface.wind": wind, "surface.waves.fetch": fetch})
-        assert sea.surface is not None and (field := sea.surface.wave_field) is not None
+        field = sea.surface.wave_field
         # A pixel's row is the plane's y, a row of the field goes along its x: the camera looks down on both.
         heights = np.roll(field.heights, (256, 256), axis=(0, 1))[::-1]
         for axes, values, label in ((row[0], heights, "height [m]"), (row[1], wave_errors(sea), "error of depth [m]")):

@@ -118,6 +118,8 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
 
 def _max_registers(spec: TransportSpec, estimator: Estimator, in_tree: bool) -> int:
     """Registers of a CUDA thread: fewer spill, more leave too few warps to hide latency. All measured."""
+    if "track" in spec.flux:
+        return 72
     if estimator.score is None:
         return 64 if in_tree or estimator.scores else 56
     if estimator.request_flight is not None:
