@@ -372,7 +372,7 @@ class SeaKind(NamedTuple):
     # ``(sea, port, x, o, seed) -> SeaConnection``: a way from x to o on the other side, which the port describes: the
     # mean plane as o sees it; `seed`: 64 random bits
     connect: wp.Function
-    clear: wp.Function  # ``(sea, x, u, length, above) -> bool``: whether no wave stands in the way
+    clear: wp.Function | None  # ``(sea, x, u, length, above) -> bool``: whether no wave stands in the way; None: never
 
 
 @wp.func
@@ -383,11 +383,6 @@ def _passage_at_plane(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, random: wp.
 @wp.func
 def _density_at_plane(sea: Sea, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
     return passage_density(sea, u, v)
-
-
-@wp.func
-def _always_clear(sea: Sea, x: wp.vec3, u: wp.vec3, length: float, above: bool) -> bool:
-    return True
 
 
 @wp.func
@@ -415,8 +410,8 @@ def _clear_of_waves(sea: Sea, x: wp.vec3, u: wp.vec3, length: float, above: bool
     return waves_distance(sea.waves, x, u, above, length) > length
 
 
-_AT_PLANE = (_is_above_plane, _plane_distance, _passage_at_plane, _density_at_plane, _connect_by_plane, _always_clear)
-FACETS = SeaKind("facets", *_AT_PLANE)
+_AT_PLANE = (_is_above_plane, _plane_distance, _passage_at_plane, _density_at_plane, _connect_by_plane)
+FACETS = SeaKind("facets", *_AT_PLANE, None)
 """Facets about the mean plane: waves by the statistics of their slopes alone."""
 
 _AT_WAVES = (_is_above_waves, _waves_distance, _passage_at_waves, _density_at_waves)

@@ -462,9 +462,9 @@ def _make_lies_across(sea: SeaKind) -> wp.Function:
 def _make_clear(sea: SeaKind) -> wp.Function | None:
     """See `Sight.clear`. A way by the surface is followed from there to both ends: to the surface it would end there by
     rounding, or not."""
-    if sea.name != WAVES.name:
-        return None
     clear_of = sea.clear
+    if clear_of is None:
+        return None
 
     @wp.func
     def clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
