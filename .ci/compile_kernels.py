@@ -3,8 +3,8 @@
 python .ci/compile_kernels.py
 
 With both packages installed, on Linux x86-64, before the wheels are built. The scenes that come with the package are
-run with both estimators, their counts drawn and their depth estimated, and a camera for simulators is run; Warp
-compiles for `x86-64-v3` meanwhile, and keeps the objects under the names that it looks for later.
+run with both estimators, their counts drawn and their depth estimated; one is reconstructed; a camera for simulators is
+run. Warp compiles for `x86-64-v3` meanwhile, and keeps the objects under the names that it looks for later.
 """
 
 import contextlib
@@ -49,6 +49,9 @@ def run_common() -> None:
         with contextlib.suppress(spadwarp.ConfigError):  # of scenes that only `simulate` takes
             spadwarp.simulate_analytic(scene, frames=1, seed=0, device="cpu")
         print(name, flush=True)
+    whole = spadwarp.simulate("staircase_15m", photons=2**17, device="cpu")
+    spadwarp.check(whole.scene, device="cpu")
+    spadwarp.reconstruct(whole, device="cpu")
 
 
 def run_cameras() -> None:

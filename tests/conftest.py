@@ -56,7 +56,8 @@ def cluster():
         patch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(sitecustomize.__file__), *sys.path]))
         try:
             try:
-                ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
+                cores = {"num_cpus": 2, "num_gpus": 0}
+                ray.init(**cores, include_dashboard=False, log_to_driver=False, object_store_memory=100 << 20)
             finally:
                 started = set(here.children(recursive=True)) - before
             yield

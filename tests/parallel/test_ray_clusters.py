@@ -26,6 +26,8 @@ except ConnectionError:
     print("refused")
 """
 
+NODE = {"num_cpus": 1, "num_gpus": 0, "object_store_memory": 100 << 20}
+
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="removes a node by a signal")
@@ -41,8 +43,8 @@ def test_a_lost_node_costs_no_bit_and_nobody_connects_without_the_token():
 def lose_a_node():
     from ray.cluster_utils import Cluster
 
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": 100 << 20})
-    second = cluster.add_node(num_cpus=1, object_store_memory=100 << 20)
+    cluster = Cluster(initialize_head=True, head_node_args=NODE)
+    second = cluster.add_node(**NODE)
     cluster.wait_for_nodes()
     remarks, removed = [], []
 
