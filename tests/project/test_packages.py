@@ -114,7 +114,7 @@ LINES = {
     "parallel": (600, 583),
     "result": (1500, 2222),
     "scene": (3700, 5270),
-    "transport": (2300, 3309),
+    "transport": (2300, 3318),
     "validate": (750, 869),
     "viz": (2200, 2477),
     "water": (800, 860),
@@ -128,7 +128,7 @@ LINES = {
     "kernels/riders": (750, 683),
     "kernels/surface": (1700, 1922),
     "kernels/tally": (450, 941),
-    "kernels/transport": (1450, 1809),
+    "kernels/transport": (1450, 1811),
     "kernels/water": (1350, 1707),
     "kernels/worlds": (1600, 2291),
 }

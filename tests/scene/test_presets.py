@@ -7,6 +7,7 @@ import pytest
 
 from helpers.pages import ROOT, text_of
 from spadwarp.scene import Camera, Medium, phase_function, presets
+from spadwarp.scene.medium import natural_laws
 from spadwarp.water import pure_water_absorption
 
 PUBLISHED = {
@@ -61,6 +62,10 @@ def test_backscatter_of_natural_waters_is_the_published_one():
         both = (Medium(preset=name), Medium(preset=name.removesuffix("-constituents")))
         sums = [(water.absorption, water.scattering, water.group_index) for water in both]
         assert sums[0] == pytest.approx(sums[1], rel=1e-12)
+        # What `check` compares Henyey and Greenstein's law with, in the water without that ending.
+        _, natural = natural_laws(both[1], both[1], 532.0)
+        own = phase_function(both[0]).backscatter_fraction
+        assert natural.backscatter_fraction == pytest.approx(own, rel=3e-3), name
 
 
 def test_bubbles_are_those_of_geometric_optics():

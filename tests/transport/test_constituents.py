@@ -57,7 +57,13 @@ def test_coefficients_add_up_by_concentration():
     assert type(one).from_dict(one.to_dict()) == one
 
 
-@pytest.mark.parametrize("law", [{"anisotropy": 0.8}, {"phase_function": "fournier_forand", "particle_index": 1.06}])
+@pytest.mark.parametrize(
+    "law",
+    [
+        {"anisotropy": 0.8},
+        pytest.param({"phase_function": "fournier_forand", "particle_index": 1.06}, marks=pytest.mark.slow),
+    ],
+)
 def test_one_constituent_is_the_water_spelt_out_to_the_bit(law, device):
     part = {"name": "algae", "absorption": 0.1, "scattering": 0.25}
     far = [{"start": 1.2, "concentrations": {"algae": 2.0}}]
@@ -99,6 +105,20 @@ def test_layers_in_which_one_kind_scatters_are_layers_of_its_water(device):
     layer = {"start": 1.2, "absorption": 0.6, "scattering": 0.9, "anisotropy": 0.5}
     expected = scene(medium={**near, "layers": [layer]}, transport=guided)
     assert equal_means_p(*(cells(each, device, 20_000) for each in (found, expected)), 0.2) > 1e-3
+
+
+@pytest.mark.slow
+def test_layers_of_mixtures_are_layers_of_summed_tables(tmp_path, device):
+    """Of tables that scatter in one layer each."""
+    far = [{"start": 1.2, "concentrations": {"molecules": 0.5, "algae": 2.0}}]
+    guided = {"estimator": "guided"}
+    one = scene(medium=mixed(MOLECULES, ALGAE, layers=far), transport=guided)
+    near, behind = (summed(tmp_path / f"{k}.csv", one, layer) for k, layer in enumerate((None, one.medium.layers[0])))
+    parts = [{**near, "name": "near"}, {**behind, "name": "behind", "concentration": 0.0}]
+    tables = scene(
+        medium=mixed(*parts, layers=[{"start": 1.2, "concentrations": {"near": 0.0, "behind": 1.0}}]), transport=guided
+    )
+    assert equal_means_p(*(cells(each, device, 20_000) for each in (one, tables)), 0.2) > 1e-3
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def quadrature(extinction, new, coefficient, anisotropy):
     return np.array([np.trapezoid(np.where(bins == k, light, 0.0), z) for k in range(len(EDGES) - 1)])
 
 
-@pytest.mark.parametrize("estimator", ["guided", "next_event"])
+@pytest.mark.parametrize("estimator", ["guided", pytest.param("next_event", marks=pytest.mark.slow)])
 def test_single_scatter_is_the_quadrature_with_both_coefficients(estimator, device):
     one = pencil(RAMAN, GLOW, estimator=estimator)
     (run,) = of_seeds(one, device, 400_000, [1])
@@ -61,6 +61,7 @@ def test_single_scatter_is_the_quadrature_with_both_coefficients(estimator, devi
         np.testing.assert_allclose(by_path(run, k), expected, rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_alike_waters_bring_a_share_of_each_scattering(device):
     """Where light keeps its coefficients and its phase function, what has become Raman light is b_R times the sum of
     1/b over the scatterings: b_R (∂/∂b - ∂/∂a) of all light."""
