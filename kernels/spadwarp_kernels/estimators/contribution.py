@@ -215,7 +215,7 @@ def sea_component(s: wp.ref[PhotonState], scatterings: int) -> int:
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
-    sea, ask_at_sea = spec.sea is not None, make_ask_at_sea(spec.waves)
+    sea, ask_at_sea = spec.sight.sea is not None, make_ask_at_sea(spec.waves)
     tracks, rides, point_in = spec.water.profile is not None, make_rider(spec).rides, spec.sight.pose.point_in
     camera_at = spec.sight.camera_at
 
@@ -363,7 +363,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
     request scatters at x into the direction v."""
     water_at, phase_pdf, face_density = spec.water.at, spec.water.phase.pdf, spec.faces.density
-    sea, passage_density = spec.sea is not None, (spec.sea or FACETS).density
+    sea, passage_density = spec.sight.sea is not None, (spec.sight.sea or FACETS).density
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
@@ -406,7 +406,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     reflects, index_of = spec.domain.reflects, spec.tally_index
     water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    sight, sea, is_hidden = spec.sight, spec.sea is not None, _make_hidden_by_waves(spec)
+    sight, sea, is_hidden = spec.sight, spec.sight.sea is not None, _make_hidden_by_waves(spec)
     image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
     (point_in, _, point_out, turn_out), camera_at, sea_at = sight.pose, sight.camera_at, sight.sea_at
     rider = make_rider(spec)

@@ -26,7 +26,7 @@ def make_none(spec: TransportSpec) -> Estimator:
 def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
     reflects, image_of, leave = spec.domain.reflects, spec.sight.project, spec.sight.leave
-    sea, point_in, turn_in = spec.sea is not None, spec.sight.pose.point_in, spec.sight.pose.turn_in
+    sea, point_in, turn_in = spec.sight.sea is not None, spec.sight.pose.point_in, spec.sight.pose.turn_in
 
     @wp.func
     def cross(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:

@@ -90,8 +90,8 @@ def make_emit(spec: TransportSpec) -> wp.Function:
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
     scans, enter, begin_carried = spec.beam.scans, spec.beam.enter, make_rider(spec).begin
-    scan_view, has_port, sea = spec.sight.scan_view, enter is not None, spec.sea is not None
-    is_above = (spec.sea or FACETS).is_above
+    scan_view, has_port, sea = spec.sight.scan_view, enter is not None, spec.sight.sea is not None
+    is_above = (spec.sight.sea or FACETS).is_above
     point_out, turn_out = spec.beam.pose.point_out, spec.beam.pose.turn_out
 
     @wp.func
@@ -212,7 +212,11 @@ def make_fly(
     plans, water_free_path, tried = plan_flight is not None, spec.water.free_path, spec.faces.tried
     events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
-    has_bvh, sea, surface_distance = spec.faces.mesh and not tried, spec.sea is not None, (spec.sea or FACETS).distance
+    has_bvh, sea, surface_distance = (
+        spec.faces.mesh and not tried,
+        spec.sight.sea is not None,
+        (spec.sight.sea or FACETS).distance,
+    )
 
     @wp.func
     def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
@@ -305,7 +309,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
     tallies_flux = score_flux is not None
     domain, local_albedo = spec.domain, spec.local_albedo
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
-    water_at, fly_carried, sea = spec.water.at, make_rider(spec).fly, spec.sea is not None
+    water_at, fly_carried, sea = spec.water.at, make_rider(spec).fly, spec.sight.sea is not None
     outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
 
     @wp.func
@@ -528,7 +532,7 @@ def make_meet_sea(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Fun
     `directed`, `flies_on`: see `make_bounce`.
     """
     terminate, continues = make_terminate(spec), make_continues(flies_on)
-    passage_at, waves = (spec.sea or FACETS).passage, spec.waves
+    passage_at, waves = (spec.sight.sea or FACETS).passage, spec.waves
 
     @wp.func
     def meet_sea(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
@@ -564,7 +568,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     specular, reflects, directed = spec.faces.specular, spec.domain.reflects, direct is not None
     survival_of, sample_direction = spec.faces.survival, make_sample_direction(spec, direct)
     terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
-    sea, meet_sea = spec.sea is not None, make_meet_sea(spec, directed, flies_on)
+    sea, meet_sea = spec.sight.sea is not None, make_meet_sea(spec, directed, flies_on)
     continues, turn_carried = make_continues(flies_on), make_rider(spec).event
 
     @wp.func
