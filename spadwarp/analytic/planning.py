@@ -11,33 +11,39 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spadwarp.analytic.budgets import OUTLIERS, axis_line, central_pixel, face_reflectance
+from spadwarp.analytic.budgets import OUTLIERS, axis_line, face_reflectance
 from spadwarp.analytic.eye_safety import EyeLimit, axis_fluence, eye_limit, safe_distance_in_water
 from spadwarp.analytic.model import false_peaks
-from spadwarp.device import pick_device
-from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
-from spadwarp.frames.depth import METHODS, Method, arrival_time
-from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.result import CHANNELS, POLARISED, Channel, analyser_channel, merge
-from spadwarp.scene import SceneLike, Transport, as_scene, noise_rate
+from spadwarp.analytic.pilot import (
+    RUNS,
+    Mask,
+    NoLight,
+    Pilot,
+    Progress,
+    measure,
+    response_deviation,
+    trace,
+    typical_pixels,
+    window,
+)
+from spadwarp.frames import detector_response
+from spadwarp.frames.depth import METHODS, Method
+from spadwarp.result import CHANNELS, POLARISED, Channel
+from spadwarp.scene import SceneLike, Transport, as_scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
-from spadwarp.scene.sight import depth_from_time, depth_per_time, lines_of_sight, port_advance
-from spadwarp.transport import RunOptions, simulate, truth_maps
-from spadwarp.transport.reconstruction import known_light
+from spadwarp.scene.sight import lines_of_sight, port_advance
+from spadwarp.transport import truth_maps
 from spadwarp.values import (
     SEED,
     ArgumentError,
     ConfigError,
-    SpadwarpWarning,
     check_choice,
     check_integer,
     range_from_time,
@@ -49,15 +55,10 @@ from spadwarp.values import (
 )
 
 if TYPE_CHECKING:
-    from spadwarp.frames import Frames
     from spadwarp.result import Result
     from spadwarp.scene import Scene
 
-__all__ = ["PILE_UP", "Pilot", "Proposal", "plan"]
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Progress = Callable[[str, int, int], None]
+__all__ = ["PILE_UP", "Proposal", "plan"]
 
 PILE_UP = 0.05
 """Detections per pulse of the brightest pixels up to which pile-up is small: the usual rule of 1 to 5 % (O'Connor &
@@ -71,46 +72,20 @@ _PROPOSED = (
     "laser.pulse_energy",
     "detector.pulses_per_frame",
 )
-_SIDE = 16  # largest width and height of the window [pixels]
-_MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself
 _MANY_PHOTONS = 100.0  # of the return, from which on the width of the response is the cheaper thing to improve
 _MOST_PULSES = 2**31 - 1
 _MOST_BINS = 1_000_000
 _LEAST = 1e-6  # beyond a port [m]
-_RUNS = 8  # of a quarter of the photons each two, whose scatter tells the noise of all
 _SCATTER = 1.6  # half-width of an interval over the standard deviation of four parts: 3.2/√4, of Student's t, 95 %
 _LIGHT_NOISE = 0.5  # of the target's light in a pixel, from which on rare heavy photons may be missing in the median
 _SECONDS, _FEWEST, _MOST = 60.0, 400_000, 2**40  # of a run that is as long as it takes; its photons
 _PART = 1.0 / 12.0  # of these seconds for one range of the search
+_LONGER = 4.0  # times as long where that would judge it
 _UNKNOWN = 1e6  # ratio that stands for what parts of the runs do not know
 _WIDE = 4.0  # ratio of pulses, from which on their number is not known
+_SHARE = 8  # part of a number of photons, for one range of the search
 _FARTHEST = 200.0  # of the search for the largest range [m]
 _STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pilot:
-    """Detections in a window of the image: of its typical pixel, the mean over the third of the pixels with a target
-    whose known light is nearest to the median, unless said otherwise. Few photons leave a mean unbiased; a median of
-    pixels that each have a few heavy photons is too low."""
-
-    pixels: int  # with a target
-    unscattered: float  # detections of the target per pulse in the gate, without scattered light
-    target: float  # the same with it
-    backscatter: float  # of backscatter
-    noise: float  # of dark counts and ambient light
-    brightest: float  # of light in the brightest twentieth of the pixels, which noise does not choose
-    bound: float  # Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N
-    shot_noise: float  # the same without background and pile-up
-    information_noise: float  # part of the runs' information on depth that was their noise; both bounds leave it out
-    floor: dict[str, float]  # estimator → median |error| of depth that is left after any number of pulses [m]
-    bias: dict[str, float]  # estimator → median error, positive if too far [m]
-    unscattered_floor: dict[str, float]  # `floor` of unscattered light alone: slopes, edges within a pixel, bins
-    pile_up: dict[str, float]  # estimator → median change of depth by pile-up [m]; 0 in free-running mode
-    peak: float  # detections per pulse of the return within ±3σ of its peak, σ that of the response
-    level: float  # of background per σ under it
-    light_noise: float  # relative standard error of the target's light in a pixel
-    photons: int  # of all runs
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -136,15 +111,18 @@ class Proposal:
     reach; "out of reach", where 2³¹ pulses are too few; "not judged"."""
     pulses_range: tuple[int, int]  # least and most by what the traced photons leave open
     frame_time: float  # for these pulses [s], at all positions of a scan
-    reached: bool  # whether the depth error is reached, within the time
+    reached: bool | None  # whether the depth error is reached, within the time; None: not judged
     terms: dict[str, float]  # name → part of the depth error at these pulses [m], "total" last; squares add up
     limit: str  # the largest of them; "a or b" where the traced photons leave it open
     advice: str  # what would help
     pilot: Pilot  # what was measured by Monte Carlo
     photons_needed: float  # photons of it that would judge, or those traced; infinite: more than 10⁴ times as many
     seconds_needed: float  # that they take here
-    largest_range: float = math.nan  # of a plane square to the axis, as asked for [m]; NaN: not sought, 0: none
+    largest_range: float = math.nan
+    """Of a plane square to the axis [m]: the farthest at which the depth error is known to be reached; 0: at none;
+    NaN: not sought, or not judged."""
     range_limit: str = ""  # what limits it
+    unjudged_ranges: tuple[float, float] | None = None  # beyond it, where the photons do not tell [m]
 
     @property
     def judged(self) -> bool:
@@ -264,12 +242,8 @@ def plan(
         proposal = dataclasses.replace(proposal, eye=dataclasses.replace(proposal.eye, water_distance=water))
     if not largest_range or not proposal.judged:
         return proposal
-    largest, limit = planner.largest_range(proposal.scene, 0.5 * sum(span), number and max(number // 8, 1))
-    return dataclasses.replace(proposal, largest_range=largest, range_limit=limit)
-
-
-class _NoLight(ConfigError):
-    """No photon of the target has come yet."""
+    sought = planner.largest_range(proposal.scene, 0.5 * sum(span), number and max(number // _SHARE, 1))
+    return dataclasses.replace(proposal, largest_range=sought[0], range_limit=sought[1], unjudged_ranges=sought[2])
 
 
 class _Outcome(NamedTuple):
@@ -352,6 +326,7 @@ class _Planner:
         small, asked = window(scene, self.device), scene
         typical = typical_pixels(small, self.device)
         budget = _SECONDS * (_PART if even else 1.0)
+        longest = budget * (_LONGER if even else 1.0)
         runs: tuple[Result, ...] = ()
         while True:
             report = None if even else self.progress
@@ -360,17 +335,17 @@ class _Planner:
             )
             traced = sum(run.photons for run in runs)
             elapsed = sum(run.timing.get("trace", 0.0) for run in runs)  # not what compiles, or judges
-            last = photons is not None or 2.0 * elapsed > budget or traced > _MOST
+            last = photons is not None or traced > _MOST
             try:
                 scene, energy_limit, piled, eye, pilot = self._settle(asked, runs, typical, even)
-                quarters = (runs[i : i + 2] for i in range(0, _RUNS, 2))
+                quarters = (runs[i : i + 2] for i in range(0, RUNS, 2))
                 found = _Sample(pilot, [self._settle(asked, two, typical, even)[-1] for two in quarters])
-            except _NoLight:
-                if last:
+            except NoLight:
+                if last or 2.0 * elapsed > budget:
                     raise
                 continue
             factor = self._missing(scene, found)
-            if factor <= 1.0 or last:
+            if factor <= 1.0 or last or 2.0 * elapsed > max(budget, min(factor * elapsed, longest)):
                 break
         low, pilot, high = found.ends(1.0)
         ends = [self._outcome(scene, one) for one in (low, pilot, high)]
@@ -405,7 +380,7 @@ class _Planner:
             pulses_for=purpose,
             pulses_range=(ends[0].pulses, ends[2].pulses),
             frame_time=frame_time,
-            reached=purpose in _ENOUGH and frame_time <= self.time,
+            reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
             terms=terms,
             limit=" or ".join(limits),
             advice=self._advice(limit, purpose, frame_time, rate, largest_rate, pilot.floor),
@@ -488,46 +463,71 @@ class _Planner:
             f"repetition rate of {with_prefix(rate, 'Hz')}{faster}; fewer pulses are needed with {advice}"
         )
 
-    def largest_range(self, scene: Scene, start: float, photons: int | None) -> tuple[float, str]:
-        """The largest range [m] of a plane, to 3 %, and what limits it there; sought from `start` on, 0: there is none.
+    def largest_range(
+        self, scene: Scene, start: float, photons: int | None
+    ) -> tuple[float, str, tuple[float, float] | None]:
+        """`largest_range`, `range_limit` and `unjudged_ranges` of a `Proposal`, sought from `start` on.
 
         The repetition rate and the pulse energy are the scene's, the gate follows the plane.
         """
-        reason = ""
+        reasons, needed = dict[float, str](), dict[float, float]()
 
-        def is_reached(distance: float) -> bool:
-            nonlocal reason
+        def judge(distance: float) -> bool | None:
             if distance <= axis_line(scene).lead[0]:
-                reason = "the port"
+                reasons[distance] = "the port"
                 return False
             if self.progress is not None:
                 self.progress(f"a plane at {distance:.3g} m", 0, 0)
             span = (distance, distance)
-            gated = with_gate(with_plane(scene, distance), span, self.margin)
-            if scene.detector.wrap and 1.0 / gated.gate.stop < scene.laser.repetition_rate:
-                reason = "repetition rate"
-                return False
             try:
+                gated = with_gate(with_plane(scene, distance), span, self.margin)
+                if scene.detector.wrap and 1.0 / gated.gate.stop < scene.laser.repetition_rate:
+                    reasons[distance] = "repetition rate"
+                    return False
                 proposal = self.propose(gated, span, photons, even=True)
-            except ConfigError:
-                reason = "no light of the target"
+            except NoLight:  # a plane that light reaches, since none is named hopeless: more photons would see it
+                return None
+            except ConfigError as error:
+                reasons[distance] = "the gate is too long" if "bin_width" in str(error) else "no light of the target"
                 return False
-            if not proposal.reached:
-                reason = proposal.limit if proposal.judged else f"not enough photons to judge {distance:.3g} m"
+            reasons[distance], needed[distance] = proposal.limit, proposal.photons_needed
             return proposal.reached
 
-        low, high = (start, 0.0) if is_reached(start) else (0.0, start)
-        while not (low and high):
-            distance = low * _STEP if low else high / _STEP
-            if distance > _FARTHEST:
-                return low, "not sought beyond 200 m"
-            if distance < start / 40.0:
-                return 0.0, reason
-            low, high = (distance, high) if is_reached(distance) else (low, distance)
-        while high / low > _RESOLUTION:
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if is_reached(middle) else (low, middle)
-        return low, reason
+        near, far, unjudged = bracket(judge, start)
+        limit = reasons[far] if far < math.inf else f"not sought beyond {_FARTHEST:g} m"
+        if unjudged is None:
+            return near, limit, None
+        would = _SHARE * needed.get(unjudged[0], math.inf)
+        told = f"about {would:.1e} photons would tell" if would < math.inf else "more photons would tell"
+        beyond = f"; from {far:.3g} m on it is not reached: {limit}" if far < math.inf else ""
+        return near or math.nan, f"not judged from {unjudged[0]:.3g} to {unjudged[1]:.3g} m: {told}{beyond}", unjudged
+
+
+def bracket(judge: Callable[[float], bool | None], start: float) -> tuple[float, float, tuple[float, float] | None]:
+    """The farthest range known to be reached, 0: none; the nearest beyond known not to be, inf: none; and between them
+    the nearest and the farthest that are not judged, `None`: none. Steps of `_STEP`, then halves to `_RESOLUTION`.
+
+    Args:
+        judge: Of a range: True: reached, False: not reached, None: not judged.
+        start: First range that is judged.
+    """
+    found = {start: judge(start)}
+    for factor, end in ((_STEP, False), (1.0 / _STEP, True)):
+        distance = start
+        while found[distance] is not end and start / 40.0 <= distance * factor <= _FARTHEST:
+            distance *= factor
+            found[distance] = judge(distance)
+    while True:
+        near = max((one for one, reached in found.items() if reached), default=0.0)
+        far = min((one for one, reached in found.items() if reached is False and one > near), default=math.inf)
+        gap = [one for one, reached in found.items() if reached is None and near < one < far]
+        for low, high in ((near, min(gap, default=far)), (max(gap, default=near), far)):
+            if low > 0.0 and high < math.inf and high / low > _RESOLUTION:
+                middle = math.sqrt(low * high)
+                found[middle] = judge(middle)
+                break
+        else:
+            return near, far, (min(gap), max(gap)) if gap else None
 
 
 # Targets and gates
@@ -578,58 +578,33 @@ def with_plane(scene: Scene, distance: float) -> Scene:
     return scene.with_overrides({"targets": [plane]})
 
 
-# The Monte Carlo run
-
-
-def window(scene: Scene, device: str | None = None) -> Scene:
-    """The scene with a camera of the pixels about the target pixel nearest to the axis, 16 × 16 at most.
-
-    Raises `ConfigError` where no target is in view.
-    """
-    camera = scene.camera
-    row, column = central_pixel(scene, truth := truth_maps(scene, device=device))
-    hit = ~np.isnan(truth.depth)
-    width, height = min(_SIDE, camera.width), min(_SIDE, camera.height)
-    if (width, height) == (camera.width, camera.height):
-        return scene
-    left, top = (camera.width - width) // 2, (camera.height - height) // 2
-    middle = hit[top : top + height, left : left + width]
-    centred = (camera.width - width) % 2 == 0 == (camera.height - height) % 2 and middle.mean() > 0.25
-    if centred and camera.is_plain:  # the kernels of a plain camera are those of the whole image
-        fov = 2.0 * math.atan(0.5 * width * camera.pixel_tangent)
-        return scene.with_overrides(camera={"width": width, "height": height, "horizontal_fov_deg": math.degrees(fov)})
-    left = int(np.clip(column - width // 2, 0, camera.width - width))
-    top = int(np.clip(row - height // 2, 0, camera.height - height))
-    (fx, fy), (cx, cy) = camera.focal_pixels, camera.principal_point
-    centre = {"cx": cx - 0.5 - left, "cy": cy - 0.5 - top}
-    return scene.with_overrides(camera={"width": width, "height": height, "fx": fx, "fy": fy, **centre})
-
-
-def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
-    """The third of the pixels with a target whose unscattered light is nearest to the median: what is known of it
-    without a photon does not choose pixels by their noise. bool `[H, W]`."""
-    light = known_light(scene, None, pick_device(device))[0].sum(axis=-1, dtype=np.float64)
-    light[np.isnan(truth_maps(scene, device=device).depth)] = np.nan
-    off = np.abs(light - np.nanmedian(light))
-    chosen = np.argsort(off, axis=None, kind="stable")[: max(1, np.isfinite(light).sum() // 3)]
-    return np.isin(np.arange(light.size), chosen).reshape(light.shape)
+# What is known before, and from the run
 
 
 def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
-    """Raises `ConfigError` where a pixel detects less than one photon of the target in all pulses of a time [s], even
-    if scattering took no light away.
+    """Raises `ConfigError` where a pixel detects less than one photon of the target in all pulses of a time [s],
+    however much of the light is forward-scattered.
 
-    Light of a pixel is ρ/π ∫ E I dA: E is the irradiance of the target, I that which the pixel would cast on it, by
-    reciprocity (Veach 1997). ∫ I dA is at most the étendue of the pixel, less what water absorbs on the shortest way.
-    Scattering spreads a beam: E is at most what it casts through clear water that absorbs, on its axis; in a wide beam
-    light that comes back from the water and the target adds to that, here twice.
+    Light of a pixel whose last face is the target is ρ/π ∫ E I dA: E is the irradiance of the target by all light, I
+    that which the pixel would cast on it before any other face, by reciprocity (Veach 1997). Energy bounds ∫ I dA by
+    the étendue of the pixel, less what water absorbs on the shortest way. E is at most 2/(1 − ρω) times that on the
+    axis of the beam in clear water that absorbs. Light that comes to a plane for the first time is in an even wide beam
+    at most as dense as in clear water, by energy; a cone has at most the light of a source of its intensity in all
+    directions, whose densest first hits go from 1 time (straight) to 2 times (diffusion, 1/(2π z²): the harmonic
+    measure of a half-space). Of what the target reflects, ρ, at most ω, the albedo, comes back: it has to scatter.
+    There is no bound where walls reflect.
     """
-    camera, laser = scene.camera, scene.laser
-    etendue = camera.aperture_area * camera.pixel_tangent**2
-    passed = math.exp(-2.0 * scene.medium.range.absorption * nearest)
+    camera, laser, water = scene.camera, scene.laser, scene.medium.range
     known = (1.0 if isinstance(one.reflectance, str) else one.reflectance for one in scene.targets)
     reflectance = max(known, default=1.0)
-    light = 2.0 * reflectance / math.pi * axis_fluence(scene, nearest) * etendue * passed
+    sight = nearest - float(axis_line(scene).lead[0])
+    way = min(nearest, sight) - math.hypot(*scene.beam.position)  # of the laser's light, at least
+    if way <= 0.0 or reflectance * water.albedo >= 1.0 or scene.domain.reflecting:
+        return
+    etendue = camera.aperture_area * camera.pixel_tangent**2
+    passed = math.exp(-water.absorption * (sight + way))
+    returns = 2.0 / (1.0 - reflectance * water.albedo)
+    light = returns * reflectance / math.pi * axis_fluence(scene, way) * etendue * passed
     pulses = min(time * laser.repetition_rate / scene.scan_positions, _MOST_PULSES)
     most = light * laser.photons_per_pulse * scene.detections_per_photon * pulses
     if most < 1.0:
@@ -642,201 +617,6 @@ def _refuse_hopeless(scene: Scene, nearest: float, time: float) -> None:
         )
 
 
-def trace(
-    scene: Scene,
-    photons: int,
-    seed: int,
-    device: str | None,
-    progress: Progress | None = None,
-    earlier: Sequence[Result] = (),
-) -> tuple[Result, ...]:
-    """Runs of an eighth of the photons each, which go on with earlier ones."""
-    each, before = max(1, photons // _RUNS), sum(run.photons for run in earlier)
-    cache: dict[str, Any] = {}
-
-    def run(number: int) -> Result:
-        def report(stage: str, done: int, total: int) -> None:
-            if progress is not None and (total or not (number or earlier)):
-                progress(stage, before + number * each + done if total else done, before + _RUNS * each if total else 0)
-
-        options: dict[str, Any] = {"seed": seed, "device": device, "progress": report, "mesh_cache": cache}
-        return simulate(scene, photons=each, run=RunOptions(first_photon=before + number * each), **options)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SpadwarpWarning)  # of few photons: `plan` judges what they tell
-        runs = [run(number) for number in range(_RUNS)]
-    return tuple(merge(pair) for pair in zip(earlier, runs, strict=True)) if earlier else tuple(runs)
-
-
-def measure(
-    runs: Sequence[Result],
-    scene: Scene,
-    typical: Mask,
-    device: str | None = None,
-    *,
-    even: bool = False,
-    channel: Channel = "I",
-) -> Pilot:
-    """Numbers of `scene`, whose laser's energy and detector may differ from those of the runs, in a channel of an
-    analyser; `typical`: the runs' `typical_pixels`.
-
-    `even`: the target is the same for all pixels, so that their median error has no noise of the runs; `floor` is then
-    its modulus.
-    """
-    # The traced scene with what a detector sees of the wanted one.
-    laser = {name: getattr(scene.laser, name) for name in ("pulse_energy", "repetition_rate", "pulse_fwhm_ps")}
-    seen_by = runs[0].scene.with_overrides(laser=laser).model_copy(update={"detector": scene.detector})
-    halves = (merge(runs[0::2]), merge(runs[1::2])) if len(runs) > 2 else runs
-    first, second = (analyser_channel(dataclasses.replace(run, scene=seen_by), channel) for run in halves)
-    both = merge([first, second])
-    clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SpadwarpWarning)  # the noise of the runs is judged here
-        frames, clear_frames = (detect(run, pulses=1, seed=0, device=device) for run in (both, clear))
-    light = frames.expected.astype(np.float64)
-    background = np.broadcast_to(frames.background, light.shape).astype(np.float64)
-    signal = light - background
-    seen = np.isfinite(both.truth.depth) & (signal.sum(axis=-1) > 0)
-    if not seen.any():
-        raise _NoLight(
-            "no light of the target reaches the pixels near the axis: `spadwarp check` says why", source=scene.source
-        )
-
-    def median(values: Any) -> float:
-        values = np.asarray(values)[seen]
-        finite = values[np.isfinite(values)]
-        return float(np.median(finite)) if finite.size else math.inf
-
-    def errors(frames: Frames, histogram: Any) -> dict[str, Any]:
-        """Depth by each estimator, from a histogram without noise, less the true depth [m]."""
-        return {method: _depth_error(both, frames, histogram, method, device) for method in METHODS}
-
-    error, unscattered = errors(frames, light), errors(clear_frames, clear_frames.expected.astype(np.float64))
-    bias = {method: median(values) for method, values in error.items()}
-    piled: dict[str, float] = {method: 0.0 for method in METHODS}
-    if scene.detector.mode == "first_photon":
-        recorded = errors(frames, first_photon_probabilities(light, device=device))
-        piled = {method: median(recorded[method] - error[method]) for method in METHODS}
-    scale = both.scene.laser.photons_per_pulse * scene.detections_per_photon
-    pool = _Pool(both, typical)
-    returned = pool(signal)
-    peak, level = _return(returned, pool(background), both.scene)
-    bound, shot, information_noise = _bounds(both, (first, second), pool, device)
-    lights = [run.tallies[:2].sum(axis=(0, 3), dtype=np.float64)[seen] for run in (first, second)]
-    return Pilot(
-        pixels=int(seen.sum()),
-        unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
-        target=float(returned.sum()),
-        backscatter=float(both.component("backscatter")[typical].sum(axis=-1).mean() * scale),
-        noise=float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start),
-        brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))),
-        bound=bound,
-        shot_noise=shot,
-        information_noise=information_noise,
-        floor={name: abs(bias[name]) if even else median(np.abs(values)) for name, values in error.items()},
-        bias=bias,
-        unscattered_floor={name: median(np.abs(values)) for name, values in unscattered.items()},
-        pile_up=piled,
-        peak=float(peak),
-        level=float(level),
-        light_noise=math.sqrt(np.mean(np.square(lights[0] - lights[1]))) / max(float(np.mean(sum(lights))), 1e-300),
-        photons=both.photons,
-    )
-
-
-def _depth_error(result: Result, frames: Frames, histogram: Any, method: Any, device: str | None) -> Floats:
-    """Depth by an estimator that knows the background, less the true depth [m]."""
-    time = arrival_time(
-        histogram,
-        gate_start=frames.gate_start,
-        bin_width=frames.bin_width,
-        method=method,
-        irf=frames.irf,
-        background=frames.background,
-        device=device,
-    )
-    return depth_from_time(time, scene=result.scene) - result.truth.depth
-
-
-def _brightest(first: Floats, second: Floats) -> float:
-    """Mean over the brightest twentieth of the pixels of two halves `[H, W]`, each chosen by the other half's averages
-    over neighbours; over both halves' brightest pixel where these have no light."""
-    from scipy.ndimage import uniform_filter
-
-    count = max(1, first.size // 20)
-    pairs = ((first, second), (second, first))
-    top = [mine.ravel()[np.argsort(uniform_filter(other, 3), axis=None)[-count:]] for mine, other in pairs]
-    return float(np.mean(top)) or float((first + second).max()) / 2.0
-
-
-def _sigma(scene: Scene) -> float:
-    """Standard deviation of the response, or of a bin where it is shorter [s]."""
-    return max(detector_response(scene.detector, scene.laser).fwhm, scene.gate.bin_width) / FWHM_PER_SIGMA
-
-
-def _return(signal: Floats, background: Floats, scene: Scene) -> tuple[Floats, Floats]:
-    """Detections per pulse about the return's peak, and of background per σ under it."""
-    bins_per_sigma = _sigma(scene) / scene.gate.bin_width
-    reach = max(1, round(3.0 * _sigma(scene) / scene.gate.bin_width))
-    top = signal.argmax(axis=-1)[..., None]
-    near = np.clip(top + np.arange(-reach, reach + 1), 0, signal.shape[-1] - 1)
-    inside = np.abs(near - top) <= reach
-    peak = (np.take_along_axis(signal, near, axis=-1) * inside).sum(axis=-1)
-    return peak, np.take_along_axis(background, near, axis=-1).mean(axis=-1) * bins_per_sigma
-
-
-class _Pool:
-    """The mean over typical pixels of light `[H, W, T]`, whose bins are counted from each pixel's own true path; `[T]`.
-    By whole bins: within a bin the run does not know where the light is."""
-
-    def __init__(self, result: Result, typical: Mask) -> None:
-        self.typical = typical
-        path = result.true_path()[typical] / (result.scene.medium.pulse_speed * result.scene.gate.bin_width)
-        shift = np.rint(path - np.median(path)).astype(np.int64)[:, None]
-        self.bins = np.arange(result.scene.gate.bins) + shift
-        self.inside = (self.bins >= 0) & (self.bins < result.scene.gate.bins)
-
-    def __call__(self, light: NDArray[Any]) -> Floats:
-        own = light[self.typical].astype(np.float64)
-        return (np.take_along_axis(own, np.clip(self.bins, 0, own.shape[1] - 1), axis=1) * self.inside).mean(axis=0)
-
-
-def _bounds(result: Result, runs: tuple[Result, Result], pool: _Pool, device: str | None) -> tuple[float, float, float]:
-    """Bounds of depth for one pulse [m]: as the detector records it, and without background and pile-up; and the part
-    of the information that was noise of the runs, for which the bounds are larger.
-
-    From products of the slopes of both runs, which noise does not change in the mean. Inf where nearly all is noise.
-    """
-    scene = result.scene
-    scale = scene.laser.photons_per_pulse * scene.detections_per_photon
-    signal, first, second = (
-        pool(run.component("ballistic") + run.component("forward_scattered")) * scale for run in (result, *runs)
-    )
-    light = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
-    options: dict[str, Any] = {
-        "bin_width": scene.gate.bin_width,
-        "irf": detector_response(scene.detector, scene.laser),
-        "signal_halves": (first, second),
-        "device": device,
-    }
-    law: Any = "first_photon" if scene.detector.mode == "first_photon" else "poisson"
-    slope = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))[pool.typical].mean()
-
-    def bound(background: Any, law: Any) -> tuple[float, float]:
-        information, noise = (float(x) for x in information_from_histogram(signal, background, law=law, **options))
-        if information <= 0.0:
-            return math.inf, 1.0
-        part = noise / information
-        left = information - noise if part < _MOST_NOISE else 0.0
-        return float(slope) / math.sqrt(left) if left > 0.0 else math.inf, part
-
-    recorded, part = bound(pool(light), law)
-    return recorded, bound(0.0, "poisson")[0], part
-
-
-# Pulses, and parts of the depth error
-
-
 def _rounded_down(value: float, digits: int = 3) -> float:
     """With so many digits, not above the value."""
     text = f"{value:.{digits - 1}e}"
@@ -847,7 +627,7 @@ def _rounded_down(value: float, digits: int = 3) -> float:
 def _pulses_without_false_peaks(scene: Scene, pilot: Pilot, device: str | None) -> float:
     """Pulses after which a fit takes background for the return with a probability of `OUTLIERS`; inf beyond 1e12."""
     pulses = np.geomspace(1.0, 1e12, 481)
-    lengths = np.full_like(pulses, (scene.gate.stop - scene.gate.start) / _sigma(scene))
+    lengths = np.full_like(pulses, (scene.gate.stop - scene.gate.start) / response_deviation(scene))
     few = np.flatnonzero(false_peaks(pulses * pilot.peak, pulses * pilot.level, lengths, device) <= OUTLIERS)
     return float(pulses[few[0]]) if few.size else math.inf
 

@@ -44,7 +44,7 @@ class PlanRow:
     pulse_energy: float  # proposed [J]
     sigma_depth: float  # Cramér–Rao bound with the pulses of the scene's own depth frame [m]
     floor: float  # error that no number of pulses removes [m]
-    largest_range: float  # of a plane with the depth error, within the time [m]; NaN: not sought
+    largest_range: float  # of a plane with the depth error, within the time [m]; NaN: not sought or not judged
     limit: str  # largest part of the depth error
 
 
@@ -59,7 +59,8 @@ class Sweep:
     @property
     def is_flat(self) -> bool:
         """Whether different values gave the same numbers throughout."""
-        return len({repr(value) for value in self.values}) > 1 and len({repr(row) for row in self.rows}) == 1
+        judged = not any(isinstance(row, PlanRow) and math.isnan(row.pulses) for row in self.rows)
+        return judged and len({repr(value) for value in self.values}) > 1 and len({repr(row) for row in self.rows}) == 1
 
     def column(self, name: str) -> NDArray[Any]:
         """One attribute of all rows, or the values of one field."""
@@ -126,7 +127,8 @@ def sweep(
 
 def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
     found = plan(scene, **options)
-    known = math.inf if found.pulses_for in ("floor", "out of reach") else 1.0 if found.judged else math.nan
+    told = 1.0 if found.judged else math.nan
+    known = math.inf if found.pulses_for in ("floor", "out of reach") else told
     least, most = (known * pulses for pulses in found.pulses_range)
     return PlanRow(
         pulses=known * found.pulses,
@@ -134,9 +136,9 @@ def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
         pulses_most=most,
         frame_time=known * found.frame_time,
         pulse_energy=found.scene.laser.pulse_energy,
-        sigma_depth=found.pilot.bound / math.sqrt(scene.pulses_per_depth_frame),
-        floor=math.hypot(found.pilot.floor[found.method], found.pilot.pile_up[found.method]),
-        largest_range=found.largest_range,
+        sigma_depth=told * found.pilot.bound / math.sqrt(scene.pulses_per_depth_frame),
+        floor=told * math.hypot(found.pilot.floor[found.method], found.pilot.pile_up[found.method]),
+        largest_range=found.largest_range if found.unjudged_ranges is None else math.nan,
         limit=found.limit if found.judged else "not judged: more photons",
     )
 

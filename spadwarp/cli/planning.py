@@ -137,7 +137,16 @@ def plan(
         made = f"# Proposed by `spadwarp plan {scene.name} --depth-error {depth_error:g}`: {_verdict(found)}\n\n"
         spadwarp.io.write_text(made + found.scene.to_toml(folder=file.parent), file)
     say(_verdict(found))
-    hidden = ["pilot", "terms", "advice", "limit", "pulses_range", "photons_needed", "seconds_needed"]
+    hidden = [
+        "pilot",
+        "terms",
+        "advice",
+        "limit",
+        "pulses_range",
+        "unjudged_ranges",
+        "photons_needed",
+        "seconds_needed",
+    ]
     hidden += [] if found.judged else ["pulses", "pulses_for", "frame_time", "reached", "pile_up_energy"]
     told = {name: value for name, value in found.to_dict().items() if value == value and value != ""}
     values = {name: value for name, value in told.items() if name not in hidden}
@@ -145,8 +154,9 @@ def plan(
     if not found.judged:
         del values["values"]["detector.pulses_per_frame"]
     say(readable(values))
-    if found.largest_range == found.largest_range:
-        say(f"largest range, for a plane square to the optical axis: {found.largest_range:.3g} m; {found.range_limit}")
+    if found.range_limit:
+        farthest = f"{found.largest_range:.3g} m; " if found.largest_range == found.largest_range else ""
+        say(f"largest range, for a plane square to the optical axis: {farthest}{found.range_limit}")
     if found.judged:
         say(rows(_terms(found)))
         say(f"What would help: {found.advice}.")

@@ -30,8 +30,29 @@ def test_few_photons_say_that_they_do_not_judge_or_judge_as_many_do(depth_error)
                 assert few.photons_needed > few.pilot.photons and "not enough photons to judge" in repr(few)
 
 
+@pytest.mark.parametrize("start", [0.7, 6.0, 60.0])
+@pytest.mark.parametrize("unjudged", [None, (3.0, 5.0), (5.0, 9.0), (20.0, 80.0), (3.0, math.inf), (0.0, 30.0)])
+def test_a_range_that_is_not_judged_counts_neither_as_reached_nor_as_not(start, unjudged):
+    """Of a depth error that is reached up to 23 m, and ranges at which photons do not tell."""
+    low, high = unjudged or (0.0, 0.0)
+    asked = []
+
+    def judge(distance):
+        asked.append(distance)
+        return None if low < distance < high else distance <= 23.0
+
+    near, far, gap = planning.bracket(judge, start)
+    assert near <= 23.0 < far and len(asked) <= 30
+    if low < 23.0 < high:
+        assert gap is not None and low < gap[0] <= gap[1] < min(high, far)
+        assert near in (0.0, pytest.approx(low, rel=0.04)) and far in (math.inf, pytest.approx(high, rel=0.04))
+        assert (near > 0.0) == (low > 0.0) and (far < math.inf) == (high < math.inf)
+    else:
+        assert gap is None and near == pytest.approx(23.0, rel=0.04) == far
+
+
 def test_hopeless_water_is_named_before_a_photon_is_traced(monkeypatch):
-    monkeypatch.setattr(planning, "simulate", None)
+    monkeypatch.setattr(planning, "trace", None)
     with pytest.raises(
         spadwarp.ConfigError, match=r"at 5\.9.* m a pixel detects .* photons at most in all 1e\+05 pulses"
     ):
