@@ -11,8 +11,8 @@ SPADWARP, KERNELS = (Path(package.__file__).parent for package in (spadwarp, spa
 
 
 @functools.cache
-def tree_of(path):
-    return ast.parse(path.read_text())
+def nodes_of(path):
+    return list(ast.walk(ast.parse(path.read_text())))
 
 
 def imported(node, package=()):
@@ -29,4 +29,4 @@ def names_imported(path, excepted=()):
     """By a file, inside functions too, but not by the nodes that are excepted."""
     top = KERNELS if KERNELS in path.parents else SPADWARP
     package = path.parent.relative_to(top.parent).parts
-    return [name for node in ast.walk(tree_of(path)) if node not in excepted for name in imported(node, package)]
+    return [name for node in nodes_of(path) if node not in excepted for name in imported(node, package)]

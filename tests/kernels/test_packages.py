@@ -6,7 +6,7 @@ import importlib
 import pytest
 
 import spadwarp_kernels as sk
-from helpers.source_code import KERNELS, names_imported, tree_of
+from helpers.source_code import KERNELS, names_imported, nodes_of
 
 # A package imports those before it.
 PACKAGES = (
@@ -63,7 +63,7 @@ def test_fields_of_a_spec_are_read_by_their_owner(package):
         node.attr
         for path in (KERNELS / package).rglob("*.py")
         if path.relative_to(KERNELS).as_posix() not in RESOLVING
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "spec"
     }
     assert read & set(sk.TransportSpec._fields) <= set(OWNED.get(package, "").split())

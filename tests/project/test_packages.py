@@ -5,7 +5,7 @@ import graphlib
 
 import pytest
 
-from helpers.source_code import KERNELS, SPADWARP, imported, names_imported, tree_of
+from helpers.source_code import KERNELS, SPADWARP, imported, names_imported, nodes_of
 
 # A package imports those further down this table only.
 LEVELS = (
@@ -36,9 +36,9 @@ ONE_LINE_METHODS = {"depth", "save", "plot", "_repr_html_", "to_xarray"}
 MODULES = sorted(path for path in SPADWARP.rglob("*.py") if path.parent != SPADWARP or path.stem in LEVEL)
 
 
-def excepted(tree):
+def excepted(path):
     """Nodes of imports in the one-line methods."""
-    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    classes = [node for node in nodes_of(path) if isinstance(node, ast.ClassDef)]
     methods = [item for node in classes for item in node.body if getattr(item, "name", None) in ONE_LINE_METHODS]
     return {inner for method in methods for inner in ast.walk(method) if imported(inner) == ["spadwarp"]}
 
@@ -57,7 +57,7 @@ def test_every_package_is_in_the_table():
 def test_arrows_point_down():
     for path in MODULES:
         here = path.relative_to(SPADWARP).parts[0].removesuffix(".py")
-        for name in names_imported(path, excepted(tree_of(path))):
+        for name in names_imported(path, excepted(path)):
             top, *parts = name.split(".")
             if top == "spadwarp_kernels":
                 assert len(parts) <= 2, f"{path.name}: {name} is not a public name of a package of the kernels"
@@ -80,7 +80,7 @@ def test_no_file_imports_itself_by_way_of_others(folder):
     }
     arrows = {}
     for name, path in names.items():
-        conditions = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.If)]
+        conditions = [node for node in nodes_of(path) if isinstance(node, ast.If)]
         hints = {x for node in conditions if ast.unparse(node.test) == "TYPE_CHECKING" for x in ast.walk(node)}
         found = names_imported(path, hints)
         found = {one if one in names else one.rpartition(".")[0] for one in found}
@@ -90,7 +90,7 @@ def test_no_file_imports_itself_by_way_of_others(folder):
 
 def test_one_line_methods_have_one_line():
     for path in MODULES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef) and node.name in ONE_LINE_METHODS:
                 calls = [item for item in ast.walk(node) if imported(item) == ["spadwarp"]]
                 assert not calls or len(statements(node)) == 2, f"{path.name}: {node.name}"
@@ -173,7 +173,7 @@ def test_files_and_functions_can_be_read_in_a_sitting():
         if lines_of(path) > MOST_LINES:
             long.append(f"{path.name}: {lines_of(path)} lines")
         limit = LONGER.get(path.name, MOST_BODY_LINES) if KERNELS in path.parents else MOST_BODY_LINES
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef) and body_lines(node) > limit:
                 long.append(f"{path.parent.name}/{path.name}: {node.name} has {body_lines(node)} lines")
     assert not long, "\n".join(long)
