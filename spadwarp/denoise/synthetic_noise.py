@@ -1,7 +1,7 @@
 """Training pairs drawn on the training device: clean scenes, crops of them, and what a SPAD camera reports of these.
 
 Each scene has open water, a wall or a slanted floor, and up to ten things before it: plates, ellipsoids, rods, ropes,
-nets, ladders, plants, chains, rocks and blocks, at depths of their own or close together as parts of one body, with a
+nets, ladders, plants, chains, rocks, blocks, slabs, sieves and waves, at depths of their own or close together as parts of one body, with a
 texture of reflectance. The shapes of `spadwarp.denoise.evaluation_scenes` and the built-in meshes are not among them.
 
 A noisy frame is never stored. Each step draws crops, gates, waters and photons anew, so no two frames of a training are
@@ -245,6 +245,17 @@ def _slab(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     return inside, steep * x
 
 
+def _sieve(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
+    """A plate with slits or square holes, through which one sees what is behind."""
+    pitch = random.log_between((4.0, 40.0), 2, 1, 1)
+    hole = random.log_between((0.7, 4.0), 2, 1, 1)
+    slit = random.coin(0.5, 1, 1)
+    open_ = (_from_lines(x, pitch[:, 0]) < hole[:, 0]) & (slit | (_from_lines(y, pitch[:, 1]) < hole[:, 1]))
+    extent = random.log_between((12.0, 120.0), 2, 1, 1)
+    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    return inside & ~open_, (random.between((-0.4, 0.4), 1, 1) * x + random.between((-0.4, 0.4), 1, 1) * y) / 100.0
+
+
 def _sea(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     """A sheet with round waves, flat to steep."""
     extent = random.log_between((15.0, 120.0), 2, 1, 1)
@@ -253,7 +264,7 @@ def _sea(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     return inside, height * torch.sin(x / random.log_between((2.0, 15.0), 1, 1)) + 0.2 * height * torch.sin(y / 9.0)
 
 
-KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, _blocks, _slab, _sea)
+KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, _blocks, _slab, _sieve, _sea)
 """Things in the scenes."""
 
 
