@@ -69,14 +69,15 @@ def find_defects(counts: NDArray[Any], background: NDArray[Any], response: NDArr
     cube = frames[0] if len(frames) == 1 else frames.sum(axis=0, dtype=np.int64)
     height, width, bins = cube.shape
     none = Defects(np.zeros((height, width), bool), np.zeros(bins, bool), 0)
-    level = len(frames) * np.broadcast_to(np.asarray(background, np.float64), (height, width, bins))
+    level = len(frames) * np.asarray(background, np.float64)
     taps = np.asarray(response, np.float64)
     most, window = _steepest(taps), return_width(taps)
     pixels, lines = _wrong_pixels(cube, level, most, window)
     if wrong_everywhere := bool(pixels.mean() > _MOST):  # by a bin, perhaps
         pixels, lines = none.pixels, 0
-    total = cube[~pixels].sum(axis=0, dtype=np.int64)
-    wrong_bins = _stuck(total, most) | _dead(total, level[~pixels].sum(axis=0), bins)
+    total = cube.sum(axis=(0, 1), dtype=np.int64) - cube[pixels].sum(axis=0, dtype=np.int64)
+    usual = (~pixels).sum() * level if level.ndim == 1 else level[~pixels].sum(axis=0)
+    wrong_bins = _stuck(total, most) | _dead(total, usual, bins)
     if wrong_bins.mean() > _MOST:
         return none
     if wrong_everywhere and wrong_bins.any():
@@ -90,18 +91,20 @@ def _wrong_pixels(
     cube: NDArray[Any], level: NDArray[np.float64], most: float, width: int
 ) -> tuple[NDArray[np.bool_], int]:
     """Pixels `[H, W]` that are stuck, dead or hot, alone or as rows and columns, and how many of these."""
-    shape, each = level.mean(axis=(0, 1)), level.sum(axis=-1)
+    each = np.broadcast_to(level.sum(axis=-1), cube.shape[:2])
+    shape = level if level.ndim == 1 else level.mean(axis=(0, 1))
     pixels = np.zeros(cube.shape[:2], bool)
     if min(pixels.shape) > _AROUND:
         pixels = _wrong(cube, each, shape, most, width)
+    sums = [cube.sum(axis=axis, dtype=np.int64) for axis in (0, 1)]
 
     def wrong_lines(axis: int) -> NDArray[np.bool_]:
         """Of the lines along an axis, without the pixels that are known to be wrong."""
         if pixels.shape[1 - axis] <= _AROUND:
             return np.zeros(pixels.shape[1 - axis], bool)
-        used = ~pixels
-        counts = (cube * used[..., None]).sum(axis=axis, dtype=np.int64)
-        return _wrong(counts, (each * used).sum(axis=axis), shape, most, width)
+        counts = sums[axis].copy()
+        np.subtract.at(counts, np.nonzero(pixels)[1 - axis], cube[pixels])
+        return _wrong(counts, (each * ~pixels).sum(axis=axis), shape, most, width)
 
     lines = 0
     first = min((0, 1), key=lambda axis: wrong_lines(axis).mean() or 1.0)  # a wrong column shows in each row's sum
@@ -133,15 +136,16 @@ def _wrong(
     from scipy.ndimage import median_filter
 
     total = counts.sum(axis=-1, dtype=np.int64)
-    usual = median_filter(total, _AROUND, mode="mirror").astype(
-        np.float64
-    )  # of those around, which a defect leaves as it is
-    wrong = _dead(total, np.minimum(expected, usual), total.size)
-    place = np.nonzero(_above(total, _WRONG * expected, total.size) & ~wrong)
-    for index in zip(*place, strict=True):
-        wrong[index] |= _hot(counts[index], expected[index] * shape / max(shape.sum(), 1e-12), total.size, width)
-    for part, rows in zip(wrong, counts, strict=True) if counts.ndim == 3 else [(wrong, counts)]:
-        part |= _stuck(rows, most, total.size).any(axis=-1)
+    around = median_filter(total, _AROUND, mode="mirror").astype(np.float64)  # which a defect leaves as it is
+    wrong = _dead(total, np.minimum(expected, around), total.size)
+    bright = _above(total, _WRONG * expected, total.size)
+    shape = shape / max(shape.sum(), 1e-12)
+    rows = (
+        zip(wrong, counts, expected, bright, strict=True) if counts.ndim == 3 else [(wrong, counts, expected, bright)]
+    )
+    for part, some, level, chosen in rows:  # so that little memory is needed
+        part |= _stuck(some, most, total.size).any(axis=-1)
+        part[chosen] |= _hot(some[chosen], level[chosen, None] * shape, total.size, width)
     return wrong
 
 
@@ -157,22 +161,26 @@ def _above(counts: NDArray[Any], expected: NDArray[np.float64], tests: int) -> N
     return np.asarray((counts > 0) & (pdtrc(counts - 1.0, np.maximum(expected, 1e-9)) < FALSE_ALARMS / tests))
 
 
-def _hot(counts: NDArray[Any], level: NDArray[np.float64], tests: int, width: int) -> bool:
-    """Whether one histogram `[T]` is above the background level everywhere, without a return.
+def _hot(counts: NDArray[Any], level: NDArray[np.float64], tests: int, width: int) -> NDArray[np.bool_]:
+    """Which histograms `[n, T]` are above the background level everywhere, without a return.
 
     That is, beside the window with the most counts, and in no window by more than chance gives there.
     """
+    from scipy.ndimage import uniform_filter1d
     from scipy.special import pdtrc
 
-    window = np.ones(min(width, counts.size))
-    inside, known = (np.convolve(one, window, mode="same") for one in (counts, level))
-    best = int(inside.argmax())
-    rest, usual = counts.sum() - inside[best], max(level.sum() - known[best], 0.0)
-    if not _above(np.rint(rest), np.asarray(_WRONG * usual), tests):
-        return False
-    excess = (rest - usual) * window.size / max(1, counts.size - window.size)
-    chance = pdtrc(np.maximum(np.rint(inside), 1.0) - 1.0, known + excess)
-    return bool(chance.min() * counts.size > _NO_RETURN)
+    side = min(width, counts.shape[-1])
+    inside, known = (side * uniform_filter1d(one.astype(float), side, mode="constant") for one in (counts, level))
+    best = inside.argmax(axis=-1)[:, None]
+    rest, usual = (
+        np.maximum(one.sum(axis=-1) - np.take_along_axis(part, best, -1)[:, 0], 0.0)
+        for one, part in ((counts, inside), (level, known))
+    )
+    found = _above(np.rint(rest), _WRONG * usual, tests)
+    excess = (rest - usual)[found, None] * (side / max(1, counts.shape[-1] - side))
+    chance = pdtrc(np.maximum(np.rint(inside[found]), 1.0) - 1.0, known[found] + excess)
+    found[found] = chance.min(axis=-1) * counts.shape[-1] > _NO_RETURN
+    return found
 
 
 def _stuck(counts: NDArray[Any], most: float, tests: int = 1) -> NDArray[np.bool_]:

@@ -2,7 +2,8 @@
 
 Each scene has open water, a wall or a slanted floor, and up to ten things before it: plates, ellipsoids, rods, ropes,
 nets, ladders, plants, chains, rocks, blocks, slabs, sieves and waves, at depths of their own or close together as parts
-of one body, with a texture of reflectance. The shapes of `spadwarp.denoise.evaluation_scenes` and the built-in meshes are not among them.
+of one body, with a texture of reflectance. The shapes of `spadwarp.evaluation` and the built-in meshes are not among
+them.
 
 A noisy frame is never stored. Each step draws crops, gates, waters and photons anew, so no two frames of a training are
 alike. Depth is over the gate: 0 at its start, 1 at its end.
