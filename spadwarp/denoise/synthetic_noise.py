@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spadwarp.denoise.classical import highest
 from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN, POOLED
 from spadwarp.denoise.histogram_features import extract_features, toeplitz
 from spadwarp.denoise.recipe import Noise
@@ -593,23 +594,12 @@ def _estimate(
     counts: Tensor, level: Tensor, response: Tensor, total: Tensor, photons: Tensor, histograms: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Maximum-likelihood depth over the gate, where there are counts, and with `histograms` the features."""
-    bins, device = counts.shape[-1], counts.device
+    bins = counts.shape[-1]
     # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), for all k at once as a product of matrices.
-    apart = torch.arange(-_TAPS, _TAPS + 1, device=device)
-    width = (response * apart.square()).sum(dim=1, keepdim=True).sqrt()
     gain = torch.log1p(photons[:, None, None] * toeplitz(response, bins) / level[:, :, None])  # [B, j, k]
     score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
-    best = score.argmax(dim=-1, keepdim=True)
     features = extract_features(counts, level[:, None, None], response, total) if histograms else None
-
-    # Centroid of the counts within 2σ around the best bin.
-    offsets = torch.arange(-6, 7, device=device)
-    near = (best + offsets).clamp(0, bins - 1)
-    weight = counts.gather(-1, near) * (offsets.abs() <= 2 * width)[:, None, None]
-    total = weight.sum(dim=-1)
-    centroid = (weight * (near + 0.5)).sum(dim=-1) / total.clamp_min(1e-9)
-    depth = torch.where(total > 0, centroid, best[..., 0] + 0.5)
-    return depth / bins, counts.sum(dim=-1) > 0, features
+    return highest(score), counts.sum(dim=-1) > 0, features
 
 
 def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:
