@@ -65,6 +65,8 @@ def find_defects(counts: NDArray[Any], background: NDArray[Any], response: NDArr
 
     `background`: expected counts of a frame, `[T]` or `[H, W, T]`; `response`: per bin, centred on its time zero.
     """
+    from scipy.ndimage import median_filter
+
     frames = counts.reshape(-1, *counts.shape[-3:])
     cube = frames[0] if len(frames) == 1 else frames.sum(axis=0, dtype=np.int64)
     height, width, bins = cube.shape
@@ -77,7 +79,8 @@ def find_defects(counts: NDArray[Any], background: NDArray[Any], response: NDArr
         pixels, lines = none.pixels, 0
     total = cube.sum(axis=(0, 1), dtype=np.int64) - cube[pixels].sum(axis=0, dtype=np.int64)
     usual = (~pixels).sum() * level if level.ndim == 1 else level[~pixels].sum(axis=0)
-    wrong_bins = _stuck(total, most) | _dead(total, usual, bins)
+    around = median_filter(total, _AROUND, mode="mirror")  # the background may be wrong at a bin
+    wrong_bins = _stuck(total, most) | _dead(total, np.minimum(usual, around), bins)
     if wrong_bins.mean() > _MOST:
         return none
     if wrong_everywhere and wrong_bins.any():
