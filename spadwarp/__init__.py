@@ -24,7 +24,7 @@ _PACKAGES = {
     "analytic": ("budget", "plan", "simulate_analytic", "sweep"),
     "inverse": ("fit",),
     "dataset": (),
-    "denoise": (),
+    **dict.fromkeys(("denoise", "evaluation"), ()),
     "files": ("export", "load"),
     "viz": (),
     "validate": (),
@@ -42,9 +42,9 @@ _HOMES = {name: package for package, names in _PACKAGES.items() for name in name
 if TYPE_CHECKING:
     from spadwarp import analytic as analytic, arrays as arrays, benchmark as benchmark, checks as checks
     from spadwarp import dataset as dataset, denoise as denoise, device as device, doctor as doctor, files as files
-    from spadwarp import frames as frames, inverse as inverse, io as io, mesh as mesh, parallel as parallel
-    from spadwarp import result as result, scene as scene, transport as transport, validate as validate
-    from spadwarp import values as values, viz as viz, water as water
+    from spadwarp import evaluation as evaluation, frames as frames, inverse as inverse, io as io, mesh as mesh
+    from spadwarp import parallel as parallel, result as result, scene as scene, transport as transport
+    from spadwarp import validate as validate, values as values, viz as viz, water as water
     from spadwarp.analytic import budget as budget, plan as plan, simulate_analytic as simulate_analytic, sweep as sweep
     from spadwarp.checks import check as check
     from spadwarp.values import ArgumentError as ArgumentError, ConfigError as ConfigError, DeviceError as DeviceError

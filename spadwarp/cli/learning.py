@@ -16,7 +16,7 @@ from spadwarp.cli.outputs import answer, check_outputs, progress, rows, show_tab
 from spadwarp.values import count, environment_integer
 
 if TYPE_CHECKING:
-    from spadwarp.denoise import Evaluation, FreshScores, PhotonSweep, SceneScores
+    from spadwarp.evaluation import Evaluation, FreshScores, PhotonSweep, SceneScores
 
 
 @command()
@@ -142,7 +142,7 @@ def evaluate(
       spadwarp evaluate data/lu2024/ --models bm3d,pyramid --frames 7 --bm3d-frames 20 --crop 128 96
       spadwarp evaluate out/result.h5 --report photons/
     """
-    denoise = spadwarp.denoise
+    evaluation = spadwarp.evaluation
     chosen = [name.strip() for name in ("median,gating,usdn,dncnn,pyramid" if models == "all" else models).split(",")]
     check_outputs(report, _REPORT, inputs=(data, weights), option="--report")
     options: dict[str, Any] = {"models": chosen, "seed": seed or 0}
@@ -151,19 +151,19 @@ def evaluate(
     show: Any
     if fresh is not None:
         opt.refuse("cannot be combined with --fresh, which makes scenes of its own", "DATA", "--models", "--report")
-        run, show, options = denoise.evaluate_fresh, _show_fresh, {"scenes": fresh, "seed": seed}
+        run, show, options = evaluation.evaluate_fresh, _show_fresh, {"scenes": fresh, "seed": seed}
     elif data is None:
-        run, show, write = denoise.evaluate_scenes, _show_scenes, denoise.write_scene_report
+        run, show, write = evaluation.evaluate_scenes, _show_scenes, evaluation.write_scene_report
     elif data.is_file() or (data / "result.h5").is_file():
-        run, show = partial(denoise.photon_sweep, opt.load_run(data)), _show_photons
+        run, show = partial(evaluation.photon_sweep, opt.load_run(data)), _show_photons
         named = [*chosen, "histograms"] if models == "all" else chosen
         options["models"] = [name for name in named if name != "bm3d"]
 
         def write(found: PhotonSweep, folder: Path) -> list[Path]:
-            return [denoise.draw_photon_sweep(found, folder / "photons.png")]
+            return [evaluation.draw_photon_sweep(found, folder / "photons.png")]
 
     else:
-        run, show, write = partial(denoise.evaluate, data), _show_gains, denoise.write_report
+        run, show, write = partial(evaluation.evaluate, data), _show_gains, evaluation.write_report
         bm3d_frames = bm3d_frames or (20 if "bm3d" in chosen else 0)
         options = {"models": chosen, "split": split, "frames": frames, "bm3d_frames": bm3d_frames, "crop": crop}
     found = run(weights=weights, device=device, progress=progress("frames" if fresh is None else "scenes"), **options)
@@ -175,7 +175,7 @@ def evaluate(
 
 def _show_gains(found: Evaluation) -> None:
     """Of a dataset, by backscatter fraction or photons."""
-    titles = spadwarp.denoise.TITLES
+    titles = spadwarp.evaluation.TITLES
     table = []
     for method in found.ranking():
         row = {"method": titles[method]}
@@ -194,7 +194,7 @@ def _show_gains(found: Evaluation) -> None:
 def _show_scenes(found: SceneScores) -> None:
     """Scenes that no training saw, by scene type."""
     for setting, water in found.types():
-        names, lines = spadwarp.denoise.scene_table(found, setting, water)
+        names, lines = spadwarp.evaluation.scene_table(found, setting, water)
         say(f"{setting}, backscatter {water}: PSNR of the input and gains over it [dB] by backscatter fraction")
         show_table(dict(zip(names, line, strict=True)) for line in lines)
 
@@ -213,7 +213,7 @@ def _show_fresh(found: FreshScores) -> None:
 
 def _show_photons(found: PhotonSweep) -> None:
     """Frames of few photons from a result."""
-    titles = {"input": "likelihood of each pixel", **spadwarp.denoise.TITLES, "bound": "Cramér–Rao bound"}
+    titles = {"input": "likelihood of each pixel", **spadwarp.evaluation.TITLES, "bound": "Cramér–Rao bound"}
     say(f"RMSE [mm]; {found.summary}")
     for row, ratio in enumerate(found.sbr):
         methods = {name: values[row] for name, values in found.rmse.items()} | {"bound": found.bound[row]}

@@ -1,4 +1,4 @@
-"""Denoisers of depth frames: networks with trained weights, baselines, training and evaluation.
+"""Denoisers of depth frames: networks with trained weights, baselines and training.
 
 torch and the other packages of the extra are loaded when a function needs them: `pip install "spadwarp[denoise]"`.
 """
@@ -6,28 +6,20 @@ torch and the other packages of the extra are loaded when a function needs them:
 from typing import TYPE_CHECKING
 
 from spadwarp.denoise.backgrounds import *
-from spadwarp.denoise.evaluation import *
-from spadwarp.denoise.evaluation_scenes import *
 from spadwarp.denoise.files import *
 from spadwarp.denoise.histograms import *
 from spadwarp.denoise.inference import *
 from spadwarp.denoise.network_files import *
-from spadwarp.denoise.photon_counts import *
 from spadwarp.denoise.recipe import *
-from spadwarp.denoise.report import *
 from spadwarp.values import guarded
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     _modules = (
         backgrounds,
-        evaluation,
-        evaluation_scenes,
         files,
         histograms,
         inference,
         network_files,
-        photon_counts,
         recipe,
-        report,
     )
     __all__ = guarded(__name__, sorted(name for module in _modules for name in module.__all__))

@@ -83,7 +83,7 @@ def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "d
     if law == "none":
         return Background(np.zeros(bins, np.float32), None, 0.0, 0.0, False)
     blocks, pixels = _blocks(cube.reshape(-1, *cube.shape[-3:]))
-    return _estimated(blocks, pixels, _width(taps), _RATES[:1] if law == "flat" else _RATES, cube.shape)
+    return _estimated(blocks, pixels, return_width(taps), _RATES[:1] if law == "flat" else _RATES, cube.shape)
 
 
 def _estimated(
@@ -129,7 +129,7 @@ def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float
     return sums.reshape(-1, frames.shape[-1]), np.tile(sizes, len(frames)).astype(np.float64)
 
 
-def _width(taps: NDArray[np.float64]) -> int:
+def return_width(taps: NDArray[np.float64]) -> int:
     """Bins that hold nearly all of a return: ± 2 deviations of the response."""
     place = np.arange(taps.size) - taps.size // 2
     total = taps.sum()
@@ -284,7 +284,7 @@ def bins_of_target(
         expected = np.tile(_blocks(each[None])[0], (len(frames), 1))
     else:
         expected = scale * pixels[:, None] * mean
-    width = _width(np.asarray(response, np.float64))
+    width = return_width(np.asarray(response, np.float64))
     tolerated = (1.0 + _TOLERANCES[-1]) * expected
     shape = (len(frames), *(-(-side // _BLOCK) for side in frames.shape[1:3]), bins)
     alone = _returns(blocks, tolerated, width, (1,)).reshape(shape)

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
-from spadwarp.denoise.backgrounds import BackgroundLaw, estimate_background, profile_of_depth
+from spadwarp.denoise.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.denoise.baselines import CLASSICAL
 from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
-from spadwarp.denoise.histograms import checked_histograms, dim_pixels, second_return, target_bins
+from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins, without_defects
 from spadwarp.denoise.inference import Estimate, detected, estimate_frames, estimate_histograms, target_threshold
 from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
@@ -132,7 +132,7 @@ def read_depth(
         source = "depth as it is" + (f": {chosen}" if chosen else "")
         source += f"; {below} values below 0 count as not reported" if below else ""
         return DepthReading(depth=frames, frames=depth.ndim == 3, gate=None, profile=None, source=source)
-    histograms = read_histograms(place, **measured, **of_result)
+    histograms = _read_histograms(place, measured | of_result, group_index)
     counted = histograms.values.dtype.kind in "iu" and histograms.response is not None
     if counted:
         histograms = _with_background(histograms, background)
@@ -143,18 +143,43 @@ def read_depth(
     return dataclasses.replace(_estimate_depth(histograms, counted, method, group_index, device), truth=truth)
 
 
+def _read_histograms(path: Path, measured: dict[str, Any], group_index: float | None) -> Histograms:
+    """Histograms of a file; an error for a fact that is missing names all that are."""
+    missing = {
+        "bin width is missing (bin_width)": measured.get("bin_width"),
+        "group index is missing (group_index): 1 in air, 1.3566 in fresh water, 1.3638 in seawater": group_index,
+    }
+    optional = "the instrument response is not given (irf): with it, counts are denoised with their histograms"
+    try:
+        histograms = read_histograms(path, **measured)
+    except ArgumentError as error:
+        if " is missing (" not in str(error):
+            raise
+        others = [text for text, value in missing.items() if value is None]
+        raise ArgumentError("; ".join([str(error), *others, *[optional] * ("irf" not in measured)])) from None
+    if histograms.scene is None and histograms.response is None:
+        known = dict(zip(missing, (histograms.bin_width, group_index), strict=True))
+        others = [text for text, value in known.items() if value is None]
+        if others:
+            raise ArgumentError("; ".join([*others, optional]))
+        return dataclasses.replace(histograms, notes=(*histograms.notes, optional))
+    return histograms
+
+
 def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) -> Histograms:
-    """Counts with the background that is given, or with that of the file, or with an estimate."""
-    if given is None and held.background is not None:
+    """Counts without defects, with the background that is given, or with that of the file, or with an estimate."""
+    if given is None and held.background is not None and (held.background_per_bin is None or held.pulses):
         return held
     assert held.response is not None
-    response = held.response.per_bin(float(held.bin_width or 0.0))
-    if given is None or isinstance(given, str):
-        found = estimate_background(held.values, response, law=given or "decay")
-        notes = (*held.notes, found.summary) if given is None or given in ("decay", "flat") else held.notes
-        return dataclasses.replace(held, background=found.counts, level_known=False, notes=notes)
-    _, levels, _ = checked_histograms(held.values, given, response)
-    return dataclasses.replace(held, background=levels, level_known=True)
+    own = "decay" if held.background is None else held.background_per_bin
+    known: Any = own if given is None else given
+    used = without_defects(held.values, known, held.response.per_bin(float(held.bin_width or 0.0)))
+    notes = [used.estimated.summary] if used.estimated is not None and known != "none" else []
+    notes += [used.defects.summary] if used.defects is not None else []
+    level_known = used.estimated is None and (given is not None or held.level_known)
+    return dataclasses.replace(
+        held, values=used.counts, background=used.background, level_known=level_known, notes=(*held.notes, *notes)
+    )
 
 
 def _unused(held: Held) -> str:

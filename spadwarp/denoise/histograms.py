@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
-from spadwarp.denoise.backgrounds import BackgroundLaw, bins_of_target, estimate_background
+from spadwarp.denoise.backgrounds import Background, BackgroundLaw, bins_of_target, estimate_background
+from spadwarp.denoise.defects import Defects, find_defects, repaired
 from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.network_files import require_torch, torch_device
 from spadwarp.frames.measured import Histograms
@@ -66,9 +67,9 @@ def histogram_tensors(
 
 
 def checked_histograms(
-    counts: ArrayLike, background: ArrayLike | BackgroundLaw, response: ArrayLike
+    counts: ArrayLike, background: ArrayLike, response: ArrayLike
 ) -> tuple[NDArray[Any], NDArray[np.float32], NDArray[np.float32]]:
-    """Counts, background and response as arrays; of a law, the background estimated by it. Raises `ArgumentError`."""
+    """Counts, background and response as arrays. Raises `ArgumentError`."""
     cubes = np.asarray(on_host(counts))
     if cubes.ndim not in (3, 4) or cubes.dtype.kind not in "biuf" or cubes.size == 0:
         raise ArgumentError(f"counts are {cubes.dtype} {cubes.shape}; numbers [H, W, T] or [N, H, W, T] are needed")
@@ -78,12 +79,41 @@ def checked_histograms(
     taps = real_array("response", response)
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
         raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
-    if isinstance(background, str):
-        return cubes, estimate_background(cubes, taps, law=background).counts, taps
     levels, one, each = real_array("background", background), cubes.shape[-1:], cubes.shape[-3:]
     if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
         raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
     return cubes, levels, taps
+
+
+class Usable(NamedTuple):
+    """Counts without defects, and what is known of them."""
+
+    counts: NDArray[Any]  # [H, W, T] or [N, H, W, T]
+    background: NDArray[np.float32]  # [T] or [H, W, T]
+    response: NDArray[np.float32]
+    defects: Defects | None  # None without any
+    estimated: Background | None  # None where the background was given
+
+
+def without_defects(counts: ArrayLike, background: ArrayLike | BackgroundLaw, response: ArrayLike) -> Usable:
+    """Checked counts, of which those of defects are left out, also of the background. Raises `ArgumentError`.
+
+    Rates have no defects.
+    """
+    law = background if isinstance(background, str) else None
+    cubes, levels, taps = checked_histograms(counts, np.zeros(np.shape(counts)[-1]) if law else background, response)
+    estimated = None if law is None else estimate_background(cubes, taps, law=law)
+    levels = levels if estimated is None else estimated.counts
+    if cubes.dtype.kind not in "biu" and not np.array_equal(cubes, np.rint(cubes)):
+        return Usable(cubes, levels, taps, None, estimated)
+    found = find_defects(cubes, levels, taps)
+    if not found.summary:
+        return Usable(cubes, levels, taps, None, estimated)
+    cubes = repaired(cubes, found)
+    if law is not None:
+        estimated = estimate_background(cubes, taps, law=law)
+        levels = estimated.counts
+    return Usable(cubes, levels, taps, found, estimated)
 
 
 def target_bins(

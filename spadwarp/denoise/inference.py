@@ -22,10 +22,10 @@ from spadwarp.denoise.frames import (
     depth_values,
     narrowed_input,
 )
-from spadwarp.denoise.histograms import checked_histograms, features_of_histograms, target_bins
+from spadwarp.denoise.histograms import features_of_histograms, target_bins, without_defects
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.frames.depth import arrival_time
-from spadwarp.values import ArgumentError, check_choice, check_real
+from spadwarp.values import ArgumentError, SpadwarpWarning, check_choice, check_real
 
 __all__ = ["METHODS", "Estimate", "apply", "estimate"]
 
@@ -152,11 +152,14 @@ def estimate(
     else:
         if counts is None or response is None:
             raise ArgumentError(f"model = {model!r} needs counts and response, of which some are missing")
-        cubes, levels, taps = checked_histograms(counts, background, response)
+        cubes, levels, taps, defects, _ = without_defects(counts, background, response)
         if depth.shape != cubes.shape[:-1]:
             raise ArgumentError(f"depth has shape {depth.shape}; {cubes.shape[:-1]} is needed, that of counts")
         if model in CLASSICAL and weights is not None:
             raise ArgumentError(f"weights are for a network, not for {model!r}")
+        if defects is not None:
+            warnings.warn(defects.summary, SpadwarpWarning, stacklevel=2)
+            depth = np.where(defects.hide(depth, gate, taps.size), np.float32(np.nan), depth)
         first, stop, part = target_bins(cubes, levels, taps, gate)
         if model not in CLASSICAL and _leaves_frames_empty(depth, gate, part):
             first, stop, part = 0, cubes.shape[-1], gate

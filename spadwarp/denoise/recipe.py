@@ -75,6 +75,9 @@ class Noise(Section):
     roughness: Limits = Field((0.0, 0.0), description="deviation of the logarithm of its rate from bin to bin")
     ambient: Share = Field(0.0, description="of these, samples with ambient light, which follows the reflectance")
     two_returns: Share = Field(0.4, description="of these, samples in which pixels see a weaker second surface")
+    wrong: Share = Field(
+        0.0, description="of these, samples with a background, and with a response, that are not known well"
+    )
     resampled: Share = Field(
         0.0, description="samples whose depth was resampled, so that pixels at edges lie between both surfaces"
     )

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spadwarp.denoise.histogram_features import FEATURES
 from spadwarp.denoise.recipe import TrainingRecipe
-from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
+from spadwarp.denoise.synthetic_noise import COUNT_BINS, Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.device import physical_memory
 from spadwarp.values import DeviceError
 
@@ -165,7 +165,7 @@ class Pool:
         host = np.random.default_rng((self.recipe.seed, self.scenes.rank, number, *wide))
         part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
         generator = torch.Generator(self.generator.device).manual_seed(int(host.integers(2**62)))
-        is_crowded = host.random() < part.crowded
+        is_crowded, bins = host.random() < part.crowded, int(host.choice(COUNT_BINS))
         with self._apart():
             scenes = self.scenes.at(max(0, number - _FIRST) * self.interval)
             if host.random() < part.open_water:
@@ -177,7 +177,7 @@ class Pool:
             with self._apart():
                 new = draw_batch(
                     scenes, part, size=min(self.piece, self.portion - done), crop=self.scenes.crop,
-                    generator=generator, histograms=True,
+                    generator=generator, histograms=True, bins=bins,
                 )  # fmt: skip
                 if is_crowded:
                     new = new._replace(judged=torch.zeros_like(new.judged))

@@ -1,8 +1,9 @@
 """Training pairs drawn on the training device: clean scenes, crops of them, and what a SPAD camera reports of these.
 
 Each scene has open water, a wall or a slanted floor, and up to ten things before it: plates, ellipsoids, rods, ropes,
-nets, ladders, plants, chains, rocks and blocks, at depths of their own or close together as parts of one body, with a
-texture of reflectance. The shapes of `spadwarp.denoise.evaluation_scenes` and the built-in meshes are not among them.
+nets, ladders, plants, chains, rocks, blocks, slabs, sieves and waves, at depths of their own or close together as parts
+of one body, with a texture of reflectance. The shapes of `spadwarp.evaluation` and the built-in meshes are not among
+them.
 
 A noisy frame is never stored. Each step draws crops, gates, waters and photons anew, so no two frames of a training are
 alike. Depth is over the gate: 0 at its start, 1 at its end.
@@ -18,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from spadwarp.denoise.classical import highest
 from spadwarp.denoise.frames import LOG_DENSITY_LIMIT, MARGIN, POOLED
 from spadwarp.denoise.histogram_features import extract_features, toeplitz
 from spadwarp.denoise.recipe import Noise
@@ -76,7 +78,8 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
                 depth[chosen] = torch.where(drawn, surface, depth[chosen])
                 paint[chosen] = torch.where(drawn, 0.5 * part.normal(torch.Size((len(chosen), 1, 1))), paint[chosen])
     metres = 15.0 + relief * (depth - 0.5)
-    texture = torch.exp(0.5 * smooth_noise(count, side, generator) + 0.3 * _pattern(side, random) + paint)
+    grain = 0.5 * random.uniform(1, 1) * random.coin(0.3, 1, 1) * random.normal(depth.shape)  # from pixel to pixel
+    texture = torch.exp(0.5 * smooth_noise(count, side, generator) + 0.3 * _pattern(side, random) + paint + grain)
     sigma = torch.where(torch.isfinite(metres), _JITTER * texture.clamp(0.3, 4.0), math.nan)
     low = torch.where(torch.isfinite(metres), metres, math.inf).flatten(1).amin(dim=1)
     high = torch.where(torch.isfinite(metres), metres, -math.inf).flatten(1).amax(dim=1)
@@ -113,10 +116,12 @@ def _background(side: int, random: Random) -> Tensor:
 
 
 def _turned(at: Tensor, side: int, random: Random) -> tuple[Tensor, Tensor]:
-    """Image coordinates about `at`, turned by a random angle, `[S, side, side]` [pixels]."""
+    """Image coordinates about `at`, turned by a random angle, often a right one, `[S, side, side]` [pixels]."""
     line = torch.arange(side, device=at.device) - 0.5 * (side - 1)
     y, x = line[None, :, None] - at[:, 0, None, None], line[None, None, :] - at[:, 1, None, None]
     angle = 2 * math.pi * random.uniform(1, 1)
+    right = torch.round(angle * (2 / math.pi)) * (math.pi / 2)
+    angle = torch.where(random.coin(0.35, 1, 1), right, angle)
     return y * angle.cos() + x * angle.sin(), x * angle.cos() - y * angle.sin()
 
 
@@ -234,7 +239,34 @@ def _blocks(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
     return inside, -random.between((0.02, 0.5), 1, 1) * height
 
 
-KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, _blocks)
+def _slab(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
+    """A steep rectangle."""
+    extent = random.log_between((3.0, 60.0), 2, 1, 1)
+    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    steep = random.log_between((0.1, 1.0), 1, 1) / extent[:, 0]
+    return inside, steep * x
+
+
+def _sieve(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
+    """A plate with slits or square holes, through which one sees what is behind."""
+    pitch = random.log_between((4.0, 40.0), 2, 1, 1)
+    hole = random.log_between((0.7, 4.0), 2, 1, 1)
+    slit = random.coin(0.5, 1, 1)
+    open_ = (_from_lines(x, pitch[:, 0]) < hole[:, 0]) & (slit | (_from_lines(y, pitch[:, 1]) < hole[:, 1]))
+    extent = random.log_between((12.0, 120.0), 2, 1, 1)
+    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    return inside & ~open_, (random.between((-0.4, 0.4), 1, 1) * x + random.between((-0.4, 0.4), 1, 1) * y) / 100.0
+
+
+def _sea(y: Tensor, x: Tensor, random: Random) -> tuple[Tensor, Tensor]:
+    """A sheet with round waves, flat to steep."""
+    extent = random.log_between((15.0, 120.0), 2, 1, 1)
+    inside = (x.abs() < extent[:, 0]) & (y.abs() < extent[:, 1])
+    height = random.log_between((0.02, 0.4), 1, 1)
+    return inside, height * torch.sin(x / random.log_between((2.0, 15.0), 1, 1)) + 0.2 * height * torch.sin(y / 9.0)
+
+
+KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, _blocks, _slab, _sieve, _sea)
 """Things in the scenes."""
 
 
@@ -244,9 +276,12 @@ KINDS = (_plate, _ellipsoid, _rod, _rope, _net, _ladder, _plant, _chain, _rock, 
 BINS = 64
 """Bins of a backscatter profile over the gate."""
 
-_COUNT_BINS = 192  # of the histograms behind frames with few photons
+COUNT_BINS = (64, 96, 128, 192, 256, 320)
+"""Bins of the histograms behind frames with few photons, one number for each batch."""
+
 _RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
-_TAPS = 9  # a response extends over this many bins to each side
+_WRONG = (0.5, 2.0)  # factors on a background that is not known well; their roots on the width of the response
+_TAPS = 12  # a response extends over this many bins to each side
 
 
 class CleanScenes(NamedTuple):
@@ -298,6 +333,7 @@ def draw_batch(
     generator: torch.Generator,
     always_replaced: bool = False,
     histograms: bool = False,
+    bins: int = 192,
 ) -> Batch:
     """`size` pairs of `crop` × `crop` pixels, on the scenes' device, which is the generator's.
 
@@ -312,10 +348,8 @@ def draw_batch(
     if counted:
         photons, sbr = random.log_between(noise.photons)[:counted], random.log_between(noise.sbr)[:counted]
         some = _Crops(*(values[:counted] for values in crops))
-        counts = _draw_counts(some, photons, photons / sbr, noise, generator)
-        reported[:counted], present[:counted], features = _estimate(
-            *counts[:3], photons, counts[3] if histograms else None
-        )
+        counts = _draw_counts(some, photons, photons / sbr, noise, generator, bins)
+        reported[:counted], present[:counted], features = _estimate(*counts, photons, histograms)
     reported, present = _defects(reported, present, noise, random)
     clean, hit, profile = crops.clean, crops.hit, crops.profile
     reported = torch.where(present, reported, 1.0)
@@ -460,15 +494,49 @@ def _backscatter_depth(profile: Tensor, reach: Tensor, u: Tensor) -> Tensor:
     return ((upper - 1 + inside.clamp(0.0, 1.0)) / bins).view_as(reach)
 
 
+class _Response(NamedTuple):
+    """An instrument response, mean 0: a Gaussian whose sides differ, in half of the samples with a wider one."""
+
+    early: Tensor  # deviations of the sides [bins], [B, 1]
+    late: Tensor
+    wide: Tensor  # part of the light in one that is three times as wide, [B, 1]
+
+    def before(self, time: Tensor) -> Tensor:
+        """Part of the light before times `[B, n]` or `[B, h, w, n]` [bins]."""
+        shape = (-1, *[1] * (time.ndim - 1))
+        early, late, wide = (part.view(shape) for part in self)
+        both, total = (late - early) * math.sqrt(2.0 / math.pi), early + late
+
+        def one(width: float) -> Tensor:
+            at = time / width + both
+            first = 2.0 * early * torch.special.ndtr(at / early).clamp_max(0.5)
+            return (first + late * (2.0 * torch.special.ndtr(at / late) - 1.0).clamp_min(0.0)) / total
+
+        return torch.lerp(one(1.0), one(3.0), wide)
+
+    def per_bin(self) -> Tensor:
+        """`[B, 2 _TAPS + 1]`, sum 1."""
+        edges = torch.arange(-_TAPS - 0.5, _TAPS + 1.0, device=self.early.device)
+        taps = self.before(edges.expand(len(self.early), -1)).diff(dim=1)
+        return taps / taps.sum(dim=1, keepdim=True)
+
+
+def _draw_response(random: Random) -> _Response:
+    width, ratio = random.log_between((0.6, 2.6), 1), random.log_between((1.0, 3.0), 1)
+    ratio = torch.where(random.coin(0.5, 1), 1.0, torch.where(random.coin(0.8, 1), ratio, 1.0 / ratio))
+    wide = 0.3 * random.uniform(1) * random.coin(0.3, 1)
+    return _Response(width / ratio.sqrt(), width * ratio.sqrt(), wide)
+
+
 def _draw_counts(
-    crops: _Crops, photons: Tensor, background: Tensor, noise: Noise, generator: torch.Generator
+    crops: _Crops, photons: Tensor, background: Tensor, noise: Noise, generator: torch.Generator, bins: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Poisson counts `[B, h, w, T]`, expected background per bin `[B, T]`, σ of the response `[B, 1]` [bins], and the
+    """Poisson counts `[B, h, w, T]`, background per bin `[B, T]` and response `[B, 2 r + 1]` as they are given, and the
     counts of each pixel, also those beyond the gate, `[B, h, w]`."""
     clean, sigma, hit, reach, profile, _ = crops
-    bins, device = _COUNT_BINS, clean.device
+    device = clean.device
     random = Random(len(clean), generator)
-    width = random.log_between((0.6, 2.6))[:, None]
+    response = _draw_response(random)
     # Signal follows the bound: σ ∝ 1/√signal.
     typical = torch.where(hit, sigma, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
     shade = (typical[:, None, None] / sigma.clamp_min(1e-9)).square().clamp(0.05, 4.0)
@@ -477,14 +545,16 @@ def _draw_counts(
     edges = torch.arange(bins + 1, device=device, dtype=torch.float32)
     level = torch.nn.functional.interpolate(profile[:, None], size=bins, mode="nearest")[:, 0]
     ambient = random.coin(noise.ambient)
-    level = torch.where(ambient[:, None], 1.0, level)
+    place = (edges[1:] - 0.5) / bins
+    bump = random.coin(0.3, 1) * 2.0 * random.uniform(1)  # of light that is scattered often
+    level = level * (1.0 + bump * torch.exp(-0.5 * ((place - random.uniform(1)) / random.between((0.05, 0.4), 1)) ** 2))
+    level = torch.where(ambient[:, None], 1.0, level / level.mean(dim=1, keepdim=True))
     level = background[:, None] * level / bins + 1e-4
     mean = torch.where(hit, shade, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
     bright = torch.where(ambient[:, None, None] & hit, shade / mean.clamp_min(1e-3)[:, None, None], 1.0)
 
     def returns(depth: Tensor, signal: Tensor) -> Tensor:
-        phase = (edges - (depth * bins)[..., None]).div_(width[:, None, None])
-        return torch.special.ndtr(phase).diff(dim=-1).mul_(signal[..., None])
+        return response.before(edges - (depth * bins)[..., None]).diff(dim=-1).clamp_min_(0.0).mul_(signal[..., None])
 
     second, share = _second_surface(clean, hit, noise, random)
     rate = returns(clean, signal * (1.0 - share))
@@ -497,7 +567,12 @@ def _draw_counts(
     counts = torch.poisson(rate.add_(1e-4), generator=generator)
     wider = random.log_between((1.0, 12.0), 1, 1) - 1.0  # the camera's gate beyond this one
     beyond = torch.poisson(wider * background[:, None, None] * bright, generator=generator)
-    return counts, level, width, counts.sum(dim=-1) + beyond
+    total = counts.sum(dim=-1) + beyond
+    # Where they are not known well, background and width of the response are given wrong.
+    level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
+    wrong = torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1).sqrt(), 1.0)
+    given = response._replace(early=response.early * wrong, late=response.late * wrong)
+    return counts, level, given.per_bin(), total
 
 
 def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
@@ -516,27 +591,15 @@ def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) ->
 
 
 def _estimate(
-    counts: Tensor, level: Tensor, width: Tensor, photons: Tensor, total: Tensor | None
+    counts: Tensor, level: Tensor, response: Tensor, total: Tensor, photons: Tensor, histograms: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Maximum-likelihood depth over the gate, where there are counts, and with `total` the features."""
-    bins, device = counts.shape[-1], counts.device
+    """Maximum-likelihood depth over the gate, where there are counts, and with `histograms` the features."""
+    bins = counts.shape[-1]
     # Log-likelihood of a return at bin k: Σ_j n_j ln(1 + S h_{j−k} / B_j), for all k at once as a product of matrices.
-    apart = torch.arange(-_TAPS, _TAPS + 1, device=device)
-    response = torch.exp(-0.5 * (apart / width).square())
-    response = response / response.sum(dim=1, keepdim=True)
     gain = torch.log1p(photons[:, None, None] * toeplitz(response, bins) / level[:, :, None])  # [B, j, k]
     score = torch.bmm(counts.flatten(1, 2), gain).view_as(counts)
-    best = score.argmax(dim=-1, keepdim=True)
-    features = extract_features(counts, level[:, None, None], response, total) if total is not None else None
-
-    # Centroid of the counts within 2σ around the best bin.
-    offsets = torch.arange(-6, 7, device=device)
-    near = (best + offsets).clamp(0, bins - 1)
-    weight = counts.gather(-1, near) * (offsets.abs() <= 2 * width)[:, None, None]
-    total = weight.sum(dim=-1)
-    centroid = (weight * (near + 0.5)).sum(dim=-1) / total.clamp_min(1e-9)
-    depth = torch.where(total > 0, centroid, best[..., 0] + 0.5)
-    return depth / bins, counts.sum(dim=-1) > 0, features
+    features = extract_features(counts, level[:, None, None], response, total) if histograms else None
+    return highest(score), counts.sum(dim=-1) > 0, features
 
 
 def _scattered(rate: Tensor, noise: Noise, generator: torch.Generator) -> Tensor:

@@ -510,7 +510,7 @@ def validation_psnr(network: nn.Module, scenes: CleanScenes, recipe: TrainingRec
     network.eval()
     device, counting, result = scenes.depth.device, recipe.model == "histograms", {}
     plain: dict[str, Any] = {"own_gate": 1.0, "own_profile": 1.0}
-    plain |= dict.fromkeys(("dead", "slanted_gate", "unknown_water"), 0.0)
+    plain |= dict.fromkeys(("dead", "slanted_gate", "unknown_water", "wrong"), 0.0)
     for level in PHOTONS if counting else LEVELS:
         generator = torch.Generator(device).manual_seed(round(1e4 * level))
         if counting:

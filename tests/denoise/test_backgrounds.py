@@ -9,7 +9,7 @@ from scipy.stats import norm
 from spadwarp import ArgumentError
 from spadwarp.denoise import denoise_file, estimate, estimate_background, read_depth
 from spadwarp.denoise.backgrounds import bins_of_target
-from spadwarp.denoise.evaluation_scenes import evaluation_scene
+from spadwarp.evaluation.drawn_scenes import evaluation_scene
 from spadwarp.frames import InstrumentResponse
 
 BINS, SIGMA, SIZE = 128, 1.5, (48, 64)

@@ -19,13 +19,14 @@ from helpers.scenes import scene as make_scene
 from helpers.stepped_frames import GATE, noisy_frame, scene
 from spadwarp import ArgumentError, FileError
 from spadwarp.dataset import Plan
-from spadwarp.denoise import baselines, evaluation, files, network_files, photon_counts, samples, training
+from spadwarp.denoise import baselines, files, network_files, samples, training
 from spadwarp.denoise.files import read_scenes
 from spadwarp.denoise.frames import depth_frames, fill_missing
 from spadwarp.denoise.networks import build_network
 from spadwarp.denoise.recipe import load_training_recipe
 from spadwarp.denoise.synthetic_noise import Batch
 from spadwarp.denoise.training import fit
+from spadwarp.evaluation import datasets, photon_counts
 from spadwarp.frames import record_frames
 
 # Baselines
@@ -67,7 +68,7 @@ def test_scores_are_those_of_their_definitions():
     clean[:, 16:] = 14.5
     estimate = clean.copy()
     estimate[::2] += 0.02
-    found = evaluation.score(clean, estimate, gate=GATE)
+    found = datasets.score(clean, estimate, gate=GATE)
     assert found.rmse_mm == pytest.approx(20.0 / np.sqrt(2), rel=1e-4)
     assert found.within_1cm == 0.5 and found.within_5cm == 1.0
     assert found.edge_mm == pytest.approx(10.0, rel=1e-3)
@@ -82,13 +83,13 @@ def test_scores_are_those_of_their_definitions():
 
 def test_pixels_without_a_target_do_not_count_and_steps_do():
     clean = scene()
-    found = evaluation.score(clean, np.nan_to_num(clean, nan=13.5), gate=GATE)
+    found = datasets.score(clean, np.nan_to_num(clean, nan=13.5), gate=GATE)
     assert found.rmse_mm == 0.0 and found.psnr == 100.0 and found.ssim == pytest.approx(1.0)
     with pytest.raises(ValueError, match="no pixel sees a target"):
-        evaluation.score(np.full((16, 16), np.nan, np.float32), np.ones((16, 16), np.float32), gate=GATE)
-    assert evaluation.staircase_steps(clean, clean) == evaluation.Steps(total=3, resolved=3)
+        datasets.score(np.full((16, 16), np.nan, np.float32), np.ones((16, 16), np.float32), gate=GATE)
+    assert datasets.staircase_steps(clean, clean) == datasets.Steps(total=3, resolved=3)
     flat = np.where(clean < 14.99, 14.8, clean).astype(np.float32)  # the steps are gone, the wall is there
-    assert evaluation.staircase_steps(clean, flat).resolved < 3
+    assert datasets.staircase_steps(clean, flat).resolved < 3
 
 
 # Evaluation on a dataset
@@ -104,7 +105,7 @@ def dataset(tmp_path_factory):
 
 @pytest.mark.slow
 def test_evaluation_and_report(dataset, tmp_path):
-    found = spadwarp.denoise.evaluate(dataset, models=("median", "gating"), frames=2)
+    found = spadwarp.evaluation.evaluate(dataset, models=("median", "gating"), frames=2)
     assert found.levels == ("0.042", "0.480") and found.targets == ("staircase",)
     for level in found.levels:
         assert found.mean("median", level=level).psnr > found.mean("input", level=level).psnr + 3
@@ -112,7 +113,7 @@ def test_evaluation_and_report(dataset, tmp_path):
     assert found.windows["0.042"] <= found.windows["0.480"]
     assert found.steps["input", "0.042"].total > 0
     assert "seed" in found.summary and "photons" in found.summary and "attenuation lengths" in found.summary
-    middle = spadwarp.denoise.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
+    middle = spadwarp.evaluation.evaluate(dataset, models=("median",), frames=2, crop=(32, 24))
     assert "the middle 32 x 24 pixels" in middle.summary
     assert middle.samples["staircase", "0.480"].clean.shape == (24, 32)
     run("evaluate", dataset, "--models", "median", "--frames", 1, "--report", tmp_path)
@@ -134,7 +135,7 @@ def test_evaluation_refuses_what_it_cannot_do(dataset, tmp_path):
         (tmp_path, {}, "no dataset there"),
     ):
         with pytest.raises((ArgumentError, FileError), match=message):
-            spadwarp.denoise.evaluate(folder, **options)
+            spadwarp.evaluation.evaluate(folder, **options)
 
 
 @pytest.mark.slow
@@ -144,7 +145,7 @@ def test_training_from_a_dataset(dataset, tmp_path):
     run("train", file, "--out", out, "--device", "cpu")
     assert {path.name for path in out.iterdir()} >= {"usdn.safetensors", "log.jsonl", "curves.png"}
     assert network_files.weights_metadata("usdn", own)["seed"] == "0"
-    found = spadwarp.denoise.evaluate(dataset, models=("usdn",), frames=1, weights=own, device="cpu")
+    found = spadwarp.evaluation.evaluate(dataset, models=("usdn",), frames=1, weights=own, device="cpu")
     assert found.methods == ("input", "usdn", "own") and str(own) in found.summary
     assert found.mean("own").psnr < found.mean("usdn").psnr  # two steps against a whole training
     assert json.loads((out / "log.jsonl").read_text().splitlines()[-1])["input_psnr"] > 10

@@ -42,7 +42,7 @@ def drawn(monkeypatch):
     """Replaces the drawing of noise, which takes long: what it was asked for, and random numbers of its generator."""
     asked = []
 
-    def draw(scenes, noise, *, size, crop, generator, histograms):
+    def draw(scenes, noise, *, size, crop, generator, histograms, bins):
         asked.append((scenes, noise, size))
         one = torch.rand(size, 1, 2, 2, generator=generator) + scenes.gate[:1, :1, None, None]
         return Batch(one, one.clone(), one.clone(), torch.ones(size, 1, 1, 1))

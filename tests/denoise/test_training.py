@@ -101,7 +101,7 @@ def test_drawn_scenes_are_varied_and_repeatable():
     assert torch.equal(first.depth.nan_to_num(), again.depth.nan_to_num())
     seen = torch.isfinite(first.depth)
     share = seen.float().mean(dim=(1, 2))
-    assert (share < 0.02).any() and (share == 1.0).any() and ((share > 0.1) & (share < 0.9)).sum() > 10
+    assert (share < 0.02).any() and (share == 1.0).any() and ((share > 0.1) & (share < 0.9)).sum() > 6
     low, high = first.gate[:, 0, None, None], first.gate[:, 1, None, None]
     assert (((first.depth > low) & (first.depth < high)) | ~seen).all()
     assert (first.sigma[seen] > 0).all() and torch.isnan(first.sigma[~seen]).all()

@@ -26,8 +26,8 @@ from spadwarp.values import SpadwarpError, _fits, in_words
 
 # Those that run for minutes whatever they are given, end the process, or are no calls with one answer.
 LEFT_OUT = {
-    "benchmark.run", "benchmark.TransportRun", "denoise.evaluate", "denoise.evaluate_fresh", "doctor.diagnose",
-    "denoise.evaluate_scenes", "denoise.photon_sweep", "denoise.train", "device.devices", "device.start_warp",
+    "benchmark.run", "benchmark.TransportRun", "evaluation.evaluate", "evaluation.evaluate_fresh", "doctor.diagnose",
+    "evaluation.evaluate_scenes", "evaluation.photon_sweep", "denoise.train", "device.devices", "device.start_warp",
     "io.parse_json", "parallel.Forked", "parallel.Ray", "viz.draw_targets",
     "viz.describe_targets",
 }  # fmt: skip

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from spadwarp.denoise import apply, evaluation
+from spadwarp.denoise import apply
+from spadwarp.evaluation import datasets
 
 GATE = (13.5, 16.0)
 
@@ -33,4 +34,4 @@ def denoised(depth, **options):
 
 def scores(clean, estimate):
     """Scores over `GATE`; a pixel without an estimate counts as one in the middle of the gate."""
-    return evaluation.score(clean, np.nan_to_num(estimate, nan=14.75), gate=GATE)
+    return datasets.score(clean, np.nan_to_num(estimate, nan=14.75), gate=GATE)

@@ -11,7 +11,7 @@ from helpers.source_code import KERNELS, SPADWARP, imported, names_imported, nod
 LEVELS = (
     ("cli",),
     ("doctor",),
-    ("benchmark", "validate"),
+    ("benchmark", "validate", "evaluation"),
     ("denoise",),
     ("viz",),
     ("files",),
@@ -105,7 +105,8 @@ LINES = {
     "checks": (800, 900),
     "cli": (2900, 3056),
     "dataset": (2600, 2718),
-    "denoise": (6900, 6603),
+    "denoise": (4300, 5351),
+    "evaluation": (1600, 1601),
     "files": (1150, 1457),
     "frames": (2500, 2772),
     "inverse": (1900, 2358),

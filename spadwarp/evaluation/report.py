@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from spadwarp.denoise.evaluation import LARGER_IS_BETTER, Evaluation
-from spadwarp.denoise.evaluation_scenes import SceneScores
+from spadwarp.evaluation.datasets import LARGER_IS_BETTER, Evaluation
+from spadwarp.evaluation.drawn_scenes import SceneScores
 from spadwarp.io.paths import atomic_path
 from spadwarp.io.text import json_text
 from spadwarp.viz.evaluation import SCORES, TITLES, draw_ranking, draw_reliability, draw_samples, draw_scores
@@ -66,7 +66,7 @@ def write_scene_report(scores: SceneScores, folder: str | Path) -> list[Path]:
 
     A table for each scene type, and how often the probabilities were true. Raises `FileError`.
     """
-    note = "scenes of spadwarp.denoise.evaluation_scenes"
+    note = "scenes of spadwarp.evaluation.drawn_scenes"
     picture = draw_reliability(scores.reliability, Path(folder) / "reliability.png", note=note)
     tables: list[_Table] = []
     for setting, water in scores.types():

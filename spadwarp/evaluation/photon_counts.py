@@ -30,7 +30,7 @@ from spadwarp.values import SEED, SpadwarpError, check_choice, check_integer, ch
 from spadwarp.viz import evaluation as drawing
 
 if TYPE_CHECKING:
-    from spadwarp.denoise.fresh_scenes import FreshScene
+    from spadwarp.evaluation.fresh_scenes import FreshScene
     from spadwarp.result.result import Result
 
 __all__ = ["FreshScores", "PhotonSweep", "draw_photon_sweep", "evaluate_fresh", "photon_sweep"]
@@ -119,7 +119,7 @@ def evaluate_fresh(
 
     Errors are those of `evaluate`.
     """
-    from spadwarp.denoise.fresh_scenes import fresh_scene
+    from spadwarp.evaluation.fresh_scenes import fresh_scene
 
     scenes = check_integer("scenes", scenes, "[1, 10000]")
     seed = time.time_ns() % 2**40 if seed is None else check_integer("seed", seed, SEED)

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.denoise.baselines import CLASSICAL, MEDIAN_WINDOWS
-from spadwarp.denoise.evaluation import Steps, near_jumps, staircase_steps
 from spadwarp.denoise.frames import DepthFrames, depth_frames
 from spadwarp.denoise.inference import METHODS, Estimate, denoise_frames, estimate_frames, target_threshold
 from spadwarp.denoise.network_files import compared
 from spadwarp.denoise.recipe import LEVELS
+from spadwarp.evaluation.datasets import Steps, near_jumps, staircase_steps
 from spadwarp.values import ArgumentError
 
 __all__ = ["SceneScores", "evaluate_scenes"]
@@ -231,7 +231,7 @@ class FrameScores:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneScores:
-    """Scores of methods on frames of `spadwarp.denoise.evaluation_scenes`, or of scenes of one's own."""
+    """Scores of methods on frames of `spadwarp.evaluation.drawn_scenes`, or of scenes of one's own."""
 
     methods: tuple[str, ...]  # in the order of the tables; "input" is the first
     rows: dict[tuple[str, str, str, float, str], FrameScores]  # scores by (method, setting, water, level, shape)

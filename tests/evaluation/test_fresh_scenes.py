@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from spadwarp.denoise import evaluate_fresh
 from spadwarp.denoise.baselines import classical_depth
-from spadwarp.denoise.fresh_scenes import BACKGROUNDS, RESPONSES, SHAPES, TEXTURES, fresh_scene
+from spadwarp.evaluation import evaluate_fresh
+from spadwarp.evaluation.fresh_scenes import BACKGROUNDS, RESPONSES, SHAPES, TEXTURES, fresh_scene
 
 PIXELS = np.mgrid[:40, :48].astype(float)
 
