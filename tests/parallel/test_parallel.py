@@ -107,6 +107,7 @@ class Killer:
         return sum(remark.startswith("lost the worker") for remark in self.remarks)
 
 
+@pytest.mark.slow
 def test_a_run_whose_workers_are_killed_has_the_bits_of_a_local_one(cluster, whole, tmp_path):
     killer, kept = Killer(2, seed=2), tmp_path / "checkpoint.h5"
     options = {"run": RunOptions(checkpoint=kept, checkpoint_every=0.0)}
