@@ -36,6 +36,9 @@ def init(
       spadwarp init my_harbour --example harbour_5m
       spadwarp init --schema scene
     """
+    if name is not None and (not Path(name).name or Path(name).name.startswith("-")):
+        why = "begins as an option does" if Path(name).name else "is no name of a file"
+        wrong(f"{name!r} {why}", "NAME")
     if schema is not None:
         opt.refuse("cannot be combined with --schema", "--example")
         path = Path(name or f"{schema}.schema.json")
@@ -50,8 +53,6 @@ def init(
         say(f"first line of a TOML file beside it, for VS Code and taplo:\n  #:schema {place}")
         return
     name = "scene" if name is None else name
-    if not Path(name).name:
-        wrong(f"{name!r} is no name of a file", "NAME")
     path = Path(name if name.lower().endswith(".toml") else f"{name}.toml")
     check_outputs(files={"NAME": path})
     out = f"{path.with_suffix('')}/"

@@ -27,6 +27,8 @@ def test_init_writes_a_scene_that_works(tmp_path, monkeypatch):
     scene = spadwarp.load_scene("mine.toml")
     assert [str(one) for one in spadwarp.check(scene) if one.level == "warning"] == []
     assert "mine.toml exists; --overwrite" in run("init", "mine", code=2).stderr
+    for name in ("-", "folder/-x.toml"):  # no command would take it as a file
+        assert "begins as an option does" in run("init", "--", name, code=2).stderr
     run("init", "mine", "--example", "harbour_5m", "--overwrite")
     assert spadwarp.load_scene("mine.toml") == spadwarp.load_scene("harbour_5m")
     printed = run("init", "--schema", "scene").stdout

@@ -554,11 +554,13 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     """
     check_kind("data", data, Data)
     check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
+    for name in ("reflecting", "has_sea"):
+        check_kind(f"data.{name}", getattr(data, name), bool)
     sums = exact_sums(data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS))
     values = dict(zip(ALL_ENTRIES, sums, strict=True))
     for name in ("before_gate", "after_gate"):
         values[name] <<= int(OUTSIDE_SHIFT)
     entries = (*LEDGER_ENTRIES, PORT_ENTRY) if values[PORT_ENTRY] else LEDGER_ENTRIES
     entries += SEA_ENTRIES if data.has_sea else ()
-    counters = COUNTERS + BOUNDARY_COUNTERS * bool(data.reflecting) + SEA_COUNTERS * bool(data.has_sea)
+    counters = COUNTERS + BOUNDARY_COUNTERS * data.reflecting + SEA_COUNTERS * data.has_sea
     return {name: values[name] for name in entries}, {name: values[name] for name in counters}
