@@ -2,9 +2,10 @@
 
 Ambient light and dark counts are constant over the gate; backscatter decays, as exp(−2 c z) / z² or by several laws at
 once. All of these are sums of decaying exponentials with weights >= 0 (completely monotone functions, Bernstein 1929),
-and of a constant. The weights are those of the highest Poisson likelihood of the counts outside the returns of targets.
-Returns are found where the counts of a block of pixels exceed the background within the time of the response; whatever
-all blocks share at the same time and does not fit into a decay counts as a return, too.
+and of a constant. Before a gate is open they rise, by any course. The weights are those of the highest Poisson
+likelihood of the counts outside the returns of targets. Returns are found where the counts of a block of pixels exceed
+the background within the time of the response; whatever all blocks share at the same time and does not fit into a decay
+counts as a return, too.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _CLIPPED = 2.0  # deviations above a fit, beyond which a bin of the first one co
 _PARTS, _COUNTS_OF_PART = 16, 10.0  # parts of the gate that a block's scale is the median of, and their least counts
 _DIFFERENT = 5.0  # standard errors of their variance beyond that of chance, from which on scales differ
 _DECAYS = 12.0  # twice the log-likelihood that decays gain where they are there; one in 400 frames does by chance
+_OPEN = 0.9  # part of the expected background from which on a gate counts as open
 _WIDER = (1, 4)  # windows of the search for returns, in widths of the response
 
 
@@ -95,17 +97,24 @@ def _estimated(
 ) -> Background:
     """The background of blocks of counts of this shape; `width`: of a return [bins]."""
     level, weight = _first_fit(blocks.sum(axis=0), pixels.sum(), rates)
-    free = np.ones(blocks.shape, bool)
+    free, opening = np.ones(blocks.shape, bool), np.ones(blocks.shape[1])
     for tolerance in _TOLERANCES:
-        scale = _scales(blocks, pixels, level, free)
+        scale = _scales(blocks, pixels, level * opening, free)
         scaled = pixels * scale
-        free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * level, width)
+        free = ~_returns(blocks, (1.0 + tolerance) * scaled[:, None] * level * opening, width)
         seen, exposure = (blocks * free).sum(axis=0), scaled @ free
-        level, weight, gain = _fit(seen, exposure, rates, weight)
-    level, _, gain = _fit(seen, exposure, rates, weight, _LAST_STEPS)
+        if len(rates) > 1:
+            opening = _opening(seen, exposure * level)
+        whole = opening == 1.0
+        level, weight, gain = _fit(seen * whole, exposure * whole, rates, weight)
+        level = np.where(whole, level, level[whole.argmax()])  # before the gate is open, no decay can be seen
+    level, _, gain = _fit(seen * whole, exposure * whole, rates, weight, _LAST_STEPS)
     decays = gain > _DECAYS
     if not decays:
-        level, *_ = _fit(seen, exposure, _RATES[:1])
+        level, *_ = _fit(seen * whole, exposure * whole, _RATES[:1])
+    level = np.where(whole, level, level[whole.argmax()])
+    if not whole.all():
+        level = np.maximum(level * _opening(seen, exposure * level), 1e-9)
     expected = exposure * level
     used = expected > 0
     misfit = float(((seen - expected)[used] ** 2 / expected[used]).sum()) / max(1, used.sum() - 2)
@@ -117,6 +126,24 @@ def _estimated(
         image = np.kron(scale.reshape(rows, columns), np.ones((_BLOCK, _BLOCK))).astype(np.float32)
         image = image[: shape[-3], : shape[-2]]
     return Background(level.astype(np.float32), image, error, hidden, bool(decays))
+
+
+def _opening(seen: NDArray[np.float64], expected: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Part of the expected background that a gate lets through while it opens, `[T]`: rising, then 1.
+
+    Isotonic regression of the counts over those expected; 1 everywhere where chance explains that the first are few, or
+    where this takes half of the gate.
+    """
+    from scipy.optimize import isotonic_regression
+
+    known = np.maximum(expected, 1e-9)
+    part = isotonic_regression(seen / known, weights=known).x
+    part = np.where(part < _OPEN, part, 1.0)
+    there = part < 1.0
+    few, usual = seen[there], known[there]
+    deviance = float((few * np.log(np.maximum(few, 1e-9) / usual) - few + usual).sum())
+    opens = deviance > np.log(seen.size) + _FALSE and known[there].sum() < 0.5 * known.sum() and there.mean() < 0.5
+    return part if opens else np.ones(seen.size)
 
 
 def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

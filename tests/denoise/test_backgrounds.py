@@ -138,3 +138,11 @@ def test_no_surface_is_left_out_that_can_be_told_from_the_background():
     assert 130 < first < 200 and 335 <= stop < 400
     counts[5, 5, 440] += 30
     assert bins_of_target(counts, level, np.ones(5))[1] > 441
+
+
+def test_a_background_that_rises_while_the_gate_opens_is_found():
+    clean = evaluation_scene("stairs", "open water", size=SIZE).clean
+    level = backscatter(30.0) * norm.cdf((PLACE - 0.15) / 0.05)
+    found = estimate_background(counts_of(clean, level, 20.0), TAPS)
+    assert np.abs(found.per_bin - level).sum() < 0.06 * level.sum()
+    assert np.abs(found.per_bin - level)[: BINS // 5].sum() < 0.1 * level[: BINS // 5].sum()
