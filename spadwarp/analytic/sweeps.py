@@ -144,9 +144,7 @@ def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
 # Values to vary
 
 
-def combinations(
-    scene: SceneLike, vary: Any, *, planned: bool
-) -> tuple[tuple[str, ...], list[tuple[tuple[Any, ...], Scene, dict]]]:
+def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[str, ...], list[Any]]:
     """The fields that `sweep` varies; of each combination its values, its scene, and arguments of `plan`."""
     scene = as_scene(scene)
     pair = isinstance(vary, tuple | list) and len(vary) == 2 and isinstance(vary[0], str) and "=" not in vary[0]
@@ -161,10 +159,8 @@ def combinations(
     check_integer("number of values to vary", math.prod(len(values) for _, values in curves), f"[1, {LONGEST}]")
     fields = tuple(field for field, _ in curves)
     if not planned and (own := [field for field in fields if field in ("range", _ANALYSER)]):
-        raise ArgumentError(
-            f"vary: {own[0]} goes with no other field in a budget (of = 'budget'): vary it alone, with `medium` for "
-            "several waters, or plan each combination (of = 'plan')"
-        )
+        text = "goes with no other field in a budget: vary it alone, or plan each combination, of = 'plan'"
+        raise ArgumentError(f"vary: {own[0]} {text}")
     waves = dict(curves).get("laser.wavelength_nm", ())
     follows = scene.medium.chlorophyll is not None or any(field.startswith("medium.") for field in fields)
     if not follows and any(isinstance(wave, float | int) and abs(wave - 532.0) > 10.0 for wave in waves):

@@ -271,12 +271,10 @@ def sweep(
         keys, draw = [{"water": row.medium} for row in found], spadwarp.viz.draw_budget
     else:
         _, chosen = spadwarp.analytic.combinations(read, texts, planned=of == "plan")
-        scenes: list[Scene] = []
-        first = chosen[0][0]
-        for values, changed, _ in chosen:  # a check takes a while: of each value one scene, not of all combinations
-            if sum(map(operator.ne, values, first)) <= 1 and changed not in scenes:
-                scenes.append(changed)
-        for text in dict.fromkeys(text for changed in scenes for text in _warnings(changed)):
+        # A check takes a while: of each value one scene, not of all combinations, and of ranges one in all.
+        once = [one for values, one, _ in chosen if sum(map(operator.ne, values, chosen[0][0])) <= 1]
+        once = [one for k, one in enumerate(once) if one not in once[:k]]
+        for text in dict.fromkeys(text for changed in once for text in _warnings(changed)):
             complain(text)
         planned: dict[str, Any] = {"depth_error": depth_error, "time": time, "photons": photons or "auto", "seed": seed}
         show = None if of == "budget" else lambda name, done, all: note(f"{name} ({done + 1} of {all})")
