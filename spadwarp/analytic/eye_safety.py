@@ -62,7 +62,7 @@ def permissible_exposure(duration: float, wavelength_nm: float) -> float:
     Raises `ArgumentError` outside 400 to 1050 nm.
     """
     if not 400.0 <= wavelength_nm <= 1050.0:
-        raise ArgumentError(f"wavelength_nm = {wavelength_nm} is outside [400, 1050], where the eye limits are known")
+        raise ArgumentError(f"wavelength_nm = {wavelength_nm} is outside [400, 1050] nm, where eye limits are known")
     duration = check_real("duration", duration, "[0, inf) s")
     c4 = 10.0 ** (0.002 * max(wavelength_nm - 700.0, 0.0))
     if duration < 1e-11:

@@ -349,7 +349,7 @@ class _Planner:
                 break
         low, pilot, high = found.ends(1.0)
         ends = [self._outcome(scene, one) for one in (low, pilot, high)]
-        pulses, purpose, terms, limit, frame_time = ends[1]
+        pulses, purpose, terms, _, frame_time = ends[1]
         limits = list(dict.fromkeys(one.limit for one in (ends[1], ends[0], ends[2])))
         if factor > 1.0:
             purpose, pulses, frame_time = "not judged", scene.detector.pulses_per_frame, math.nan
@@ -383,7 +383,7 @@ class _Planner:
             reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
             terms=terms,
             limit=" or ".join(limits),
-            advice=self._advice(limit, purpose, frame_time, rate, largest_rate, pilot.floor),
+            advice=self._advice(ends[1]._replace(purpose=purpose, time=frame_time), pilot.floor, rate, largest_rate),
             pilot=pilot,
             photons_needed=traced * factor,
             seconds_needed=sum(run.timing.get("trace", math.nan) for run in runs) * factor,
@@ -441,10 +441,9 @@ class _Planner:
         digits = 10.0 ** max(0, math.floor(math.log10(max(wanted, 1.0))) - 1)
         return int(min(max(1.0, math.ceil(wanted / digits) * digits), _MOST_PULSES)), purpose
 
-    def _advice(
-        self, limit: str, purpose: str, frame_time: float, rate: float, largest: float, floor: dict[str, float]
-    ) -> str:
+    def _advice(self, found: _Outcome, floor: dict[str, float], rate: float, largest: float) -> str:
         """What would help: time, where the pulses reach the depth error but take too long."""
+        _, purpose, _, limit, frame_time = found
         advice, best = _ADVICE[limit], min(floor, key=floor.__getitem__)
         if limit == "forward scattering" and floor[best] < 0.7 * floor[self.method]:
             advice += f", or --method {best}, whose floor is {with_prefix(floor[best], 'm')}, at more noise"
@@ -667,12 +666,11 @@ def _limit(scene: Scene, pilot: Pilot, terms: dict[str, float], pulses: int, met
     return largest
 
 
+_WIDTH = "the error is proportional to the width of the response, while photons act only by their root"
 _ADVICE = {
     "shot noise": "more pulses, energy, aperture or reflectance; the error falls with the root of the photons",
-    "jitter": "a detector with less jitter: the error is proportional to the width of the response, while photons act "
-    "only by their root",
-    "pulse duration": "a shorter pulse: the error is proportional to the width of the response, while photons act only "
-    "by their root",
+    "jitter": f"a detector with less jitter: {_WIDTH}",
+    "pulse duration": f"a shorter pulse: {_WIDTH}",
     "bin width": "narrower bins, gate.bin_width_ps: where light is within a bin is not known",
     "backscatter": "a gate that begins closer to the target, more distance between laser and lens, a narrower view",
     "dark counts and ambient light": "a shorter gate, a narrower spectral filter, a cooler or quieter detector",

@@ -102,15 +102,13 @@ def sweep(
     Raises `ConfigError`: an unknown field, a value out of its range, a wavelength that the water does not follow, a
     scene that the model does not cover; `ArgumentError`: `vary` or `of` not of the form above.
     """
-    fields, chosen = combinations(scene, vary)
     planned = check_choice("of", of, ("budget", "plan")) == "plan"
+    fields, chosen = combinations(scene, vary, planned=planned)
     rows = list[Any]()
     for number, (values, changed, arguments) in enumerate(chosen):
         if progress is not None:
             progress(", ".join(map(str, values)), number, len(chosen))
         if not planned:
-            if arguments:
-                raise ConfigError(f"{next(iter(arguments))} is of a plan, not of a budget: of = 'plan'")
             rows.append(central_row(changed, device))
             continue
         options: Any = {"depth_error": depth_error, "time": time, "photons": photons, "seed": seed} | arguments
@@ -146,7 +144,7 @@ def _plan_row(scene: Scene, options: dict[str, Any]) -> PlanRow:
 # Values to vary
 
 
-def combinations(scene: SceneLike, vary: Any) -> tuple[tuple[str, ...], list[tuple[tuple[Any, ...], Scene, dict]]]:
+def combinations(scene: SceneLike, vary: Any, *, planned: bool) -> tuple[tuple[str, ...], list[Any]]:
     """The fields that `sweep` varies; of each combination its values, its scene, and arguments of `plan`."""
     scene = as_scene(scene)
     pair = isinstance(vary, tuple | list) and len(vary) == 2 and isinstance(vary[0], str) and "=" not in vary[0]
@@ -160,6 +158,9 @@ def combinations(scene: SceneLike, vary: Any) -> tuple[tuple[str, ...], list[tup
             raise ArgumentError(f"vary = {shown(one)} is neither 'section.field=from:to:count' nor (field, values)")
     check_integer("number of values to vary", math.prod(len(values) for _, values in curves), f"[1, {LONGEST}]")
     fields = tuple(field for field, _ in curves)
+    if not planned and (own := [field for field in fields if field in ("range", _ANALYSER)]):
+        text = "goes with no other field in a budget: vary it alone, or plan each combination, of = 'plan'"
+        raise ArgumentError(f"vary: {own[0]} {text}")
     waves = dict(curves).get("laser.wavelength_nm", ())
     follows = scene.medium.chlorophyll is not None or any(field.startswith("medium.") for field in fields)
     if not follows and any(isinstance(wave, float | int) and abs(wave - 532.0) > 10.0 for wave in waves):

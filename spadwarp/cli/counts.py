@@ -229,7 +229,7 @@ def fit(
     path: Path,
     scene: Path | None = None,
     *,
-    unknown: str,
+    unknown: str | None = None,
     out: Path | None = None,
     bounds: bool = False,
     start: _Start | None = None,
@@ -271,6 +271,8 @@ def fit(
           --start medium.absorption=0.1 --out fit/
       spadwarp fit harbour_5m --bounds --unknown depth,absorption,scattering
     """
+    if unknown is None:
+        wrong("is missing; name what is not known, such as --unknown absorption,scattering", "--unknown")
     options: dict[str, Any] = {"unknown": unknown, "pulses": pulses, "photons": photons, "seed": seed, "device": device}
     options["prior"] = prior or {}
     if bounds:

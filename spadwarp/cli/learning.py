@@ -149,6 +149,8 @@ def evaluate(
     run: Any
     write: Any = None
     show: Any
+    if fresh is not None or data is None:
+        opt.refuse("is for a dataset", "--split", "--frames", "--bm3d-frames", "--crop")
     if fresh is not None:
         opt.refuse("cannot be combined with --fresh, which makes scenes of its own", "DATA", "--models", "--report")
         run, show, options = evaluation.evaluate_fresh, _show_fresh, {"scenes": fresh, "seed": seed}

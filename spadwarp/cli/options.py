@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import enum
 import inspect
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from types import UnionType
@@ -97,9 +97,8 @@ def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name:
     elif item in (int, float):
         extra["parser"] = whole_number if item is int else real_number
     elif get_origin(item) is Literal:
-        metavar = metavar or ("|".join(get_args(item)) if repeated else "")
-        choice = enum.StrEnum("Choice", {word: word for word in get_args(item)})  # type: ignore[misc]
-        item = choice
+        words = get_args(item)
+        metavar, extra["parser"] = metavar or "|".join(words), partial(_word, words)
     kinds: dict[Any, str] = {int: "N", float: "X", Path: "PATH" if repeated else "FILE", str: "NAME"}
     extra["metavar"] = metavar or kinds.get(item)
     if "parser" in extra and item is not float:  # which decides what typer makes of the text
@@ -117,14 +116,21 @@ def _parameter(one: inspect.Parameter, kind: Any, metavar: str, text: str, name:
 
 
 def _plain(value: Any) -> Any:
-    """Choices as text, and the tables of a repeated option as one."""
+    """The tables of a repeated option as one."""
     if isinstance(value, list):
         tables = [item for item in value if isinstance(item, dict)]
-        return {name: item for table in tables for name, item in table.items()} if tables else list(map(_plain, value))
-    return value.value if isinstance(value, enum.Enum) else value
+        return {name: item for table in tables for name, item in table.items()} if tables else value
+    return value
 
 
 # Values, each read from its text; what is wrong with them is a `typer.BadParameter`
+
+
+def _word(known: Sequence[str], text: str) -> str:
+    """One of the known words."""
+    if text not in known:
+        raise typer.BadParameter(f"{shown(text)} is not one of {', '.join(known)}{suggestion(text, known)}")
+    return text
 
 
 def whole_number(text: str | int) -> int:

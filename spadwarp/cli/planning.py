@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -269,8 +270,11 @@ def sweep(
         lines = found = spadwarp.budget(read, values, medium or None, reflectance=reflectance, device=device)
         keys, draw = [{"water": row.medium} for row in found], spadwarp.viz.draw_budget
     else:
-        _, chosen = spadwarp.analytic.combinations(read, texts)
-        for text in dict.fromkeys(text for _, changed, _ in chosen for text in _warnings(changed)):
+        _, chosen = spadwarp.analytic.combinations(read, texts, planned=of == "plan")
+        # A check takes a while: of each value one scene, not of all combinations, and of ranges one in all.
+        once = [one for values, one, _ in chosen if sum(map(operator.ne, values, chosen[0][0])) <= 1]
+        once = [one for k, one in enumerate(once) if one not in once[:k]]
+        for text in dict.fromkeys(text for changed in once for text in _warnings(changed)):
             complain(text)
         planned: dict[str, Any] = {"depth_error": depth_error, "time": time, "photons": photons or "auto", "seed": seed}
         show = None if of == "budget" else lambda name, done, all: note(f"{name} ({done + 1} of {all})")
@@ -338,7 +342,7 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
         "outliers": _in_percent(row.outlier_probability),
-        "unscattered: pulses for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
+        "for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
     }
 
 

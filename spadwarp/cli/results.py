@@ -45,7 +45,12 @@ def info(path: Path, *, verify: bool = False) -> None:
     elif (path / "recipe.toml").is_file():
         manifest = spadwarp.dataset.read_manifest(path)
         size = sum(one["bytes"] for one in manifest["files"].values())
-        say(readable({"kind": "dataset", "bytes": size, **manifest, "files": len(manifest["files"])}))
+        facts = {"kind": "dataset", "bytes": size, **manifest, "files": len(manifest["files"])}
+        facts |= {
+            name: f"{one['frames']} frames of {', '.join(one['targets'])}" for name, one in facts.pop("splits").items()
+        }
+        del facts["targets"]
+        say(readable(facts))
         write_json({"kind": "dataset", **manifest})
     else:
         loaded = spadwarp.load(path)
@@ -66,6 +71,7 @@ def _is_mesh(path: Path) -> bool:
 
 
 # Options of `view` by what is drawn.
+_KINDS = {".gif": "video", ".mp4": "video", ".png": "picture"}
 _DRAWN = {
     "page": ("--method", "--frame", "--channel"),
     "video": ("--frame", "--window", "--pictures", "--fps", "--linear"),
@@ -119,13 +125,17 @@ def view(
       spadwarp view data/small/ --out sheet.png
     """
     target = out or Path(f"{path.stem}.png" if _is_mesh(path) else "view.html")
-    kind = {".gif": "video", ".mp4": "video", ".png": "picture"}.get(target.suffix.lower(), "page")
+    kind = _KINDS.get(target.suffix.lower(), "page")
     if _is_mesh(path):
         if kind != "picture":
             wrong(f"{target} does not end in .png: {path} is a mesh", "--out")
         kind = "picture of a mesh"
     others = {option for options in _DRAWN.values() for option in options} - {*_DRAWN[kind]}
     opt.refuse(f"is not for a {kind} ({target})", *sorted(others))
+    if target.suffix.lower() not in (*_KINDS, ".html"):
+        wrong(f"{target} does not end in .html, .gif, .mp4 or .png", "--out")
+    if kind == "picture" and not path.is_dir() and path.suffix.lower() not in (".h5", ".hdf5"):
+        wrong(f"{target} is a picture of a dataset or a mesh, and {path} is none{spadwarp.io.used(path)}", "--out")
     if kind == "picture":
         spadwarp.dataset.read_manifest(path)  # before a folder is made for the picture
     check_outputs(files={"--out": target}, inputs=(path,))

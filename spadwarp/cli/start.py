@@ -146,7 +146,7 @@ def _list_presets(section: str | None) -> None:
     everything = spadwarp.scene.presets()
     sections = list(dict.fromkeys(preset.section for preset in everything.values()))
     if section is not None and section not in sections:
-        wrong(f"{section!r} is not one of {', '.join(sections)}", "NAME")
+        wrong(f"{section!r} is not one of {', '.join(sections)}{suggestion(section, sections)}", "NAME")
     chosen = [preset for preset in everything.values() if section in (None, preset.section)]
     groups = itertools.groupby(chosen, lambda preset: f"[{preset.section}] {preset.source}")
     before: list[str] = []

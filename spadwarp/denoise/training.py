@@ -486,7 +486,8 @@ def _duration(workers: Workers, seconds: float, steps: int) -> str:
     """How long the rest of a training takes."""
     left = seconds * steps
     number, unit = (left, "s") if left < 120 else (left / 60, "minutes") if left < 7200 else (left / 3600, "hours")
-    return f"{steps} step{'s' * (steps != 1)} to go, about {max(number, 1):.0f} {unit}{_advice(workers)}"
+    advice = _advice(workers) if left > 120 else ""
+    return f"{steps} step{'s' * (steps != 1)} to go, about {max(number, 1):.0f} {unit}{advice}"
 
 
 def _advice(workers: Workers) -> str:

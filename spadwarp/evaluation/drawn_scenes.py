@@ -303,7 +303,8 @@ def evaluate_scenes(
         weights, device, progress: See `evaluate`, as for errors.
     """
     if unknown := [name for name in models if name not in METHODS or name in ("histograms", *CLASSICAL)]:
-        raise ArgumentError(f"models: {unknown[0]!r} is not a method for depth frames")
+        known = [name for name in METHODS if name not in ("histograms", *CLASSICAL)]
+        raise ArgumentError(f"models: {unknown[0]!r} is not one of {', '.join(known)}, the methods for depth frames")
     if scenes is None:
         scenes = [evaluation_scene(shape, setting) for setting in SETTINGS for shape in SHAPES]
     chosen, methods = list(scenes), compared(["input", *models], weights)

@@ -704,7 +704,7 @@ def key_text(key: Sequence[str | int]) -> str:
 
 # What people write for a field's name, beyond misspellings.
 _SYNONYMS = {"g": "anisotropy", "a": "absorption", "b": "scattering", "c": "extinction", "omega": "albedo"}
-_SYNONYMS["fov"] = "horizontal_fov_deg"
+_SYNONYMS |= {"fov": "horizontal_fov_deg", "water": "medium", "light": "laser", "sensor": "camera", "spad": "detector"}
 
 _KINDS = {"float_type": "a number", "int_type": "an integer", "int_from_float": "an integer", "tuple_type": "a list"}
 _KINDS |= {"bool_type": "true or false", "string_type": "a string"}
@@ -792,7 +792,8 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         others = "".join(f" and not {word!r}" for word in choices)
         return f"{entry} is outside {interval_of(info)}{others}{_percentage(info, value)}"
     if choices and not (kind in _KINDS and isinstance(value, str)):
-        listed = ", ".join([*map(repr, choices), *texts[2:]]) if len(choices) < 9 else "the known presets"
+        listed = ", ".join([*map(repr, choices), *texts[2:]])
+        listed = listed if len(choices) < 9 else f"those of `spadwarp list presets {key[0]}`"
         return f"{entry} is not one of {listed}{suggestion(value, choices)}"
     if kind in _KINDS:
         values = f" of {size} values" if kind == "tuple_type" and size is not None else ""

@@ -306,6 +306,7 @@ class Panels:
         ratios = [*[height, 0.1] * lines, *below]
         grid = self.figure.add_gridspec(len(ratios), columns, height_ratios=ratios)
         self._free = iter([(grid[2 * k, c], grid[2 * k + 1, c]) for k in range(lines) for c in range(columns)])
+        self._lines = [0] * len(ratios)  # of labels, beyond the first
         self._below = [grid[row, :] for row in range(2 * lines, len(ratios))]
 
     def below(self) -> list[Axes]:
@@ -342,6 +343,9 @@ class Panels:
             hatch(axis, self.unclear)
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)
+        row, taller = axis.get_subplotspec().rowspan.start, label.count("\n")  # type: ignore[union-attr]
+        self.figure.set_figheight(self.figure.get_figheight() + 0.17 * max(taller - self._lines[row], 0))
+        self._lines[row] = max(taller, self._lines[row])
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
         bar.set_visible(bool(np.isfinite(image).any()))  # it would have no values
         if scale == "log":

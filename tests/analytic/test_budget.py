@@ -147,6 +147,7 @@ def test_choices_of_an_experiment_are_combined():
             "camera.port.preset=none,flat-glass",
             "range=2 m",
         ],
+        planned=True,
     )
     assert len(chosen) == 8 and len(fields) == 4
     assert len({scene.medium.absorption for _, scene, _ in chosen}) == 2  # blue and green water

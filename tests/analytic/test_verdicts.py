@@ -1,12 +1,15 @@
 """Verdicts of `spadwarp.plan`: of few photons none, of hopeless water one before a photon is traced."""
 
+import dataclasses
 import math
 
 import pytest
 
 import spadwarp
+from helpers.pages import ROOT
 from helpers.planned import SCENE
 from spadwarp.analytic import planning
+from spadwarp.cli.planning import _verdict
 from spadwarp.scene import Scene
 
 pytestmark = pytest.mark.usefixtures("shared_runs")
@@ -49,6 +52,28 @@ def test_a_range_that_is_not_judged_counts_neither_as_reached_nor_as_not(start, 
         assert (near > 0.0) == (low > 0.0) and (far < math.inf) == (high < math.inf)
     else:
         assert gap is None and near == pytest.approx(23.0, rel=0.04) == far
+
+
+def test_the_page_shows_verdicts_as_they_are_printed():
+    page = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
+    found, terms = plan(20_000), dict.fromkeys(("shot noise", "total"), 0.0)
+    reached = {"reached": True, "pulses_for": "depth error", "pulses_range": (450, 470), "terms": terms}
+    said = [
+        {"pulses": 460, "frame_time": 46e-6, "limit": "shot noise", "terms": terms | {"total": 0.0099}},
+        {
+            "pulses": 18_000,
+            "pulses_range": (15_000, 22_000),
+            "frame_time": 1.8,
+            "limit": "backscatter",
+            "reached": False,
+        },
+        {"pulses": 900, "pulses_for": "floor", "frame_time": 45e-6, "limit": "bin width", "reached": False}
+        | {"terms": terms | {"total": 0.161}},
+        {"pulses_for": "not judged", "pilot": dataclasses.replace(found.pilot, photons=3_200_000)}
+        | {"photons_needed": 5.1e7, "seconds_needed": 340.0},
+    ]
+    for changes in said:
+        assert f"- `{_verdict(dataclasses.replace(found, **(reached | changes)))}`" in page
 
 
 def test_hopeless_water_is_named_before_a_photon_is_traced(monkeypatch):

@@ -124,7 +124,7 @@ def test_python_of_the_kernels_runs_without_spadwarp_in_reach(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_COMMANDS, ids=by_name)
-def test_commands_in_the_text_run(page, checkout):
+def test_commands_in_the_text_run(page, checkout, tmp_path):
     """The commands of a page, one after the other. A mesh, poses, a depth frame and a result are the reader's."""
     trimesh.creation.box().export("bust.stl")
     Path("poses.csv").write_text("time,camera.position[2]\n0.0,0.0\n0.1,0.4\n")
@@ -132,6 +132,8 @@ def test_commands_in_the_text_run(page, checkout):
         Path("out").mkdir()
         np.save("out/depth.npy", np.full((24, 32), 15.0))
         spadwarp.simulate("plane_5m", photons=20_000).save("out/result.h5")
+    if page.name == "own_counts.md":
+        runpy.run_path(program_of(page, tmp_path))  # which makes the counts
     for line in commands(page):
         run_small(line)
 

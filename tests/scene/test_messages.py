@@ -63,7 +63,10 @@ def port(*names, **fields):
         ("targets[0].color=1", "targets[0].color is not a known field; known are "),
         ("lasser.position=1", "lasser is not a known section; did you mean 'laser'?"),
         ("transport.estimator=nextevent", "transport.estimator = 'nextevent' (an override) is not one of 'analog', '"),
-        ("medium.preset=jerlov-1C", "medium.preset = 'jerlov-1C' (an override) is not one of the known presets; did "),
+        (
+            "medium.preset=jerlov-1C",
+            "medium.preset = 'jerlov-1C' (an override) is not one of those of `spadwarp list presets medium`; did ",
+        ),
         ("detector.irf=gausian", "detector.irf = 'gausian' (an override) is not one of 'gaussian', "),
         ("medium=uwoc-harbour", '; a preset is taken by {preset = "uwoc-harbour"}'),
         ("medium.extinction.b=1", "does not name a field"),
