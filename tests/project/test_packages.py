@@ -105,13 +105,8 @@ LINES = {
     "checks": (800, 900),
     "cli": (2900, 3081),
     "dataset": (2600, 2718),
-<<<<<<< HEAD
     "denoise": (4300, 5378),
     "evaluation": (1600, 1601),
-=======
-    "denoise": (4300, 5352),
-    "evaluation": (1600, 1602),
->>>>>>> 1c795017c76369191d9bffafb0dcb95afa804b0d
     "files": (1150, 1457),
     "frames": (2500, 2772),
     "inverse": (1900, 2358),
