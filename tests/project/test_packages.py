@@ -103,7 +103,7 @@ LINES = {
     "analytic": (2000, 2524),
     "benchmark": (500, 508),
     "checks": (800, 900),
-    "cli": (2900, 3056),
+    "cli": (2900, 3059),
     "dataset": (2600, 2718),
     "denoise": (4300, 5351),
     "evaluation": (1600, 1601),
@@ -129,7 +129,7 @@ LINES = {
     "kernels/riders": (750, 683),
     "kernels/surface": (1700, 1922),
     "kernels/tally": (450, 941),
-    "kernels/transport": (1450, 1815),
+    "kernels/transport": (1450, 1817),
     "kernels/water": (1350, 1707),
     "kernels/worlds": (1600, 2291),
 }
