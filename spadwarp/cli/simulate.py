@@ -323,9 +323,9 @@ def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
     needed = files.bytes_needed(result.scene, derivatives=len(result.derivatives))
     check_outputs(out, files.RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
     made = files.write_run(result, out, device=device)
-    say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))
     if problem := spadwarp.result.noise_problem(result):
         say(problem)
+    say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))
     summary = {**result.summary(), "photon_ranges": result.photon_ranges, "files": made.written}
     answer(summary, shown=_brief(result, made))
 
@@ -351,6 +351,8 @@ def reconstruct(run: Path, *, out: Path | None = None, device: str | None = None
     needed = files.bytes_needed(result.scene, derivatives=len(result.derivatives))
     check_outputs(place, files.RUN_FILES, resume=out is None, inputs=inputs, needed=needed)
     result = spadwarp.reconstruct(result, device=device)
+    if problem := spadwarp.result.noise_problem(result):
+        say(problem)
     made = files.write_run(result, place, device=device, keep=("records.h5",) if out is None else ())
     answer({**result.summary(), "files": made.written}, shown=_brief(result, made))
 

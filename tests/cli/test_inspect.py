@@ -80,7 +80,10 @@ def test_info_tells_what_the_result_holds(done, tmp_path):
     # One that says little about its origin is shown too.
     dataclasses.replace(result, provenance={}, timing={}, counters={}).save(tmp_path / "result.h5")
     run("info", tmp_path / "result.h5")
-    run("merge", tmp_path / "result.h5", "--out", tmp_path / "out", *DEVICE)
+    for command in ("merge", "reconstruct"):  # of few photons, which both say first
+        printed = run(command, tmp_path / "result.h5", "--out", tmp_path / command, *DEVICE).stdout
+        assert spadwarp.load(tmp_path / command).target_noise_ratio > 0.1
+        assert printed.startswith("not enough photons")
     run("view", tmp_path, "--out", tmp_path / "view.html")
 
 
