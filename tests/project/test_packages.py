@@ -103,15 +103,10 @@ LINES = {
     "analytic": (2000, 2524),
     "benchmark": (500, 508),
     "checks": (800, 900),
-    "cli": (2900, 3081),
+    "cli": (2900, 3083),
     "dataset": (2600, 2718),
-<<<<<<< HEAD
-    "denoise": (4300, 5378),
-    "evaluation": (1600, 1601),
-=======
-    "denoise": (4300, 5352),
+    "denoise": (4300, 5379),
     "evaluation": (1600, 1602),
->>>>>>> 1c795017c76369191d9bffafb0dcb95afa804b0d
     "files": (1150, 1457),
     "frames": (2500, 2772),
     "inverse": (1900, 2358),
@@ -134,7 +129,7 @@ LINES = {
     "kernels/riders": (750, 683),
     "kernels/surface": (1700, 1922),
     "kernels/tally": (450, 941),
-    "kernels/transport": (1450, 1815),
+    "kernels/transport": (1450, 1817),
     "kernels/water": (1350, 1707),
     "kernels/worlds": (1600, 2291),
 }
