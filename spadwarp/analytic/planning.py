@@ -511,11 +511,14 @@ def bracket(judge: Callable[[float], bool | None], start: float) -> tuple[float,
         start: First range that is judged.
     """
     found = {start: judge(start)}
-    for factor, end in ((_STEP, False), (1.0 / _STEP, True)):
-        distance = start
-        while found[distance] is not end and start / 40.0 <= distance * factor <= _FARTHEST:
-            distance *= factor
-            found[distance] = judge(distance)
+    distance = start
+    while found[distance] is not False and distance * _STEP <= _FARTHEST:
+        distance *= _STEP
+        found[distance] = judge(distance)
+    distance = start
+    while True not in found.values() and distance / _STEP >= start / 40.0:
+        distance /= _STEP
+        found[distance] = judge(distance)
     while True:
         near = max((one for one, reached in found.items() if reached), default=0.0)
         far = min((one for one, reached in found.items() if reached is False and one > near), default=math.inf)
