@@ -574,7 +574,7 @@ def _check_timing(survey: Survey) -> None:
             f"unambiguous range is {unambiguous:.4g} m, "
             f"{'time wraps' if wraps else 'ignored, since detector.wrap is false'}"
         )
-        report = survey.warn if wraps else survey.note
+        report = survey.warn if wraps and survey.scene.surface is None else survey.note  # in orbit, many are under way
         report("laser.repetition_rate", text, unambiguous_range=unambiguous, last_ns=last, period_ns=period)
     if (length := (gate.stop - gate.start) * 1e9) > period * (1 + 1e-9):
         text = f"the gate of {length:.5g} ns is longer than the pulse period, {period:.5g} ns: time wraps within it"

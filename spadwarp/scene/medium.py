@@ -547,8 +547,8 @@ def grid_cells(medium: Medium) -> GridCells:
         status = Path(grid.file or "").stat()
         stamp = status.st_mtime_ns, status.st_size
     if part := next((one for one in medium.constituents if one.name == grid.constituent), None):
-        albedo = part.scattering / part.extinction if part.extinction > 0.0 else 0.0
-        grid = grid.model_copy(update={"extinction": part.extinction, "albedo": albedo})
+        own = part.scattering / part.extinction if part.extinction > 0.0 else 0.0
+        grid = grid.model_copy(update={"extinction": part.extinction, "albedo": own})
     return cells_of(grid, (medium.extinction, albedo, medium.anisotropy), medium.has_phase_table, stamp)
 
 

@@ -56,7 +56,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     """
     names = list(_OF_BUDGETS)
     if not isinstance(curves.rows[0], BudgetRow):
-        names = [name for name in _OF_PLANS if not np.isnan(curves.column(name)).all()]
+        # Where photons judge nothing, empty panels say so.
+        names = [name for name in _OF_PLANS if not np.isnan(curves.column(name)).all()] or list(_OF_PLANS[:2])
     figure, axes = panel_grid(len(names), width, least=2.3, height=2.1, more=0.3)
     at, others = [value[0] for value in curves.values], [value[1:] for value in curves.values]
     ticks = list(dict.fromkeys(map(str, at)))
@@ -89,6 +90,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             axis.plot(beyond, np.full(len(beyond), 0.97), "x", transform=top, color=style_of["color"])
         axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=_broken(label))
         _value_axis(axis, y)
+        if np.isnan(y).all():
+            axis.text(0.5, 0.5, "not enough photons\nto judge", transform=axis.transAxes, ha="center", va="center")
         if not numeric:
             axis.set_xticks(range(len(ticks)), ticks, rotation=20, ha="right", rotation_mode="anchor")
             axis.set_xlim(-0.5, len(ticks) - 0.5)

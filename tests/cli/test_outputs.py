@@ -72,9 +72,8 @@ def test_what_is_read_is_never_replaced(done, tmp_path):
     before = source.read_bytes(), depth.read_bytes()
     (tmp_path / "link").symlink_to(done)
     refused("view", done, "--out", source, words=("--out", "result.h5"))
+    refused("view", tmp_path / "link", "--out", source, "--overwrite", words=("does not end in .html",))
     for command in (
-        ("view", done, "--out", source),
-        ("view", tmp_path / "link", "--out", source),
         ("merge", done, "--out", done),
         ("depth", depth, "--out", tmp_path, "--input", "bin_width=100ps"),
     ):
@@ -149,7 +148,7 @@ def test_a_dataset_is_no_output(tmp_path):
     small = {"targets.builtin": ["staircase"], "targets.validation": [], "frames.per_scene": 1, "scenes_per_target": 1}
     make(recipe(**small), folder)
     before = (folder / "manifest.json").read_bytes()
-    for words in (("info", folder, "--json"), ("view", folder, "--out"), ("info", folder, "--verify", "--json")):
+    for words in (("info", folder, "--json"), ("info", folder, "--verify", "--json")):
         refused(*words, folder / "manifest.json", "--overwrite", words=("is read by this command",))
     refused("dataset", folder / "recipe.toml", "--out", folder, "--json", folder / "x.json", words=("folder",))
     preview = ("view", folder, "--pictures", 1, "--out", folder / "preview.png")
@@ -166,7 +165,7 @@ def test_a_dataset_is_no_output(tmp_path):
 @pytest.mark.parametrize(
     "words",
     [
-        ("view", "--out", "old", "--overwrite"),
+        ("view", "--out", "old.html", "--overwrite"),
         ("export", "--format", "npy", "--out", ".", "--overwrite"),
         ("detect", "--pulses", "1000", "--out", ".", "--overwrite", *DEVICE),
     ],
@@ -178,7 +177,7 @@ def test_a_full_disk_leaves_the_old_files(words, done, tmp_path, monkeypatch):
     place = tmp_path / "place"
     place.mkdir()
     monkeypatch.chdir(place)
-    old = dict.fromkeys(("old", "result.npy", "frames.h5"), "old")
+    old = dict.fromkeys(("old", "old.html", "result.npy", "frames.h5"), "old")
     for name, text in old.items():
         (place / name).write_text(text)
     command, *rest = words
@@ -197,7 +196,7 @@ def test_a_directory_below_a_file_or_of_too_long_a_name_is_refused(done, tmp_pat
     ):
         assert "cannot be written" in run(*words, code=1).stderr
     assert (tmp_path / "file").read_text() == "mine"
-    for words in (("info", tmp_path / ("x" * 300)), ("view", done, "--out", tmp_path / ("x" * 300))):
+    for words in (("info", tmp_path / ("x" * 300)), ("view", done, "--out", tmp_path / ("x" * 300 + ".html"))):
         assert run(*words, code=1).stderr.startswith("error: ")
 
 

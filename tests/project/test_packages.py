@@ -117,7 +117,7 @@ LINES = {
     "scene": (3700, 5271),
     "transport": (2300, 3318),
     "validate": (750, 869),
-    "viz": (2200, 2481),
+    "viz": (2200, 2484),
     "water": (800, 860),
     "kernels/spadwarp_kernels": (50, 45),
     "kernels/analytic": (1650, 1630),

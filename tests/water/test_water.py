@@ -189,7 +189,7 @@ def test_henyey_greenstein_in_natural_water_is_told():
         assert one.values == pytest.approx(expected, rel=1e-3)
     texts = [one.text.partition("; ")[2] for one in found]
     assert texts[0].startswith("constituents fit: 'rayleigh' with scattering = 0.002 and")
-    assert texts[1] == "phase_function = 'fournier_forand' fits"
+    assert texts[1] == "phase_function = 'fournier_forand' with particle_index = 1.1, junge_slope = 3.5835 fits"
     # With one water of chlorophyll, the molecules are there already, and particles alone fall short.
     (one,) = [one for one in spadwarp.check(scene({"chlorophyll": 0.05})) if one.field == "medium.anisotropy"]
     assert one.values["ratio"] < 1.2 < found[0].values["ratio"] and one.text.endswith(texts[1])
