@@ -156,7 +156,7 @@ def test_a_dataset_is_no_output(tmp_path):
     refused(*preview, words=("preview.png exists",))
     run(*preview, "--overwrite")
     assert (folder / "manifest.json").read_bytes() == before and not (folder / "x.json").exists()
-    run("view", tmp_path / "nosuch", "--out", tmp_path / "nosuch" / "preview.png", code=1)
+    run("view", tmp_path / "nosuch", "--out", tmp_path / "nosuch" / "preview.png", code=2)
     assert not (tmp_path / "nosuch").exists()
 
 
