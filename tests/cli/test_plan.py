@@ -1,5 +1,6 @@
 """`analytic`, `sweep` and `plan` say what Python says."""
 
+import math
 import re
 from contextlib import ExitStack
 
@@ -76,7 +77,8 @@ def test_sweep_is_that_of_python(scene, tmp_path, vary):
     twin = spadwarp.sweep(scene, vary=vary, device="cpu", **planned)
     found = tables(summary)
     assert tuple(found["fields"]) == twin.fields and tuple(map(tuple, found["values"])) == twin.values
-    assert [row["sigma_depth"] for row in found["rows"]] == [row.sigma_depth for row in twin.rows]
+    sigmas = [None if math.isnan(row.sigma_depth) else row.sigma_depth for row in twin.rows]  # too few photons to judge
+    assert [row["sigma_depth"] for row in found["rows"]] == sigmas
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"sweep.png", "sweep.csv"}
 
 
