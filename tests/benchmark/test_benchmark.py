@@ -174,6 +174,7 @@ def test_a_missed_mean_fails_the_command(monkeypatch, staircase):
     assert "cube60: a mean is not what it should be" in run("bench", "cube60", code=1).output
 
 
+@pytest.mark.slow
 def test_scaling_says_how_cost_grows(monkeypatch, staircase):
     def like(photons, rate):
         size = {"photons": photons}

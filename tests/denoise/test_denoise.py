@@ -52,6 +52,7 @@ def test_gating_drops_what_the_water_explains():
     assert np.abs(found[0] - clean)[near].mean() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of the packages that bmnd compiles with
 def test_bm3d_smooths_a_small_crop():
     clean = np.full((24, 24), 15.0, np.float32)

@@ -12,6 +12,7 @@ from helpers.cli import DEVICE, ENVIRONMENT, run, tables
 from spadwarp.validate import references
 
 
+@pytest.mark.slow
 def test_self_test_measures_what_is_known(tmp_path):
     printed = run("doctor", *DEVICE, "--json", tmp_path / "report.json").stdout
     report = tables(tmp_path / "report.json")

@@ -158,6 +158,7 @@ def test_figure_scripts_import_and_say_how_to_run_them(path):
     assert f"python docs/figures/{path.name}" in module.__doc__
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_figure_of_a_capture_finds_its_own_model(tmp_path, monkeypatch):
     """Counts that the detector model drew: the response is found again, and the distributions of errors agree."""

@@ -269,6 +269,7 @@ def test_a_port_polarises_what_it_lets_through(device):
     assert q[0] / i[0] > 0.02 and np.abs(u / i).max() < 0.01 and not v.any()
 
 
+@pytest.mark.slow
 def test_an_analyser_splits_the_stokes_vector(device):
     """co and cross from I, Q and U of the same photons, and their errors."""
     analyser = {"polarisation": "analyser", "analyser_angle_deg": 30.0, "analyser_extinction_ratio": 50.0}

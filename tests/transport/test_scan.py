@@ -167,6 +167,7 @@ def test_moving_shots_have_the_truth_of_their_pose(device):
     assert (spadwarp.transport.target_map(_moving(targets=[]), device=device) == -1).all()
 
 
+@pytest.mark.slow
 def test_each_shot_is_the_run_of_its_pose_alone(device):
     """Totals by component of the shots of a moving scan, against scenes in which nothing moves."""
     one, photons, shots = _moving(), 2000, (0, 6, 13)

@@ -238,6 +238,7 @@ def test_light_scattered_once_between_two_faces_is_that_of_the_images(device):
     assert (np.abs(mean - expected)[seen] < 5.5 * error[seen]).all()
 
 
+@pytest.mark.slow
 def test_analog_counts_what_it_drops_for_too_many_reflections(device):
     """Without mirrored connections, and with so many that hardly anything is left out. Faces that reflect leave
     ballistic light as it is, to the bit."""

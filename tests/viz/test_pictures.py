@@ -231,7 +231,7 @@ PICTURES_OF_THE_DOCS = {
 @pytest.mark.parametrize(
     ("kind", "width"),
     [
-        (kind, width)
+        pytest.param(kind, width, marks=[pytest.mark.slow] * (kind == "sweep_plan"))
         for kind, draw in PICTURES.items()
         for width in (style.PAGE, style.COLUMN)[: 1 + (draw not in AS_WIDE_AS_A_PAGE)]
     ],
