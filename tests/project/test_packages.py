@@ -129,7 +129,7 @@ LINES = {
     "kernels/riders": (750, 683),
     "kernels/surface": (1700, 1922),
     "kernels/tally": (450, 941),
-    "kernels/transport": (1450, 1817),
+    "kernels/transport": (1450, 1814),
     "kernels/water": (1350, 1707),
     "kernels/worlds": (1600, 2291),
 }

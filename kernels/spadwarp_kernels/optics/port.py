@@ -505,8 +505,8 @@ def make_flat_port(
     n = tuple(port.index)
     slopes = [_slopes(n[0], n[k], largest_angle) for k in (1, 2)]
     port.glass_slope, port.water_slope = (wp.vec2(*bounds) for bounds in slopes)
-    steepest = max(math.tan(largest_angle), slopes[0][1] * math.tan(largest_angle))
-    longest = min(math.hypot(1.0, steepest), _FAR)
+    tangent = max(1.0, slopes[0][1]) * math.tan(largest_angle)  # the largest inside and in the window
+    longest = min(math.hypot(1.0, tangent), _FAR)
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
     _widen(port, _STEEPEST * math.sqrt(slope_variance) + steepest, largest_angle)
     if amplitude > 0.0:

@@ -212,11 +212,8 @@ def make_fly(
     plans, water_free_path, tried = plan_flight is not None, spec.water.free_path, spec.faces.tried
     events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
-    has_bvh, sea, surface_distance = (
-        spec.faces.mesh and not tried,
-        spec.sight.sea is not None,
-        (spec.sight.sea or FACETS).distance,
-    )
+    has_bvh, sea = spec.faces.mesh and not tried, spec.sight.sea is not None
+    surface_distance = (spec.sight.sea or FACETS).distance
 
     @wp.func
     def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
