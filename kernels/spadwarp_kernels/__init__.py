@@ -35,7 +35,7 @@ else:
             return [public for package in _PACKAGES for public in __getattr__(package).__all__]
         for package in () if name.startswith("_") else map(__getattr__, _PACKAGES):
             if name in package.__all__:
-                return getattr(package, name)
+                return globals().setdefault(name, getattr(package, name))  # asked for once
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
     def __dir__() -> list[str]:

@@ -438,9 +438,8 @@ def see_through_waves_kernel(
     v = wp.vec3(0.0)
     if distance < 1.0e30:
         x += distance * u
-        v = refracted(
-            u, facet_normal(sea.waves, facet_at(sea.waves, x).slope), wp.where(above, 1.0 / sea.index, sea.index)
-        )
+        normal = facet_normal(sea.waves, facet_at(sea.waves, x).slope)
+        v = refracted(u, normal, wp.where(above, 1.0 / sea.index, sea.index))
     if wp.length_sq(v) == 0.0:
         v = wp.vec3(wp.nan)
         distance = wp.nan
