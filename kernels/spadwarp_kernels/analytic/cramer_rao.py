@@ -8,7 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_arrays, check_choice, check_range
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, SQRT_2PI, TWO, ZERO, normal_cdf, one_minus_exp
 
@@ -117,8 +118,8 @@ def _outliers(
 
 def outlier_probabilities(signal_count: wp.array, level: wp.array, window: wp.array) -> wp.array:
     """`outlier_probability` of every element: float64 arrays of one length in and out."""
-    check_array("signal_count", signal_count, wp.float64, (None,))
-    check_arrays(wp.float64, signal_count.shape, signal_count.device, level=level, window=window)
+    check.array("signal_count", signal_count, wp.float64, (None,))
+    check.arrays(wp.float64, signal_count.shape, signal_count.device, level=level, window=window)
     out = wp.empty(signal_count.shape[0], dtype=wp.float64, device=signal_count.device)
     launch_pixels(_outliers, signal_count.shape[0], [signal_count, level, window, out], device=signal_count.device)
     return out
@@ -320,14 +321,14 @@ def statistics_maps(
     """
     columns = {"signal": signal, "arrival": arrival, "backscatter": backscatter}
     optics, count, device = check_lidar(lidar, optics, view, **columns)
-    check_array("profile", profile, wp.float32, (None, None), device)
+    check.array("profile", profile, wp.float32, (None, None), device)
     if not profile.size:
         raise ArgumentError(f"profile has shape {profile.shape}; (1 or pixels, bins) is needed")
     water = make_scattering(lidar, phase, device, lines=lines, profile=profile)
-    check_choice("count_law", count_law, COUNT_LAWS)
-    check_range("(0, inf)", acquisitions=acquisitions, pulses_per_frame=pulses_per_frame)
+    check.choice("count_law", count_law, COUNT_LAWS)
+    check.within("(0, inf)", acquisitions=acquisitions, pulses_per_frame=pulses_per_frame)
     ambient = wp.zeros(1, dtype=wp.float64, device=device) if ambient is None else ambient
-    check_array("ambient", ambient, wp.float64, (None,), device)
+    check.array("ambient", ambient, wp.float64, (None,), device)
     if ambient.size not in (1, count):
         raise ArgumentError(f"ambient has {ambient.size} entries; 1 or {count} are needed")
     out: Any = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(5))
@@ -351,12 +352,12 @@ def histogram_information(
     Raises:
         ArgumentError: Arrays that do not fit each other.
     """
-    check_array("signal", signal, wp.float32, (None, None))
-    check_array("background", background, wp.float32, (None, None), signal.device)
+    check.array("signal", signal, wp.float32, (None, None))
+    check.array("background", background, wp.float32, (None, None), signal.device)
     if background.shape[0] < 1 or background.shape[1] not in (1, signal.shape[1]):
         raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {signal.shape[1]}) is needed")
     for name, array in {"taps": taps, "slope_taps": slope_taps}.items():
-        check_array(name, array, wp.float64, (None,), signal.device)
+        check.array(name, array, wp.float64, (None,), signal.device)
         if array.size % 2 == 0:
             raise ArgumentError(f"{name} has {array.size} entries; an odd number is needed")
     out = wp.empty(signal.shape[0], dtype=wp.float64, device=signal.device)

@@ -9,18 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_arrays,
-    check_fields,
-    check_integer,
-    check_number,
-    check_seed,
-    check_struct,
-    check_vector,
-)
+from spadwarp_kernels.base import check
 from spadwarp_kernels.base.binomial import count_quantile
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.philox import STREAM_ANALYTIC, STREAM_FRAMES, random_block, u01, u01_open
 from spadwarp_kernels.optics.laser import first_above
@@ -140,20 +131,20 @@ def _pixel_maps(
     optics: Any, ports: Any, laser: Sequence[float], gate: Sequence[float], view: Any, **maps: Any
 ) -> tuple[Optics, PixelMaps]:
     """The maps of all pixels, if they fit each other; raises `ArgumentError`."""
-    check_array("view", view, wp.vec3, (None,))
+    check.array("view", view, wp.vec3, (None,))
     rows = {name: maps[name] for name in ("paths", "cumulative")}
-    check_arrays(wp.float32, (None, None), view.device, **rows)
-    check_arrays(wp.float32, view.shape, view.device, **{name: maps[name] for name in maps if name not in rows})
+    check.arrays(wp.float32, (None, None), view.device, **rows)
+    check.arrays(wp.float32, view.shape, view.device, **{name: maps[name] for name in maps if name not in rows})
     for name, array in rows.items():
-        check_integer(f"rows of {name}", array.shape[0], 1)
-        check_integer(f"columns of {name}", array.shape[1], 2)
+        check.integer(f"rows of {name}", array.shape[0], 1)
+        check.integer(f"columns of {name}", array.shape[1], 2)
     if rows["paths"].shape[1] != rows["cumulative"].shape[1]:
         raise ArgumentError(
             f"paths {rows['paths'].shape} and cumulative {rows['cumulative'].shape} have not as many columns"
         )
-    check_vector("laser", laser)
-    check_vector("gate_paths", gate, size=2)
-    check_number("gate_paths[1]", gate[1], f"[{float(gate[0])}, inf)")
+    check.vector("laser", laser)
+    check.vector("gate_paths", gate, size=2)
+    check.number("gate_paths[1]", gate[1], f"[{float(gate[0])}, inf)")
     made = PixelMaps()
     optics, made.ports = check_ports("ports", ports, optics)
     made.laser, (made.nearest, made.farthest), made.view = wp.vec3(*map(float, laser)), gate, view
@@ -205,14 +196,14 @@ def sample_frames(
     maps |= {"paths": paths, "cumulative": cumulative}
     optics, drawn = _pixel_maps(optics, ports, laser, gate_paths, view, **maps)
     pixels, device = view.shape[0], view.device
-    frames = check_integer("frames", frames, 0)
-    first_frame, seed = check_integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check_seed(seed)
+    frames = check.integer("frames", frames, 0)
+    first_frame, seed = check.integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check.seed(seed)
     kinds = (wp.float32, wp.bool)
     made: Any = tuple(wp.empty((frames, pixels), dtype=kind, device=device) for kind in kinds) if out is None else out
     if not (isinstance(made, tuple) and len(made) == 2):
         raise ArgumentError("out is not a pair of arrays, of depth and of labels")
     for k, kind in enumerate(kinds):
-        check_array(f"out[{k}]", made[k], kind, (frames, pixels), device)
+        check.array(f"out[{k}]", made[k], kind, (frames, pixels), device)
     # wp.tid() is a 32-bit integer, and a thread draws two frames.
     step = 2 * max((1 << 30) // max(pixels, 1), 1)
     for start in range(0, frames, step):
@@ -332,18 +323,18 @@ def draw_frames(
     Raises:
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
-    check_struct("coding", coding, FrameCoding)
-    width = check_integer("coding.width", coding.width, 1)
-    if check_integer("coding.pixels", coding.pixels, 1) % width:
+    check.kind("coding", coding, FrameCoding)
+    width = check.integer("coding.width", coding.width, 1)
+    if check.integer("coding.pixels", coding.pixels, 1) % width:
         raise ArgumentError(f"coding.width = {width} does not divide coding.pixels = {coding.pixels}")
-    check_fields("coding", coding, {"depth_offset": "(-inf, inf)", "depth_step": "(0, inf)"})
-    check_fields("coding", coding, {"intensity_step": "(0, inf)", "pulses": "[0, inf)"})
-    check_array("view", view, wp.vec3, (coding.pixels,))
+    check.fields("coding", coding, {"depth_offset": "(-inf, inf)", "depth_step": "(0, inf)"})
+    check.fields("coding", coding, {"intensity_step": "(0, inf)", "pulses": "[0, inf)"})
+    check.array("view", view, wp.vec3, (coding.pixels,))
     maps = {"depth": depth, "sigma_depth": sigma_depth, "probability": probability, "flat_share": flat_share}
     maps |= {"paths": paths, "cumulative": cumulative}
     optics, drawn = _pixel_maps(optics, ports, coding.laser, (coding.nearest, coding.farthest), view, **maps)
-    check_array("alpha", alpha, wp.float32, (coding.pixels,), view.device)
-    check_array("fraction", fraction, wp.float32, (None,), view.device)
+    check.array("alpha", alpha, wp.float32, (coding.pixels,), view.device)
+    check.array("fraction", fraction, wp.float32, (None,), view.device)
     device, frames = view.device, fraction.size
     label_count = coding.pixels // width * ((width + 7) // 8)
     depth_codes = wp.empty((frames, coding.pixels), dtype=wp.uint16, device=device)

@@ -9,16 +9,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_arrays,
-    check_fields,
-    check_integer,
-    check_number,
-    check_struct,
-    check_vector,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 from spadwarp_kernels.optics.port import DOME_PORT, FLAT_PORT, Port, PortKind, check_port
@@ -459,7 +451,7 @@ def check_ports(name: str, ports: Any, optics: Any) -> tuple[Optics, Any]:
     if not isinstance(optics, Optics):
         raise ArgumentError(f"optics = {optics!r} is not of make_optics")
     ports = Ports() if ports is None else ports
-    check_struct(name, ports, Ports)
+    check.kind(name, ports, Ports)
     for part, kind in zip(("camera", "laser"), optics.kinds, strict=True):
         if kind is not None:
             check_port(f"{name}.{part}", getattr(ports, part), kind)
@@ -469,23 +461,23 @@ def check_ports(name: str, ports: Any, optics: Any) -> tuple[Optics, Any]:
 def check_lidar(lidar: Any, optics: Any, view: Any, **columns: Any) -> tuple[Optics, int, Any]:
     """A `Lidar` whose numbers are in range, optics that its laser can have, lines of sight, and float64 columns of a
     number for each: the optics, number and device of the lines. Raises `ArgumentError`."""
-    check_struct("lidar", lidar, Lidar)
-    check_integer("lidar.lu2024", lidar.lu2024, 0, 1)
-    check_fields("lidar", lidar, {name: interval for interval, names in _RANGES.items() for name in names})
-    check_number("lidar.stop", lidar.stop, f"({float(lidar.start)}, inf)")
-    check_vector("lidar.laser", lidar.laser)
-    check_vector("lidar.axis", lidar.axis, unit=True)
-    check_fields("lidar", lidar, _BEAM[check_integer("lidar.profile", lidar.profile, 0, len(_BEAM) - 1)])
-    source = check_integer("lidar.source", lidar.source, 0, len(BACKSCATTER_SOURCES) - 1)
+    check.kind("lidar", lidar, Lidar)
+    check.integer("lidar.lu2024", lidar.lu2024, 0, 1)
+    check.fields("lidar", lidar, {name: interval for interval, names in _RANGES.items() for name in names})
+    check.number("lidar.stop", lidar.stop, f"({float(lidar.start)}, inf)")
+    check.vector("lidar.laser", lidar.laser)
+    check.vector("lidar.axis", lidar.axis, unit=True)
+    check.fields("lidar", lidar, _BEAM[check.integer("lidar.profile", lidar.profile, 0, len(_BEAM) - 1)])
+    source = check.integer("lidar.source", lidar.source, 0, len(BACKSCATTER_SOURCES) - 1)
     if lidar.lu2024:
-        check_number("lidar.tan2", lidar.tan2, "(0, inf)")
+        check.number("lidar.tan2", lidar.tan2, "(0, inf)")
     if BACKSCATTER_SOURCES[source] == "monte_carlo":
-        check_number("lidar.bin_width", lidar.bin_width, "(0, inf)")
+        check.number("lidar.bin_width", lidar.bin_width, "(0, inf)")
     optics, _ = check_ports("lidar.ports", lidar.ports, optics)
     if optics is not IN_WATER and lidar.lu2024:
         raise ArgumentError("lidar.lu2024 = 1 is for a camera and a laser in the water, not for optics of ports")
     if lidar.profile == 2 and optics.kinds[1] == DOME_PORT:
         raise ArgumentError("lidar.profile = 2: a collimated beam does not stay one behind a dome")
-    check_array("view", view, wp.vec3d, (None,))
-    check_arrays(wp.float64, (view.shape[0],), view.device, **columns)
+    check.array("view", view, wp.vec3d, (None,))
+    check.arrays(wp.float64, (view.shape[0],), view.device, **columns)
     return optics, view.shape[0], view.device

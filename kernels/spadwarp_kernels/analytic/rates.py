@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_array, check_integer, check_number
+from spadwarp_kernels.base import check
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 
@@ -205,7 +205,7 @@ def signal_map(
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
     optics, count, device = check_lidar(lidar, optics, view, distance=distance, reflectance=reflectance)
-    check_array("normal", normal, wp.vec3d, (count,), device)
+    check.array("normal", normal, wp.vec3d, (count,), device)
     out = tuple(wp.empty(count, dtype=wp.float64, device=device) for _ in range(2))
     inputs = [lidar, view, distance, normal, reflectance, *out]
     launch_pixels(_make_signal_kernel(optics), count, inputs, device=device)
@@ -229,13 +229,13 @@ def make_scattering(
 ) -> Scattering:
     """The lines given, or the lidar's own photons, extinction and scattering as one line; and a phase function, whose
     table is checked. Raises `ArgumentError`."""
-    check_array("phase", phase, wp.float64, (None,), device)
-    check_integer("entries of phase", phase.size, 2)
+    check.array("phase", phase, wp.float64, (None,), device)
+    check.integer("entries of phase", phase.size, 2)
     if lines is None:
         own = wp.vec3d(float(lidar.photons), float(lidar.extinction), float(lidar.scattering))
         lines = wp.array([own], dtype=wp.vec3d, device=device)
-    check_array("lines", lines, wp.vec3d, (None,), device)
-    check_integer("number of lines", lines.size, 1)
+    check.array("lines", lines, wp.vec3d, (None,), device)
+    check.integer("number of lines", lines.size, 1)
     water = Scattering()
     water.lines, water.phase = lines, phase
     water.profile = wp.zeros((1, 1), dtype=float, device=device) if profile is None else profile
@@ -400,7 +400,7 @@ def single_scatter_table(
         ArgumentError: A number out of range, or arrays that do not fit each other.
     """
     optics, count, device = check_lidar(lidar, optics, view, distance=distance)
-    check_number("lidar.nearest", lidar.nearest, "(0, inf)")
+    check.number("lidar.nearest", lidar.nearest, "(0, inf)")
     water = make_scattering(lidar, phase, device, lines=lines)
     paths, cumulative = (wp.empty((count, TABLE_EDGES), dtype=float, device=device) for _ in range(2))
     total = wp.empty(count, dtype=wp.float64, device=device)

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-from .arguments import *
+from .check import *
 from .kernels import *
 from .philox import *
 from .rotations import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = arguments.__all__ + kernels.__all__ + philox.__all__ + rotations.__all__
+    __all__ = check.__all__ + kernels.__all__ + philox.__all__ + rotations.__all__

@@ -14,7 +14,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from .arguments import ArgumentError, check_numbers
+from . import check
+from .check import ArgumentError
 
 Floats = NDArray[np.float64]
 
@@ -130,7 +131,7 @@ def tabulate(density: Callable[[Floats], Floats]) -> Floats:
     finite or zero everywhere.
     """
     z, weight = folded_quadrature()
-    values = check_numbers("density(t)", density(z))
+    values = check.numbers("density(t)", density(z))
     if values.shape != z.shape:
         raise ArgumentError(f"density(t) has shape {values.shape}; that of t, {z.shape}, is needed")
     if not (np.isfinite(values).all() and values.min() >= 0.0 and values.any()):

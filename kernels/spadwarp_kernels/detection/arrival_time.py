@@ -9,14 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_choice,
-    check_integer,
-    check_number,
-    check_numbers,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 
 from .counts import RATES
@@ -258,17 +252,17 @@ class ArrivalEstimator:
         width: float | None = None,
         **test: Any,
     ) -> None:
-        check_choice("method", method, ("peak", "centroid", "matched", "likelihood"))
+        check.choice("method", method, ("peak", "centroid", "matched", "likelihood"))
         self.device, self.method = wp.get_device(device), method
-        self.bins = check_integer("bins", bins, 0)
+        self.bins = check.integer("bins", bins, 0)
         self._search = search = _Search()
-        search.first = check_integer("first", first, 0, bins)
-        search.stop = bins if stop is None else check_integer("stop", stop, first, bins)
-        search.half_width = check_integer("half_width", half_width, 0, 2**24)
-        search.lowest_tap = check_integer("lowest_tap", lowest_tap, -(2**24), 2**24)
+        search.first = check.integer("first", first, 0, bins)
+        search.stop = bins if stop is None else check.integer("stop", stop, first, bins)
+        search.half_width = check.integer("half_width", half_width, 0, 2**24)
+        search.lowest_tap = check.integer("lowest_tap", lowest_tap, -(2**24), 2**24)
         if background is None:
             background = wp.zeros((1, 1), dtype=float, device=self.device)
-        check_array("background", background, wp.float32, (None, None), self.device)
+        check.array("background", background, wp.float32, (None, None), self.device)
         if background.shape[0] < 1 or background.shape[1] not in (1, bins):
             raise ArgumentError(f"background has shape {background.shape}; (1 or pixels, 1 or {bins}) is needed")
         search.background = background
@@ -276,7 +270,7 @@ class ArrivalEstimator:
         if method in ("matched", "likelihood"):
             if response is None:
                 raise ArgumentError(f"method = {method!r} needs a response")
-            taps = check_numbers("response", response)
+            taps = check.numbers("response", response)
             if taps.ndim != 2 or taps.shape[0] != PHASES or taps.size == 0:
                 raise ArgumentError(f"response has shape {taps.shape}; ({PHASES}, taps) is needed")
             largest = taps.max()
@@ -292,7 +286,7 @@ class ArrivalEstimator:
                 taps = np.log(np.maximum(taps, floor) / floor)
             search.peak_tap = search.lowest_tap + int(np.argmax(taps[0]))
         search.response = wp.array(taps.astype(np.float32), device=self.device)
-        search.min_significance = check_number("min_significance", min_significance, "[0, 1e6]")
+        search.min_significance = check.number("min_significance", min_significance, "[0, 1e6]")
         test = {"first": first, "stop": stop, "background": background if "profile" not in test else None, **test}
         self.test = DetectionTest(bins, self.device, half_width / 1.5 if width is None else width, **test)
         search.half_width_of_window = self.test.half_width
@@ -300,9 +294,9 @@ class ArrivalEstimator:
     def __call__(self, histogram: wp.array, arrival: wp.array, significance: wp.array | None = None) -> None:
         """Writes the arrival times of a histogram into `arrival`, float32 `[pixel]`, and of counts, where there is an
         array for it or a threshold, the significance."""
-        check_array("histogram", histogram, RATES, (None, self.bins), self.device)
+        check.array("histogram", histogram, RATES, (None, self.bins), self.device)
         pixels = histogram.shape[0]
-        check_array("arrival", arrival, wp.float32, (pixels,), self.device)
+        check.array("arrival", arrival, wp.float32, (pixels,), self.device)
         search = self._search
         if search.min_significance > 0.0 or significance is not None:
             if search.window is None or search.window.shape != (pixels,):
@@ -375,7 +369,7 @@ def arrival_bins(
     Raises:
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
-    check_array("histogram", histogram, RATES, (None, None))
+    check.array("histogram", histogram, RATES, (None, None))
     bins, device = histogram.shape[1], histogram.device
     if min_significance is None:
         min_significance = MIN_SIGNIFICANCE if histogram.dtype in COUNTS else 0.0

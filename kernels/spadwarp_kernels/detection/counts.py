@@ -12,17 +12,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_device,
-    check_integer,
-    check_number,
-    check_numbers,
-    check_range,
-    check_seed,
-)
+from spadwarp_kernels.base import check
 from spadwarp_kernels.base.binomial import PURPOSE_COUNTS, PURPOSE_DARK_COUNTS, PURPOSE_EVENTS, binomial, uniforms
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import expm1, log1p
 
@@ -74,7 +66,7 @@ def _invalid_kernel(dtype: Any) -> wp.Kernel:
 
 def first_invalid_row(values: wp.array) -> int | None:
     """The first row of `values` `[pixel, bin]` that holds a negative or non-finite number, or None."""
-    check_array("values", values, RATES, (None, None))
+    check.array("values", values, RATES, (None, None))
     if values.shape[0] == 0:
         return None
     worst = wp.full(1, 2**31 - 1, dtype=int, device=values.device)
@@ -134,11 +126,11 @@ def expected_detections(
     Raises:
         ArgumentError: Arrays that do not fit each other, or a matrix that points outside the source.
     """
-    check_array("source", source, RATES, (None, None))
+    check.array("source", source, RATES, (None, None))
     device = source.device
-    check_array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
+    check.array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
     given = {"row_start": row_start, "source_bin": source_bin, "weight": weight, "width": width}
-    rows, entries, factors, widths = (check_numbers(name, values, 1) for name, values in given.items())
+    rows, entries, factors, widths = (check.numbers(name, values, 1) for name, values in given.items())
     if rows.size != widths.size + 1:
         raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {widths.shape}, is needed")
     if factors.shape != entries.shape:
@@ -199,11 +191,11 @@ def dark_count_rates(
     Lognormal about `median` with `spread` the standard deviation of ln(rate); hot pixels, a `hot_fraction` of all, have
     `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure. Raises `ArgumentError`.
     """
-    pixels, seed = check_integer("pixels", pixels, 0), check_seed(seed)
-    check_range("[0, 1e12]", median=median, hot_rate=hot_rate, offset=offset)
-    check_number("spread", spread, "[0, 10]")
-    check_number("hot_fraction", hot_fraction, "[0, 1]")
-    rate = wp.empty(pixels, dtype=float, device=check_device("device", device))
+    pixels, seed = check.integer("pixels", pixels, 0), check.seed(seed)
+    check.within("[0, 1e12]", median=median, hot_rate=hot_rate, offset=offset)
+    check.number("spread", spread, "[0, 10]")
+    check.number("hot_fraction", hot_fraction, "[0, 1]")
+    rate = wp.empty(pixels, dtype=float, device=check.device("device", device))
     return _by_row(_dark_count_kernel, [seed, median, spread, hot_fraction, hot_rate, offset], rate)
 
 
@@ -231,10 +223,10 @@ def add_crosstalk(hazard: wp.array, detections: wp.array, *, image_width: int, p
 
     Raises `ArgumentError`.
     """
-    check_array("hazard", hazard, wp.float32, (None, None))
-    check_array("detections", detections, wp.float32, hazard.shape, hazard.device)
-    image_width = check_integer("image_width", image_width, 1)
-    check_number("probability", probability, "[0, 1]")
+    check.array("hazard", hazard, wp.float32, (None, None))
+    check.array("detections", detections, wp.float32, hazard.shape, hazard.device)
+    image_width = check.integer("image_width", image_width, 1)
+    check.number("probability", probability, "[0, 1]")
     if hazard.shape[0] % image_width:
         raise ArgumentError(f"image_width = {image_width} does not divide hazard's {hazard.shape[0]} pixels")
     _by_row(_crosstalk_kernel, [image_width, probability, detections], hazard)
@@ -259,7 +251,7 @@ def _first_photon_law_kernel(dtype: Any) -> wp.Kernel:
 
 def first_photon_probabilities(hazard: wp.array) -> wp.array:
     """P(first photon in bin k) = exp(−Σ_{j<k} λ_j)·(1 − exp(−λ_k)), of λ's shape `[pixel, bin]` and float type."""
-    check_array("hazard", hazard, (wp.float32, wp.float64), (None, None))
+    check.array("hazard", hazard, (wp.float32, wp.float64), (None, None))
     law = wp.empty(hazard.shape, dtype=hazard.dtype, device=hazard.device)
     return _by_row(_first_photon_law_kernel(hazard.dtype), [hazard], law)
 
@@ -282,9 +274,9 @@ def free_running_probabilities(hazard: wp.array, *, dead_time: float, period: fl
 
     Exact in the sum for a steady rate; the shadow that a strong return casts over the bins behind it is spread out.
     """
-    check_array("hazard", hazard, wp.float32, (None, None))
-    check_number("dead_time", dead_time, "[0, inf)")
-    check_number("period", period, "(0, inf)")
+    check.array("hazard", hazard, wp.float32, (None, None))
+    check.number("dead_time", dead_time, "[0, inf)")
+    check.number("period", period, "(0, inf)")
     seen = wp.empty(hazard.shape, dtype=float, device=hazard.device)
     return _by_row(_free_running_kernel, [hazard, dead_time, period], seen)
 
@@ -309,8 +301,8 @@ def coates(counts: wp.array, *, pulses: float) -> wp.array:
     Source: P. B. Coates, "The correction for photon pile-up in the measurement of radiative lifetimes", J. Phys. E 1,
     878 (1968).
     """
-    check_array("counts", counts, wp.int32, (None, None))
-    check_number("pulses", pulses, "(0, inf)")
+    check.array("counts", counts, wp.int32, (None, None))
+    check.number("pulses", pulses, "(0, inf)")
     hazard = wp.empty(counts.shape, dtype=wp.float64, device=counts.device)
     return _by_row(_coates_kernel, [counts, pulses], hazard)
 
@@ -322,18 +314,18 @@ def _check_exposure(
     hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int, first_frame: int | wp.array
 ) -> tuple[int, int, int, int]:
     """Pulses, frames, the largest count of a bin and the seed, in range; on the CPU, rates are checked, too."""
-    check_array("hazard", hazard, wp.float32, (None, None))
+    check.array("hazard", hazard, wp.float32, (None, None))
     if isinstance(first_frame, wp.array):
-        check_array("first_frame", first_frame, wp.int64, (1,), hazard.device)
+        check.array("first_frame", first_frame, wp.int64, (1,), hazard.device)
     else:
-        check_integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31)
+        check.integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31)
         if hazard.device.is_cpu and (row := first_invalid_row(hazard)) is not None:
             raise ArgumentError(f"hazard of pixel {row} holds numbers that are negative or not finite")
     return (
-        check_integer("pulses", pulses, 0),
-        check_integer("frames", frames, 1, (2**31 - 1) // max(hazard.shape[0], 1)),
-        check_integer("counter_depth", counter_depth, 0) or 2**31 - 1,
-        check_seed(seed),
+        check.integer("pulses", pulses, 0),
+        check.integer("frames", frames, 1, (2**31 - 1) // max(hazard.shape[0], 1)),
+        check.integer("counter_depth", counter_depth, 0) or 2**31 - 1,
+        check.seed(seed),
     )
 
 
@@ -343,7 +335,7 @@ def _zeroed_counts(array: wp.array | None, shape: tuple[int, int], device: Any) 
         return wp.zeros(shape, dtype=int, device=device)
     if not isinstance(array, wp.array) or array.size != shape[0] * shape[1]:
         raise ArgumentError(f"counts do not have the {shape[0] * shape[1]} entries of a contiguous int32 array {shape}")
-    check_array("counts", array, wp.int32, tuple(array.shape), device, contiguous=True)
+    check.array("counts", array, wp.int32, tuple(array.shape), device, contiguous=True)
     array.zero_()
     return array.reshape(shape)
 
@@ -682,13 +674,13 @@ def event_counts(
     pulses, frames, depth, seed = _check_exposure(hazard, pulses, counter_depth, seed, frames, first_frame)
     device, (pixels, bins) = hazard.device, hazard.shape
     detector = _Detector()
-    detector.recorded = recorded = check_integer("recorded", recorded, 1, bins)
-    check_range("(0, inf)", period=period, afterpulsing_time_constant=afterpulsing_time_constant)
+    detector.recorded = recorded = check.integer("recorded", recorded, 1, bins)
+    check.within("(0, inf)", period=period, afterpulsing_time_constant=afterpulsing_time_constant)
     detector.pulses, detector.period, detector.gated = pulses, period, bool(gated)
-    detector.dead_time = check_number("dead_time", dead_time, "[0, inf)")
-    detector.afterpulsing = check_number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
+    detector.dead_time = check.number("dead_time", dead_time, "[0, inf)")
+    detector.afterpulsing = check.number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
     detector.time_constant = afterpulsing_time_constant
-    rising = check_numbers("edges", edges)
+    rising = check.numbers("edges", edges)
     if rising.shape != (bins + 1,):
         raise ArgumentError(f"edges has shape {rising.shape}; ({bins + 1},), one more than the bins, is needed")
     if not (rising[0] == 0.0 and (np.diff(rising) > 0.0).all() and rising[-1] <= period * (1.0 + 1e-9)):

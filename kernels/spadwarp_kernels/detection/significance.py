@@ -14,7 +14,8 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_number
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO, log1p, one_minus_exp
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, u01_open
@@ -237,26 +238,26 @@ class DetectionTest:
         first: int = 0,
         stop: int | None = None,
     ) -> None:
-        self.device, self.bins = wp.get_device(device), check_integer("bins", bins, 0)
+        self.device, self.bins = wp.get_device(device), check.integer("bins", bins, 0)
         self.windows = windows = Windows()
-        windows.first = check_integer("first", first, 0, bins)
-        windows.stop = bins if stop is None else check_integer("stop", stop, first, bins)
-        windows.half_width = self.half_width = max(1, math.ceil(0.75 * check_number("width", width, "[0, 1e6]")))
+        windows.first = check.integer("first", first, 0, bins)
+        windows.stop = bins if stop is None else check.integer("stop", stop, first, bins)
+        windows.half_width = self.half_width = max(1, math.ceil(0.75 * check.number("width", width, "[0, 1e6]")))
         windows.level_known = background is not None
-        windows.pulses = float(check_integer("pulses", pulses, 0, 2**62)) if windows.level_known else 0.0
-        windows.pixels = 2**31 - 1 if pixels is None else check_integer("pixels", pixels, 1)
+        windows.pulses = float(check.integer("pulses", pulses, 0, 2**62)) if windows.level_known else 0.0
+        windows.pixels = 2**31 - 1 if pixels is None else check.integer("pixels", pixels, 1)
         name, rows = ("profile", profile) if background is None else ("background", background)
         rows = wp.ones((1, 1), dtype=float, device=self.device) if rows is None else rows
-        windows.background = check_array(name, rows, wp.float32, (None, None), self.device)
+        windows.background = check.array(name, rows, wp.float32, (None, None), self.device)
         if rows.shape[0] < 1 or rows.shape[1] not in (1, bins):
             raise ArgumentError(f"{name} has shape {rows.shape}; (1 or pixels, 1 or {bins}) is needed")
 
     def __call__(self, counts: wp.array, significance: wp.array, window: wp.array) -> None:
         """Writes the significance, float32 `[pixel]`, and the first bin of the best window, int32 `[pixel]`, of counts
         int32 or int64 `[pixel, bin]`."""
-        check_array("counts", counts, COUNTS, (None, self.bins), self.device)
+        check.array("counts", counts, COUNTS, (None, self.bins), self.device)
         shape = (counts.shape[0],)
-        check_array("significance", significance, wp.float32, shape, self.device)
-        check_array("window", window, wp.int32, shape, self.device)
+        check.array("significance", significance, wp.float32, shape, self.device)
+        check.array("window", window, wp.int32, shape, self.device)
         inputs = [counts, self.windows, significance, window]
         launch_pixels(_significance_kernel(counts.dtype), shape[0], inputs, device=self.device)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_choice
+from spadwarp_kernels.base import check
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import u01
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -83,5 +83,5 @@ ESTIMATORS: dict[str, Callable[[TransportSpec], Estimator]] = {
 @memoised
 def make_estimator(spec: TransportSpec) -> Estimator:
     """The estimator of a spec, made once: each launch asks for it, and its Warp functions take milliseconds to make."""
-    check_choice("estimator", spec.estimator, ESTIMATORS)
+    check.choice("estimator", spec.estimator, ESTIMATORS)
     return ESTIMATORS[spec.estimator](spec)

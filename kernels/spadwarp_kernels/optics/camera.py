@@ -9,14 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_fields,
-    check_integer,
-    check_number,
-    check_struct,
-    check_vector,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .port import Port
@@ -215,18 +209,18 @@ def toward_axis(view: wp.vec4, x: wp.vec3) -> wp.vec2:
 
 def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     """A camera that images something; raises `ArgumentError`."""
-    check_struct(name, camera, Camera)
+    check.kind(name, camera, Camera)
     for field_name in ("width", "height"):
-        check_integer(f"{name}.{field_name}", getattr(camera, field_name), 1)
-    check_fields(name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)"})
-    check_fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
+        check.integer(f"{name}.{field_name}", getattr(camera, field_name), 1)
+    check.fields(name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)"})
+    check.fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
     if not calibrated:
         return
     finite = dict.fromkeys(("principal", "radial", "tangential", "view"), "(-inf, inf)")
-    check_fields(name, camera, {"focal": "(0, inf)", **finite})
+    check.fields(name, camera, {"focal": "(0, inf)", **finite})
     left, top, right, bottom = camera.view
-    check_number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
-    check_number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")
+    check.number(f"{name}.view, its right,", right, f"({float(left)}, inf)")
+    check.number(f"{name}.view, its bottom,", bottom, f"({float(top)}, inf)")
 
 
 # ---- The time gate: arrival times are kept as optical path lengths, path = time * c0 / n_g.
@@ -267,17 +261,17 @@ def make_camera(
         ArgumentError: A number out of range, or an area that is not that of the radius.
     """
     camera = Camera()
-    camera.width, camera.height = check_integer("width", width, 1), check_integer("height", height, 1)
-    camera.pixel_tangent = check_number("pixel_tangent", pixel_tangent, "(0, inf)")
-    radius = check_number("aperture_radius", aperture_radius, "[0, inf)")
-    area = check_number("aperture_area", math.pi * radius**2 if aperture_area is None else aperture_area, "[0, inf)")
+    camera.width, camera.height = check.integer("width", width, 1), check.integer("height", height, 1)
+    camera.pixel_tangent = check.number("pixel_tangent", pixel_tangent, "(0, inf)")
+    radius = check.number("aperture_radius", aperture_radius, "[0, inf)")
+    area = check.number("aperture_area", math.pi * radius**2 if aperture_area is None else aperture_area, "[0, inf)")
     if radius > 0.0 and abs(area - math.pi * radius**2) > 0.01 * math.pi * radius**2:
         disc = f"that of aperture_radius = {radius} m is {math.pi * radius**2:.4g} m^2"
         raise ArgumentError(f"aperture_area = {area} m^2, and {disc}; a lens of another area has aperture_radius = 0")
     if area == 0.0:
         raise ArgumentError("aperture_radius = 0 needs aperture_area [m^2]: a camera of no area sees nothing")
     camera.aperture_radius, camera.aperture_area = radius, area
-    camera.inverse_focus = 0.0 if focus == math.inf else 1.0 / check_number("focus", focus, "(0, inf)")
+    camera.inverse_focus = 0.0 if focus == math.inf else 1.0 / check.number("focus", focus, "(0, inf)")
     return camera
 
 
@@ -301,12 +295,12 @@ def make_gate(
     if (one_way_metres is None) == (two_way_seconds is None) or (two_way_seconds is None) != (group_index is None):
         raise ArgumentError("one_way_metres, or two_way_seconds and group_index: one of the two is needed")
     name, ends = ("one_way_metres", one_way_metres) if one_way_metres else ("two_way_seconds", two_way_seconds)
-    check_vector(name, ends, size=2)
-    scale = 2.0 if group_index is None else C0 / check_number("group_index", group_index, "[1, inf)")
-    start = check_number(f"{name}[0]", ends[0], "[0, inf)")
-    stop = check_number(f"{name}[1]", ends[1], f"({start}, inf)")
+    check.vector(name, ends, size=2)
+    scale = 2.0 if group_index is None else C0 / check.number("group_index", group_index, "[1, inf)")
+    start = check.number(f"{name}[0]", ends[0], "[0, inf)")
+    stop = check.number(f"{name}[1]", ends[1], f"({start}, inf)")
     gate = Gate()
-    gate.bins = check_integer("bins", bins, 1)
+    gate.bins = check.integer("bins", bins, 1)
     gate.start, gate.stop, gate.bins_per_metre = scale * start, scale * stop, gate.bins / (scale * (stop - start))
     return gate
 

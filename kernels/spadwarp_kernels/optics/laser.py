@@ -8,7 +8,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_number, check_numbers, check_vector
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
@@ -60,17 +61,17 @@ def make_laser(
     Raises:
         ArgumentError: A number out of range, or one that the profile does not have.
     """
-    check_choice("profile", profile, LASER_PROFILES)
+    check.choice("profile", profile, LASER_PROFILES)
     needed, other = ("radius", half_angle) if profile == "collimated" else ("half_angle", radius)
     value = {"radius": radius, "half_angle": half_angle}[needed]
     if value is None or other is not None:
         raise ArgumentError(f"profile = {profile!r} needs {needed}, and that alone")
     interval = {"uniform_cone": "(0, 3.1416]", "gaussian": "(0, 1.57]", "collimated": "[0, inf)"}[profile]
-    value = check_number(needed, value, interval)
-    check_vector("position", position)
-    check_vector("axis", axis)
+    value = check.number(needed, value, interval)
+    check.vector("position", position)
+    check.vector("axis", axis)
     length = math.hypot(*axis)
-    check_number("length of axis", length, "(0, inf)")
+    check.number("length of axis", length, "(0, inf)")
     laser = Laser()
     laser.position, laser.axis = wp.vec3(*position), wp.vec3(*(x / length for x in axis))
     laser.profile = LASER_PROFILES.index(profile)
@@ -131,7 +132,7 @@ def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.fl
     Raises:
         ArgumentError: Another shape, or values that cannot be.
     """
-    power = check_numbers("profile", image)
+    power = check.numbers("profile", image)
     if power.ndim != 2 or power.size == 0:
         raise ArgumentError(f"profile has shape {power.shape}; [height, width] is needed")
     if not (np.isfinite(power).all() and power.min() >= 0 and power.max() > 0):
@@ -208,15 +209,15 @@ def make_sun(
     that does nothing; `sky`: part of the irradiance, in [0, 1], of a sky of even radiance. Raises `ArgumentError`, also
     for a sun below the horizon.
     """
-    height = max(_ABOVE, _ABOVE * abs(check_number("distance", distance, "(-inf, inf)")))
-    position = (distance - height) * check_numbers("normal", normal, 1)
+    height = max(_ABOVE, _ABOVE * abs(check.number("distance", distance, "(-inf, inf)")))
+    position = (distance - height) * check.numbers("normal", normal, 1)
     laser = make_laser("collimated", radius=0.0, axis=direction, position=position)
-    indices = (1.0, 1.0, check_number("index", index, "[1, 1e3]"))
+    indices = (1.0, 1.0, check.number("index", index, "[1, 1e3]"))
     laser.port = make_flat_port(
         distance=distance, normal=normal, index=indices, group_index=indices, origin=laser.position
     )
-    check_number("cosine of direction to normal", float(wp.dot(laser.axis, laser.port.normal)), "(0, 1.000001]")
-    laser.spread = check_number("sky", sky, "[0, 1]")
+    check.number("cosine of direction to normal", float(wp.dot(laser.axis, laser.port.normal)), "(0, 1.000001]")
+    laser.spread = check.number("sky", sky, "[0, 1]")
     return laser
 
 

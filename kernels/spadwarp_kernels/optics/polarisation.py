@@ -6,7 +6,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_items, check_number, check_numbers
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 
 __all__ = ["MATRIX_POINTS", "MOST_CHANNELS", "Polarisation", "make_polarisation", "matrix_cosines"]
 
@@ -60,9 +61,9 @@ def make_polarisation(
     Raises:
         ArgumentError: Numbers that no light and no matrix can have.
     """
-    device = check_device("device", device)
+    device = check.device("device", device)
     polarisation = Polarisation()
-    stokes = check_numbers("laser", laser)
+    stokes = check.numbers("laser", laser)
     if stokes.shape != (4,) or not np.isfinite(stokes).all() or stokes[0] != 1.0:
         raise ArgumentError(f"laser = {laser!r} is not a Stokes vector with I = 1")
     if float(np.linalg.norm(stokes[1:])) > 1.0 + 1e-6:
@@ -73,21 +74,21 @@ def make_polarisation(
     if not (matrix is None or callable(matrix)):
         raise ArgumentError(f"matrix = {matrix!r} is not a function of cosines")
     if matrix is not None:
-        table = check_numbers("matrix", matrix(cosines))
+        table = check.numbers("matrix", matrix(cosines))
     if table.shape != (cosines.size, 5):
         raise ArgumentError(f"matrix gives {table.shape} for {cosines.size} cosines; [cosines, 5] is needed")
     if not (np.isfinite(table).all() and np.abs(table).max() <= 1.0 + 1e-6):
         raise ArgumentError("matrix holds elements that are not finite or beyond m11: outside [-1, 1]")
     polarisation.first = wp.array(table[:, :4].astype(np.float32), dtype=wp.vec4, device=device)
     polarisation.last = wp.array(table[:, 4].astype(np.float32), dtype=float, device=device)
-    given = [check_items(f"channels[{k}]", row) for k, row in enumerate(check_items("channels", channels))]
+    given = [check.items(f"channels[{k}]", row) for k, row in enumerate(check.items("channels", channels))]
     if len(given) > MOST_CHANNELS or any(len(row) != 4 for row in given):
         raise ArgumentError(f"channels are not up to {MOST_CHANNELS} rows of 4 numbers")
     rows = np.zeros((MOST_CHANNELS, 4))
     for k, row in enumerate(given):
-        rows[k] = [check_number(f"channels[{k}]", one, "[-1, 1]") for one in row]
+        rows[k] = [check.number(f"channels[{k}]", one, "[-1, 1]") for one in row]
     polarisation.channels = Channels(*rows.ravel().tolist())
-    facets = np.ravel(check_numbers("facet_index", facet_index))
+    facets = np.ravel(check.numbers("facet_index", facet_index))
     if facets.size and not (np.isfinite(facets).all() and facets.min() > 0.0):
         raise ArgumentError("facet_index holds numbers outside (0, inf)")
     polarisation.facet_index = wp.array(facets.astype(np.float32), dtype=float, device=device)

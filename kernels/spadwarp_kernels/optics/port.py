@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_fields, check_number, check_range, check_vector
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 
 __all__ = ["DOME_PORT", "FLAT_PORT", "Port", "PortKind", "make_dome_port", "make_flat_port"]
 
@@ -488,10 +489,10 @@ def make_flat_port(
     Raises:
         ArgumentError: A number out of its range.
     """
-    check_number("distance", distance, "(-inf, inf)")
-    check_number("slope_variance", slope_variance, "[0, 0.5]")
-    check_range("[0, 1e4]", amplitude=amplitude, steepest=steepest)
-    check_vector("normal", normal, unit=True)
+    check.number("distance", distance, "(-inf, inf)")
+    check.number("slope_variance", slope_variance, "[0, 0.5]")
+    check.within("[0, 1e4]", amplitude=amplitude, steepest=steepest)
+    check.vector("normal", normal, unit=True)
     port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     tilt = aperture_radius * math.hypot(normal[0], normal[1])
     inside = distance - sum(x * n for x, n in zip(origin, normal, strict=True))
@@ -539,8 +540,8 @@ def make_dome_port(
         ArgumentError: A number out of its range, or a lens so far from the centre that some of its light could not get
             through.
     """
-    check_number("radius", radius, "(0, 1e9]")
-    check_vector("centre", centre)
+    check.number("radius", radius, "(0, 1e9]")
+    check.vector("centre", centre)
     port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     port.radius, port.centre = radius, wp.vec3(*centre)
     n = tuple(port.index)
@@ -565,7 +566,7 @@ def make_dome_port(
 def check_port(name: str, port: Port, kind: PortKind) -> None:
     """Parameters of a port of that kind; raises `ArgumentError`."""
     flat, dome = {"distance": "(-inf, inf)", "normal": "unit"}, {"radius": "(0, inf)", "centre": "(-inf, inf)"}
-    check_fields(name, port, {"index": "[1, inf)"} | (flat if kind.name == FLAT_PORT.name else dome))
+    check.fields(name, port, {"index": "[1, inf)"} | (flat if kind.name == FLAT_PORT.name else dome))
 
 
 def _port(
@@ -577,13 +578,13 @@ def _port(
     largest_angle: float,
 ) -> Port:
     """What both kinds have, whose numbers are in range."""
-    check_vector("origin", origin)
-    check_range("[0, 1e9]", thickness=thickness, aperture_radius=aperture_radius)
+    check.vector("origin", origin)
+    check.within("[0, 1e9]", thickness=thickness, aperture_radius=aperture_radius)
     for name, values in (("index", index), ("group_index", group_index)):
-        check_vector(name, values)
+        check.vector(name, values)
         for k, value in enumerate(values):
-            check_number(f"{name}[{k}]", value, "[1, inf)")
-    check_number("largest_angle", largest_angle, "[0, 1.5707963]")
+            check.number(f"{name}[{k}]", value, "[1, inf)")
+    check.number("largest_angle", largest_angle, "[0, 1.5707963]")
     port = Port()
     port.thickness = thickness
     # A window without thickness has no faces, and must not be the layer of the least index.

@@ -13,7 +13,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_range, check_vector
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn
 from spadwarp_kernels.water.limits import fresnel_reflectance
@@ -454,7 +455,7 @@ def see_through_waves_kernel(
 def slope_variances(wind: float, *, by_direction: bool = False) -> tuple[float, float]:
     """Variances of the slopes along and across the wind (Cox & Munk 1954, clean surface), at a wind speed of 0 ... 30
     m/s at 12.5 m above the sea; evenly distributed unless `by_direction`. Raises `ArgumentError`."""
-    check_number("wind", wind, "[0, 30]")
+    check.number("wind", wind, "[0, 30]")
     if by_direction:
         return 3.16e-3 * wind, 0.003 + 1.92e-3 * wind
     even = 0.5 * (0.003 + 5.12e-3 * wind)
@@ -524,14 +525,14 @@ def make_sea(
     Raises:
         ArgumentError: A number out of its range.
     """
-    check_vector("variances", variances, size=2)
+    check.vector("variances", variances, size=2)
     for k, variance in enumerate(variances):
-        check_number(f"variances[{k}]", variance, "[0, 0.5]" if not any(variances) else "[1e-9, 0.5]")
-    check_vector("normal", normal, unit=True)
-    check_number("index", index, "(1, 4]")
-    check_range("[0, 1e9]", extinction=extinction)
-    check_number("height", height, "(-inf, inf)")
-    check_number("delay", delay, "(0, 4]")
+        check.number(f"variances[{k}]", variance, "[0, 0.5]" if not any(variances) else "[1e-9, 0.5]")
+    check.vector("normal", normal, unit=True)
+    check.number("index", index, "(1, 4]")
+    check.within("[0, 1e9]", extinction=extinction)
+    check.number("height", height, "(-inf, inf)")
+    check.number("delay", delay, "(0, 4]")
     up = np.array(normal, np.float64)
     wind = _level("along", np.eye(3)[np.argmin(np.abs(up))] if along is None else along, up)
     sea = Sea()
@@ -539,7 +540,7 @@ def make_sea(
     sea.slope = wp.vec2(*(math.sqrt(2.0 * variance) for variance in variances))
     sea.index, sea.delay, sea.extinction = index, delay, extinction
     if heights is not None:
-        check_vector("origin", origin)
+        check.vector("origin", origin)
         first = wind if columns is None else _level("columns", columns, up)
         second = np.cross(up, first)
         sea.waves = make_waves(heights, size, device=device)
@@ -558,8 +559,8 @@ def make_sea(
 def _level(name: str, vector: ArrayLike, up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The unit vector of the mean plane that a vector lies above."""
     direction = np.array(vector, np.float64)
-    check_vector(name, direction.tolist())
+    check.vector(name, direction.tolist())
     level = direction - (direction @ up) * up
-    check_number(f"length of {name} in the plane", float(np.linalg.norm(level)), "(0, inf)")
+    check.number(f"length of {name} in the plane", float(np.linalg.norm(level)), "(0, inf)")
     unit: NDArray[np.float64] = level / np.linalg.norm(level)
     return unit

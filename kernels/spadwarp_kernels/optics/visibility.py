@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_array, check_kind
+from spadwarp_kernels.base import check
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import cos_sin_turn
 
@@ -80,11 +80,11 @@ def near_depth_map(mesh: wp.Mesh, camera: Camera, near_depth: wp.array | None = 
     A point of the view that lies before it is seen from everywhere on the lens: the segments to the lens stay within
     the texel's cone, up to what the outlines of faces are widened by, and before every face in it.
     """
-    check_kind("mesh", mesh, wp.Mesh)
+    check.kind("mesh", mesh, wp.Mesh)
     check_camera("camera", camera, calibrated=False)
     shape = (int(_TEXELS), int(_TEXELS))
     near_depth = wp.empty(shape, dtype=float, device=mesh.device) if near_depth is None else near_depth
-    check_array("near_depth", near_depth, wp.float32, shape, mesh.device).fill_(_NOTHING)
+    check.array("near_depth", near_depth, wp.float32, shape, mesh.device).fill_(_NOTHING)
     view = field(camera) if camera.view[2] == camera.view[0] else camera.view
     # A warp for each face on a GPU: some cover all of the map.
     threads = 32 if mesh.device.is_cuda else 1

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_number, check_vector
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 
 __all__ = ["Waves", "facet_covariance", "make_waves", "steepest_facet"]
 
@@ -249,7 +250,7 @@ def _checked(heights: ArrayLike, size: Sequence[float]) -> NDArray[np.float64]:
         raise ArgumentError(f"heights of shape {h.shape}: [rows, columns] are needed, at least 2 of each")
     if not (np.abs(h) <= 1e4).all():
         raise ArgumentError("heights are not all numbers in [-1e4, 1e4] m")
-    check_vector("size", size, size=2)
+    check.vector("size", size, size=2)
     for k, length in enumerate(size):
-        check_number(f"size[{k}]", length, "[1e-3, 1e6]")
+        check.number(f"size[{k}]", length, "[1e-3, 1e6]")
     return h

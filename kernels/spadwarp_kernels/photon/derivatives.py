@@ -10,16 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_choice,
-    check_device,
-    check_integer,
-    check_items,
-    check_number,
-    check_numbers,
-    check_struct,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.water.medium import MOST_CONSTITUENTS, Grid
 
 __all__ = [
@@ -107,22 +99,22 @@ def make_derivatives(
     `blocks`: from `make_blocks`, of a spec with blocks; without them, one kind at least. Raises `ArgumentError` for a
     kind that is not one of DERIVATIVES, or a number out of range.
     """
-    channels = check_integer("channels", channels, 0, MOST_DERIVATIVES)
+    channels = check.integer("channels", channels, 0, MOST_DERIVATIVES)
     given = {"kinds": kinds, "value": value, "scale": scale}
-    kinds, value, scale = (check_items(name, items) for name, items in given.items())
-    device, count = check_device("device", device), check_integer("derivatives", len(kinds), 0, MOST_DERIVATIVES)
+    kinds, value, scale = (check.items(name, items) for name, items in given.items())
+    device, count = check.device("device", device), check.integer("derivatives", len(kinds), 0, MOST_DERIVATIVES)
     least = 1 if blocks is None else 0
-    tallies = check_integer("derivatives and channels", count + channels, least, MOST_DERIVATIVES)
+    tallies = check.integer("derivatives and channels", count + channels, least, MOST_DERIVATIVES)
     if len(value) != count or len(scale) != tallies:
         raise ArgumentError(
             f"{count} derivatives, {channels} channels, {len(value)} values, {len(scale)} scales: each needs a scale, "
             "derivatives a value"
         )
     for p, kind in enumerate(kinds):
-        check_choice(f"kinds[{p}]", kind, DERIVATIVES)
-        check_number(f"value[{p}], {kind},", value[p], DERIVATIVES[kind])
+        check.choice(f"kinds[{p}]", kind, DERIVATIVES)
+        check.number(f"value[{p}], {kind},", value[p], DERIVATIVES[kind])
     for p, one in enumerate(scale):
-        check_number(f"scale[{p}]", one, "(0, inf)")
+        check.number(f"scale[{p}]", one, "(0, inf)")
     if len(extinction) != len(constituent) or ("concentration" in kinds and len(extinction) != count):
         raise ArgumentError(
             f"{count} derivatives, {len(extinction)} extinctions, {len(constituent)} constituents: of concentrations "
@@ -130,18 +122,18 @@ def make_derivatives(
         )
     derivatives = Derivatives()
     for p, (one, row) in enumerate(zip(extinction, constituent, strict=True)):
-        derivatives.extinction[p] = check_number(f"extinction[{p}]", one, "[0, inf)")
-        derivatives.constituent[p] = check_integer(f"constituent[{p}]", row, 0, MOST_CONSTITUENTS - 1)
+        derivatives.extinction[p] = check.number(f"extinction[{p}]", one, "[0, inf)")
+        derivatives.constituent[p] = check.integer(f"constituent[{p}]", row, 0, MOST_CONSTITUENTS - 1)
     derivatives.value = LogDerivatives(*value, *[0.0] * (MOST_DERIVATIVES - count))
     derivatives.scale = LogDerivatives(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
     for name, parts in (("waters", waters), ("faces", faces)):
-        numbers = check_numbers(name, parts, 1)
+        numbers = check.numbers(name, parts, 1)
         whole = np.nan_to_num(numbers).astype(np.int32) if np.abs(numbers).max(initial=0.0) < 2**31 else None
         if whole is None or not np.array_equal(whole, numbers):
             raise ArgumentError(f"{name} holds numbers that are not whole or beyond 2^31")
         setattr(derivatives, name, wp.array(whole, dtype=int, device=device, shape=whole.size))
     if blocks is not None:
-        check_struct("blocks", blocks, Blocks)
+        check.kind("blocks", blocks, Blocks)
         derivatives.blocks = blocks
     return derivatives
 
@@ -157,22 +149,22 @@ def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blo
     Raises:
         ArgumentError: A number that does not divide that of the cells, or is out of range; too many derivatives.
     """
-    check_struct("grid", grid, Grid)
-    shape, scale = check_items("shape", shape), check_items("scale", scale)
-    kinds = check_integer("kinds of derivatives by block", len(scale), 1, len(BLOCK_DERIVATIVES))
+    check.kind("grid", grid, Grid)
+    shape, scale = check.items("shape", shape), check.items("scale", scale)
+    kinds = check.integer("kinds of derivatives by block", len(scale), 1, len(BLOCK_DERIVATIVES))
     for q, value in enumerate(scale):
-        check_number(f"scale[{q}]", value, "(0, inf)")
+        check.number(f"scale[{q}]", value, "(0, inf)")
     if len(shape) != 3:
         raise ArgumentError(f"blocks = {list(shape)} has {len(shape)} numbers; 3 are needed")
     for edge, (blocks, cells) in enumerate(zip(shape, list(grid.size), strict=True)):
-        check_integer(f"blocks[{edge}]", blocks, 1, cells)
+        check.integer(f"blocks[{edge}]", blocks, 1, cells)
         if cells % blocks:
             raise ArgumentError(
                 f"blocks[{edge}] = {blocks} does not divide {cells}, the number of cells along that edge"
             )
     made = Blocks()
     made.count = shape[0] * shape[1] * shape[2]
-    check_integer("number of derivatives by block", kinds * made.count, 1, MOST_BLOCK_DERIVATIVES)
+    check.integer("number of derivatives by block", kinds * made.count, 1, MOST_BLOCK_DERIVATIVES)
     made.kinds = kinds
     made.scale = wp.vec3(*scale, *[0.0] * (3 - kinds))
     factor = np.array(shape) / np.array(list(grid.size))

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple, get_origin
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.optics.camera import PLAIN, SCANNED, Lens
 from spadwarp_kernels.optics.laser import Beam, make_beam
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
@@ -186,12 +187,12 @@ def check_spec(spec: Any) -> None:
         "flux": (FLUX_KINDS, len(FLUX_KINDS)),
     }
     for name, (allowed, most) in choices.items():
-        check_integer(f"length of spec.{name}", len(getattr(spec, name)), 0, most)
+        check.integer(f"length of spec.{name}", len(getattr(spec, name)), 0, most)
         for index, kind in enumerate(getattr(spec, name)):
-            check_choice(f"spec.{name}[{index}]", kind, allowed)
+            check.choice(f"spec.{name}[{index}]", kind, allowed)
     # A block has 48 KiB of shared memory for queues.
-    check_integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
-    check_integer("spec.channels", spec.channels, 0, MOST_CHANNELS * spec.polarised + MOST_LINES * spec.inelastic)
+    check.integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
+    check.integer("spec.channels", spec.channels, 0, MOST_CHANNELS * spec.polarised + MOST_LINES * spec.inelastic)
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
         (spec.sea and spec.confocal and spec.lens.name != SCANNED.name, "sea: a scan needs spec.lens = SCANNED"),

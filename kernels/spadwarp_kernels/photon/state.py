@@ -4,7 +4,7 @@ from typing import TypeAlias
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_device, check_integer
+from spadwarp_kernels.base import check
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import RoundKeys
 from spadwarp_kernels.optics.camera import BEFORE, Camera, Gate, gate_bin
@@ -65,8 +65,8 @@ class Records:
 def make_records(count: int, *, device: wp.DeviceLike = None, derivatives: int = 0) -> Records:
     """Room for the terminal states of `count` photons, with so many derivatives; raises `ArgumentError` for negative
     numbers."""
-    count, derivatives = check_integer("count", count, 0), check_integer("derivatives", derivatives, 0)
-    device, records = check_device("device", device), Records()
+    count, derivatives = check.integer("count", count, 0), check.integer("derivatives", derivatives, 0)
+    device, records = check.device("device", device), Records()
     for name, var in Records.vars.items():
         shape = (count, derivatives) if name == "log_derivatives" else count
         setattr(records, name, wp.zeros(shape, dtype=var.type.dtype, device=device))

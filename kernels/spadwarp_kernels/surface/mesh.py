@@ -6,17 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_device,
-    check_fields,
-    check_kind,
-    check_number,
-    check_numbers,
-    check_struct,
-    check_values,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.optics.camera import Camera
 from spadwarp_kernels.optics.visibility import near_depth_map
 
@@ -103,31 +94,31 @@ def make_surfaces(
     surfaces = Surfaces()
     face_count = 0
     if mesh is None:
-        device = check_device("device", device)
+        device = check.device("device", device)
     else:
-        check_kind("mesh", mesh, wp.Mesh)
+        check.kind("mesh", mesh, wp.Mesh)
         if mesh.indices.size < 3:
             raise ArgumentError(f"mesh.indices has {mesh.indices.size} entries; 3 for each face are needed")
-        check_values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+        check.values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
         device, face_count = mesh.device, mesh.indices.size // 3
 
     def by_face(name: str, value: Any, dtype: type, interval: str = "[0, 1]") -> wp.array:
         if mesh is None or (value is None and name != "reflectance"):
             return wp.zeros(0, dtype=dtype, device=device)
         if not isinstance(value, wp.array) and np.ndim(value) == 0:
-            return wp.full(face_count, check_number(name, value, interval), dtype=dtype, device=device)
+            return wp.full(face_count, check.number(name, value, interval), dtype=dtype, device=device)
         if isinstance(value, wp.array) and value.ndim == 1 and value.size != face_count:
             raise ArgumentError(f"{name} has {value.size} entries; the mesh has {face_count} faces")
-        check_array(name, value, dtype, (face_count,), device, contiguous=True)
-        check_values(name, value, interval)
+        check.array(name, value, dtype, (face_count,), device, contiguous=True)
+        check.values(name, value, interval)
         return value
 
     surfaces.reflectance = by_face("reflectance", reflectance, float)
     if textures is not None:
-        check_struct("textures", textures, Textures)
+        check.kind("textures", textures, Textures)
         if mesh is not None:
             needs = {"region": (None,), "texels": (None,), "coordinates": (face_count, 3)}
-            check_fields("textures", textures, needs, device)
+            check.fields("textures", textures, needs, device)
             by_face("textures.face", textures.face, int, f"[-1, {textures.region.size - 1}]")
             if corner_reflectance is None:
                 rows = surfaces.reflectance.numpy()[:, None].repeat(3, axis=1)
@@ -155,7 +146,7 @@ def _set_tree(surfaces: Surfaces, mesh: wp.Mesh, extent: float | None, use_warp_
         raise ArgumentError(f"mesh.points[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
     lower, upper, still = points.min(axis=0), points.max(axis=0), extent is None
     if not still:
-        upper = np.full(3, check_number("extent", extent, "(0, inf)"))
+        upper = np.full(3, check.number("extent", extent, "(0, inf)"))
         lower = -upper
     surfaces.extent = float(abs(points).max() if still else upper[0])
     padding = 1e-6 * surfaces.extent + 1e-6
@@ -193,8 +184,8 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     Raises:
         ArgumentError: Surfaces of another mesh, made with a camera and updated without one, or the other way round.
     """
-    check_struct("surfaces", surfaces, Surfaces)
-    check_kind("mesh", mesh, wp.Mesh)
+    check.kind("surfaces", surfaces, Surfaces)
+    check.kind("mesh", mesh, wp.Mesh)
     if surfaces.mesh != mesh.id:
         raise ArgumentError("surfaces are not those of mesh")
     for name in ("near_depth", "nodes", "faces", "order", "depth", "levels", "patches", "normals"):
@@ -211,7 +202,7 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     elif not surfaces.levels:
         raise ArgumentError("surfaces are not made to move: make_surfaces needs an extent")
     elif mesh.device.is_cuda:
-        check_array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 4,), mesh.device)
+        check.array("surfaces.depth", surfaces.depth, wp.int32, (surfaces.nodes.size // 4,), mesh.device)
         refit_bvh(*tree, surfaces.depth, surfaces.levels)
     else:
         refit_wide(*tree)
@@ -224,13 +215,13 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
 def check_faces(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:
     """Raises `ArgumentError` for arrays of `Surfaces` that do not hold so many faces."""
     slots = faces if device.is_cuda else None
-    slots = check_array(f"{name}.order", surfaces.order, wp.int32, (slots,), device).size
-    check_array(f"{name}.faces", surfaces.faces, wp.vec4, (face_vectors(slots, device),), device)
+    slots = check.array(f"{name}.order", surfaces.order, wp.int32, (slots,), device).size
+    check.array(f"{name}.faces", surfaces.faces, wp.vec4, (face_vectors(slots, device),), device)
 
 
 def check_patches(name: str, surfaces: Surfaces, faces: int, device: wp.Device) -> None:
     """Raises `ArgumentError` for patches of another number of faces, or of none."""
-    check_fields(name, surfaces, {"normals": (faces,), "patches": (None,)}, device)
+    check.fields(name, surfaces, {"normals": (faces,), "patches": (None,)}, device)
     size = surfaces.patches.size
     if size == 0 or size % PATCH_ROWS:
         raise ArgumentError(f"{name}.patches has {size} entries; make_surfaces fills it")
@@ -251,7 +242,7 @@ def _check_sum(surfaces: Surfaces) -> None:
 
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
     """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `use_warp_bvh`."""
-    check_struct("surfaces", surfaces, Surfaces)
+    check.kind("surfaces", surfaces, Surfaces)
     arrays = {name: getattr(surfaces, name) for name in ("corner_reflectance", "specular", "nodes")}
     for name, array in arrays.items():
         if not isinstance(array, wp.array):
@@ -289,9 +280,9 @@ def make_textures(
     Raises:
         ArgumentError: Another shape, or a value out of range.
     """
-    check_kind("images", images, Sequence)
-    device = check_device("device", device)
-    images = [check_numbers(f"images[{k}]", image, 2).astype(np.float32) for k, image in enumerate(images)]
+    check.kind("images", images, Sequence)
+    device = check.device("device", device)
+    images = [check.numbers(f"images[{k}]", image, 2).astype(np.float32) for k, image in enumerate(images)]
     if not images:
         raise ArgumentError("images has no entries; one image or more is needed")
     for k, image in enumerate(images):
@@ -299,7 +290,7 @@ def make_textures(
             raise ArgumentError(f"images[{k}] has shape {image.shape}; one texel or more is needed")
         if not (image.min() >= 0.0 and image.max() <= 1.0):
             raise ArgumentError(f"images[{k}] holds {image.min()} to {image.max()}, outside [0, 1]")
-    face, coordinates = np.asarray(face), check_numbers("coordinates", coordinates)
+    face, coordinates = np.asarray(face), check.numbers("coordinates", coordinates)
     if face.ndim != 1 or face.dtype.kind not in "iu" or coordinates.shape != (face.size, 3, 2):
         raise ArgumentError(
             f"face {face.dtype} {face.shape} and coordinates {coordinates.shape} are not integers [faces] and "

@@ -7,7 +7,7 @@ coordinates and of the face itself, then the lower and the upper corner of each 
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import check_integer
+from spadwarp_kernels.base import check
 from spadwarp_kernels.base.native import zeros
 
 # Boxes and faces are widened by this part of the coordinates and distances: a few units in the last place of float32.
@@ -187,7 +187,7 @@ def set_faces(mesh: wp.Mesh, extent: float, order: wp.array, faces: wp.array) ->
 def pack_faces(mesh: wp.Mesh, extent: float, order: wp.array) -> wp.array:
     """The faces of a mesh in the slots of an order; raises `ArgumentError` for more than a CPU's indices reach."""
     if not mesh.device.is_cuda:
-        check_integer("faces of the mesh, in slots,", order.size, 0, _MOST_SLOTS)
+        check.integer("faces of the mesh, in slots,", order.size, 0, _MOST_SLOTS)
     faces = zeros(face_vectors(order.size, mesh.device), wp.vec4, mesh.device)
     set_faces(mesh, extent, order, faces)
     return faces

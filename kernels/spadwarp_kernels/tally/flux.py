@@ -11,14 +11,8 @@ from typing import Any
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_device,
-    check_integer,
-    check_number,
-    check_numbers,
-    check_vector,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 
 __all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "Leg", "add_flux_collision", "add_flux_crossings"]
 __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume"]
@@ -212,26 +206,26 @@ def make_flux_volume(
     other from `gate_start` on. Lengths and paths in metres. Raises `ArgumentError`.
     """
     for name, vector in (("shape", shape), ("lower", lower), ("origin", origin)):
-        check_vector(name, vector)
+        check.vector(name, vector)
     if estimator not in FLUX_KINDS[:2]:
         raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
     volume: Any = FluxVolume()
     rows, shift = [], []
-    edge, turn = check_numbers("edge", edge, 1), check_numbers("rotation", rotation, 2)
+    edge, turn = check.numbers("edge", edge, 1), check.numbers("rotation", rotation, 2)
     if edge.shape != (3,) or turn.shape != (3, 3):
         raise ArgumentError(f"edge, rotation have shapes {edge.shape}, {turn.shape}; (3,), (3, 3) are needed")
     for k, width in enumerate(edge.tolist()):
-        check_number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
-        check_integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
+        check.number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
+        check.integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
         rows += [x / width for x in turn[k].tolist()]
         shift.append((origin[k] - lower[k]) / width)
     volume.turn, volume.shift, volume.size = wp.mat33(*rows), wp.vec3(*shift), wp.vec3i(*shape)
-    gate_path = float(check_numbers("gate_path", gate_path, 0))
-    check_number("gate_path", min(gate_path, 1e30), "(0, inf)")
-    volume.gates = check_integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
-    volume.gate_start = check_number("gate_start", gate_start, "(-inf, inf)")
+    gate_path = float(check.numbers("gate_path", gate_path, 0))
+    check.number("gate_path", min(gate_path, 1e30), "(0, inf)")
+    volume.gates = check.integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
+    volume.gate_start = check.number("gate_start", gate_start, "(-inf, inf)")
     volume.gates_per_metre, volume.by_collision = 1.0 / gate_path, int(estimator == "collision")
-    volume.scale = check_number("scale", scale, "(0, inf)")
+    volume.scale = check.number("scale", scale, "(0, inf)")
     return volume
 
 
@@ -249,12 +243,12 @@ def make_flux_planes(
     """So many planes, see `FluxPlanes`; `make_flux` takes their positions, in order. Raises `ArgumentError`."""
     planes: Any = FluxPlanes()
     for name, vector in {"axis": axis, "right": right, "centre": centre}.items():
-        check_vector(name, vector, unit=name != "centre")
+        check.vector(name, vector, unit=name != "centre")
         setattr(planes, name, wp.vec3(*vector))
     for name, number, least in (("count", count, 1), ("polar", polar, 0), ("azimuth", azimuth, 0)):
-        setattr(planes, name, check_integer(name, number, least, 1 << 16))
-    planes.radius2 = min(check_number("radius", min(radius, 1e15), "(0, inf)") ** 2, 1e30)
-    planes.scale = check_number("scale", scale, "(0, inf)")
+        setattr(planes, name, check.integer(name, number, least, 1 << 16))
+    planes.radius2 = min(check.number("radius", min(radius, 1e15), "(0, inf)") ** 2, 1e30)
+    planes.scale = check.number("scale", scale, "(0, inf)")
     return planes
 
 
@@ -263,7 +257,7 @@ def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, devic
 
     Raises `ArgumentError`: a tally of 2^31 entries or more, or positions that are not those of the planes.
     """
-    device, flux, size, begin = check_device("device", device), Flux(), 0, 0
+    device, flux, size, begin = check.device("device", device), Flux(), 0, 0
     kinds: dict[str, list[Any]] = {"tracks": [], "collisions": [], "planes": []}
     for section in sections:
         section.first = size
@@ -275,7 +269,7 @@ def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, devic
         else:
             size += math.prod(section.size) * section.gates
             kinds["collisions" if section.by_collision else "tracks"].append(section)
-        check_integer("entries of the tally of flux", size, 0, 2**31 - 1)
+        check.integer("entries of the tally of flux", size, 0, 2**31 - 1)
     if len(positions) != begin:
         raise ArgumentError(f"positions: {len(positions)} of {begin} planes")
     flux.size = size

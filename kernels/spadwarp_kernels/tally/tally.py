@@ -7,7 +7,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer, check_kind, check_number
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels
 
 __all__ = ["COMPONENTS", "Batches", "add_tallies", "has_overflowed", "tally_rates"]
@@ -73,8 +74,8 @@ def has_overflowed(tally: wp.array, *, signed: bool = False) -> bool:
     Asked often enough, before a voxel can go round, this leaves no overflow unnoticed. Raises `ArgumentError` unless
     `tally` is an array of int64 with one axis.
     """
-    check_array("tally", tally, wp.int64, (None,))
-    check_kind("signed", signed, bool)
+    check.array("tally", tally, wp.int64, (None,))
+    check.kind("signed", signed, bool)
     found = wp.zeros(1, dtype=int, device=tally.device)
     least = wp.int64(1 - (1 << 62) if signed else 0)
     wp.launch(find_overflow_kernel, dim=tally.size, inputs=[tally, least], outputs=[found], device=tally.device)
@@ -101,8 +102,8 @@ def add_tallies(total: wp.array, more: wp.array) -> None:
 
     Raises `ArgumentError` unless they are contiguous arrays of int64 with one axis and equally long.
     """
-    check_array("total", total, wp.int64, (None,), contiguous=True)
-    check_array("more", more, wp.int64, tuple(total.shape), contiguous=True)
+    check.array("total", total, wp.int64, (None,), contiguous=True)
+    check.array("more", more, wp.int64, tuple(total.shape), contiguous=True)
     for piece in _pieces(total.size):
         part = more[piece].to(total.device)
         wp.launch(add_kernel, dim=part.size, inputs=[part], outputs=[total[piece]], device=total.device)
@@ -290,14 +291,14 @@ class Batches:
         signed: bool = False,
         halved: bool = False,
     ) -> None:
-        check_array("tally", tally, wp.int64, (None,), contiguous=True)
-        self._component_count = check_integer("component_count", component_count, 1, max(tally.size, 1))
+        check.array("tally", tally, wp.int64, (None,), contiguous=True)
+        self._component_count = check.integer("component_count", component_count, 1, max(tally.size, 1))
         if tally.size % component_count:
             raise ArgumentError(
                 f"tally has {tally.size} entries, which {component_count} components do not share evenly"
             )
         if total is not None:
-            check_array("total", total, wp.int64, tuple(tally.shape), tally.device, contiguous=True)
+            check.array("total", total, wp.int64, tuple(tally.shape), tally.device, contiguous=True)
         self._untaken, self._signed, self._least = 0, signed, wp.int64(1 - (1 << 62) if signed else 0)
         with wp.ScopedDevice(tally.device):
             self._sums = wp.zeros((self.MOST_SUMS, component_count * _SLOTS), dtype=wp.int64)
@@ -312,11 +313,11 @@ class Batches:
         """Takes the tally over as one batch, or a part of one in (0, 1], and sets it to zero; on a CPU with so many
         threads. The square of a part is divided by it, so that parts and batches add up to one estimate of the
         variance. `in_half`: whether it belongs to the half."""
-        check_array("tally", tally, wp.int64, tuple(self.total.shape), self.total.device, contiguous=True)
-        threads = 1 if tally.device.is_cuda else check_integer("threads", threads, 1, 4096)
+        check.array("tally", tally, wp.int64, tuple(self.total.shape), self.total.device, contiguous=True)
+        threads = 1 if tally.device.is_cuda else check.integer("threads", threads, 1, 4096)
         run = 1 if tally.device.is_cuda else _RUN
         half = self.half if in_half and self.half is not None else self._no_half
-        weight = wp.float64(1.0 / math.sqrt(check_number("part", part, "(0, 1]")))
+        weight = wp.float64(1.0 / math.sqrt(check.number("part", part, "(0, 1]")))
         inputs = [self._component_count, self._least, run, weight, tally, self.total, half, *self.second_moment]
         inputs += [self._sums[self._untaken % self.MOST_SUMS], self._overflow]
         runs = -(-self.second_moment[0].size // run)  # a thread costs as much as some hundred
@@ -328,7 +329,7 @@ class Batches:
 
         Raises `ArgumentError` for another size or number of components.
         """
-        check_kind("other", other, Batches)
+        check.kind("other", other, Batches)
         if other.second_moment[0].size != self.second_moment[0].size:
             raise ArgumentError(f"other has {other.second_moment[0].size} voxels, not {self.second_moment[0].size}")
         device = self.total.device
@@ -401,15 +402,15 @@ def tally_rates(
     Raises:
         ArgumentError: Arrays or numbers that do not fit each other.
     """
-    check_array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
-    bins, parameters = check_integer("bins", bins, 1), check_integer("parameters", parameters, 1)
+    check.array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
+    bins, parameters = check.integer("bins", bins, 1), check.integer("parameters", parameters, 1)
     if not (isinstance(components, tuple | list) and len(components) == 2):
         raise ArgumentError("components is not a pair such as (0, 3)")
-    stop = check_integer("components[1]", components[1], 1, len(COMPONENTS))
-    first = check_integer("components[0]", components[0], 0, stop - 1)
-    parameter = check_integer("parameter", parameter, 0, parameters - 1)
+    stop = check.integer("components[1]", components[1], 1, len(COMPONENTS))
+    first = check.integer("components[0]", components[0], 0, stop - 1)
+    parameter = check.integer("parameter", parameter, 0, parameters - 1)
     shape = (len(COMPONENTS), scale.shape[0], bins, parameters)
-    check_array("tally", tally, wp.int64, (check_integer("values of tally", math.prod(shape), 0),), contiguous=True)
+    check.array("tally", tally, wp.int64, (check.integer("values of tally", math.prod(shape), 0),), contiguous=True)
     rates: Any = wp.empty(shape[1:3], dtype=float, device=tally.device)
     inputs = [tally.reshape(shape), scale, first, stop, parameter, rates]
     launch_pixels(_rates_kernel, shape[1], inputs, device=tally.device)

@@ -9,18 +9,8 @@ from operator import attrgetter
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    Need,
-    check_array,
-    check_device,
-    check_fields,
-    check_integer,
-    check_kind,
-    check_number,
-    check_seed,
-    check_struct,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError, Need
 from spadwarp_kernels.base.native import zeros
 from spadwarp_kernels.base.philox import round_keys
 from spadwarp_kernels.base.tables import TABLE_CELLS
@@ -117,12 +107,12 @@ class Model:
     sums."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "device", check_device("model.device", self.device))
+        object.__setattr__(self, "device", check.device("model.device", self.device))
         for name, struct in _STRUCTS.items():
-            check_struct(f"model.{name}", getattr(self, name), struct)
+            check.kind(f"model.{name}", getattr(self, name), struct)
         if self.mesh is not None and not isinstance(self.mesh, wp.Mesh):
             raise ArgumentError(f"model.mesh is {type(self.mesh).__name__}; a wp.Mesh or None is needed")
-        check_number("model.scale", self.scale, "(0, inf)")
+        check.number("model.scale", self.scale, "(0, inf)")
 
     @property
     def tally_size(self) -> int:
@@ -176,14 +166,14 @@ def make_data(
     largest launch, where `spec.records` asks for their records; `derivatives` is how many the spec has, those by block
     included. Raises `ArgumentError`.
     """
-    check_kind("model", model, Model)
-    size = check_integer("bins of the tally", model.tally_size, 0) if histogram else 1
+    check.kind("model", model, Model)
+    size = check.integer("bins of the tally", model.tally_size, 0) if histogram else 1
     if tally is None:
         tally = zeros(size, wp.int64, model.device)
     else:
-        check_array("tally", tally, wp.int64, (size,), model.device, contiguous=True)
-    derivatives = check_integer("derivatives", derivatives, 0, MOST_DERIVATIVES + MOST_BLOCK_DERIVATIVES)
-    signed = check_integer("bins of data.gradients", size * derivatives, 0)
+        check.array("tally", tally, wp.int64, (size,), model.device, contiguous=True)
+    derivatives = check.integer("derivatives", derivatives, 0, MOST_DERIVATIVES + MOST_BLOCK_DERIVATIVES)
+    signed = check.integer("bins of data.gradients", size * derivatives, 0)
     return Data(
         tally=tally,
         ledger=wp.zeros(LEDGER_SLOTS * LEDGER_WIDTH, dtype=wp.int64, device=model.device),
@@ -200,7 +190,7 @@ def make_data(
 # ---- What a launch checks before it: a kernel trusts what it is given.
 
 
-# Fields of a part of the model, by its path, and what each must be, see `check_fields`.
+# Fields of a part of the model, by its path, and what each must be, see `check.fields`.
 Needs = Iterator[tuple[str, Mapping[str, Need]]]
 
 # What each laser profile reads.
@@ -212,7 +202,7 @@ def check_launch(spec: TransportSpec, model: Model, data: Data, photon_count: in
     check_spec(spec)
     for needs in (_surface_needs, _water_needs, _light_needs, _limit_needs, _rider_needs):
         for path, fields in needs(spec, model):
-            check_fields(f"model.{path}", attrgetter(path)(model), fields, model.device)
+            check.fields(f"model.{path}", attrgetter(path)(model), fields, model.device)
     _check_data(spec, model, data, photon_count)
 
 
@@ -223,7 +213,7 @@ def _water_needs(spec: TransportSpec, model: Model) -> Needs:
         yield "medium.phase", dict.fromkeys(("cells", "guide"), (3 + mixed, TABLE_CELLS))
     if spec.layered:
         yield "layers", {"start": (None,), "axis": "unit"}
-        check_integer("number of model.layers", layers.start.size, 1)
+        check.integer("number of model.layers", layers.start.size, 1)
         yield "layers", dict.fromkeys(("extinction", "albedo", "anisotropy"), layers.start.shape)
         if mixed:
             yield "layers", {"shares": layers.start.shape}
@@ -246,11 +236,11 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
     yield "laser", {"position": "(-inf, inf)"}
     if spec.measured_beam:
         yield "laser", {"rows": (None,), "extent": "(0, inf)"}
-        check_integer("rows of the laser's profile", laser.rows.size, 1)
+        check.integer("rows of the laser's profile", laser.rows.size, 1)
         yield "laser", {"columns": (laser.rows.size, None)}
-        check_integer("columns of the laser's profile", laser.columns.shape[1], 1)
+        check.integer("columns of the laser's profile", laser.columns.shape[1], 1)
     else:
-        yield "laser", _BEAM[check_integer("model.laser.profile", laser.profile, 0, len(LASER_PROFILES) - 1)]
+        yield "laser", _BEAM[check.integer("model.laser.profile", laser.profile, 0, len(LASER_PROFILES) - 1)]
     if spec.laser_port is not None:
         check_port("model.laser.port", laser.port, spec.laser_port)
     if (spec.sea is not None) != model.has_sea:
@@ -268,11 +258,11 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
             raise ArgumentError(f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.sea needs 1")
     if spec.confocal:
         most = camera.width * camera.height if estimator.scores else 2**31 - 1
-        count = check_integer("model.scan.count", model.scan.count, 1, most)
+        count = check.integer("model.scan.count", model.scan.count, 1, most)
         arrays = ("pose",) if spec.lens.name == SCANNED.name else ("axis", "view")
         yield "scan", dict.fromkeys(arrays, (None,))
         for name in arrays:
-            check_integer(f"entries of model.scan.{name}", getattr(model.scan, name).size, count)
+            check.integer(f"entries of model.scan.{name}", getattr(model.scan, name).size, count)
     else:
         yield "laser", {"axis": "unit"}
     if estimator.scores:
@@ -295,7 +285,7 @@ def _limit_needs(spec: TransportSpec, model: Model) -> Needs:
     if spec.bounded:
         yield "limits", {"lateral": "(0, inf)", "lower": "(-inf, inf)", "upper": "(-inf, inf)"}
         for axis, (low, high) in enumerate(zip(model.limits.lower, model.limits.upper, strict=True)):
-            check_number(f"model.limits.upper[{axis}]", high, f"({float(low)}, inf)")
+            check.number(f"model.limits.upper[{axis}]", high, f"({float(low)}, inf)")
     if spec.reflecting:
         yield "limits.boundary", {"low": "[0, 1e9]", "high": "[0, 1e9]", "max_reflections": "[0, inf)"}
         yield "limits.boundary", {"images": (None,)}
@@ -340,20 +330,20 @@ def _surface_needs(spec: TransportSpec, model: Model) -> Needs:
 def _rider_needs(spec: TransportSpec, model: Model) -> Needs:
     derivatives, faces = model.derivatives, (model.surfaces.reflectance.size,) if spec.mesh else ()
     for p, kind in enumerate(spec.derivatives):
-        check_number(f"model.derivatives.value[{p}]", derivatives.value[p], DERIVATIVES[kind])
+        check.number(f"model.derivatives.value[{p}]", derivatives.value[p], DERIVATIVES[kind])
         last = max(spec.phase.constituents - 1, 0)
-        check_integer(f"model.derivatives.constituent[{p}]", derivatives.constituent[p], 0, last)
+        check.integer(f"model.derivatives.constituent[{p}]", derivatives.constituent[p], 0, last)
     for p in range(spec.signed):
-        check_number(f"model.derivatives.scale[{p}]", derivatives.scale[p], "(0, inf)")
+        check.number(f"model.derivatives.scale[{p}]", derivatives.scale[p], "(0, inf)")
     if spec.blocks:
         blocks = derivatives.blocks
         for edge, (count, cells) in enumerate(zip(blocks.grid.size, model.layers.grid.size, strict=True)):
-            check_integer(f"model.derivatives.blocks.grid.size[{edge}]", count, 1, cells)
-        count = check_integer("model.derivatives.blocks.count", blocks.count, 1, MOST_BLOCK_DERIVATIVES)
+            check.integer(f"model.derivatives.blocks.grid.size[{edge}]", count, 1, cells)
+        count = check.integer("model.derivatives.blocks.count", blocks.count, 1, MOST_BLOCK_DERIVATIVES)
         if count != math.prod(blocks.grid.size):
             raise ArgumentError(f"model.derivatives.blocks.count = {count}; see make_blocks")
         for q in range(len(spec.blocks)):
-            check_number(f"model.derivatives.blocks.scale[{q}]", blocks.scale[q], "(0, inf)")
+            check.number(f"model.derivatives.blocks.scale[{q}]", blocks.scale[q], "(0, inf)")
     if spec.derivatives and spec.layered:
         yield "derivatives", {"waters": (model.layers.start.size,)}
     if "reflectance" in spec.derivatives:
@@ -378,28 +368,28 @@ def _rider_needs(spec: TransportSpec, model: Model) -> Needs:
 def _check_data(spec: TransportSpec, model: Model, data: Data, photon_count: int) -> None:
     device, scores = model.device, make_estimator(spec).scores
 
-    def check(name: str, dtype: type, size: int | None) -> None:
-        check_array(f"data.{name}", getattr(data, name), dtype, (size,), device, contiguous=True)
+    def fits(name: str, dtype: type, size: int | None) -> None:
+        check.array(f"data.{name}", getattr(data, name), dtype, (size,), device, contiguous=True)
 
     bins = 2 * model.tally_size // len(COMPONENTS) if spec.merged else model.tally_size
-    check("tally", wp.int64, check_integer("bins of the tally", bins, 1) if scores else None)
+    fits("tally", wp.int64, check.integer("bins of the tally", bins, 1) if scores else None)
     signed = spec.signed + len(spec.blocks) * model.derivatives.blocks.count if scores else 0
     if signed or data.gradients is not None:
-        check("gradients", wp.int64, check_integer("bins of data.gradients", bins * signed, 1) if signed else None)
+        fits("gradients", wp.int64, check.integer("bins of data.gradients", bins * signed, 1) if signed else None)
     if spec.flux:
-        check("flux", wp.int64, check_integer("model.flux.size", model.flux.size, 1))
+        fits("flux", wp.int64, check.integer("model.flux.size", model.flux.size, 1))
     if data.split_accumulators is not None:
-        check("split_accumulators", wp.uint32, data.tally.size)
-    check("ledger", wp.int64, LEDGER_SLOTS * LEDGER_WIDTH)
-    check("cursor", wp.int32, 1)
+        fits("split_accumulators", wp.uint32, data.tally.size)
+    fits("ledger", wp.int64, LEDGER_SLOTS * LEDGER_WIDTH)
+    fits("cursor", wp.int32, 1)
     if spec.stepped or data.offset is not None:
-        check("offset", wp.uint64, 1)
-    check_struct("data.records", data.records, Records)
+        fits("offset", wp.uint64, 1)
+    check.kind("data.records", data.records, Records)
     if spec.records:
         shapes: dict[str, Need] = dict.fromkeys(Records.vars, (None,))
         shapes["log_derivatives"] = (None, len(spec.derivatives))
         for name in shapes if spec.derivatives else [*shapes][:-1]:
-            check_fields("data.records", data.records, {name: shapes[name]}, device)
+            check.fields("data.records", data.records, {name: shapes[name]}, device)
             room = getattr(data.records, name).shape[0]
             if room < photon_count:
                 raise ArgumentError(
@@ -427,11 +417,11 @@ def load_transport_kernel(
     too: with a large tally on CUDA it may be another one, see `Model.split_accumulators`.
     """
     check_spec(spec)
-    device = check_device("device", device)
+    device = check.device("device", device)
     split_accumulators = False
     if model is not None:
-        check_kind("model", model, Model)
-        photon_count = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
+        check.kind("model", model, Model)
+        photon_count = check.integer("photon_count", photon_count, 1, _MOST_PHOTONS)
         split_accumulators = splits_accumulators(spec, model, photon_count)
     kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators)
     kernel.module.load(device, BLOCK_SIZE if device.is_cuda else 1)
@@ -473,8 +463,8 @@ def launch_transport(
             an array that is too short or on another device, or surfaces that the spec does not describe, see
             `surface_choices`.
     """
-    photon_count = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
-    first_id = check_integer("first_id", first_id, 0, 2**64 - photon_count)
+    photon_count = check.integer("photon_count", photon_count, 1, _MOST_PHOTONS)
+    first_id = check.integer("first_id", first_id, 0, 2**64 - photon_count)
     launch = prepare_transport(spec, model, data, seed=seed, photon_count=photon_count, threads=threads)
     launch(first_id, photon_count)
 
@@ -487,11 +477,11 @@ def prepare_transport(
     Returns the launch, a function of `first_id` and of a `photon_count` of at most the one here, which it does not
     check. Args and raises: as `launch_transport`.
     """
-    check_kind("model", model, Model)
-    check_kind("data", data, Data)
-    most = check_integer("photon_count", photon_count, 1, _MOST_PHOTONS)
-    seed = check_seed(seed)
-    blocks = check_integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE
+    check.kind("model", model, Model)
+    check.kind("data", data, Data)
+    most = check.integer("photon_count", photon_count, 1, _MOST_PHOTONS)
+    seed = check.seed(seed)
+    blocks = check.integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE
     check_launch(spec, model, data, most)
     device, split_accumulators = model.device, _split_accumulators(spec, model, data, most)
     kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators is not None)
@@ -552,10 +542,10 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     Entries are LEDGER_ENTRIES and, behind a laser's port, what that reflects: `laser_port`. Counters are COUNTERS and,
     where faces of the domain reflect, BOUNDARY_COUNTERS; with the surface of a sea SEA_ENTRIES and SEA_COUNTERS, too.
     """
-    check_kind("data", data, Data)
-    check_array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
+    check.kind("data", data, Data)
+    check.array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
     for name in ("reflecting", "has_sea"):
-        check_kind(f"data.{name}", getattr(data, name), bool)
+        check.kind(f"data.{name}", getattr(data, name), bool)
     sums = exact_sums(data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS))
     values = dict(zip(ALL_ENTRIES, sums, strict=True))
     for name in ("before_gate", "after_gate"):

@@ -17,14 +17,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_device,
-    check_integer,
-    check_number,
-    check_numbers,
-    check_vector,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.native import load_float, load_vec2
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_open
 
@@ -472,11 +466,11 @@ def make_grid(
     Raises:
         ArgumentError: Another shape, a number out of range, or more than 2^30 cells.
     """
-    device = check_device("device", device)
+    device = check.device("device", device)
     columns = {"extinction": (extinction, "[0, inf)"), "albedo": (albedo, "[0, 1]")}
     if anisotropy is not None:
         columns["anisotropy"] = (anisotropy, "(-1, 1)")
-    arrays = {name: check_numbers(name, values, 3).astype(np.float32) for name, (values, _) in columns.items()}
+    arrays = {name: check.numbers(name, values, 3).astype(np.float32) for name, (values, _) in columns.items()}
     shape = arrays["extinction"].shape
     if not 0 < math.prod(shape) <= LARGEST_CELL_COUNT:
         raise ArgumentError(f"extinction has cells {shape}; 1 to 2^30 of them are needed")
@@ -484,17 +478,17 @@ def make_grid(
         if array.shape != shape:
             raise ArgumentError(f"{name} has cells {array.shape}, extinction {shape}")
         for value in (array.min(), array.max()):
-            check_number(name, float(value), columns[name][1])
-    check_vector("size", size)
+            check.number(name, float(value), columns[name][1])
+    check.vector("size", size)
     for edge in size:
-        check_number("size", edge, "(0, inf)")
-    check_vector("centre", centre)
-    axes = check_numbers("rotation", rotation, 2)
+        check.number("size", edge, "(0, inf)")
+    check.vector("centre", centre)
+    axes = check.numbers("rotation", rotation, 2)
     if axes.shape != (3, 3) or not np.allclose(axes.T @ axes, np.eye(3), atol=1e-5):
         raise ArgumentError(f"rotation = {axes.tolist()} is not a rotation matrix")
     longest = max(shape)
     edge_cells = max(1, math.ceil(longest / 6)) if block_edge is None else block_edge
-    edge_cells = check_integer("block_edge", edge_cells, 1, longest)
+    edge_cells = check.integer("block_edge", edge_cells, 1, longest)
 
     grid = Grid()
     turn = (np.array(shape) / np.array(size, np.float64))[:, None] * axes.T

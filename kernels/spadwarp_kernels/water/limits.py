@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_device, check_integer, check_items, check_number
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
 
 __all__ = ["Boundary", "Limits", "make_boundary"]
@@ -135,12 +136,12 @@ def make_boundary(
     Raises:
         ArgumentError: A number out of range, or all faces let light out.
     """
-    sides: dict[str, list[Any]] = {"low": check_items("low", low), "high": check_items("high", high)}
+    sides: dict[str, list[Any]] = {"low": check.items("low", low), "high": check.items("high", high)}
     for name, indices in sides.items():
         if len(indices) != 3:
             raise ArgumentError(f"{name} = {indices!r} is not three numbers")
-        sides[name] = [check_number(f"{name}, {axis},", indices[k], "[0, 1e9]") for k, axis in enumerate("xyz")]
-    most = check_integer("max_reflections", max_reflections, 0, 8)
+        sides[name] = [check.number(f"{name}, {axis},", indices[k], "[0, 1e9]") for k, axis in enumerate("xyz")]
+    most = check.integer("max_reflections", max_reflections, 0, 8)
     if not any((*sides["low"], *sides["high"])):
         raise ArgumentError("low and high: all faces let all light out; such a spec is not `reflecting`")
     # A face without its opposite is met once. Ways of few reflections come first.
@@ -152,7 +153,7 @@ def make_boundary(
     images = sorted(chains, key=lambda chain: (sum(map(abs, chain)), chain))
     boundary = Boundary()
     boundary.low, boundary.high = (wp.vec3(*indices) for indices in sides.values())
-    boundary.images = wp.array(images, dtype=wp.vec3i, device=check_device("device", device), shape=len(images))
+    boundary.images = wp.array(images, dtype=wp.vec3i, device=check.device("device", device), shape=len(images))
     boundary.max_reflections = most
     return boundary
 

@@ -14,14 +14,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_device,
-    check_integer,
-    check_number,
-    check_numbers,
-    check_vector,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
@@ -54,11 +48,11 @@ def make_medium(absorption: float, scattering: float, *, anisotropy: float = 0.0
         ArgumentError: A number out of range.
     """
     medium = Medium()
-    absorption = check_number("absorption", absorption, "[0, inf)")
-    scattering = check_number("scattering", scattering, "[0, inf)")
+    absorption = check.number("absorption", absorption, "[0, inf)")
+    scattering = check.number("scattering", scattering, "[0, inf)")
     medium.extinction = absorption + scattering
     medium.albedo = scattering / medium.extinction if medium.extinction > 0.0 else 0.0
-    medium.anisotropy, medium.axis_threshold = check_number("anisotropy", anisotropy, "(-1, 1)"), 1.0
+    medium.anisotropy, medium.axis_threshold = check.number("anisotropy", anisotropy, "(-1, 1)"), 1.0
     return medium
 
 
@@ -127,13 +121,13 @@ def make_inelastic(
     """
     given = {"source": source, "anisotropy": anisotropy, "extinction": extinction, "scattering": scattering}
     given["passed"] = passed
-    lines, numbers = Inelastic(), {name: [float(x) for x in check_numbers(name, v, 1)] for name, v in given.items()}
-    count = check_integer("number of lines", len(numbers["source"]), 1, MOST_LINES)
+    lines, numbers = Inelastic(), {name: [float(x) for x in check.numbers(name, v, 1)] for name, v in given.items()}
+    count = check.integer("number of lines", len(numbers["source"]), 1, MOST_LINES)
     if any(len(values) != count for values in numbers.values()):
         raise ArgumentError(f"lines: {', '.join(f'{name} {len(v)}' for name, v in numbers.items())} entries differ")
-    b = check_number("scattering of the medium", medium.extinction * medium.albedo, "(0, inf)")
+    b = check.number("scattering of the medium", medium.extinction * medium.albedo, "(0, inf)")
     for k in range(count):
-        row = {name: check_number(f"{name}[{k}]", values[k], "[0, inf)") for name, values in numbers.items()}
+        row = {name: check.number(f"{name}[{k}]", values[k], "[0, inf)") for name, values in numbers.items()}
         lines.source[k], lines.passed[k] = row["source"], row["passed"]
         lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + row["anisotropy"] / 3.0))
         lines.squared[k] = row["anisotropy"] * lines.even[k]
@@ -323,7 +317,7 @@ LAYERED = Water(layered_free_path, layered_extinction, layered_water, layered_mi
 def mixture_shares(shares: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Shares `[n, 4]` of the scattering, which add up to 1, from those of up to 4 constituents, `[*shape, count]`;
     none from none. Raises `ArgumentError`."""
-    values = check_numbers("shares", shares)
+    values = check.numbers("shares", shares)
     if not values.size:
         return np.zeros((0, MOST_CONSTITUENTS), np.float32)
     if values.shape[:-1] != shape or values.shape[-1] > MOST_CONSTITUENTS:
@@ -351,17 +345,17 @@ def make_layers(
     """
     columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
     for name, column in columns.items():
-        check_numbers(name, column, 1)
-    device = check_device("device", device)
+        check.numbers(name, column, 1)
+    device = check.device("device", device)
     if len({len(column) for column in columns.values()}) > 1:
         sizes = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
         raise ArgumentError(f"layers: {sizes} entries; one each for every layer are needed")
-    check_integer("number of layers", len(start), 1)
-    check_vector("axis", axis, unit=True)
+    check.integer("number of layers", len(start), 1)
+    check.vector("axis", axis, unit=True)
     for name, interval in _RANGES.items():
         for k, value in enumerate(columns[name]):
             above = name == "start" and k > 1
-            check_number(f"{name}[{k}]", value, f"[{float(start[k - 1])}, inf)" if above else interval)
+            check.number(f"{name}[{k}]", value, f"[{float(start[k - 1])}, inf)" if above else interval)
     layers = Layers()
     layers.axis = wp.vec3(*axis)
     layers.shares = wp.array(mixture_shares(shares, (len(start),)), dtype=wp.vec4, device=device)

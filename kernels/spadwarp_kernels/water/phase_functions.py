@@ -8,14 +8,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_device,
-    check_integer,
-    check_kind,
-    check_number,
-    check_numbers,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.tables import (
     DensityTables,
@@ -53,23 +47,23 @@ __all__ = [
 
 def henyey_greenstein_density(t: ArrayLike, g: float) -> Floats:
     """Henyey & Greenstein (1941); mean cosine g in (-1, 1)."""
-    check_number("g", g, "(-1, 1)")
-    t = check_numbers("t", t)
+    check.number("g", g, "(-1, 1)")
+    t = check.numbers("t", t)
     return (1.0 - g * g) / (4.0 * np.pi * ((1.0 - g) ** 2 + 2.0 * g * t) ** 1.5)
 
 
 def two_term_henyey_greenstein_density(t: ArrayLike, g1: float, g2: float, alpha: float) -> Floats:
     """alpha HG(g1) + (1 - alpha) HG(g2), alpha in [0, 1] (Haltrin, Appl. Opt. 41, 1022 (2002), with -g2 for his g2)."""
-    check_number("alpha", alpha, "[0, 1]")
+    check.number("alpha", alpha, "[0, 1]")
     return alpha * henyey_greenstein_density(t, g1) + (1.0 - alpha) * henyey_greenstein_density(t, g2)
 
 
 def rayleigh_density(t: ArrayLike, depolarisation_ratio: float = 0.0) -> Floats:
     """Molecules: 1 + cos^2(theta)(1 - r)/(1 + r), r in [0, 1] the depolarisation ratio of unpolarised light that is
     scattered by 90 degrees (Hansen & Travis, Space Sci. Rev. 16, 527 (1974), eq 2.15)."""
-    check_number("depolarisation_ratio", depolarisation_ratio, "[0, 1]")
+    check.number("depolarisation_ratio", depolarisation_ratio, "[0, 1]")
     part = (1.0 - depolarisation_ratio) / (1.0 + depolarisation_ratio)
-    return (1.0 + part * (1.0 - check_numbers("t", t)) ** 2) / (4.0 * np.pi * (1.0 + part / 3.0))
+    return (1.0 + part * (1.0 - check.numbers("t", t)) ** 2) / (4.0 * np.pi * (1.0 + part / 3.0))
 
 
 def fournier_forand_density(t: ArrayLike, particle_index: float, junge_slope: float) -> Floats:
@@ -80,9 +74,9 @@ def fournier_forand_density(t: ArrayLike, particle_index: float, junge_slope: fl
         particle_index: Real index n of the particles over that of the water, in (1, 1.35].
         junge_slope: Slope mu of their size distribution, in (3, 5).
     """
-    check_number("particle_index", particle_index, "(1, 1.35]")
-    check_number("junge_slope", junge_slope, "(3, 5)")
-    s2 = 0.5 * check_numbers("t", t)  # sin^2(theta/2)
+    check.number("particle_index", particle_index, "(1, 1.35]")
+    check.number("junge_slope", junge_slope, "(3, 5)")
+    s2 = 0.5 * check.numbers("t", t)  # sin^2(theta/2)
     nu = 0.5 * (3.0 - junge_slope)
     delta_180 = 4.0 / (3.0 * (particle_index - 1.0) ** 2)
     delta = delta_180 * s2
@@ -115,7 +109,7 @@ def interpolated_density(angles: ArrayLike, values: ArrayLike) -> Callable[[Arra
     Raises:
         ArgumentError: Angles or values are not of that kind.
     """
-    theta, value = check_numbers("angles", angles), check_numbers("values", values)
+    theta, value = check.numbers("angles", angles), check.numbers("values", values)
     if theta.ndim != 1 or theta.size < 2 or value.shape != theta.shape:
         raise ArgumentError(f"angles {theta.shape} and values {value.shape} are not two equal lists of two or more")
     if not (np.isfinite(theta).all() and (np.diff(theta) > 0.0).all()):
@@ -147,7 +141,7 @@ def sphere_integral(function: Callable[[Floats], Floats]) -> float:
     z, weight = folded_quadrature()
     if not callable(function):
         raise ArgumentError(f"function = {function!r} is not a function of t")
-    found = check_numbers("what function returns", function(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
+    found = check.numbers("what function returns", function(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
     if found.shape != z.shape and not (found.shape == () and np.isfinite(found)):
         raise ArgumentError(f"what function returns has shape {found.shape}; {z.shape} is needed, that of t")
     return float(4.0 * np.pi * (found * weight).sum())
@@ -394,7 +388,7 @@ def make_mixture(count: int) -> PhaseFunction:
     the share it is uniform again. Densities are of the sum, which varies less than that of the chosen one would.
     `guided` follows the tables' own density, whatever the shares are.
     """
-    return _mixture(check_integer("count", count, 1, MOST_CONSTITUENTS))
+    return _mixture(check.integer("count", count, 1, MOST_CONSTITUENTS))
 
 
 @memoised
@@ -446,8 +440,8 @@ def make_phase_tables(
     Raises:
         ArgumentError: A density is negative, not finite or zero everywhere.
     """
-    device = check_device("device", device)
-    check_kind("density", density, Callable)
+    device = check.device("device", device)
+    check.kind("density", density, Callable)
 
     def over_t(one: Callable[[Floats], Floats]) -> Floats:
         return tabulate(lambda z: one(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))

@@ -11,17 +11,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_choice,
-    check_device,
-    check_integer,
-    check_items,
-    check_kind,
-    check_struct,
-    check_values,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.surface.mesh import Textures, no_textures
 from spadwarp_kernels.surface.reflectance import texture_at
 
@@ -127,28 +118,28 @@ def make_shapes(
         ArgumentError: Arrays of another length or on another device, values out of range, or a world or mesh that
             there is not.
     """
-    device = check_device("device", device)
+    device = check.device("device", device)
     if frame is not None:
-        check_choice("frame", frame, CAMERA_FRAMES)
-    worlds = check_integer("worlds", worlds, 1, 1 << 24)
+        check.choice("frame", frame, CAMERA_FRAMES)
+    worlds = check.integer("worlds", worlds, 1, 1 << 24)
     if not isinstance(kind, wp.array):
-        kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in check_items("kind", kind)])
+        kind = np.array([SHAPE_KINDS.index(one) if one in SHAPE_KINDS else one for one in check.items("kind", kind)])
         if kind.dtype.kind not in "iu" or kind.size == 0:
             names = ", ".join(SHAPE_KINDS)
             raise ArgumentError(f"kind = {kind.tolist()} is not a list of {names}, or of their indices")
     count = kind.shape[0]
-    given = {one.id: one for one in check_items("meshes", meshes)}
+    given = {one.id: one for one in check.items("meshes", meshes)}
     if mesh is not None and not isinstance(mesh, wp.array):
-        mesh = check_items("mesh", mesh)
+        mesh = check.items("mesh", mesh)
         given |= {one.id: one for one in mesh if isinstance(one, wp.Mesh)}
-        mesh = [one.id if isinstance(one, wp.Mesh) else check_integer("mesh", one or 0, 0, 2**64 - 1) for one in mesh]
+        mesh = [one.id if isinstance(one, wp.Mesh) else check.integer("mesh", one or 0, 0, 2**64 - 1) for one in mesh]
     table = ShapeTable()
     defaults = {"body": -1, "local": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "mesh": 0, "first_face": -1}
     columns = {"kind": kind, "size": size, "body": body, "local": local, "mesh": mesh, "reflectance": reflectance}
     for name, value in (columns | {"first_face": first_face}).items():
         setattr(table, name, _column(name, defaults.get(name) if value is None else value, count, device))
     if textures is not None:
-        check_struct("textures", textures, Textures)
+        check.kind("textures", textures, Textures)
     table.textures = no_textures(device) if textures is None else textures
     world = _plain_array("world", np.full(count, 0 if worlds == 1 else -1) if world is None else world)
     if world.shape != (count,) or world.dtype.kind not in "iu" or world.min() < -1 or world.max() >= worlds:
@@ -170,7 +161,7 @@ def _column(name: str, value: Any, count: int, device: wp.Device) -> wp.array:
     """An array of the table, of values on the host or on the device."""
     dtype = ShapeTable.vars[name].type.dtype
     if isinstance(value, wp.array):
-        return check_array(name, value, dtype, (count,), device)
+        return check.array(name, value, dtype, (count,), device)
     width = wp.types.type_size(dtype)
     try:
         rows = np.asarray(value, np.uint64 if dtype == wp.uint64 else np.float64)
@@ -212,7 +203,7 @@ def _check_shapes(table: ShapeTable, seen: np.ndarray, given: dict[int, wp.Mesh]
     """Shapes that are in range; returns the meshes that they use."""
     ranges = {"kind": f"[0, {len(SHAPE_KINDS) - 1}]", "reflectance": "[0, 1]", "body": "[-1, 2147483647]"}
     for name, interval in ranges.items():
-        check_values(name, getattr(table, name), interval)
+        check.values(name, getattr(table, name), interval)
     check_poses("local", table.local)
     kind, size = table.kind.numpy(), table.size.numpy()
     needed = np.array([_COMPONENTS[name] for name in SHAPE_KINDS])[kind]
@@ -238,7 +229,7 @@ def _checked_faces(k: int, id: int, mesh: wp.Mesh | None) -> int:
         raise ArgumentError(f"kind[{k}] is a mesh and mesh[{k}] = 0 is none")
     if mesh is None:
         raise ArgumentError(f"mesh[{k}] is not the id of a wp.Mesh in meshes; give the wp.Mesh itself, or it in meshes")
-    check_values(f"mesh[{k}].indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+    check.values(f"mesh[{k}].indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
     return mesh.indices.size // 3
 
 
@@ -255,10 +246,10 @@ def _move_kernel(table: ShapeTable, body_q: wp.array[wp.transform]):
 
 def move_shapes(shapes: Shapes, body_q: wp.array | None) -> None:
     """Carries the shapes to the poses of their bodies `[bodies]`, None where no shape is on one; on the device."""
-    check_kind("shapes", shapes, Shapes)
+    check.kind("shapes", shapes, Shapes)
     if body_q is None:
         body_q = wp.empty(0, dtype=wp.transform, device=shapes.device)
-    check_array("body_q", body_q, wp.transform, (None,), shapes.device)
+    check.array("body_q", body_q, wp.transform, (None,), shapes.device)
     if body_q.size < shapes.bodies:
         raise ArgumentError(f"body_q has {body_q.size} poses; the shapes are on {shapes.bodies} bodies")
     wp.launch(_move_kernel, len(shapes), [shapes.table, body_q], device=shapes.device)

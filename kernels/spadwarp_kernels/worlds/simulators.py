@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_array, check_integer
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 
 from .shapes import SHAPE_KINDS, Shapes, make_shapes
 
@@ -96,7 +97,7 @@ def mujoco_shapes(
     Raises:
         ArgumentError: A model without geoms.
     """
-    worlds = check_integer("worlds", worlds, 1)
+    worlds = check.integer("worlds", worlds, 1)
     count = int(model.ngeom)
     if not count:
         raise ArgumentError("model.ngeom = 0; a camera needs something to look at")
@@ -177,11 +178,11 @@ def write_poses(position: wp.array, rotation: wp.array, out: wp.array) -> None:
     Raises:
         ArgumentError: Arrays that do not fit.
     """
-    check_array("position", position, wp.vec3, (None,) * (2 if getattr(position, "ndim", 1) == 2 else 1))
+    check.array("position", position, wp.vec3, (None,) * (2 if getattr(position, "ndim", 1) == 2 else 1))
     shape = (position.shape[0], 1) if position.ndim == 1 else position.shape
     matrix = isinstance(rotation, wp.array) and wp.types.types_equal(rotation.dtype, wp.mat33)
-    check_array("rotation", rotation, (wp.mat33, wp.quat), position.shape, position.device)
-    check_array("out", out, wp.transform, (shape[0] * shape[1],), position.device, contiguous=True)
+    check.array("rotation", rotation, (wp.mat33, wp.quat), position.shape, position.device)
+    check.array("out", out, wp.transform, (shape[0] * shape[1],), position.device, contiguous=True)
     if position.ndim == 1:
         # Views [n, 1] of arrays [n] that need not be contiguous.
         position, rotation = (

@@ -16,17 +16,8 @@ import warp as wp
 from spadwarp_kernels.analytic.depth_frames import depth_of_path
 from spadwarp_kernels.analytic.optics import IN_WATER, Lidar, beam_path
 from spadwarp_kernels.analytic.rates import radiometric_signal
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_choice,
-    check_device,
-    check_integer,
-    check_items,
-    check_kind,
-    check_number,
-    check_numbers,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.detection.arrival_time import ArrivalEstimator
 from spadwarp_kernels.detection.counts import FirstPhotons, draw_bin
@@ -57,7 +48,7 @@ _see = IN_WATER.see
 
 def optical_to(frame: Any) -> wp.transform:
     """The pose of the optical frame in a camera frame of `CAMERA_FRAMES`; raises `ArgumentError`."""
-    check_choice("frame", frame, CAMERA_FRAMES)
+    check.choice("frame", frame, CAMERA_FRAMES)
     return wp.transform(wp.vec3(0.0), wp.quat(*CAMERA_FRAMES[frame]))
 
 
@@ -421,12 +412,12 @@ class WorldCameras:
         device: wp.DeviceLike,
     ) -> None:
         self.config = config = SpadConfig() if config is None else config
-        check_kind("config", config, SpadConfig)
-        self.device = device = check_device("device", device)
-        self.cameras = check_integer("cameras", cameras, 1)
-        self.outputs = tuple(check_items("outputs", outputs))
+        check.kind("config", config, SpadConfig)
+        self.device = device = check.device("device", device)
+        self.cameras = check.integer("cameras", cameras, 1)
+        self.outputs = tuple(check.items("outputs", outputs))
         for one in self.outputs:
-            check_choice("outputs", one, CAMERA_OUTPUTS)
+            check.choice("outputs", one, CAMERA_OUTPUTS)
         sizes = {"cameras": self.cameras, "config.height": config.height, "config.width": config.width}
         image, self._rows = tuple(sizes.values()), self.cameras * config.height * config.width
         pixels, sizes["config.bins"] = dict(sizes), config.bins
@@ -435,11 +426,11 @@ class WorldCameras:
         check_memory("rates and counts", sizes, needed + 16 // self.cameras, device, rows=0)
         check_memory("images", pixels, 56, device, rows=3)
         if frame is not None:
-            check_choice("frame", frame, CAMERA_FRAMES)
+            check.choice("frame", frame, CAMERA_FRAMES)
         self.frame = frame
         self._set_worlds(world)
         self._set_mount(body, offset)
-        self._period = check_number("update_period", update_period, "[0, inf)")
+        self._period = check.number("update_period", update_period, "[0, inf)")
         self._masked = False  # whether a step has had a mask
         self._age = wp.full(self.cameras, math.inf, dtype=float, device=device)
         self._due = wp.ones(self.cameras, dtype=int, device=device)
@@ -469,7 +460,7 @@ class WorldCameras:
 
     def _checked_rays(self, rays: Any) -> np.ndarray:
         shape = (self.config.height, self.config.width, 3)
-        lines = check_numbers("rays", rays.numpy() if isinstance(rays, wp.array) else rays)
+        lines = check.numbers("rays", rays.numpy() if isinstance(rays, wp.array) else rays)
         length = np.linalg.norm(lines, axis=-1, keepdims=True)
         if lines.shape != shape or not (length > 0.0).all():
             raise ArgumentError(f"rays have shape {lines.shape}; directions (height, width, 3) = {shape} are needed")
@@ -478,10 +469,10 @@ class WorldCameras:
     def _set_worlds(self, world: wp.array | Sequence[int] | None) -> None:
         self._most_worlds = 0
         if isinstance(world, wp.array):
-            self._world = check_array("world", world, wp.int32, (self.cameras,), self.device)
+            self._world = check.array("world", world, wp.int32, (self.cameras,), self.device)
             return
-        items = range(self.cameras) if world is None else check_items("world", world)
-        worlds = [check_integer("world", one, 0) for one in items]
+        items = range(self.cameras) if world is None else check.items("world", world)
+        worlds = [check.integer("world", one, 0) for one in items]
         if len(worlds) != self.cameras:
             raise ArgumentError(f"world has {len(worlds)} entries; one for each of {self.cameras} cameras is needed")
         self._world, self._most_worlds = wp.array(worlds, dtype=int, device=self.device), max(worlds) + 1
@@ -492,7 +483,7 @@ class WorldCameras:
             if offset is not None:
                 raise ArgumentError("offset is a pose on a body; body is needed with it")
             return
-        rows = check_numbers("body", body.numpy() if isinstance(body, wp.array) else np.array(body))
+        rows = check.numbers("body", body.numpy() if isinstance(body, wp.array) else np.array(body))
         if rows.shape not in ((), (self.cameras,)) or (rows < 0).any() or (rows != np.rint(rows)).any():
             raise ArgumentError(f"body = {rows.tolist()} is not the index of a body for each of {self.cameras} cameras")
         rows = np.broadcast_to(rows, self.cameras).astype(np.int32)
@@ -588,17 +579,17 @@ class WorldCameras:
             raise ArgumentError(f"world = {self._most_worlds - 1} is none of the {shapes.worlds} worlds of the shapes")
         if not (self._poses_checked or self.device.is_capturing):  # once: later steps wait for nothing
             if camera_q is not None:
-                check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+                check.array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
                 check_poses("camera_q", camera_q)
             if body_q is not None:
-                check_array("body_q", body_q, wp.transform, (None,), self.device)
+                check.array("body_q", body_q, wp.transform, (None,), self.device)
                 check_poses("body_q", body_q, max(shapes.bodies, self._bodies))
             self._poses_checked = True
         if not self._bodies:
-            return check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+            return check.array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
         if camera_q is not None:
             raise ArgumentError("camera_q: cameras on a body have the pose of the body and offset")
-        check_array("body_q", body_q, wp.transform, (None,), self.device)
+        check.array("body_q", body_q, wp.transform, (None,), self.device)
         if body_q.size < self._bodies:
             raise ArgumentError(f"body_q has {body_q.size} poses; a camera is on body {self._bodies - 1}")
         inputs = [self._body, self._offset, body_q]
@@ -616,16 +607,16 @@ class WorldCameras:
     def _schedule(self, active: wp.array | None, dt: float) -> None:
         """Which cameras are due."""
         if active is not None:
-            check_array("active", active, wp.bool, (None,), self.device)
+            check.array("active", active, wp.bool, (None,), self.device)
             self._masked = True
         elif self._period == 0.0 and not self._masked:
             return
-        inputs = [self._world, active, check_number("dt", dt, "[0, inf)"), self._period * (1.0 - 1e-5)]
+        inputs = [self._world, active, check.number("dt", dt, "[0, inf)"), self._period * (1.0 - 1e-5)]
         wp.launch(_schedule_kernel, self.cameras, inputs, [self._age, self._due], device=self.device)
 
     def _cast_rays(self, shapes: Shapes, camera_q: wp.array | None, body_q: wp.array | None) -> wp.array:
         """Moves the shapes, casts a ray a pixel, and returns the poses of the cameras."""
-        check_kind("shapes", shapes, Shapes)
+        check.kind("shapes", shapes, Shapes)
         optical, poses = self._optical(shapes.frame), self._pose(shapes, camera_q, body_q)
         move_shapes(shapes, body_q)
         inputs = [shapes.table, poses, optical, self._world, self._due, self._view]
@@ -655,7 +646,7 @@ class WorldCameras:
         """Points of the noisy depth, vec3 `[cameras, height, width]` [m], in a frame of CAMERA_FRAMES; NaN for none.
 
         A row of 12 bytes a point: the data of a `PointCloud2` with the fields x, y and z of FLOAT32."""
-        check_array("out", out, wp.vec3, self.depth.shape, self.device)
+        check.array("out", out, wp.vec3, self.depth.shape, self.device)
         inputs = [self.distance, self._view, optical_to(frame)]
         wp.launch(_points_kernel, self.depth.shape, inputs, [out], device=self.device)
 
@@ -845,16 +836,16 @@ class SpadCamera(WorldCameras):
         """
         self._schedule(active, dt)
         shape = self.true_depth.shape
-        check_array("depth", depth, wp.float32, shape, self.device)
+        check.array("depth", depth, wp.float32, shape, self.device)
         number = 0.0
         if isinstance(reflectance, wp.array):
-            check_array("reflectance", reflectance, wp.float32, shape, self.device)
+            check.array("reflectance", reflectance, wp.float32, shape, self.device)
         else:
-            number, reflectance = check_number("reflectance", reflectance, "[0, 1]"), None
+            number, reflectance = check.number("reflectance", reflectance, "[0, 1]"), None
         if normal is not None:
-            check_array("normal", normal, wp.vec3, shape, self.device)
+            check.array("normal", normal, wp.vec3, shape, self.device)
         if camera_q is not None:
-            check_array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
+            check.array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
         optical = wp.transform_identity() if normal is None else self._optical("optical" if not self.frame else None)
         inputs = [self._view, depth, bool(along_ray), normal, camera_q, optical, reflectance, number]
         outputs = [self.true_distance, self.true_depth, self.normal, self.reflectance]

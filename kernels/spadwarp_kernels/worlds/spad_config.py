@@ -10,17 +10,8 @@ import warp as wp
 
 from spadwarp_kernels.analytic.optics import BACKSCATTER_SOURCES, Lidar, beam_fluence
 from spadwarp_kernels.analytic.rates import collection
-from spadwarp_kernels.base.arguments import (
-    ArgumentError,
-    check_array,
-    check_choice,
-    check_integer,
-    check_kind,
-    check_number,
-    check_numbers,
-    check_values,
-    check_vector,
-)
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels
 from spadwarp_kernels.detection.arrival_time import PHASES
 from spadwarp_kernels.detection.significance import MIN_SIGNIFICANCE
@@ -97,19 +88,19 @@ class SpadConfig:
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "bins"):
-            check_integer(f"config.{name}", getattr(self, name), 1)
-        check_integer("config.pulses", self.pulses, 0)
+            check.integer(f"config.{name}", getattr(self, name), 1)
+        check.integer("config.pulses", self.pulses, 0)
         for name, within in _RANGES.items():
-            check_number(f"config.{name}", getattr(self, name), within)
+            check.number(f"config.{name}", getattr(self, name), within)
         self._check_field_of_view()
-        check_vector("config.gate_distance", self.gate_distance, size=2)
-        check_number("config.gate_distance[0]", self.gate_distance[0], "[0, inf)")
-        check_number("config.gate_distance[1]", self.gate_distance[1], f"({float(self.gate_distance[0])}, inf)")
-        check_vector("config.laser_position", self.laser_position)
+        check.vector("config.gate_distance", self.gate_distance, size=2)
+        check.number("config.gate_distance[0]", self.gate_distance[0], "[0, inf)")
+        check.number("config.gate_distance[1]", self.gate_distance[1], f"({float(self.gate_distance[0])}, inf)")
+        check.vector("config.laser_position", self.laser_position)
         if self.laser_half_angle is not None:
-            check_number("config.laser_half_angle", self.laser_half_angle, "(0, 3.1416]")
-        check_choice("config.method", self.method, ("centroid", "peak", "matched", "likelihood"))
-        check_integer("config.seed", self.seed, 0, 2**64 - 1)
+            check.number("config.laser_half_angle", self.laser_half_angle, "(0, 3.1416]")
+        check.choice("config.method", self.method, ("centroid", "peak", "matched", "likelihood"))
+        check.integer("config.seed", self.seed, 0, 2**64 - 1)
         if (bins := self._sigma_bins) > 1e4:
             width = f"bins of {self.bin_path / self.speed:.3g} s"
             raise ArgumentError(
@@ -121,9 +112,9 @@ class SpadConfig:
         if len(found) > 1:
             raise ArgumentError(f"config.{found[0]} and config.{found[1]}: only one says what the image shows")
         for name in set(found) - {"camera_matrix"}:
-            check_number(f"config.{name}", getattr(self, name), "(0, 3.1)")
+            check.number(f"config.{name}", getattr(self, name), "(0, 3.1)")
         if self.camera_matrix is not None:
-            k = check_numbers("config.camera_matrix", self.camera_matrix)
+            k = check.numbers("config.camera_matrix", self.camera_matrix)
             if k.shape != (3, 3) or not (
                 k[0, 0] > 0.0 < k[1, 1] and (k * [[0, 1, 0], [1, 0, 0], [1, 1, 0]] == 0).all()
             ):
@@ -299,14 +290,14 @@ def world_value(values: wp.array[float], world: int, otherwise: float) -> float:
 def world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.Device) -> tuple[WorldValues, int]:
     """Arrays of checked values, and the number of worlds that they are for; 0 for none."""
     values, worlds = WorldValues(), 0
-    check_kind("by_world", by_world, Mapping)
+    check.kind("by_world", by_world, Mapping)
     for name, given in by_world.items():
-        check_choice("by_world", name, WorldValues.vars)
+        check.choice("by_world", name, WorldValues.vars)
         dtype = WorldValues.vars[name].type.dtype
         if not isinstance(given, wp.array):
-            rows = check_numbers(f"by_world[{name!r}]", given, 1)
+            rows = check.numbers(f"by_world[{name!r}]", given, 1)
             given = wp.array(rows.astype(wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
-        check_array(f"by_world[{name!r}]", given, dtype, (worlds or None,), device)
+        check.array(f"by_world[{name!r}]", given, dtype, (worlds or None,), device)
         high = (
             config.gate_distance[1] - config.gate_distance[0]
             if name == "gate_delay"
@@ -314,7 +305,7 @@ def world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.Dev
             if name == "pulses"
             else 1e6
         )
-        check_values(f"by_world[{name!r}]", given, f"[0, {high}]")
+        check.values(f"by_world[{name!r}]", given, f"[0, {high}]")
         setattr(values, name, given)
         worlds = given.size
     return values, worlds

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.base.arguments import ArgumentError, check_choice, check_integer, check_kind
+from spadwarp_kernels.base import check
+from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.optics.camera import make_camera, make_gate
 from spadwarp_kernels.optics.laser import make_laser
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -281,8 +282,8 @@ class SpadTracer(WorldCameras):
         use_warp_bvh: bool = False,
         device: wp.DeviceLike = None,
     ) -> None:
-        check_kind("shapes", shapes, Shapes)
-        self._parts = check_integer("oversampling", oversampling, 1, 1024)
+        check.kind("shapes", shapes, Shapes)
+        self._parts = check.integer("oversampling", oversampling, 1, 1024)
         options: dict[str, Any] = {"body": body, "offset": offset, "update_period": 0.0, "outputs": outputs}
         options["device"] = shapes.device if device is None else device
         super().__init__(config, cameras, world=world, frame=frame, **options)
@@ -294,8 +295,8 @@ class SpadTracer(WorldCameras):
         check_memory("tallies", {**sizes, "oversampling": self._parts}, 16, shapes.device, rows=4)
         if self.device != shapes.device:
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
-        check_choice("estimator", estimator, ESTIMATORS)
-        self.photons = check_integer("photons", photons, 1, 1 << 26)
+        check.choice("estimator", estimator, ESTIMATORS)
+        self.photons = check.integer("photons", photons, 1, 1 << 26)
         self.shapes, self._use_warp_bvh = shapes, use_warp_bvh
         worlds = self._world.numpy().tolist()
         if max(worlds) >= shapes.worlds:
@@ -303,7 +304,7 @@ class SpadTracer(WorldCameras):
         self._meshes = CameraMeshes(shapes, worlds, self.device)
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(np.pad(taps, (_RUN - 1) * self._parts), dtype=float, device=self.device)
-        lanes = check_integer("lanes", lanes, 1, 64)
+        lanes = check.integer("lanes", lanes, 1, 64)
         bins = (self._rows, self.config.bins)
         self._light = self.rates.reshape(bins) if self.rates.size else wp.empty(bins, dtype=float, device=self.device)
         self._water = wp.empty(bins, dtype=float, device=self.device)

@@ -1,7 +1,8 @@
 """What public functions check of their arguments before anything is launched, and the error that they raise.
 
-Kinds, shapes, dtypes, devices and numbers are read on the host and cost microseconds. Values of arrays are read only
-where something is built from them once: a check of every call would wait for a GPU.
+Used as a module, `check.number("g", g, "(-1, 1)")`: each function takes the argument's name and value, and most return
+it. Kinds, shapes, dtypes, devices and numbers are read on the host and cost microseconds. Values of arrays are read
+only where something is built from them once: a check of every call would wait for a GPU.
 """
 
 import math
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 __all__ = ["ArgumentError"]
 
 
-# What a field of a struct must be, see `check_fields`.
+# What a field of a struct must be, see `fields`.
 Need: TypeAlias = str | tuple[int | None, ...]
 
 
@@ -34,80 +35,82 @@ def _limits(interval: str) -> tuple[float, float, bool, bool]:
     return float(low), float(high), interval[0] == "(", interval[-1] == ")"
 
 
-def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
+def number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
     """A finite number in an interval, as in an error: `"[0, 1)"`; closed ends hold what float32 makes of them."""
     try:
-        number = float(value)
+        found = float(value)
     except (TypeError, ValueError, OverflowError):
         raise ArgumentError(f"{name} = {value!r} is not a number") from None
     low, high, low_open, high_open = _limits(interval)
-    inside = (low < number if low_open else low <= number) and (number < high if high_open else number <= high)
+    inside = (low < found if low_open else low <= found) and (found < high if high_open else found <= high)
     ends = [end for end, is_open in ((low, low_open), (high, high_open)) if not is_open]
-    if not (math.isfinite(number) and (inside or any(math.isclose(number, end, rel_tol=6e-8) for end in ends))):
+    if not (math.isfinite(found) and (inside or any(math.isclose(found, end, rel_tol=6e-8) for end in ends))):
         raise ArgumentError(f"{name} = {value} is outside {interval}")
-    return number
+    return found
 
 
-def check_range(interval: str, **values: Any) -> None:
-    """`check_number` for several numbers of one interval, by name."""
+def within(interval: str, **values: Any) -> None:
+    """`number` for several numbers of one interval, by name."""
     for name, value in values.items():
-        check_number(name, value, interval)
+        number(name, value, interval)
 
 
-def check_integer(name: str, value: Any, low: int, high: int = 2**31 - 1) -> int:
+def integer(name: str, value: Any, low: int, high: int = 2**31 - 1) -> int:
     """An integer from low to high, also one that is written as a float."""
     try:
-        number = int(value) if isinstance(value, float) and value.is_integer() else operator.index(value)
+        found = int(value) if isinstance(value, float) and value.is_integer() else operator.index(value)
     except TypeError:
         raise ArgumentError(f"{name} = {value!r} is not an integer") from None
-    if not low <= number <= high:
+    if not low <= found <= high:
         raise ArgumentError(f"{name} = {value} is outside [{low}, {high}]")
-    return number
+    return found
 
 
-def check_seed(seed: Any) -> int:
+def seed(value: Any) -> int:
     """A seed of 64 bits."""
-    return check_integer("seed", seed, 0, 2**64 - 1)
+    return integer("seed", value, 0, 2**64 - 1)
 
 
-def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
+def choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """One of a few values."""
     if value not in tuple(choices):
         raise ArgumentError(f"{name} = {value!r} is not one of {', '.join(map(repr, choices))}")
 
 
-def check_device(name: str, device: Any) -> wp.Device:
+def device(name: str, value: Any) -> wp.Device:
     """A device by name, or the current one for None."""
     try:
-        return wp.get_device(device)
+        return wp.get_device(value)
     except (ValueError, TypeError, RuntimeError) as error:
-        raise ArgumentError(f"{name} = {device!r} is not a device of this machine: {error}") from None
+        raise ArgumentError(f"{name} = {value!r} is not a device of this machine: {error}") from None
 
 
-def check_struct(name: str, value: Any, struct: Any) -> None:
-    """An instance of a Warp struct."""
-    if not isinstance(value, struct.cls):
-        raise ArgumentError(f"{name} is {_kind(value)}; a {struct.key.rsplit('.')[-1]} is needed")
+def kind(name: str, value: Any, of: Any) -> Any:
+    """An instance of a class or of a Warp struct."""
+    if not isinstance(value, getattr(of, "cls", of)):
+        needed = of.key.rsplit(".")[-1] if hasattr(of, "cls") else of.__name__
+        raise ArgumentError(f"{name} is {_kind(value)}; a {needed} is needed")
+    return value
 
 
-def check_fields(name: str, struct: Any, needs: Mapping[str, Need], device: Any = None) -> None:
+def fields(name: str, struct: Any, needs: Mapping[str, Need], device: Any = None) -> None:
     """Fields of a struct, each by what it must be: numbers, also those of a vector, in an interval such as `"[0, 1)"`;
-    `"unit"`, a unit vector or a matrix of them; a shape: an array of the field's dtype, see `check_array`."""
+    `"unit"`, a unit vector or a matrix of them; a shape: an array of the field's dtype, see `array`."""
     for field, need in needs.items():
         path, value = f"{name}.{field}", getattr(struct, field)
         if isinstance(need, tuple):
-            check_array(path, value, struct._cls.vars[field].type.dtype, need, device)
+            array(path, value, struct._cls.vars[field].type.dtype, need, device)
         elif need == "unit":
             for row in np.reshape(value, (-1, 3)):
-                check_vector(path, row, unit=True)
+                vector(path, row, unit=True)
         elif hasattr(value, "__len__"):
-            for k, number in enumerate(value):
-                check_number(f"{path}[{k}]", number, need)
+            for k, one in enumerate(value):
+                number(f"{path}[{k}]", one, need)
         else:
-            check_number(path, value, need)
+            number(path, value, need)
 
 
-def check_vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
+def vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
     """Finite components, of a unit vector if asked."""
     try:
         components = [float(x) for x in value]
@@ -120,70 +123,64 @@ def check_vector(name: str, value: Sequence[float], *, unit: bool = False, size:
         raise ArgumentError(f"{name} = {tuple(components)} has the length {length:g}; a unit vector is needed")
 
 
-def check_numbers(name: str, values: Any, dimensions: int | None = None) -> NDArray[np.float64]:
+def numbers(name: str, values: Any, dimensions: int | None = None) -> NDArray[np.float64]:
     """An array of numbers in NumPy, with so many dimensions (None: any)."""
     try:
-        array = np.asarray(values, np.float64)
+        found = np.asarray(values, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ArgumentError(f"{name} is {_kind(values)} and not an array of numbers") from None
-    if dimensions is not None and array.ndim != dimensions:
-        raise ArgumentError(f"{name} has shape {array.shape}; {dimensions} dimensions are needed")
-    return array
+    if dimensions is not None and found.ndim != dimensions:
+        raise ArgumentError(f"{name} has shape {found.shape}; {dimensions} dimensions are needed")
+    return found
 
 
-def check_kind(name: str, value: Any, kind: type) -> None:
-    """An instance of a class."""
-    if not isinstance(value, kind):
-        raise ArgumentError(f"{name} is {_kind(value)}; a {kind.__name__} is needed")
-
-
-def check_items(name: str, value: Any) -> list[Any]:
+def items(name: str, value: Any) -> list[Any]:
     """A list of what has items, such as a list, a tuple or an array."""
     if isinstance(value, str | bytes) or not (isinstance(value, Iterable) and getattr(value, "ndim", 1)):
         raise ArgumentError(f"{name} is {_kind(value)}; a list is needed")
     return list(value)
 
 
-def check_array(
-    name: str, array: Any, dtypes: Any, shape: Sequence[int | None], device: Any = None, *, contiguous: bool = False
+def array(
+    name: str, value: Any, dtypes: Any, shape: Sequence[int | None], device: Any = None, *, contiguous: bool = False
 ) -> Any:
     """A `wp.array` of one of the dtypes, with the sizes given (None: any), on a device (None: any)."""
     allowed = dtypes if isinstance(dtypes, tuple) else (dtypes,)
-    if not isinstance(array, wp.array):
-        problem = f"is {_kind(array)}"
+    if not isinstance(value, wp.array):
+        problem = f"is {_kind(value)}"
     elif not (
-        len(array.shape) == len(shape)
-        and all(needed in (None, size) for size, needed in zip(array.shape, shape, strict=True))
-        and any(wp.types.types_equal(array.dtype, dtype) for dtype in allowed)
+        len(value.shape) == len(shape)
+        and all(needed in (None, size) for size, needed in zip(value.shape, shape, strict=True))
+        and any(wp.types.types_equal(value.dtype, dtype) for dtype in allowed)
     ):
-        problem = f"is a wp.array of {_dtype_name(array.dtype)}, shape {tuple(array.shape)}"
-    elif device is not None and array.device != device:
-        problem = f"is on {array.device} and not on {device}"
-    elif contiguous and not array.is_contiguous:
+        problem = f"is a wp.array of {_dtype_name(value.dtype)}, shape {tuple(value.shape)}"
+    elif device is not None and value.device != device:
+        problem = f"is on {value.device} and not on {device}"
+    elif contiguous and not value.is_contiguous:
         problem = "is not contiguous"
     else:
-        return array
+        return value
     kinds = " or ".join(map(_dtype_name, allowed))
     sizes = ", ".join("any" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
     raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape ({sizes}), is needed")
 
 
-def check_arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **arrays: Any) -> None:
-    """`check_array` for several arrays of one kind, by name."""
-    for name, array in arrays.items():
-        check_array(name, array, dtypes, shape, device)
+def arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **values: Any) -> None:
+    """`array` for several arrays of one kind, by name."""
+    for name, value in values.items():
+        array(name, value, dtypes, shape, device)
 
 
-def check_values(name: str, array: wp.array, interval: str) -> None:
+def values(name: str, array: wp.array, interval: str) -> None:
     """Every number of an array of float32, int32 or vectors of float32 is finite and within a closed interval; waits
     for the device."""
     low, high, *_ = _limits(interval)
-    values = array.numpy().ravel()
-    ends = np.array([low, high], np.float64 if values.dtype.kind == "i" else values.dtype)
-    outside = ~((values >= ends[0]) & (values <= ends[1]))
+    found = array.numpy().ravel()
+    ends = np.array([low, high], np.float64 if found.dtype.kind == "i" else found.dtype)
+    outside = ~((found >= ends[0]) & (found <= ends[1]))
     if outside.any():
         k = int(outside.argmax())
-        raise ArgumentError(f"{name}[{k // (values.size // array.size)}] = {values[k]} is outside {interval}")
+        raise ArgumentError(f"{name}[{k // (found.size // array.size)}] = {found[k]} is outside {interval}")
 
 
 def _kind(value: Any) -> str:
