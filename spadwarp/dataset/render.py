@@ -109,7 +109,10 @@ def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> Rende
 
     if draw.signal_photons is not None:
         middle = slice(_COARSE // 2, None, _COARSE)
-        coarse = maps_of(scene, (middle, middle))[0]
+        for part in ((middle, middle), ...):  # thin things lie between the coarse pixels
+            coarse = maps_of(scene, part)[0]
+            if (coarse["fisher"] > 0).any():
+                break
         # Of the recorded photons, the share signal / alpha comes from the target.
         signal = coarse["signal"] / coarse["alpha"] * -np.expm1(-coarse["alpha"])
         scene = with_exposure(scene, draw, signal[coarse["fisher"] > 0], most=_MOST_PULSES)

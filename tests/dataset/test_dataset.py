@@ -30,9 +30,11 @@ from spadwarp.dataset import (
     load_recipe,
     verify_dataset,
 )
+from spadwarp.dataset.render import render_analytic
 from spadwarp.dataset.shards import HISTOGRAM_FIELDS
 from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
+from spadwarp.transport import truth_maps
 from spadwarp.values import SPEED_OF_LIGHT
 
 
@@ -309,6 +311,14 @@ def test_the_centre_of_a_mesh_is_at_the_distance_of_the_recipe(tmp_path):
         box = trimesh.creation.box(extents=(1.1 * unit, 0.7 * unit, 0.3 * unit))
         size = np.ptp(build_mesh(plan_of_mesh(box, tmp_path, **options).scene(0).scene).bounds, axis=0)
         np.testing.assert_allclose(size, (1.1, 0.7, 0.3), rtol=1e-5)
+
+
+def test_a_thin_target_between_the_pixels_of_the_exposure_gets_one(tmp_path):
+    plan = plan_of_mesh(trimesh.creation.box(extents=(0.3, 2.0, 0.1)), tmp_path)
+    seen = np.isfinite(truth_maps(plan.scene(0).scene, device="cpu").depth).any(axis=0)
+    assert seen.any() and not seen[4::8].any()
+    rendered = render_analytic(plan, plan.scene(0), device="cpu")
+    assert 15.0 <= rendered.signal * rendered.scene.analytic.pulses_per_depth_frame <= 210.0
 
 
 @pytest.mark.parametrize(
