@@ -281,7 +281,7 @@ class WorldValues:
 
 
 @wp.func
-def world_value(values: wp.array[float], world: int, otherwise: float) -> float:
+def world_value(values: wp.array[Any], world: int, otherwise: Any):
     if world >= 0 and world < values.shape[0]:
         return values[world]
     return otherwise
