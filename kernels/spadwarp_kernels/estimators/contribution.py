@@ -214,10 +214,8 @@ def sea_component(s: wp.ref[PhotonState], scatterings: int) -> int:
 @memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
-    view_of, shows, reflects = spec.sight.view, spec.sight.shows, spec.domain.reflects
-    sea, ask_at_sea = spec.sight.sea is not None, make_ask_at_sea(spec.waves)
-    tracks, rides, point_in = spec.water.profile is not None, make_rider(spec).rides, spec.sight.pose.point_in
-    camera_at = spec.sight.camera_at
+    sight, reflects, sea = spec.sight, spec.domain.reflects, spec.sight.sea is not None
+    ask_at_sea, tracks, rides = make_ask_at_sea(spec.waves), spec.water.profile is not None, make_rider(spec).rides
 
     @wp.func
     def event_request(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
@@ -225,9 +223,9 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
         on_surface = s.hit.face >= 0
         # Mirrored, any point may be seen.
         if wp.static(not flights or reflects) or on_surface:
-            x = point_in(world.scan, s.target, s.x)
-            if wp.static(reflects) or shows(
-                camera_at(world.camera, world.scan, s.target), view_of(world.camera, s.view), x
+            x = sight.pose.point_in(world.scan, s.target, s.x)
+            if wp.static(reflects) or sight.shows(
+                sight.camera_at(world.camera, world.scan, s.target), sight.view(world.camera, s.view), x
             ):
                 q.wanted = True
                 if wp.static(reflects):
@@ -273,14 +271,10 @@ def scores_collision(word: wp.uint32) -> bool:
 @memoised
 def make_flight_point(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, world) -> ScoredPoint`` that draws the point of a flight to be scored."""
-    local_albedo = spec.local_albedo
-    water, profile = spec.water, spec.water.profile
-    water_extinction, water_at = water.extinction, water.at
+    water, profile, sight = spec.water, spec.water.profile, spec.sight
     sample_flight = make_sample_flight(water.phase.guide or HENYEY_GREENSTEIN_GUIDE, profile)
     has_profile, collides = profile is not None, spec.scores_collisions
-    depth_along = profile.depth if profile is not None else water_extinction  # any function: it is not called
-    apparent_lens, point_in, point_out = spec.sight.apparent, spec.sight.pose.point_in, spec.sight.pose.point_out
-    camera_at = spec.sight.camera_at
+    depth_along = profile.depth if profile is not None else water.extinction  # any function: it is not called
 
     @wp.func
     def flight_point(request: Request, world: wp.ref[World]) -> ScoredPoint:
@@ -291,9 +285,9 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
         middle = request.x + (0.5 * (s0 + request.interval[1])) * request.u
         begin = request.x + s0 * request.u
         seed = join_words(request.first, request.second)
-        middle = point_in(world.scan, request.target, middle)
-        seen = apparent_lens(camera_at(world.camera, world.scan, request.target), middle, request.lens)
-        from_lens = request.x - point_out(world.scan, request.target, seen)
+        middle = sight.pose.point_in(world.scan, request.target, middle)
+        seen = sight.apparent(sight.camera_at(world.camera, world.scan, request.target), middle, request.lens)
+        from_lens = request.x - sight.pose.point_out(world.scan, request.target, seen)
         xi_choice = u01(request.first)
         xi = u01_fine(request.second)
         if wp.static(collides):
@@ -301,15 +295,15 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
                 xi = from_bits(int(request.second))
         mean = float(0.0)
         if wp.static(not has_profile):
-            mean = water_extinction(world.medium, world.layers, begin, request.u, width, seed)
+            mean = water.extinction(world.medium, world.layers, begin, request.u, width, seed)
         flight = sample_flight(
             from_lens, request.u, request.interval, mean, world.medium, xi_choice, xi, world.layers, begin
         )
         point.x = request.x + flight.s * request.u
         point.path = request.path + flight.s
-        there = water_at(world.medium, world.layers, point.x)
+        there = water.at(world.medium, world.layers, point.x)
         weight = float(request.weight)
-        if wp.static(local_albedo):
+        if wp.static(spec.local_albedo):
             weight *= there.albedo
         if wp.static(collides):
             # What is scored at collisions has lost light by chance already. Both kinds of points share a density, of
@@ -330,7 +324,7 @@ def make_flight_point(spec: TransportSpec) -> wp.Function:
             # The extinction of the draw: beside it in a dense cell, that of a thin one would leave a spike.
             weight *= flight.extinction * wp.exp(-before - flight.depth)
         else:
-            passed = water_extinction(world.medium, world.layers, request.x, request.u, flight.s, seed)
+            passed = water.extinction(world.medium, world.layers, request.x, request.u, flight.s, seed)
             weight *= there.extinction * wp.exp(-passed * flight.s)
         point.weight = wp.where(flight.density <= 0.0, 0.0, weight / flight.density)
         return point
@@ -362,17 +356,17 @@ def make_point_of(points: int) -> wp.Function:
 def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
     request scatters at x into the direction v."""
-    water_at, phase_pdf, face_density = spec.water.at, spec.water.phase.pdf, spec.faces.density
+    water, faces = spec.water, spec.faces
     sea, passage_density = spec.sight.sea is not None, (spec.sight.sea or FACETS).density
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
         scattering = float(0.0)
         if request.slot >= 0:
-            scattering = face_density(world.surfaces, request.slot, x, request.u, v)
+            scattering = faces.density(world.surfaces, request.slot, x, request.u, v)
         else:
             snapped = snap_from(request.u, world.medium.axis_threshold)
-            scattering = phase_pdf(one_minus_cosine(snapped, v), water_at(world.medium, world.layers, x))
+            scattering = water.phase.pdf(one_minus_cosine(snapped, v), water.at(world.medium, world.layers, x))
         if wp.static(sea):
             if request.slot == SEA_SLOT:
                 scattering = passage_density(world.sea, x, request.u, v)
@@ -403,24 +397,20 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
 
     `flights`: whether requests may ask for a point of a flight.
     """
-    reflects, index_of = spec.domain.reflects, spec.tally_index
-    water_extinction, collides = spec.water.extinction, flights and spec.scores_collisions
+    reflects, collides, water = spec.domain.reflects, flights and spec.scores_collisions, spec.water
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    sight, sea, is_hidden = spec.sight, spec.sight.sea is not None, _make_hidden_by_waves(spec)
-    image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
-    (point_in, _, point_out, turn_out), camera_at, sea_at = sight.pose, sight.camera_at, sight.sea_at
-    rider = make_rider(spec)
-    rides, (_begin, fork, fly, event, _mirror, deliver) = rider.rides, rider
+    sight, pose, sea, rider = spec.sight, spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
+    is_hidden = _make_hidden_by_waves(spec)
 
     @wp.func
     def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):
         carried = request.carried
-        fork(carried, world)
-        to_lens = turn_out(world.scan, request.target, link.to_lens)
-        fly(carried, world, request.x, request.u, wp.length(found.origin - request.x))
-        event(carried, world, request.slot, found.origin, request.u, to_lens)
-        fly(carried, world, found.origin, to_lens, link.water)
-        deliver(found.contribution, carried, world, link.end, link.to_lens, wp.normalize(inside))
+        rider.fork(carried, world)
+        to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
+        rider.fly(carried, world, request.x, request.u, wp.length(found.origin - request.x))
+        rider.event(carried, world, request.slot, found.origin, request.u, to_lens)
+        rider.fly(carried, world, found.origin, to_lens, link.water)
+        rider.deliver(found.contribution, carried, world, link.end, link.to_lens, wp.normalize(inside))
 
     @wp.func
     def score(request: Request, world: wp.ref[World]) -> Scored:
@@ -442,19 +432,19 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                 weight = point.weight
                 path = point.path
                 ahead = point.ahead
-        view = scan_view(world.camera, world.scan, request.target)
+        view = sight.scan_view(world.camera, world.scan, request.target)
         at_sea = bool(False)
         bits = wp.uint64(0)
         if wp.static(sea):
             at_sea = request.slot == SEA_SLOT
             bits = join_words(request.second, request.first)
-        origin = point_in(world.scan, request.target, found.origin)
-        camera = camera_at(world.camera, world.scan, request.target)
-        link = link_to(camera, sea_at(world.sea, world.scan, request.target), origin, lens, at_sea, bits)
-        to_lens = turn_out(world.scan, request.target, link.to_lens)
-        found.lens = point_out(world.scan, request.target, link.end)
-        found.behind = point_out(world.scan, request.target, lens)
-        pixel = image_of(world.camera, view, request.target, link.image, lens)
+        origin = pose.point_in(world.scan, request.target, found.origin)
+        camera = sight.camera_at(world.camera, world.scan, request.target)
+        link = sight.link(camera, sight.sea_at(world.sea, world.scan, request.target), origin, lens, at_sea, bits)
+        to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
+        found.lens = pose.point_out(world.scan, request.target, link.end)
+        found.behind = pose.point_out(world.scan, request.target, lens)
+        pixel = sight.project(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)
         if pixel >= 0 and not scattering <= 0.0 and not is_hidden(camera, origin, lens, link, request.target, world):
             seed = join_words(request.second, request.first)
@@ -465,19 +455,21 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
                     begin = wp.where(ahead > 0.0, request.x, found.origin)
                     u = wp.where(ahead > 0.0, request.u, to_lens)
                     length = wp.where(ahead > 0.0, ahead, link.water)
-                    extinction = water_extinction(world.medium, world.layers, begin, u, length, seed)
+                    extinction = water.extinction(world.medium, world.layers, begin, u, length, seed)
                     weight *= wp.where(ahead > 0.0, wp.exp(-extinction * ahead), 1.0)
                     seed += wp.uint64(0x632BE59BD9B4E019)  # another sequence
                     ahead = wp.where(ahead > 0.0, 0.0, -1.0)
             elif wp.static(sea):
-                begin = point_out(world.scan, request.target, link.begin)
-                along = turn_out(world.scan, request.target, link.along)
-                extinction = water_extinction(world.medium, world.layers, begin, along, link.water, seed)
+                begin = pose.point_out(world.scan, request.target, link.begin)
+                along = pose.turn_out(world.scan, request.target, link.along)
+                extinction = water.extinction(world.medium, world.layers, begin, along, link.water, seed)
             else:
-                extinction = water_extinction(world.medium, world.layers, found.origin, to_lens, link.water, seed)
-            found.contribution.value = value_of(world.camera, extinction, weight, scattering, link)
-            found.contribution.index = index_of(world.camera, world.gate, pixel, path + link.path, request.component)
-            if wp.static(rides):
+                extinction = water.extinction(world.medium, world.layers, found.origin, to_lens, link.water, seed)
+            found.contribution.value = sight.value(world.camera, extinction, weight, scattering, link)
+            found.contribution.index = spec.tally_index(
+                world.camera, world.gate, pixel, path + link.path, request.component
+            )
+            if wp.static(rider.rides):
                 if found.contribution.value > 0.0:
                     carry(found, request, link, world, lens - link.image)
         return found

@@ -53,32 +53,30 @@ def make_guided(spec: TransportSpec) -> Estimator:
 
 def make_plan_flight(spec: TransportSpec) -> wp.Function:
     """The part of a flight that the view and the gate show by way of a point of the lens."""
-    sight, varies, has_phase_guide = spec.sight, spec.varies, spec.water.phase.guide is not None
-    view_of, clip_to_view, gate_of, sample_lens = sight.view, sight.clip, sight.gate, sight.sample_lens
-    within, sea = spec.domain.within, sight.sea is not None
-    point_in, turn_in, camera_at = sight.pose.point_in, sight.pose.turn_in, sight.camera_at
+    sight, sea, has_phase_guide = spec.sight, spec.sight.sea is not None, spec.water.phase.guide is not None
+    within = spec.domain.within
 
     @wp.func
     def plan_flight(s: wp.ref[PhotonState], block: wp.vec4ui, world: wp.ref[World]) -> FlightPlan:
         plan = FlightPlan()
-        x = point_in(world.scan, s.target, s.x)
-        u = turn_in(world.scan, s.target, s.u)
+        x = sight.pose.point_in(world.scan, s.target, s.x)
+        u = sight.pose.turn_in(world.scan, s.target, s.u)
         if wp.static(has_phase_guide):
             # The direction was drawn for this point, see `make_direct`.
             plan.lens = lens_point(world.camera, u01(block[2]), u01(block[3]))
             plan.lens_weight = 1.0
         else:
-            lens = sample_lens(world.camera, x, u, u01(block[2]), u01(block[3]))
+            lens = sight.sample_lens(world.camera, x, u, u01(block[2]), u01(block[3]))
             plan.lens = lens.point
             plan.lens_weight = lens.weight
         limit = within(world.limits, world.limits.max_path - s.path, s.x, s.u)
         if wp.static(sea):
             limit = wp.where(s.above, -1.0, wp.min(limit, s.flight.sea))
-        camera = camera_at(world.camera, world.scan, s.target)
-        plan.interval = clip_to_view(camera, view_of(world.camera, s.view), x, u, plan.lens, limit)
-        gate = gate_of(world.camera, world.gate)
+        camera = sight.camera_at(world.camera, world.scan, s.target)
+        plan.interval = sight.clip(camera, sight.view(world.camera, s.view), x, u, plan.lens, limit)
+        gate = sight.gate(world.camera, world.gate)
         plan.interval = clip_to_gate(gate, x, u, s.path, plan.lens, plan.interval)
-        if not (wp.static(varies) or world.medium.extinction > 0.0):
+        if not (wp.static(spec.varies) or world.medium.extinction > 0.0):
             plan.interval = wp.vec2(0.0, 0.0)
         return plan
 
@@ -89,7 +87,7 @@ def make_choose_meeting(spec: TransportSpec) -> wp.Function:
     """Light on its way to the first surface in view, through a transmittance T, that would collide before it reaches it
     with the chance sqrt(T) (1 - sqrt(T))/2 nevertheless: in turbid water few photons do, and all light of the target
     comes from them. More would take too many from the light that the water scatters back."""
-    water_extinction = spec.water.extinction
+    water = spec.water
 
     @wp.func
     def choose_meeting(s: wp.ref[PhotonState], world: wp.ref[World], distance: float) -> Meeting:
@@ -100,7 +98,7 @@ def make_choose_meeting(spec: TransportSpec) -> wp.Function:
         planned = interval[0] < interval[1] and interval[0] <= distance and distance <= interval[1]
         if planned and s.surface_count == 0:
             seed = join_words(s.flight.block[0], s.flight.block[2])
-            extinction = water_extinction(world.medium, world.layers, s.x, s.u, distance, seed)
+            extinction = water.extinction(world.medium, world.layers, s.x, s.u, distance, seed)
             root = wp.exp(-0.5 * extinction * distance)
             # Within the bound of weights of `guided_part`; in steps of 1/256, for the last 8 bits of a word, which
             # `u01` leaves.
@@ -130,8 +128,7 @@ def leads_aside(x: wp.vec3, u: wp.vec3) -> bool:
 
 def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
     """Of the flight, from which `make_score` takes a point, and of the surface at its end."""
-    local_albedo, rides = spec.local_albedo, make_rider(spec).rides
-    collides = spec.scores_collisions
+    rides, collides = make_rider(spec).rides, spec.scores_collisions
     spares = collides and not spec.domain.reflects  # mirrored, any flight may lead to an image of the lens
 
     @wp.func
@@ -142,7 +139,7 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
         q.u = s.u
         # In this order, so that layers of one water have the bits of that water.
         q.weight = s.flight.lens_weight * s.weight.value
-        q.weight = wp.where(wp.static(local_albedo), q.weight, q.weight * s.albedo)
+        q.weight = wp.where(wp.static(spec.local_albedo), q.weight, q.weight * s.albedo)
         q.path = s.path
         q.lens = s.flight.lens
         q.interval = s.flight.interval
@@ -179,9 +176,7 @@ def make_requests(spec: TransportSpec) -> tuple[wp.Function, wp.Function]:
 def make_sample_angle(phase: PhaseFunction) -> wp.Function:
     """The Warp function ``(word, to_lens, directed, here, medium, guiding) -> float``: t = 1 - cos(theta) from the axis
     of the lobe towards the lens, of other directed light (back into the view), or of what the water scatters."""
-    guide = phase.guide or HENYEY_GREENSTEIN_GUIDE
-    phase_sample, lobe_sample = phase.sample, guide.lobe_sample
-    one_family = phase.name == HENYEY_GREENSTEIN.name
+    guide, one_family = phase.guide or HENYEY_GREENSTEIN_GUIDE, phase.name == HENYEY_GREENSTEIN.name
 
     @wp.func
     def sample_angle(
@@ -192,9 +187,9 @@ def make_sample_angle(phase: PhaseFunction) -> wp.Function:
             # One draw for both: the lanes of a warp take theirs together.
             t = sample_henyey_greenstein(xi, wp.where(directed, guiding.return_anisotropy, here.anisotropy))
         else:
-            t = phase_sample(xi, here)
+            t = phase.sample(xi, here)
         if to_lens:
-            t = lobe_sample(xi, medium, guiding)
+            t = guide.lobe_sample(xi, medium, guiding)
         elif wp.static(not one_family) and directed:
             t = sample_henyey_greenstein(xi, guiding.return_anisotropy)
         return t
@@ -228,15 +223,9 @@ def guided_part(weight: float, analog_weight: float, surfaces_met: int, probabil
 
 def make_direct(spec: TransportSpec) -> wp.Function:
     """Directions towards the lens, or back into the view, with some chance; the weight makes up for it."""
-    phase, water_at = spec.water.phase, spec.water.at
-    guide, has_phase_guide, phase_pdf = phase.guide or HENYEY_GREENSTEIN_GUIDE, phase.guide is not None, phase.pdf
-    lobe_pdf, sample_angle = guide.lobe_pdf, make_sample_angle(phase)
-    tracks, collides = spec.water.profile is not None, spec.scores_collisions
-    face_pdf, specular, sight = spec.faces.pdf, spec.faces.specular, spec.sight
-    view_of, in_view, toward_middle = sight.view, sight.shows, sight.toward_middle
-    toward, toward_centre, gate_of = sight.toward, sight.toward_centre, sight.gate
-    point_in, turn_in, turn_out = sight.pose.point_in, sight.pose.turn_in, sight.pose.turn_out
-    camera_at = sight.camera_at
+    water, phase, sight, pose = spec.water, spec.water.phase, spec.sight, spec.sight.pose
+    guide, has_phase_guide = phase.guide or HENYEY_GREENSTEIN_GUIDE, phase.guide is not None
+    sample_angle, tracks, collides = make_sample_angle(phase), water.profile is not None, spec.scores_collisions
 
     @wp.func
     def direct(
@@ -244,43 +233,43 @@ def make_direct(spec: TransportSpec) -> wp.Function:
     ) -> Direction:
         new = Direction()
         on_surface = s.hit.face >= 0
-        x = point_in(world.scan, s.target, s.x)
-        here = water_at(world.medium, world.layers, s.x)
+        x = pose.point_in(world.scan, s.target, s.x)
+        here = water.at(world.medium, world.layers, s.x)
         # On surfaces for what the water scatters on the way to the lens: where it is clear there is nothing to gain.
         extinction = float(0.0)
         if wp.static(not tracks):
             extinction = here.extinction
         elif on_surface:  # else no cell need be looked up
-            extinction = water_at(world.medium, world.layers, s.x).extinction
+            extinction = water.at(world.medium, world.layers, s.x).extinction
         at_surface = world.guiding.surface_probability * wp.min(2.0 * extinction * wp.length(x), 1.0)
         to_lens_chance = world.guiding.probability
         if wp.static(collides):
             # Two chances for light that flies back: what comes late through a cloud has turned in several steps, and
             # such histories are few and heavy. A grid that repeats layers has the histories of layers, and one chance.
-            u = turn_in(world.scan, s.target, s.u)
+            u = pose.turn_in(world.scan, s.target, s.u)
             to_lens_chance = wp.where(u[2] < 0.0, to_lens_chance * (2.0 - to_lens_chance), to_lens_chance)
         to_lens_chance = wp.where(on_surface, at_surface, to_lens_chance)
         # Light that goes straight to the lens and arrives before the gate is not worth a chance.
-        if s.path + wp.length(x) < gate_of(world.camera, world.gate).start:
+        if s.path + wp.length(x) < sight.gate(world.camera, world.gate).start:
             to_lens_chance = 0.0
         met = s.surface_count + wp.where(on_surface, 1, 0)
         snapped = snap_from(s.u, world.medium.axis_threshold)
-        camera = camera_at(world.camera, world.scan, s.target)
-        v = toward_centre(camera, x)
+        camera = sight.camera_at(world.camera, world.scan, s.target)
+        v = sight.toward_centre(camera, x)
         if wp.static(has_phase_guide):
             # To the point of the lens at which the flight to come will be scored: a lobe about the lens's centre could
             # not have a peak narrower than the lens.
             ahead = random_block_keyed(world.keys, id, wp.uint32(s.collisions + 1), STREAM_FLIGHT_SAMPLE)
-            v = toward(camera, x, lens_point(world.camera, u01(ahead[2]), u01(ahead[3])))
-        v = turn_out(world.scan, s.target, v)
-        view = view_of(world.camera, s.view)
-        way = toward_middle(view, x)
+            v = sight.toward(camera, x, lens_point(world.camera, u01(ahead[2]), u01(ahead[3])))
+        v = pose.turn_out(world.scan, s.target, v)
+        view = sight.view(world.camera, s.view)
+        way = sight.toward_middle(view, x)
         to_axis = wp.vec3()
         to_view_chance = float(0.0)
-        if wp.dot(way, way) > 0.0 and not in_view(camera, view, x):
+        if wp.dot(way, way) > 0.0 and not sight.shows(camera, view, x):
             to_view_chance = world.guiding.return_probability
             way *= 1.0 / wp.length(way)
-            to_axis = turn_out(world.scan, s.target, wp.vec3(way[0], way[1], 0.0))
+            to_axis = pose.turn_out(world.scan, s.target, wp.vec3(way[0], way[1], 0.0))
         part = guided_part(s.weight.value, s.analog_weight, met, to_lens_chance + to_view_chance)
         to_lens_chance *= part
         to_view_chance *= part
@@ -293,13 +282,13 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         # Selected rather than branched to, so that what is left out stays in no register.
         t = wp.where(on_surface and not directed, sample_cosine_law(u01(s.flight.block[1])), t)
         new.u = rotate_by(axis, t, cos_sin_word(s.flight.block[2]))
-        if wp.static(specular):
+        if wp.static(spec.faces.specular):
             if on_surface and not directed:
                 new.u = reflected
-        density = phase_pdf(one_minus_cosine(snapped, new.u), here)
-        density = face_pdf(world.surfaces, s.hit, s.u, new.u, lobe, density)
+        density = phase.pdf(one_minus_cosine(snapped, new.u), here)
+        density = spec.faces.pdf(world.surfaces, s.hit, s.u, new.u, lobe, density)
         mixture = (1.0 - to_lens_chance - to_view_chance) * density
-        mixture += to_lens_chance * lobe_pdf(one_minus_cosine(v, new.u), world.medium, world.guiding)
+        mixture += to_lens_chance * guide.lobe_pdf(one_minus_cosine(v, new.u), world.medium, world.guiding)
         mixture += to_view_chance * henyey_greenstein_pdf(
             one_minus_cosine(to_axis, new.u), world.guiding.return_anisotropy
         )

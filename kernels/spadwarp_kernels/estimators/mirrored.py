@@ -41,10 +41,7 @@ def _make_follow(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(found, request, x, v, length, reflections, end, inside, world, seed)`` that follows the
     light of a request's event, which leaves x along v in the domain's axes and is reflected so many times within that
     length, to the end of the water, and delivers what rides along."""
-    has_mesh, hides, water_extinction = spec.faces.mesh, spec.faces.hides, spec.water.extinction
-    point_back, turn_back = spec.domain.point_back, spec.domain.turn_back
-    rider = make_rider(spec)
-    rides, (_begin, fork, fly, event, mirror, deliver) = rider.rides, rider
+    faces, domain, rider = spec.faces, spec.domain, make_rider(spec)
 
     @wp.func
     def follow(
@@ -63,36 +60,36 @@ def _make_follow(spec: TransportSpec) -> wp.Function:
         carried = request.carried
         begin = wp.vec3(x)
         along = wp.vec3(v)
-        heading = turn_back(limits, along)
+        heading = domain.turn_back(limits, along)
         rest = float(length)
-        if wp.static(rides):
-            fork(carried, world)
-            event(carried, world, request.slot, request.x, request.u, heading)
+        if wp.static(rider.rides):
+            rider.fork(carried, world)
+            rider.event(carried, world, request.slot, request.x, request.u, heading)
         for k in range(reflections + 1):
             part = float(rest)
             face = int(0)
             if k < reflections:
                 part = wp.min(rest, to_next_face(limits, begin, along))
                 face = next_face(limits, 9.0e29, begin, along).face
-            start = point_back(limits, begin)
-            extinction = water_extinction(world.medium, world.layers, start, heading, part, seed + wp.uint64(k))
+            start = domain.point_back(limits, begin)
+            extinction = spec.water.extinction(world.medium, world.layers, start, heading, part, seed + wp.uint64(k))
             found.depth += part * extinction
-            if wp.static(rides):
-                fly(carried, world, start, heading, part)
-            if wp.static(has_mesh):
+            if wp.static(rider.rides):
+                rider.fly(carried, world, start, heading, part)
+            if wp.static(faces.mesh):
                 if found.clear and segment_meets_box(start, heading, part, world.surfaces.lower, world.surfaces.upper):
                     found.shadow_queries += 1
-                    found.clear = not hides(world.surfaces, start, heading, part)
+                    found.clear = not faces.hides(world.surfaces, start, heading, part)
             begin += part * along
             rest -= part
             if face > 0:
                 along = flipped(along, (face - 1) // 2)
-                mirrored = turn_back(limits, along)
-                if wp.static(rides):
-                    mirror(carried, heading, mirrored, face_index(limits.boundary, face))
+                mirrored = domain.turn_back(limits, along)
+                if wp.static(rider.rides):
+                    rider.mirror(carried, heading, mirrored, face_index(limits.boundary, face))
                 heading = mirrored
-        if wp.static(rides):
-            deliver(found.contribution, carried, world, end, heading, wp.normalize(inside))
+        if wp.static(rider.rides):
+            rider.deliver(found.contribution, carried, world, end, heading, wp.normalize(inside))
 
     return follow
 
@@ -103,9 +100,7 @@ def _make_score_image(spec: TransportSpec) -> wp.Function:
     measured = spec.faces.mesh or spec.varies
     followed = measured or make_rider(spec).rides
     sight, domain = spec.sight, spec.domain
-    image_of, scan_view, link_to, value_of = sight.project, sight.scan_view, sight.link, sight.value
     scattering_density, follow = make_scattering(spec), _make_follow(spec)
-    point, point_back, turn, turn_back = domain.point, domain.point_back, domain.turn, domain.turn_back
 
     @wp.func
     def score_image(request: Request, number: int, world: wp.ref[World]) -> Mirrored:
@@ -113,18 +108,18 @@ def _make_score_image(spec: TransportSpec) -> wp.Function:
         found.clear = True
         limits = world.limits
         image = limits.boundary.images[number]
-        x = point(limits, request.x)
-        seen = point_back(limits, image_point(limits.lower, limits.upper, image, x))
+        x = domain.point(limits, request.x)
+        seen = domain.point_back(limits, image_point(limits.lower, limits.upper, image, x))
         lens = lens_point(world.camera, u01_high(request.first), u01_low(request.first))
-        view = scan_view(world.camera, world.scan, request.target)
+        view = sight.scan_view(world.camera, world.scan, request.target)
         # The lens, or a port, sees the image as it would see a point in water without an end.
-        link = link_to(world.camera, world.sea, seen, lens, False, wp.uint64(0))
-        pixel = image_of(world.camera, view, request.target, link.image, lens)
+        link = sight.link(world.camera, world.sea, seen, lens, False, wp.uint64(0))
+        pixel = sight.project(world.camera, view, request.target, link.image, lens)
         if pixel < 0:
             return found
-        along = turn(limits, link.to_lens)
+        along = domain.turn(limits, link.to_lens)
         heading = image_direction(image, along)
-        scattering = scattering_density(request, request.x, turn_back(limits, heading), world)
+        scattering = scattering_density(request, request.x, domain.turn_back(limits, heading), world)
         scattering *= image_reflectance(limits.boundary, image, along)
         if scattering <= 0.0:
             return found
@@ -140,7 +135,7 @@ def _make_score_image(spec: TransportSpec) -> wp.Function:
         if wp.static(measured):
             extinction = found.depth / link.water
             scattering = wp.where(found.clear, scattering, 0.0)
-        found.contribution.value *= value_of(world.camera, extinction, request.weight, scattering, link)
+        found.contribution.value *= sight.value(world.camera, extinction, request.weight, scattering, link)
         found.contribution.index = tally_index(world.camera, world.gate, pixel, request.path + link.path, component)
         return found
 

@@ -25,8 +25,7 @@ def make_none(spec: TransportSpec) -> Estimator:
 
 def make_analog(spec: TransportSpec) -> Estimator:
     """Photons that enter the lens within the view; slow to converge, and the reference for the others."""
-    reflects, image_of, leave = spec.domain.reflects, spec.sight.project, spec.sight.leave
-    sea, point_in, turn_in = spec.sight.sea is not None, spec.sight.pose.point_in, spec.sight.pose.turn_in
+    reflects, sight, sea = spec.domain.reflects, spec.sight, spec.sight.sea is not None
 
     @wp.func
     def cross(s: wp.ref[PhotonState], world: wp.ref[World]) -> Contribution:
@@ -34,7 +33,9 @@ def make_analog(spec: TransportSpec) -> Estimator:
         anything else happens to it."""
         found = Contribution()
         found.index = -3
-        ray = leave(world.camera, point_in(world.scan, s.target, s.x), turn_in(world.scan, s.target, s.u))
+        ray = sight.leave(
+            world.camera, sight.pose.point_in(world.scan, s.target, s.x), sight.pose.turn_in(world.scan, s.target, s.u)
+        )
         # Events but reflections, which alone bring no light that next events could.
         scatterings = s.collisions
         if wp.static(not sea):
@@ -42,7 +43,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
         radius2 = ray.x[0] * ray.x[0] + ray.x[1] * ray.x[1]
         inside = radius2 <= world.camera.aperture_radius * world.camera.aperture_radius
         if scatterings > 0 and inside and ray.water > 0.0 and ray.transmission > 0.0:
-            pixel = image_of(world.camera, s.view, s.target, ray.seen, ray.x)
+            pixel = sight.project(world.camera, s.view, s.target, ray.seen, ray.x)
             if pixel >= 0 and ray.water <= wp.min(s.flight.distance, world.limits.max_path - s.path):
                 component = wp.where(s.surface_count > 0, FORWARD_SCATTERED, BACKSCATTER)
                 if s.surface_count == 1 and s.collisions == 1:

@@ -17,7 +17,6 @@ def make_flux_score(spec: TransportSpec) -> wp.Function | None:
     if not spec.flux:
         return None
     tracks, collisions, planes = (kind in spec.flux for kind in ("track", "collision", "planes"))
-    water_at = spec.water.at
 
     @wp.func
     def score_flux(s: PhotonRef, world: WorldRef, sink: SinkRef, length: float, collides: bool):
@@ -30,7 +29,7 @@ def make_flux_score(spec: TransportSpec) -> wp.Function | None:
                 add_flux_crossings(world.flux.planes[k], world.flux.positions, sink.flux, leg)
         if wp.static(collisions):
             if collides:
-                extinction = water_at(world.medium, world.layers, leg.x + length * leg.u).extinction
+                extinction = spec.water.at(world.medium, world.layers, leg.x + length * leg.u).extinction
                 for k in range(world.flux.collisions.shape[0]):
                     add_flux_collision(world.flux.collisions[k], sink.flux, leg, extinction)
 

@@ -188,12 +188,11 @@ def make_polarisation_rider(spec: TransportSpec) -> Rider:
 
 def _make_begin(spec: TransportSpec) -> wp.Function:
     """A beam's field on its axis is turned to the direction of each photon by the smallest rotation."""
-    axis_of, elements = spec.beam.axis, make_port_elements(spec.beam.cosines)
-    has_port = elements is not None
+    elements, has_port = make_port_elements(spec.beam.cosines), spec.beam.cosines is not None
 
     @wp.func
     def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
-        axis = set_apart(axis_of(world.laser, world.scan, target))
+        axis = set_apart(spec.beam.axis(world.laser, world.scan, target))
         right, _down = beam_frame(axis)
         heading = set_apart(wp.spatial_bottom(emitted))
         stokes = transport_stokes(stokes_from(world.polarisation.laser, right, axis), axis, heading)
@@ -208,15 +207,14 @@ def _make_begin(spec: TransportSpec) -> wp.Function:
 def _make_event(spec: TransportSpec) -> wp.Function:
     """Water multiplies by L M L/m11. A Lambertian surface depolarises; a specular lobe has Fresnel's matrix of the
     facet between u and v, over its m11; both in proportion to what they send to v."""
-    shares, specular = spec.faces.shares, spec.faces.specular
 
     @wp.func
     def on_a_face(stokes: wp.vec4, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec4:
         left = wp.vec4(stokes[0], 0.0, 0.0, 0.0)
-        if wp.static(specular):
+        if wp.static(spec.faces.specular):
             index = world.polarisation.facet_index[face_in(world.surfaces.order, slot)]
             turned = turn_stokes(stokes, u, v, facet_elements(u, v, index))
-            left += shares(world.surfaces, slot, x, u, v)[1] * (turned - left)
+            left += spec.faces.shares(world.surfaces, slot, x, u, v)[1] * (turned - left)
         return left
 
     @wp.func
@@ -241,8 +239,7 @@ def _mirror(c: CarriedRef, u: wp.vec3, v: wp.vec3, index: float):
 def _make_deliver(spec: TransportSpec) -> wp.Function:
     """What a port does to the light, and what the receiver takes of it: with respect to the image's x, to which the
     lens turns all light by the smallest rotation to the optical axis."""
-    channels, elements = spec.channels, make_port_elements(spec.sight.cosines)
-    has_port = elements is not None
+    elements, has_port = make_port_elements(spec.sight.cosines), spec.sight.cosines is not None
 
     @wp.func
     def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
@@ -251,10 +248,10 @@ def _make_deliver(spec: TransportSpec) -> wp.Function:
             before = set_apart(u)
             through = elements(world.camera.port, set_apart(end), before)
             stokes = turn_stokes(stokes, before, set_apart(inside), through)
-        if wp.static(channels > 0):
+        if wp.static(spec.channels > 0):
             stokes = transport_stokes(stokes, set_apart(inside), wp.vec3(0.0, 0.0, -1.0))
         k.value *= stokes[0]
-        for channel in range(wp.static(channels)):
+        for channel in range(wp.static(spec.channels)):
             taken = wp.dot(world.polarisation.channels[channel], stokes)
             k.factors[channel] = taken / wp.max(stokes[0], 1.0e-30)
 

@@ -55,7 +55,6 @@ def _make_inelastic_rider(spec: TransportSpec) -> Rider:
     place of elastically, is carried on with the coefficients of its own wavelength over those. Thus no photon is spent
     on what few of them do, and each brings light of all wavelengths.
     """
-    channels, water_at, phase_pdf = spec.channels, spec.water.at, spec.water.phase.pdf
 
     @wp.func
     def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
@@ -69,9 +68,9 @@ def _make_inelastic_rider(spec: TransportSpec) -> Rider:
     @wp.func
     def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
         if slot < 0:
-            water = water_at(world.medium, world.layers, x)
+            water = spec.water.at(world.medium, world.layers, x)
             t = one_minus_cosine(snap_from(u, world.medium.axis_threshold), v)
-            elastic = wp.max(water.extinction * water.albedo * phase_pdf(t, water), 1.0e-30)
+            elastic = wp.max(water.extinction * water.albedo * spec.water.phase.pdf(t, water), 1.0e-30)
             square = (1.0 - t) * (1.0 - t)
             for k in range(2):
                 turned = world.inelastic.source[k] * (world.inelastic.even[k] + world.inelastic.squared[k] * square)
@@ -79,7 +78,7 @@ def _make_inelastic_rider(spec: TransportSpec) -> Rider:
 
     @wp.func
     def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
-        for channel in range(wp.static(channels)):
+        for channel in range(wp.static(spec.channels)):
             k.factors[channel] = world.inelastic.passed[channel] * c.shifted[channel]
 
     return NOTHING._replace(begin=begin, fly=fly, event=event, deliver=deliver)
@@ -110,8 +109,7 @@ def _deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3,
 
 
 def _make_fly(spec: TransportSpec) -> wp.Function:
-    count, layered = len(spec.derivatives), spec.water.layered
-    by_concentration = _bits(spec.derivatives, "concentration")
+    count, by_concentration = len(spec.derivatives), _bits(spec.derivatives, "concentration")
     on_path = _bits(spec.derivatives, "absorption", "scattering") | by_concentration
 
     @wp.func
@@ -126,7 +124,7 @@ def _make_fly(spec: TransportSpec) -> wp.Function:
 
     @wp.func
     def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
-        if wp.static(not layered):
+        if wp.static(not spec.water.layered):
             c.log_derivatives = shorter(c.log_derivatives, world, wp.static(on_path), length)
         else:
             d = c.log_derivatives
@@ -147,7 +145,7 @@ def _make_fly(spec: TransportSpec) -> wp.Function:
 
 
 def _make_event(spec: TransportSpec) -> wp.Function:
-    count, layered, shares = len(spec.derivatives), spec.water.layered, spec.faces.shares
+    count = len(spec.derivatives)
     by_scattering, by_anisotropy, by_reflectance, by_concentration = (
         _bits(spec.derivatives, kind) for kind in ("scattering", "anisotropy", "reflectance", "concentration")
     )
@@ -157,7 +155,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
     @wp.func
     def in_the_water(d: LogDerivatives, world: WorldRef, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
         here = int(wp.static(in_water))
-        if wp.static(layered):
+        if wp.static(spec.water.layered):
             here = here & world.derivatives.waters[layer_index(world.layers, wp.dot(world.layers.axis, x))]
         t = one_minus_cosine(snap_from(u, world.medium.axis_threshold), v)
         for p in range(wp.static(count)):
@@ -172,7 +170,7 @@ def _make_event(spec: TransportSpec) -> wp.Function:
 
     @wp.func
     def on_a_face(d: LogDerivatives, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> LogDerivatives:
-        part = shares(world.surfaces, slot, x, u, v)[0]
+        part = spec.faces.shares(world.surfaces, slot, x, u, v)[0]
         here = world.derivatives.faces[face_in(world.surfaces.order, slot)]
         for p in range(wp.static(count)):
             if (wp.static(by_reflectance) >> p) & 1 == 1:
@@ -192,12 +190,12 @@ def _make_event(spec: TransportSpec) -> wp.Function:
 
 def _make_add_concentrations(spec: TransportSpec, parameters: int) -> wp.Function:
     """Of an event in the water that turns light by t = 1 - cos(theta), where the parameters `here` are of the water."""
-    count, water_at, mixed = len(spec.derivatives), spec.water.at, spec.water.phase.part is not None
+    count, mixed = len(spec.derivatives), spec.water.phase.part is not None
     part_of = spec.water.phase.part or spec.water.phase.pdf  # any: it is not called
 
     @wp.func
     def add_concentrations(d: LogDerivatives, world: WorldRef, x: wp.vec3, t: float, here: int) -> LogDerivatives:
-        water = water_at(world.medium, world.layers, x)
+        water = spec.water.at(world.medium, world.layers, x)
         for p in range(wp.static(count)):
             if (wp.static(parameters) >> p) & 1 == 1:
                 slope = world.derivatives.value[p] / (water.extinction * water.albedo)
@@ -292,7 +290,7 @@ def _make_block_fly(kinds: int, beside: Rider) -> wp.Function:
 
 
 def _make_block_event(spec: TransportSpec, beside: Rider) -> wp.Function:
-    kinds, water_at, meet = len(spec.blocks), spec.water.at, _make_meet(len(spec.blocks))
+    kinds, meet = len(spec.blocks), _make_meet(len(spec.blocks))
     by_scattering, by_extinction = _bits(spec.blocks, "scattering"), _bits(spec.blocks, "extinction")
 
     @wp.func
@@ -302,7 +300,7 @@ def _make_block_event(spec: TransportSpec, beside: Rider) -> wp.Function:
         block = grid_cell(blocks.grid, x)
         if slot < 0 and block >= 0:
             meet(blocks, c.half, block)
-            water = water_at(world.medium, world.layers, x)
+            water = spec.water.at(world.medium, world.layers, x)
             for q in range(wp.static(kinds)):
                 coefficient = float(0.0)
                 if (wp.static(by_scattering) >> q) & 1 == 1:

@@ -145,24 +145,23 @@ def _make_serve_now(serve: wp.Function) -> wp.Function:
 
 def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.Function]:
     """Of a flight and of an event; `take`: ``(s, request, world, sink, memory)``."""
-    estimator, points = make_estimator(spec), spec.points
-    request_flight, request_event = estimator.request_flight, estimator.request_event
-    flights, events, point_of = request_flight is not None, request_event is not None, make_point_of(max(points, 2))
+    estimator, point_of = make_estimator(spec), make_point_of(max(spec.points, 2))
+    flights, events = estimator.request_flight is not None, estimator.request_event is not None
 
     @wp.func
     def ask_flight(s: PhotonRef, world: WorldRef, sink: SinkRef, memory: int):
         if wp.static(flights):
             if is_planned(s.flight):
-                request = request_flight(s)
+                request = estimator.request_flight(s)
                 take(s, request, world, sink, memory)
-                for i in range(wp.static(points - 1)):
+                for i in range(wp.static(spec.points - 1)):
                     take(s, point_of(request, i + 1), world, sink, memory)
                 s.flight.interval = wp.vec2(0.0, 0.0)
 
     @wp.func
     def ask_event(s: PhotonRef, world: WorldRef, sink: SinkRef, memory: int):
         if wp.static(events):
-            take(s, request_event(s, world), world, sink, memory)
+            take(s, estimator.request_event(s, world), world, sink, memory)
 
     return ask_flight, ask_event
 
@@ -170,30 +169,29 @@ def _make_asks(spec: TransportSpec, take: wp.Function) -> tuple[wp.Function, wp.
 def _make_serve(spec: TransportSpec, split: bool, deposit: wp.Function, waits: bool) -> wp.Function:
     """See `Stages.serve`; with `waits` a contribution behind which a tree must be walked is left in the state, else the
     ray is traced here, and what a face hides is set to 0."""
-    has_mesh, hides, reflects, sea = spec.mesh, spec.faces.hides, spec.reflecting, spec.sea is not None
-    view_of, may_hide = spec.sight.view, spec.sight.may_hide
+    faces, sight, reflects, sea = spec.faces, spec.sight, spec.reflecting, spec.sea is not None
     score, score_images = make_estimator(spec).score, make_score_images(spec, split)
 
     @wp.func
     def is_seen(s: PhotonRef, found: wp.ref[Scored], world: WorldRef) -> bool:
         seen = bool(True)
-        if wp.static(has_mesh and sea):
+        if wp.static(faces.mesh and sea):
             # The rest of the way, on the other side of the surface: few scenes have targets there.
             rest = found.behind - found.lens
             length = wp.length(rest)
             if segment_meets_box(found.lens, rest, 1.0, world.surfaces.lower, world.surfaces.upper) and length > 0.0:
                 s.shadow_queries += 1
-                if hides(world.surfaces, found.lens, rest / length, length):
+                if faces.hides(world.surfaces, found.lens, rest / length, length):
                     found.contribution.value = 0.0
-        if wp.static(has_mesh):
-            if may_hide(view_of(world.camera, world.camera.view), world.surfaces.near_depth, found.origin):
+        if wp.static(faces.mesh):
+            if sight.may_hide(sight.view(world.camera, world.camera.view), world.surfaces.near_depth, found.origin):
                 to = found.lens - found.origin
                 seen = not segment_meets_box(found.origin, to, 1.0, world.surfaces.lower, world.surfaces.upper)
                 if wp.static(not waits):
                     if not seen:
                         s.shadow_queries += 1
                         length = wp.length(to)
-                        hidden = hides(world.surfaces, found.origin, to / length, length)
+                        hidden = faces.hides(world.surfaces, found.origin, to / length, length)
                         found.contribution.value = wp.where(hidden, 0.0, found.contribution.value)
                         seen = True
         return seen

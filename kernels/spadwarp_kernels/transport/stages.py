@@ -89,37 +89,35 @@ def make_emit(spec: TransportSpec) -> wp.Function:
 
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
-    scans, enter, begin_carried = spec.beam.scans, spec.beam.enter, make_rider(spec).begin
-    scan_view, has_port, sea = spec.sight.scan_view, enter is not None, spec.sight.sea is not None
-    is_above = (spec.sight.sea or FACETS).is_above
-    point_out, turn_out = spec.beam.pose.point_out, spec.beam.pose.turn_out
+    beam, rider, sight, surface = spec.beam, make_rider(spec), spec.sight, spec.sight.sea or FACETS
+    has_port, sea = beam.enter is not None, sight.sea is not None
 
     @wp.func
     def begin(s: PhotonRef, world: WorldRef, sink: SinkRef, emitted: wp.spatial_vector, id: wp.uint64):
-        if wp.static(scans):
+        if wp.static(beam.scans):
             s.target = int(id % wp.uint64(world.scan.count))
-            s.view = scan_view(world.camera, world.scan, s.target)
+            s.view = sight.scan_view(world.camera, world.scan, s.target)
         s.x = wp.spatial_top(emitted)
         s.u = wp.spatial_bottom(emitted)
         s.path = 0.0
         s.weight.value = 1.0
         s.weight.absorbed_water += to_ledger(1.0)
         if wp.static(has_port):
-            passage = enter(world.laser.port, s.x, s.u)
+            passage = beam.enter(world.laser.port, s.x, s.u)
             reweigh(s.weight, passage.transmission)
             if passage.transmission > 0.0:
                 s.x = passage.x
                 s.u = passage.u
                 s.path = passage.path
             book_weight(s.weight, s.account, sink, ledger.LASER_PORT)
-        s.x = point_out(world.scan, s.target, s.x)
-        s.u = turn_out(world.scan, s.target, s.u)
+        s.x = beam.pose.point_out(world.scan, s.target, s.x)
+        s.u = beam.pose.turn_out(world.scan, s.target, s.u)
         if wp.static(sea):
-            s.above = is_above(world.sea, s.x)
+            s.above = surface.is_above(world.sea, s.x)
         s.analog_weight = s.weight.value
         s.collisions = 0
         s.surface_count = 0
-        begin_carried(s.carried, world, s.target, emitted, s.x, s.u)
+        rider.begin(s.carried, world, s.target, emitted, s.x, s.u)
         s.stage = FLIGHT
 
     return begin
@@ -209,11 +207,10 @@ def make_fly(
     On a CPU `words`, PREFETCHED_WORDS of them, keep the random words of the photon's next flights. They are drawn for
     several flights at once, so that it must be called for each flight of a photon in turn.
     """
-    plans, water_free_path, tried = plan_flight is not None, spec.water.free_path, spec.faces.tried
+    plans, tried, surface = plan_flight is not None, spec.faces.tried, spec.sight.sea or FACETS
     events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
     has_bvh, sea = spec.faces.mesh and not tried, spec.sight.sea is not None
-    surface_distance = (spec.sight.sea or FACETS).distance
 
     @wp.func
     def fly(s: PhotonRef, world: WorldRef, draws: wp.ref[Draws], words: wp.array[int]):
@@ -228,12 +225,12 @@ def make_fly(
             s.flight.block = prefetched_block(words, k)
         seed = join_words(s.flight.block[0], s.flight.block[2])
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
-        s.flight.distance = water_free_path(world.medium, world.layers, s.x, s.u, xi, seed)
+        s.flight.distance = spec.water.free_path(world.medium, world.layers, s.x, s.u, xi, seed)
         if wp.static(sea):
             limit = world.limits.max_path - s.path
             if s.above:
                 limit /= world.sea.delay
-            s.flight.sea = surface_distance(world.sea, s.x, s.u, s.above, limit)
+            s.flight.sea = surface.distance(world.sea, s.x, s.u, s.above, limit)
             s.flight.distance = wp.min(wp.where(s.above, 1.0e30, s.flight.distance), s.flight.sea)
         s.flight.reach = wp.min(s.flight.distance, world.limits.max_path - s.path)
         if wp.static(sea):
@@ -258,7 +255,7 @@ def make_fly(
         if wp.static(has_bvh):
             if segment_meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
                 s.stage = RAY
-        if wp.static(tried):
+        if wp.static(spec.faces.tried):
             # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
             met = nearest_patch(world.surfaces.patches, s.x, s.u, NOWHERE)
             s.surface_queries += 1
@@ -303,11 +300,9 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
     `chosen`: an estimator chooses what ends a flight; `flies_on`: see `make_continues`; `score_flux`: see
     `make_flux_score`.
     """
-    tallies_flux = score_flux is not None
-    domain, local_albedo = spec.domain, spec.local_albedo
+    domain, rider, sea = spec.domain, make_rider(spec), spec.sight.sea is not None
     reflects, bounded = domain.reflects, domain.bounded and not domain.reflects
-    water_at, fly_carried, sea = spec.water.at, make_rider(spec).fly, spec.sight.sea is not None
-    outside, exit_of, to_exit = domain.is_outside, domain.exit, domain.exit_distance
+    tallies_flux = score_flux is not None
 
     @wp.func
     def end_of_flight(s: PhotonRef, world: WorldRef) -> Collision:
@@ -321,17 +316,17 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
             c.reason = ledger.MAX_PATH
             c.distance = limit
         if wp.static(bounded):
-            if outside(world.limits, s.x + c.distance * s.u):
-                leaves = exit_of(world.limits, s.x, s.u)
+            if domain.is_outside(world.limits, s.x + c.distance * s.u):
+                leaves = domain.exit(world.limits, s.x, s.u)
                 c.reason = ledger.EXIT + leaves.face
                 c.distance = wp.min(c.distance, leaves.distance)
         if wp.static(reflects):
             # By distance: a photon that has been reflected may be outside by a rounding error.
-            exit = to_exit(world.limits, s.x, s.u)
+            exit = domain.exit_distance(world.limits, s.x, s.u)
             if exit < c.distance:
                 c.distance = exit
                 c.reason = -1
-                face = exit_of(world.limits, s.x, s.u).face
+                face = domain.exit(world.limits, s.x, s.u).face
                 if limits.face_index(world.limits.boundary, face) > 0.0:
                     c.mirror = face
                 else:
@@ -353,7 +348,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
         if wp.static(chosen):
             reweigh(s.weight, s.flight.factor)
             s.directed += s.weight.taken
-        fly_carried(s.carried, world, s.x, s.u, c.distance)
+        rider.fly(s.carried, world, s.x, s.u, c.distance)
         if wp.static(tallies_flux):
             score_flux(s, world, sink, c.distance, c.reason < 0 and c.mirror == 0 and s.hit.face < 0)
         s.x = s.x + c.distance * s.u
@@ -368,8 +363,8 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
         s.reason = c.reason
         s.stage = END
         if c.reason < 0:
-            if wp.static(local_albedo):
-                s.albedo = water_at(world.medium, world.layers, s.x).albedo
+            if wp.static(spec.local_albedo):
+                s.albedo = spec.water.at(world.medium, world.layers, s.x).albedo
             if s.hit.face >= 0 and c.mirror == 0:
                 s.x = offset_from_surface(s.x, s.hit.normal, c.distance)
         if wp.static(reflects or sea):
@@ -385,24 +380,21 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
 def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Function) -> wp.Function:
     """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
     estimator says so, with what rides along."""
-    crosses, leave, pose = cross is not None, spec.sight.leave, spec.sight.pose
-    point_in, turn_in = pose.point_in, pose.turn_in
-    rider = make_rider(spec)
-    rides, (_begin, fork, fly, _event, _mirror, deliver) = rider.rides, rider
+    crosses, sight, pose, rider = cross is not None, spec.sight, spec.sight.pose, make_rider(spec)
 
     @wp.func
     def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
         if wp.static(crosses):
             c = cross(s, world)
             s.bounces.dropped += wp.where(c.index == TOO_LONG, 1, 0)
-            if wp.static(rides):
+            if wp.static(rider.rides):
                 if c.value > 0.0:
                     carried = s.carried
-                    x, u = point_in(world.scan, s.target, s.x), turn_in(world.scan, s.target, s.u)
-                    passage = leave(world.camera, x, u)
-                    fork(carried, world)
-                    fly(carried, world, s.x, s.u, passage.water)
-                    deliver(c, carried, world, s.x, s.u, passage.u)
+                    x, u = pose.point_in(world.scan, s.target, s.x), pose.turn_in(world.scan, s.target, s.u)
+                    passage = sight.leave(world.camera, x, u)
+                    rider.fork(carried, world)
+                    rider.fly(carried, world, s.x, s.u, passage.water)
+                    rider.deliver(c, carried, world, s.x, s.u, passage.u)
             if not c.value <= 0.0:
                 s.contributions += 1
                 deposit(s.account, sink, world, c)
@@ -429,19 +421,19 @@ def make_sample_direction(spec: TransportSpec, direct: wp.Function | None) -> wp
     """
     if direct is not None:
         return direct
-    specular, phase_sample, water_at = spec.faces.specular, spec.water.phase.sample, spec.water.at
+    water = spec.water
 
     @wp.func
     def sample_direction(s: PhotonRef, reflected: wp.vec3, lobe: float, world: WorldRef, id: wp.uint64) -> Direction:
         new = Direction()
         on_surface = s.hit.face >= 0
         axis = snap_from(s.u, world.medium.axis_threshold)
-        t = phase_sample(u01_fine(s.flight.block[1]), water_at(world.medium, world.layers, s.x))
+        t = water.phase.sample(u01_fine(s.flight.block[1]), water.at(world.medium, world.layers, s.x))
         if on_surface:
             axis = s.hit.normal
             t = sample_cosine_law(u01(s.flight.block[1]))
         new.u = rotate_by(axis, t, cos_sin_word(s.flight.block[2]))
-        if wp.static(specular):
+        if wp.static(spec.faces.specular):
             if on_surface:
                 new.u = reflected
         return new
@@ -464,13 +456,12 @@ def make_continues(flies_on: bool) -> wp.Function:
 
 def make_terminate(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(new, s, world, sink, id)``: the end of a history for its analog weight or its events."""
-    roulette = spec.roulette
 
     @wp.func
     def terminate(new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         if new.analog_weight < world.limits.weight_cutoff:
             new.reason = ledger.WEIGHT_CUTOFF
-            if wp.static(roulette):
+            if wp.static(spec.roulette):
                 chance = u01(random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
                 new.reason = ledger.ROULETTE
                 if chance < 0.1 and new.analog_weight > 0.0:
@@ -490,25 +481,24 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
 
     `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
     """
-    rotated, turn, turn_back = spec.domain.rotated, spec.domain.turn, spec.domain.turn_back
+    domain, rider = spec.domain, make_rider(spec)
     terminate, continues = make_terminate(spec), make_continues(flies_on)
-    mirror_carried = make_rider(spec).mirror
 
     @wp.func
     def bounce(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         face = s.bounces.face
         axis = (face - 1) // 2
         index = limits.face_index(world.limits.boundary, face)
-        u = turn(world.limits, s.u)
+        u = domain.turn(world.limits, s.u)
         part = limits.fresnel_reflectance(wp.min(wp.abs(u[axis]), 1.0), index)
-        u = turn_back(world.limits, limits.flipped(u, axis))
-        if wp.static(rotated):
+        u = domain.turn_back(world.limits, limits.flipped(u, axis))
+        if wp.static(domain.rotated):
             u = wp.normalize(u)
         new = Outcome()
         new.reason = s.reason
         new.weight = s.weight
         reweigh(new.weight, part)
-        mirror_carried(s.carried, s.u, u, index)
+        rider.mirror(s.carried, s.u, u, index)
         # The light of an event that was the last is accounted for by what has ended the history.
         book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.EXIT + face, s.reason))
         if s.reason < 0:
@@ -529,18 +519,18 @@ def make_meet_sea(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Fun
     `directed`, `flies_on`: see `make_bounce`.
     """
     terminate, continues = make_terminate(spec), make_continues(flies_on)
-    passage_at, waves = (spec.sight.sea or FACETS).passage, spec.waves
+    surface = spec.sight.sea or FACETS
 
     @wp.func
     def meet_sea(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
-        passage = passage_at(world.sea, s.x, s.u, s.above, draw)
+        passage = surface.passage(world.sea, s.x, s.u, s.above, draw)
         new = Outcome()
         new.reason = s.reason
         new.weight = s.weight
         # The light of an event that was the last goes to the lens; what is reflected would come from an event here.
         scored_here = passage.reflected
-        if wp.static(waves):
+        if wp.static(spec.waves):
             scored_here = passage.reflected or s.bounces.leg > 1
         reweigh(new.weight, wp.where(s.reason >= 0 and scored_here, 0.0, passage.part))
         book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.SURFACE_MASKING, s.reason))
@@ -562,30 +552,29 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
 
     `flies_on`: see `make_continues`.
     """
-    specular, reflects, directed = spec.faces.specular, spec.domain.reflects, direct is not None
-    survival_of, sample_direction = spec.faces.survival, make_sample_direction(spec, direct)
-    terminate, bounce = make_terminate(spec), make_bounce(spec, directed, flies_on)
-    sea, meet_sea = spec.sight.sea is not None, make_meet_sea(spec, directed, flies_on)
-    continues, turn_carried = make_continues(flies_on), make_rider(spec).event
+    directed, sea, rider = direct is not None, spec.sight.sea is not None, make_rider(spec)
+    sample_direction, terminate = make_sample_direction(spec, direct), make_terminate(spec)
+    bounce, meet_sea = make_bounce(spec, directed, flies_on), make_meet_sea(spec, directed, flies_on)
+    continues = make_continues(flies_on)
 
     @wp.func
     def turn(
         new: wp.ref[Outcome], s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64, on_surface: bool, lobe: float
     ):
         reflected = s.u
-        if wp.static(specular):
+        if wp.static(spec.faces.specular):
             if on_surface:
                 draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
                 roughness = world.surfaces.roughness[s.hit.face]
                 reflected = sample_reflection(s.u, s.hit.normal, roughness, lobe, draw)
         heading = sample_direction(s, reflected, lobe, world, id)
-        turn_carried(s.carried, world, wp.where(on_surface, s.hit.slot, -1), s.x, s.u, heading.u)
+        rider.event(s.carried, world, wp.where(on_surface, s.hit.slot, -1), s.x, s.u, heading.u)
         if wp.static(directed):
             reweigh(new.weight, heading.factor)
             s.directed += new.weight.taken
             if new.weight.value <= 0.0:
                 new.reason = ledger.DIRECTED
-        if wp.static(specular):
+        if wp.static(spec.faces.specular):
             if on_surface:
                 # What one facet takes of another's light stays in the surface.
                 leaving = unshadowed(s.u, heading.u, s.hit.normal, world.surfaces.roughness[s.hit.face], lobe)
@@ -605,7 +594,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         new.reason = -1
         new.weight = s.weight
         on_surface = s.hit.face >= 0
-        survival = survival_of(world.surfaces, s.hit, s.x, s.albedo)
+        survival = spec.faces.survival(world.surfaces, s.hit, s.x, s.albedo)
         if on_surface:
             reweigh(new.weight, survival[0])
             s.absorbed_surface += new.weight.taken
@@ -626,7 +615,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         s.collisions += 1
         id = draws.base + wp.uint64(s.photon)
         bounced = False
-        if wp.static(reflects):
+        if wp.static(spec.domain.reflects):
             bounced = s.bounces.face > 0
             if bounced:
                 bounce(s, world, sink, id)

@@ -52,6 +52,59 @@ def optical_to(frame: Any) -> wp.transform:
     return wp.transform(wp.vec3(0.0), wp.quat(*CAMERA_FRAMES[frame]))
 
 
+@wp.struct
+class Images:
+    """Images of all cameras, by row: a pixel of a camera; see the attributes of `SpadCamera`."""
+
+    true_distance: wp.array[float]
+    true_depth: wp.array[float]
+    normal: wp.array[wp.vec3]
+    reflectance: wp.array[float]
+    counts: wp.array[int]
+    significance: wp.array[float]
+    depth: wp.array[float]
+    distance: wp.array[float]
+    status: wp.array[int]
+
+
+@wp.struct
+class Sensor:
+    """What the frames of all cameras have in common."""
+
+    lidar: Lidar
+    images: Images
+    values: WorldValues
+    world: wp.array[int]
+    due: wp.array[int]  # whether a camera sees at this step
+    step: wp.array[wp.int64]
+    view: wp.array[wp.vec3]  # unit vectors of the pixels in the optical frame
+    scans: bool  # each ray has the laser and the axis of a scanner, which turns with it
+    table: wp.array2d[float]  # see `scattering_table`; one row of a scanner's rays
+    gate_start: float  # [m of path]
+    bin_path: float  # [m of path]
+    sigma_path: float  # [m of path]
+    dark: float  # dark counts per pulse and bin
+    bins: int
+    pulse_energy: float  # [J]
+    pulses: int
+    margin: int  # bins beside the first one of the best window in which an estimator reads the background
+    seed: wp.uint64
+
+
+@wp.struct
+class PixelLight:
+    """What a pixel gets."""
+
+    signal: float  # of the surface, detections per pulse
+    path: float  # of its light [m], infinite where there is none
+    start: float  # at which the gate opens [m of path]
+    delay: float  # of the gate [bins]
+    water: float  # by which the table is multiplied
+    decay: float  # and by exp(-decay * path) [1/m]
+    dark: float  # per pulse and bin
+    row: int  # of the table
+
+
 # ---- Rays.
 
 
@@ -73,92 +126,45 @@ def _schedule_kernel(
 
 @wp.kernel(enable_backward=False)
 def _mount_kernel(
-    body: wp.array[int],
-    offset: wp.array[wp.transform],
-    body_q: wp.array[wp.transform],
-    camera_q: wp.array[wp.transform],
+    body: wp.array[int], offset: wp.array[wp.transform], body_q: wp.array[wp.transform], poses: wp.array[wp.transform]
 ):
     """Launch: cameras."""
     v = wp.tid()
-    camera_q[v] = wp.transform_multiply(body_q[body[v]], offset[v])
+    poses[v] = wp.transform_multiply(body_q[body[v]], offset[v])
 
 
 @wp.kernel(enable_backward=False)
-def _trace_kernel(
-    shapes: ShapeTable,
-    camera_q: wp.array[wp.transform],
-    optical: wp.transform,
-    world: wp.array[int],
-    due: wp.array[int],
-    view: wp.array[wp.vec3],
-    # Out, [cameras, height, width]:
-    distance: wp.array3d[float],
-    depth: wp.array3d[float],
-    normal: wp.array3d[wp.vec3],
-    reflectance: wp.array3d[float],
-):
-    """Launch: (cameras, height, width)."""
-    v, i, j = wp.tid()
-    if due[v] == 0:
+def _trace_kernel(shapes: ShapeTable, camera_q: wp.array[wp.transform], optical: wp.transform, sensor: Sensor):
+    """Launch: rows, each a pixel of a camera."""
+    row = wp.tid()
+    v = row / sensor.view.shape[0]
+    if sensor.due[v] == 0:
         return
     pose = wp.transform_multiply(camera_q[v], optical)
-    u = view[i * depth.shape[2] + j]
+    u = sensor.view[row % sensor.view.shape[0]]
     x = wp.transform_get_translation(pose)
-    hit, hit_reflectance = intersect_shapes(shapes, world[v], x, wp.transform_vector(pose, u))
-    distance[v, i, j] = wp.NAN
-    depth[v, i, j] = wp.NAN
-    normal[v, i, j] = wp.vec3(wp.NAN)
-    reflectance[v, i, j] = wp.NAN
+    hit, reflectance = intersect_shapes(shapes, sensor.world[v], x, wp.transform_vector(pose, u))
+    images = sensor.images
+    images.true_distance[row] = wp.NAN
+    images.true_depth[row] = wp.NAN
+    images.normal[row] = wp.vec3(wp.NAN)
+    images.reflectance[row] = wp.NAN
     if hit.distance >= 0.0:
-        distance[v, i, j] = hit.distance
-        depth[v, i, j] = hit.distance * u[2]
-        normal[v, i, j] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), hit.normal)
-        reflectance[v, i, j] = hit_reflectance
+        images.true_distance[row] = hit.distance
+        images.true_depth[row] = hit.distance * u[2]
+        images.normal[row] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), hit.normal)
+        images.reflectance[row] = reflectance
 
 
 # ---- Frames.
 
 
-@wp.struct
-class Sensor:
-    """What the frames of all cameras have in common."""
-
-    lidar: Lidar
-    values: WorldValues
-    world: wp.array[int]
-    due: wp.array[int]  # whether a camera sees at this step
-    step: wp.array[wp.int64]
-    view: wp.array[wp.vec3]  # unit vectors of the pixels in the optical frame
-    scans: bool  # each ray has the laser and the axis of a scanner, which turns with it
-    table: wp.array2d[float]  # see `scattering_table`; one row of a scanner's rays
-    gate_start: float  # [m of path]
-    bin_path: float  # [m of path]
-    sigma_path: float  # [m of path]
-    dark: float  # dark counts per pulse and bin
-    bins: int
-    pulse_energy: float  # [J]
-    pulses: int
-    seed: wp.uint64
-
-
-@wp.struct
-class PixelLight:
-    """What a pixel gets."""
-
-    signal: float  # of the surface, detections per pulse
-    path: float  # of its light [m], infinite where there is none
-    start: float  # at which the gate opens [m of path]
-    delay: float  # of the gate [bins]
-    water: float  # by which the table is multiplied
-    decay: float  # and by exp(-decay * path) [1/m]
-    dark: float  # per pulse and bin
-    row: int  # of the table
-
-
 @wp.func
-def _light(sensor: Sensor, pixel: int, world: int, distance: float, normal: wp.vec3, reflectance: float) -> PixelLight:
+def _light(sensor: Sensor, row: int, world: int) -> PixelLight:
     light = PixelLight()
     lidar = sensor.lidar
+    pixel = row % sensor.view.shape[0]
+    distance = sensor.images.true_distance[row]
     values = sensor.values
     scattering = world_value(values.scattering, world, float(lidar.scattering))
     absorption = world_value(values.absorption, world, float(lidar.extinction - lidar.scattering))
@@ -181,12 +187,13 @@ def _light(sensor: Sensor, pixel: int, world: int, distance: float, normal: wp.v
     light.path = wp.inf
     if distance > 0.0:
         u = wp.vec3d(sensor.view[pixel])
-        n = normal
+        n = sensor.images.normal[row]
         if sensor.scans:
             u = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
-            n = wp.quat_rotate(wp.quat_between_vectors(sensor.view[pixel], wp.vec3(0.0, 0.0, 1.0)), normal)
+            n = wp.quat_rotate(wp.quat_between_vectors(sensor.view[pixel], wp.vec3(0.0, 0.0, 1.0)), n)
         r = wp.float64(distance)
-        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(n), wp.float64(reflectance))
+        reflectance = wp.float64(sensor.images.reflectance[row])
+        value = radiometric_signal(lidar, _see(lidar.ports, u), r, wp.vec3d(n), reflectance)
         light.path = float(beam_path(lidar, r * u) + r)
         if value > wp.float64(0.0) and wp.isfinite(value):
             light.signal = float(value) * brightness
@@ -233,14 +240,6 @@ def _expected(sensor: Sensor, light: PixelLight, k: int, water: float) -> float:
     return light.dark + water * _below(-0.5 * (low + high)) + wp.max(surface, 0.0)
 
 
-@wp.func
-def _pulses(sensor: Sensor, world: int) -> int:
-    """Of a frame in a world."""
-    if world >= 0 and world < sensor.values.pulses.shape[0]:
-        return sensor.values.pulses[world]
-    return sensor.pulses
-
-
 _FRAME_BLOCK = 128
 
 
@@ -253,39 +252,30 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
     def frame(
         first: int,
         first_row: int,
-        rows: wp.uint64,
         sensor: Sensor,
         windows: Windows,
-        # In, [rows of this launch]:
-        distance: wp.array[float],
-        normal: wp.array[wp.vec3],
-        reflectance: wp.array[float],
+        # [rows of this launch], but for arrays without entries; rates are read if they are traced:
         water: wp.array2d[float],
-        # Out, [rows of this launch], but for arrays without entries; rates are read if they are traced:
         rates: wp.array2d[float],
         histogram: wp.array2d[int],
         known: wp.array2d[float],
-        margin: int,
-        counts: wp.array[int],
-        significance: wp.array[float],
         window: wp.array[int],
     ):
         """Counts of a pixel, the background that it knows, and the significance of its best window. Launch: rows, each
         a pixel of a camera."""
         i = first + wp.tid()
         row = first_row + i
-        pixel = row % sensor.view.shape[0]
         v = row / sensor.view.shape[0]
         if sensor.due[v] == 0:
             return
         world = sensor.world[v]
-        pulses = _pulses(sensor, world)
+        pulses = world_value(sensor.values.pulses, world, sensor.pulses)
         light = PixelLight()
         if wp.static(traced):
             light.dark = sensor.dark
         else:
-            light = _light(sensor, pixel, world, distance[i], normal[i], reflectance[i])
-        id = wp.uint64(sensor.step[0]) * rows + wp.uint64(row)
+            light = _light(sensor, row, world)
+        id = wp.uint64(sensor.step[0]) * wp.uint64(sensor.images.counts.shape[0]) + wp.uint64(row)
         draws = FirstPhotons()
         draws.left = pulses
         search = begin_search(windows, row)
@@ -304,12 +294,12 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
             draws = draw_bin(draws, rate, sensor.seed, id)
             histogram[i, k] = draws.count
             search = offer_bin(windows, search, k, wp.int64(draws.count), float(pulses) * (level + light.dark))
-        counts[i] = pulses - draws.left
-        significance[i] = significance_of(windows, search)
+        sensor.images.counts[row] = pulses - draws.left
+        sensor.images.significance[row] = significance_of(windows, search)
         window[i] = search.window
         if known.shape[0] > 0:
-            low = wp.max(search.window - margin, 0)
-            for k in range(low, wp.min(search.window + margin, histogram.shape[1])):
+            low = wp.max(search.window - sensor.margin, 0)
+            for k in range(low, wp.min(search.window + sensor.margin, histogram.shape[1])):
                 level = water[i, k] if wp.static(traced) else _background(sensor, light, k)
                 known[i, k] = float(pulses) * (level + light.dark)
 
@@ -317,61 +307,51 @@ def _frame_kernel(traced: bool) -> wp.Kernel:
 
 
 @wp.kernel(enable_backward=False)
-def _depth_kernel(
-    first: int,
-    first_row: int,
-    advance: int,
-    sensor: Sensor,
-    laser: wp.vec3,
-    # In, [rows of this launch]:
-    arrival: wp.array[float],
-    counts: wp.array[int],
-    true_distance: wp.array[float],
-    # Out:
-    depth: wp.array[float],
-    distance: wp.array[float],
-    status: wp.array[int],
-):
-    """Depths, their status, and with the last rows the next step. Launch: rows, each a pixel of a camera."""
+def _depth_kernel(first: int, first_row: int, sensor: Sensor, arrival: wp.array[float]):
+    """Depths, their status, and with the last of all rows the next step. `arrival`: of the rows of this launch. Launch:
+    rows, each a pixel of a camera."""
     i = first + wp.tid()
-    if i == 0 and advance > 0:
-        sensor.step[0] = sensor.step[0] + wp.int64(1)
     row = first_row + i
-    pixel = row % sensor.view.shape[0]
+    images = sensor.images
+    if row + 1 == images.counts.shape[0]:
+        sensor.step[0] = sensor.step[0] + wp.int64(1)
     v = row / sensor.view.shape[0]
     if sensor.due[v] == 0:
         return
-    u = sensor.view[pixel]
+    u = sensor.view[row % sensor.view.shape[0]]
     ray = u
     if sensor.scans:
         ray = wp.vec3(0.0, 0.0, 1.0)
+    laser = wp.vec3(sensor.lidar.laser)
     world = sensor.world[v]
     start = sensor.gate_start + 2.0 * world_value(sensor.values.gate_delay, world, 0.0)
-    depth[i] = wp.NAN
-    distance[i] = wp.NAN
-    status[i] = NO_RETURN
+    images.depth[row] = wp.NAN
+    images.distance[row] = wp.NAN
+    status = int(NO_RETURN)
     if arrival.shape[0] > 0 and wp.isfinite(arrival[i]):
         z = depth_of_path(laser, ray, start + arrival[i] * sensor.bin_path)
         if z > 0.0:
-            distance[i] = z / ray[2]
-            depth[i] = wp.where(sensor.scans, z * u[2], z)
-            status[i] = TARGET
-    pulses = float(_pulses(sensor, world))
-    if pulses > 0.0 and float(counts[i]) >= _SATURATION * pulses:
-        status[i] = SATURATED
-    elif status[i] == NO_RETURN and true_distance[i] > 0.0:
-        path = true_distance[i] + wp.length(true_distance[i] * ray - laser)
+            images.distance[row] = z / ray[2]
+            images.depth[row] = wp.where(sensor.scans, z * u[2], z)
+            status = TARGET
+    pulses = float(world_value(sensor.values.pulses, world, sensor.pulses))
+    true_distance = images.true_distance[row]
+    if pulses > 0.0 and float(images.counts[row]) >= _SATURATION * pulses:
+        status = SATURATED
+    elif status == NO_RETURN and true_distance > 0.0:
+        path = true_distance + wp.length(true_distance * ray - laser)
         if path < start or path > start + float(sensor.bins) * sensor.bin_path:
-            status[i] = OUTSIDE_GATE
+            status = OUTSIDE_GATE
+    images.status[row] = status
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
-def _points_kernel(
-    distance: wp.array3d[float], view: wp.array[wp.vec3], pose: wp.transform, points: wp.array3d[wp.vec3]
-):
+def _points_kernel(sensor: Sensor, pose: wp.transform, points: wp.array3d[wp.vec3]):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
-    points[v, i, j] = wp.transform_point(pose, distance[v, i, j] * view[i * distance.shape[2] + j])
+    pixel = i * points.shape[2] + j
+    distance = sensor.images.distance[v * sensor.view.shape[0] + pixel]
+    points[v, i, j] = wp.transform_point(pose, distance * sensor.view[pixel])
 
 
 # ---- Both kinds of cameras.
@@ -396,20 +376,22 @@ def check_memory(what: str, sizes: Mapping[str, int], item_bytes: int, device: w
 class WorldCameras:
     """The part that `SpadCamera` and `SpadTracer` share; see there."""
 
+    traced = False  # whether the light comes from transport, which fills `_light` and `_water`
+
     def __init__(
         self,
-        config: SpadConfig | None,
-        cameras: int,
+        config: SpadConfig | None = None,
+        cameras: int = 1,
         *,
-        world: wp.array | Sequence[int] | None,
-        frame: str | None,
-        outputs: Sequence[str],
-        body: Any,
-        offset: Any,
-        update_period: float,
-        rays: Any = None,
+        world: wp.array | Sequence[int] | None = None,
+        frame: str | None = None,
+        outputs: Sequence[str] = CAMERA_OUTPUTS,
         by_world: Mapping[str, Any] | None = None,
-        device: wp.DeviceLike,
+        rays: Any = None,
+        body: Any = None,
+        offset: Any = None,
+        update_period: float = 0.0,
+        device: wp.DeviceLike = None,
     ) -> None:
         self.config = config = SpadConfig() if config is None else config
         check.kind("config", config, SpadConfig)
@@ -457,6 +439,7 @@ class WorldCameras:
             raise ArgumentError(f"by_world has arrays of {worlds} worlds; the cameras are in {self._most_worlds}")
         if config.pulse_energy == 0.0 and self._values.pulse_energy is not None:
             raise ArgumentError("by_world['pulse_energy'] needs config.pulse_energy > 0, to which it is relative")
+        self._tabulate()
 
     def _checked_rays(self, rays: Any) -> np.ndarray:
         shape = (self.config.height, self.config.width, 3)
@@ -526,52 +509,49 @@ class WorldCameras:
             return wp.array(np.ascontiguousarray(values.T), dtype=float, device=self.device).transpose()
         return wp.array(np.ascontiguousarray(values), dtype=float, device=self.device)
 
-    def _tabulate(self, light: wp.array | None = None, water: wp.array | None = None) -> None:
-        """Light and responses that no shape changes, after all arguments are checked. `light`, `water`: rates
-        `[rows, bins]` of all light and of the water's alone, where they are traced."""
-        config, device = self.config, self.device
+    def _tabulate(self) -> None:
+        """Light and responses that no shape changes, after all arguments are checked."""
+        config, device, bins = self.config, self.device, self.config.bins
         lines = np.array([[0.0, 0.0, 1.0]]) if self._scans else self._lines
-        bins = config.bins * (1 if self._values.gate_delay is None else 2)
-        table = np.zeros((1, bins), np.float32) if light else scattering_table(config, lines, bins, device)
+        columns = bins * (1 if self._values.gate_delay is None else 2)
+        table = np.zeros((1, columns), np.float32) if self.traced else scattering_table(config, lines, columns, device)
         sensor = self._sensor = Sensor()
+        for name in Images.vars:
+            setattr(sensor.images, name, getattr(self, name).flatten())
         sensor.lidar, sensor.values, sensor.table = config.lidar(), self._values, self._columns(table)
         sensor.world, sensor.due, sensor.step, sensor.view = self._world, self._due, self.step, self._view
-        sensor.scans, sensor.bins, sensor.pulses, sensor.seed = self._scans, config.bins, config.pulses, config.seed
+        sensor.scans, sensor.bins, sensor.pulses, sensor.seed = self._scans, bins, config.pulses, config.seed
         sensor.gate_start, sensor.bin_path = config.gate_paths[0], config.bin_path
         sensor.sigma_path = config.timing_sigma * config.speed
         sensor.dark = config.dark_rate * config.bin_path / config.speed
         sensor.pulse_energy = config.pulse_energy
-        known = config.pulses * (config.scattering * table[:, : config.bins] + sensor.dark)
-        known = self._columns(known)
+        known = self._columns(config.pulses * (config.scattering * table[:, :bins] + sensor.dark))
         response, lowest_tap = config.response()
         taps = {"response": response, "lowest_tap": lowest_tap, "half_width": -lowest_tap - 1}
         taps |= {"min_significance": config.min_significance, "width": 2.355 * config._sigma_bins}
-        self._estimate = ArrivalEstimator(config.bins, device, config.method, known, **taps, pulses=config.pulses)
-        # Bins beside the first one of the best window in which an estimator reads the background.
+        self._estimate = ArrivalEstimator(bins, device, config.method, known, **taps, pulses=config.pulses)
         margin = 4 * self._estimate.test.half_width + 2 * response.shape[1]
-        self._margin = margin if config.min_significance > 0.0 else config.bins
-        pixels = len(self._lines)
-        own = self._by_world or water is not None
-        rows = max(_ROWS // pixels, 1) * pixels
+        sensor.margin = margin if config.min_significance > 0.0 else bins
+        rates, counts = (
+            each.reshape((self._rows, bins)) if each.size else None for each in (self.rates, self.histogram)
+        )
+        water = None
+        if self.traced:
+            shape = (self._rows, bins)
+            rates = wp.empty(shape, dtype=float, device=device) if rates is None else rates
+            water = wp.empty(shape, dtype=float, device=device)
+        self._light, self._water = rates, water
+        rows = max(_ROWS // len(self._lines), 1) * len(self._lines)
+        most = min(rows, self._rows)
+        scratch = self._matrix(most, int) if counts is None else None
+        known = self._matrix(most) if self._by_world or self.traced else None
+        window, arrival = wp.empty(most, dtype=int, device=device), wp.empty(most, dtype=float, device=device)
         self._launches = []
-        scratch = [self._matrix(min(rows, self._rows), int)] if "histogram" not in self.outputs else []
-        own_known = self._matrix(min(rows, self._rows)) if own else None
-        window, arrival = wp.empty(rows, dtype=int, device=device), wp.empty(rows, dtype=float, device=device)
-        flat = {name: getattr(self, name).flatten() for name in _IMAGES}
         for start in range(0, self._rows, rows):
             stop = min(start + rows, self._rows)
-            part = {name: array[start:stop] for name, array in flat.items()}
-            for name in ("rates", "histogram"):
-                array = getattr(self, name)
-                part[name] = array.reshape((self._rows, config.bins))[start:stop] if array.size else None
-            if scratch:
-                part["histogram"] = scratch[0][: stop - start]
-            part["known"] = own_known[: stop - start] if own_known else None
-            part["water"] = None
-            if light is not None and water is not None:
-                part["rates"], part["water"] = light[start:stop], water[start:stop]
-            part |= {"window": window[: stop - start], "arrival": arrival[: stop - start]}
-            self._launches.append((start, stop, part))
+            own = [None if each is None else each[start:stop] for each in (water, rates, counts)]
+            shared = [None if each is None else each[: stop - start] for each in (scratch, known, window, arrival)]
+            self._launches.append((start, stop, [*own[:2], own[2] or shared[0], *shared[1:]]))
 
     def _pose(self, shapes: Shapes, camera_q: wp.array | None, body_q: wp.array | None) -> wp.array:
         """Poses of the cameras, which are checked at the first step."""
@@ -619,39 +599,28 @@ class WorldCameras:
         check.kind("shapes", shapes, Shapes)
         optical, poses = self._optical(shapes.frame), self._pose(shapes, camera_q, body_q)
         move_shapes(shapes, body_q)
-        inputs = [shapes.table, poses, optical, self._world, self._due, self._view]
-        outputs = [self.true_distance, self.true_depth, self.normal, self.reflectance]
-        wp.launch(_trace_kernel, self.true_depth.shape, inputs, outputs, device=self.device)
+        inputs = [shapes.table, poses, optical, self._sensor]
+        wp.launch(_trace_kernel, self._rows, inputs, device=self.device)
         return poses
 
     def _detect(self) -> None:
         """Counts and depth of all cameras, and the next step; nothing is allocated or read."""
-        estimate, sensor, laser = self._estimate, self._sensor, wp.vec3(*self.config.laser_position)
-        for start, stop, part in self._launches:
-            inputs = [start, self._rows, sensor, estimate.test.windows]
-            inputs += [part[name] for name in ("true_distance", "normal", "reflectance", "water", "rates", "histogram")]
-            inputs += [part["known"], self._margin, part["counts"], part["significance"], part["window"]]
-            kernel = _frame_kernel(part["water"] is not None)
-            launch_pixels(kernel, stop - start, inputs, device=self.device, block_dim=_FRAME_BLOCK)
-            arrival = None
+        estimate, sensor, kernel = self._estimate, self._sensor, _frame_kernel(self.traced)
+        for start, stop, (water, rates, histogram, known, window, arrival) in self._launches:
+            count, significance = stop - start, sensor.images.significance[start:stop]
+            inputs = [start, sensor, estimate.test.windows, water, rates, histogram, known, window]
+            launch_pixels(kernel, count, inputs, device=self.device, block_dim=_FRAME_BLOCK)
             if "depth" in self.outputs:
-                arrival = part["arrival"]
-                known = {} if part["known"] is None else {"background": part["known"]}
-                estimate.locate(part["histogram"], arrival, part["significance"], part["window"], **known)
-            inputs = [start, int(stop == self._rows), sensor, laser, arrival, part["counts"], part["true_distance"]]
-            inputs += [part["depth"], part["distance"], part["status"]]
-            launch_pixels(_depth_kernel, stop - start, inputs, device=self.device)
+                estimate.locate(histogram, arrival, significance, window, known)
+            inputs = [start, sensor, arrival if "depth" in self.outputs else None]
+            launch_pixels(_depth_kernel, count, inputs, device=self.device)
 
     def point_cloud(self, out: wp.array, *, frame: str = "optical") -> None:
         """Points of the noisy depth, vec3 `[cameras, height, width]` [m], in a frame of CAMERA_FRAMES; NaN for none.
 
         A row of 12 bytes a point: the data of a `PointCloud2` with the fields x, y and z of FLOAT32."""
         check.array("out", out, wp.vec3, self.depth.shape, self.device)
-        inputs = [self.distance, self._view, optical_to(frame)]
-        wp.launch(_points_kernel, self.depth.shape, inputs, [out], device=self.device)
-
-
-_IMAGES = ("true_distance", "normal", "reflectance", "counts", "significance", "depth", "distance", "status")
+        wp.launch(_points_kernel, self.depth.shape, [self._sensor, optical_to(frame)], [out], device=self.device)
 
 
 # ---- The fast camera.
@@ -659,46 +628,42 @@ _IMAGES = ("true_distance", "normal", "reflectance", "counts", "significance", "
 
 @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 1})
 def _images_kernel(
-    view: wp.array[wp.vec3],
-    # In, [cameras, height, width]; those that are None have no entries:
-    depth_in: wp.array3d[float],
+    sensor: Sensor,
+    # [cameras, height, width]; those that are None have no entries:
+    depth: wp.array3d[float],
     along_ray: bool,
-    normal_in: wp.array3d[wp.vec3],
+    normal: wp.array3d[wp.vec3],
     camera_q: wp.array[wp.transform],
     optical: wp.transform,
-    reflectance_in: wp.array3d[float],
-    one_reflectance: float,
-    # Out:
-    distance: wp.array3d[float],
-    depth: wp.array3d[float],
-    normal: wp.array3d[wp.vec3],
     reflectance: wp.array3d[float],
+    one_reflectance: float,
 ):
     """Launch: (cameras, height, width)."""
     v, i, j = wp.tid()
-    width = depth.shape[2]
-    u = view[i * width + j]
-    s = depth_in[v, i, j]
+    view = sensor.view
+    images = sensor.images
+    u = view[i * depth.shape[2] + j]
+    row = v * view.shape[0] + i * depth.shape[2] + j
+    s = depth[v, i, j]
     if not along_ray:
         s = s / u[2]
     s = wp.where(wp.isfinite(s) and s > 0.0, s, wp.NAN)
-    distance[v, i, j] = s
-    depth[v, i, j] = s * u[2]
-    value = one_reflectance
-    if reflectance_in.shape[0] > 0:
-        value = reflectance_in[v, i, j]
-    reflectance[v, i, j] = value
+    images.true_distance[row] = s
+    images.true_depth[row] = s * u[2]
+    images.reflectance[row] = one_reflectance
+    if reflectance.shape[0] > 0:
+        images.reflectance[row] = reflectance[v, i, j]
     n = wp.vec3(0.0)
-    if normal_in.shape[0] > 0:
-        n = normal_in[v, i, j]
+    if normal.shape[0] > 0:
+        n = normal[v, i, j]
         if camera_q.shape[0] > 0:
             n = wp.quat_rotate_inv(wp.transform_get_rotation(camera_q[v]), n)
         n = wp.quat_rotate_inv(wp.transform_get_rotation(optical), n)
     else:
-        n = wp.cross(_edge(view, depth_in, along_ray, v, i, j, 0, 1), _edge(view, depth_in, along_ray, v, i, j, 1, 0))
+        n = wp.cross(_edge(view, depth, along_ray, v, i, j, 0, 1), _edge(view, depth, along_ray, v, i, j, 1, 0))
         n = wp.where(wp.length_sq(n) > 0.0, n, u)
     n = wp.normalize(n)
-    normal[v, i, j] = wp.where(wp.dot(n, u) > 0.0, -n, n)
+    images.normal[row] = wp.where(wp.dot(n, u) > 0.0, -n, n)
 
 
 @wp.func
@@ -771,26 +736,6 @@ class SpadCamera(WorldCameras):
         ArgumentError: A number out of range, or arrays that do not fit.
     """
 
-    def __init__(
-        self,
-        config: SpadConfig | None = None,
-        cameras: int = 1,
-        *,
-        world: wp.array | Sequence[int] | None = None,
-        frame: str | None = None,
-        outputs: Sequence[str] = CAMERA_OUTPUTS,
-        by_world: Mapping[str, Any] | None = None,
-        rays: Any = None,
-        body: Any = None,
-        offset: Any = None,
-        update_period: float = 0.0,
-        device: wp.DeviceLike = None,
-    ) -> None:
-        options: dict[str, Any] = {"body": body, "offset": offset, "update_period": update_period, "rays": rays}
-        options |= {"by_world": by_world, "outputs": outputs}
-        super().__init__(config, cameras, world=world, frame=frame, **options, device=device)
-        self._tabulate()
-
     def update(
         self,
         shapes: Shapes,
@@ -847,7 +792,6 @@ class SpadCamera(WorldCameras):
         if camera_q is not None:
             check.array("camera_q", camera_q, wp.transform, (self.cameras,), self.device)
         optical = wp.transform_identity() if normal is None else self._optical("optical" if not self.frame else None)
-        inputs = [self._view, depth, bool(along_ray), normal, camera_q, optical, reflectance, number]
-        outputs = [self.true_distance, self.true_depth, self.normal, self.reflectance]
-        wp.launch(_images_kernel, shape, inputs, outputs, device=self.device)
+        inputs = [self._sensor, depth, bool(along_ray), normal, camera_q, optical, reflectance, number]
+        wp.launch(_images_kernel, shape, inputs, device=self.device)
         self._detect()

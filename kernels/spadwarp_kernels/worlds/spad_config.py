@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from spadwarp_kernels.analytic.optics import BACKSCATTER_SOURCES, Lidar, beam_fluence
-from spadwarp_kernels.analytic.rates import collection
+from spadwarp_kernels.analytic.optics import BACKSCATTER_SOURCES, IN_WATER, Lidar
+from spadwarp_kernels.analytic.rates import Scattering, make_scattering, single_scatter_rate
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels
@@ -17,12 +17,15 @@ from spadwarp_kernels.detection.arrival_time import PHASES
 from spadwarp_kernels.detection.significance import MIN_SIGNIFICANCE
 from spadwarp_kernels.optics.camera import C0
 from spadwarp_kernels.optics.laser import LASER_PROFILES
+from spadwarp_kernels.water.phase_functions import henyey_greenstein_density
 
 __all__ = ["SpadConfig"]
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 PLANCK = 6.62607015e-34  # [J s]
+
+_see = IN_WATER.see
 
 _FIELDS_OF_VIEW = ("horizontal_fov", "vertical_fov", "pixel_fov", "camera_matrix")
 
@@ -188,7 +191,7 @@ class SpadConfig:
         lidar.tan2 = math.tan(min(self.half_angle, 1.57)) ** 2
         lidar.pixel_tangent, lidar.aperture_area = self.pixel_tangent, math.pi * self.aperture_radius**2
         lidar.start, lidar.stop = (path / self.speed for path in self.gate_paths)
-        lidar.sigma = self.timing_sigma
+        lidar.sigma, lidar.bin_width = self.timing_sigma, self.bin_path / self.speed
         lidar.source, lidar.nearest = BACKSCATTER_SOURCES.index("single_scatter"), self.nearest
         return lidar
 
@@ -228,37 +231,28 @@ def _normal_integral(z: float) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def _table_kernel(
-    first: int, lidar: Lidar, width: wp.float64, g: wp.float64, view: wp.array[wp.vec3d], table: wp.array2d[float]
-):
-    """Mean over each bin of the single-scatter rate, for a scattering coefficient of 1 / m, times its width. Launch:
-    pixels."""
+def _table_kernel(first: int, lidar: Lidar, water: Scattering, view: wp.array[wp.vec3d], table: wp.array2d[float]):
+    """Single scattering per pulse and bin, by its rate at four times of the bin. Launch: pixels."""
     i = first + wp.tid()
-    one = wp.float64(1.0)
-    half = wp.float64(0.5)
-    u = view[i]
-    p = lidar.laser
-    scale = lidar.photons * lidar.pde * collection(lidar, u[2]) * width / wp.float64(4.0)
-    scale *= (one - g * g) / (wp.float64(4.0) * wp.float64(wp.pi))
+    sight = _see(lidar.ports, view[i])
+    step = wp.float64(0.25) * lidar.bin_width
     for k in range(table.shape[1]):
         total = wp.float64(0.0)
         for n in range(4):
-            path = lidar.speed * lidar.start + (wp.float64(k) + (wp.float64(n) + half) / wp.float64(4.0)) * width
-            r = (path * path - wp.dot(p, p)) * half / (path - wp.dot(u, p))
-            s = path - r  # from the laser
-            if r >= lidar.nearest and s > wp.float64(0.0):
-                y = r * u - p
-                back = wp.dot(y, u) / s
-                density = wp.pow(one + g * g + wp.float64(2.0) * g * back, wp.float64(-1.5))
-                total += density * beam_fluence(lidar, y, s * s) * wp.exp(-lidar.extinction * path) / (one + back)
-        table[i, k] = float(scale * total)
+            time = lidar.start + (wp.float64(4 * k + n) + wp.float64(0.5)) * step
+            total += single_scatter_rate(lidar, water, sight, time)
+        table[i, k] = float(total * step)
 
 
 def scattering_table(config: SpadConfig, view: np.ndarray, bins: int, device: wp.Device) -> np.ndarray:
     """Detections of single scattering without a target, blurred by the response, per pulse and bin, in the config's
     water but for a scattering coefficient of 1 / m, float32 `[pixels, bins]`; waits for the device."""
-    table = wp.zeros((len(view), bins), dtype=float, device=device)
-    inputs = [config.lidar(), config.bin_path, config.anisotropy, wp.array(view, dtype=wp.vec3d, device=device), table]
+    lidar, table = config.lidar(), wp.zeros((len(view), bins), dtype=float, device=device)
+    cosines = np.cos(np.linspace(0.0, np.pi, 3601))
+    phase = wp.array(henyey_greenstein_density(1.0 - cosines, config.anisotropy), dtype=wp.float64, device=device)
+    line = wp.array([wp.vec3d(lidar.photons, lidar.extinction, 1.0)], dtype=wp.vec3d, device=device)
+    water = make_scattering(lidar, phase, device, lines=line)
+    inputs = [lidar, water, wp.array(view, dtype=wp.vec3d, device=device), table]
     launch_pixels(_table_kernel, len(view), inputs, device=device)
     taps, lowest = config.bin_response()
     padded = np.pad(table.numpy(), ((0, 0), (-lowest, -lowest)))
@@ -281,7 +275,7 @@ class WorldValues:
 
 
 @wp.func
-def world_value(values: wp.array[float], world: int, otherwise: float) -> float:
+def world_value(values: wp.array[Any], world: int, otherwise: Any):
     if world >= 0 and world < values.shape[0]:
         return values[world]
     return otherwise

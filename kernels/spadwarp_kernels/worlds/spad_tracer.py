@@ -264,6 +264,8 @@ class SpadTracer(WorldCameras):
         ArgumentError: A number out of range, a world without shapes, or arrays that do not fit.
     """
 
+    traced = True
+
     def __init__(
         self,
         shapes: Shapes,
@@ -284,9 +286,8 @@ class SpadTracer(WorldCameras):
     ) -> None:
         check.kind("shapes", shapes, Shapes)
         self._parts = check.integer("oversampling", oversampling, 1, 1024)
-        options: dict[str, Any] = {"body": body, "offset": offset, "update_period": 0.0, "outputs": outputs}
-        options["device"] = shapes.device if device is None else device
-        super().__init__(config, cameras, world=world, frame=frame, **options)
+        options: dict[str, Any] = {"world": world, "frame": frame, "outputs": outputs, "body": body, "offset": offset}
+        super().__init__(config, cameras, **options, device=shapes.device if device is None else device)
         if self.config.camera_matrix is not None:
             raise ArgumentError(
                 "config.camera_matrix: SpadTracer has square pixels about the axis; give a field of view"
@@ -305,10 +306,6 @@ class SpadTracer(WorldCameras):
         taps, self._lowest = self.config.bin_response(self._parts)
         self._taps = wp.array(np.pad(taps, (_RUN - 1) * self._parts), dtype=float, device=self.device)
         lanes = check.integer("lanes", lanes, 1, 64)
-        bins = (self._rows, self.config.bins)
-        self._light = self.rates.reshape(bins) if self.rates.size else wp.empty(bins, dtype=float, device=self.device)
-        self._water = wp.empty(bins, dtype=float, device=self.device)
-        self._tabulate(self._light, self._water)
         self._lane_count = min(lanes, self.cameras if self.device.is_cuda else 1)
         self._estimator = estimator
         self._models: list[Model] = []
