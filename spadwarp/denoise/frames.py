@@ -198,16 +198,14 @@ def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.flo
 
 # The part of a gate that holds the target: networks are more accurate in a gate that is not much wider than that.
 
-_BINS = 20  # into which a gate is divided
-_NEAR = 0.01  # part of the gate within which two depths agree
-_NEAR_SQUARE = float(np.float32(_NEAR) ** 2)  # in float32, whose squares tell all numbers about _NEAR apart
+_BINS = 200  # into which a gate is divided
+_NEAR = (0.01, 0.04)  # parts of the gate within which two depths agree, on flat surfaces and on steep ones
 _AGREEING = 4  # of the 24 pixels around a pixel
-_ROUNDS = 3
 _KEPT = 0.7  # a gate is narrowed only to less than this part of its width
 
 
 def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The part of the gate in which depths agree with those around them more often than backscatter would.
+    """The part of the gate outside which depths agree with those around them no more often than backscatter would.
 
     Of depth over the gate, NaN where nothing was reported, and the density of backscatter there, each `[N, H, W]`: its
     start and width, with a margin, each `[N]`; 0 and 1, the whole gate, where nothing agrees, or where little would be
@@ -216,21 +214,44 @@ def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Ten
     """
     import torch
 
-    start, width = depth.new_zeros(len(depth)), depth.new_ones(len(depth))
-    frames = torch.arange(len(depth), device=depth.device)
-    part = torch.ones_like(start)
-    for turn in range(_ROUNDS):
-        begin, extent = start[frames], width[frames]
-        scaled = (depth - begin[:, None, None]) / extent[:, None, None]
-        low, high, most = _narrowed(scaled, density * extent[:, None, None])
-        part = most if turn == 0 else part  # by the whole gate
-        narrower = high - low < _KEPT
-        start[frames] = torch.where(narrower, begin + low * extent, begin)
-        width[frames] = torch.where(narrower, (high - low) * extent, extent)
-        frames, depth, density = (values[narrower] for values in (frames, depth, density))
-        if len(frames) == 0:
-            break
-    return start, width, part
+    reported = (depth >= 0.0) & (depth < 1.0)
+    inside = torch.where(reported, depth, torch.nan)
+    share = reported.flatten(1).float().mean(dim=1)
+    place = torch.where(reported, depth * _BINS, _BINS).long()
+    one = torch.ones((), device=depth.device)
+    pixels = _sums(one, place)
+
+    def unnoticed(observed: Tensor, expected: Tensor) -> Tensor:
+        """How many bins can be left out from the first on, `[N]`."""
+        more = observed.cumsum(1) > expected.cumsum(1) + 2.0 * expected.cumsum(1).sqrt() + 2.0
+        return torch.where(more.any(dim=1), more.int().argmax(dim=1), _BINS)
+
+    first, stop = (torch.full_like(share, bin) for bin in (_BINS, 0))
+    for near in _NEAR[::-1]:
+        agreeing = _agreeing(inside, near)
+        # Backscatter of this density, in as many pixels as report, agrees by chance.
+        chance = (2.0 * near * share[:, None, None] * density).clamp(0.0, 1.0)
+        by_chance, observed = (_sums(each, place) for each in (chance, (agreeing >= _AGREEING).float()))
+        part = by_chance / pixels.clamp_min(1.0)
+        fewer = sum(math.comb(24, n) * part**n * (1.0 - part) ** (24 - n) for n in range(_AGREEING))
+        expected = (pixels * (1.0 - fewer)).clamp_min(0.0)
+        total = expected.sum(dim=1)
+        found = observed.sum(dim=1) > total + 4.0 * total.sqrt() + 6.0  # of the last, where chance makes fewer agree
+        first = torch.minimum(first, unnoticed(observed, expected))
+        stop = torch.maximum(stop, _BINS - unnoticed(observed.flip(1), expected.flip(1)))
+    margin = 2.0 + 0.1 * (stop - first)
+    low, high = ((first - margin) / _BINS).clamp_min(0.0), ((stop + margin) / _BINS).clamp_max(1.0)
+    narrower = found & (reported.flatten(1).sum(dim=1) >= 50) & (stop > first) & (high - low < _KEPT)
+    start, width = torch.where(narrower, low, 0.0), torch.where(narrower, high - low, 1.0)
+    # Pairs of pixels within two of each other, those that chance makes agree, and how many more would be noticed.
+    rows, columns = depth.shape[1:]
+    around = ((y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0))
+    pairs = sum(max(0, rows - abs(y)) * max(0, columns - abs(x)) for y, x in around)
+    by_chance = by_chance.sum(dim=1) * (pairs / (rows * columns))
+    noticed = 4.0 * (2.0 * by_chance).sqrt() + 12.0
+    agrees = agreeing.flatten(1).sum(dim=1) > by_chance + noticed
+    most = torch.where(agrees, 1.0, (noticed / (pairs * share.square() + 1.0)).clamp_max(1.0))
+    return start.to(depth.dtype), width.to(depth.dtype), most.to(depth.dtype)
 
 
 def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -246,38 +267,8 @@ def narrowed_input(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tens
     return torch.stack(channels, dim=1), start, width, part
 
 
-def _narrowed(scaled: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Start and stop as parts of the gate, and the largest part of the frame that a target can take, `[N]`."""
-    import torch
-
-    reported = (scaled >= 0.0) & (scaled < 1.0)
-    share = reported.flatten(1).float().mean(dim=1)
-    agreeing = _agreeing(torch.where(reported, scaled, torch.nan))
-    # Backscatter of this density, in as many pixels as report, agrees by chance.
-    chance = (2.0 * _NEAR * share[:, None, None] * density).clamp(0.0, 1.0)
-    place = torch.where(reported, scaled * _BINS, _BINS).long()
-    one = torch.ones((), device=scaled.device)
-    pixels, by_chance, observed = (_sums(each, place) for each in (one, chance, (agreeing >= _AGREEING).float()))
-    part = by_chance / pixels.clamp_min(1.0)
-    fewer = sum(math.comb(24, n) * part**n * (1.0 - part) ** (24 - n) for n in range(_AGREEING))
-    expected = pixels * (1.0 - fewer)
-    significant = observed > expected + 4.0 * expected.clamp_min(0.0).sqrt() + 6.0
-    found = significant.any(dim=1) & (reported.flatten(1).sum(dim=1) >= 50)
-    first, last = significant.int().argmax(dim=1), _BINS - 1 - significant.int().flip(1).argmax(dim=1)
-    low, high = ((first - 1.5) / _BINS).clamp_min(0.0), ((last + 2.5) / _BINS).clamp_max(1.0)
-    # Pairs of pixels within two of each other, those that chance makes agree, and how many more would be noticed.
-    rows, columns = scaled.shape[1:]
-    around = ((y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) != (0, 0))
-    pairs = sum(max(0, rows - abs(y)) * max(0, columns - abs(x)) for y, x in around)
-    expected = by_chance.sum(dim=1) * (pairs / (rows * columns))
-    noticed = 4.0 * (2.0 * expected).sqrt() + 12.0
-    agrees = agreeing.flatten(1).sum(dim=1) > expected + noticed
-    most = torch.where(agrees, 1.0, (noticed / (pairs * share.square() + 1.0)).clamp_max(1.0))
-    return torch.where(found, low, 0.0), torch.where(found, high, 1.0), most.to(scaled.dtype)
-
-
-def _agreeing(values: Tensor) -> Tensor:
-    """How many of the 24 pixels around each pixel agree with it, uint8 `[N, H, W]`; none where either is NaN."""
+def _agreeing(values: Tensor, near: float) -> Tensor:
+    """How many of the 24 pixels around each pixel are as `near` to it, uint8 `[N, H, W]`; none where either is NaN."""
     import torch
     import torch.nn.functional as F
 
@@ -286,11 +277,12 @@ def _agreeing(values: Tensor) -> Tensor:
     padded = F.pad(values, (0, 2, 0, 2), value=torch.nan)
     line, row = padded.flatten(), padded.shape[2]
     agreeing = torch.zeros_like(line, dtype=torch.uint8)
+    near_square = float(np.float32(near) ** 2)  # in float32, whose squares tell all numbers about `near` apart
     for apart in (1, 2, *(row * down + right for down in (1, 2) for right in range(-2, 3))):
         # A square is one pass over memory less than a difference and its absolute value; this one is exact.
-        near = (F.mse_loss(line[:-apart], line[apart:], reduction="none") < _NEAR_SQUARE).view(torch.uint8)
-        agreeing[:-apart] += near
-        agreeing[apart:] += near
+        agree = (F.mse_loss(line[:-apart], line[apart:], reduction="none") < near_square).view(torch.uint8)
+        agreeing[:-apart] += agree
+        agreeing[apart:] += agree
     return agreeing.view_as(padded)[:, : values.shape[1], : values.shape[2]]
 
 

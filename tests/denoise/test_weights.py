@@ -208,9 +208,22 @@ def test_the_gate_is_narrowed_to_where_depths_agree():
     noisy = [noisy_depth(scene, water="uniform", level=0.264, seed=1) for scene in (target, water)]
     starts, widths, parts = gates(depth_frames(np.stack(noisy), gate=(12.0, 20.0)))
     start, stop = 12.0 + 8.0 * starts[0], 12.0 + 8.0 * (starts[0] + widths[0])
-    assert 13.5 < start < np.nanmin(target.clean) and np.nanmax(target.clean) < stop < 16.0
+    assert 12.5 < start < np.nanmin(target.clean) and np.nanmax(target.clean) < stop < 17.5
     assert (starts[1], widths[1], parts[0]) == (0.0, 1.0, 1.0)
     assert gates(depth_frames(noisy[1], gate=GATE))[2][0] < 0.01  # of water, no target takes more than this part
+
+
+def test_a_small_steep_target_is_seen_whole():
+    random = np.random.default_rng(5)
+    target = np.full((48, 64), np.nan)
+    target[16:31, 20:44] = np.linspace(13.9, 15.2, 24)  # 2.3 % of the gate from pixel to pixel
+    noisy = np.where(random.random(target.shape) < 0.3, random.uniform(13.5, 16.0, target.shape), target)
+    noisy += random.normal(0.0, 0.01, target.shape)
+    found = estimate(noisy, gate=(13.5, 16.0))
+    seen = np.isfinite(target)
+    assert np.mean(found.target_probability[seen] > inference.target_threshold("pyramid")) > 0.95
+    assert np.mean(found.target_probability[~seen] > inference.target_threshold("pyramid")) < 0.1
+    assert np.mean(np.abs(found.depth - target)[seen] < 0.06) > 0.8  # steps from pixel to pixel are 0.057 m
 
 
 def test_the_bins_of_the_target_are_those_of_the_excess():
