@@ -6,7 +6,6 @@ import re
 import tomllib
 from pathlib import Path
 
-import jsonschema
 import pytest
 import typer.main
 
@@ -85,6 +84,8 @@ MODELS = {
 @functools.cache
 def validator(kind):
     schema = json.loads(json.dumps(json_schema(MODELS[kind]), allow_nan=False))
+    import jsonschema  # takes seconds
+
     jsonschema.Draft202012Validator.check_schema(schema)
     return jsonschema.Draft202012Validator(schema)
 

@@ -76,7 +76,13 @@ def test_splits_share_neither_targets_nor_seeds(folder):
 PORTS = {"scene.camera.port": {"preset": "flat-glass"}, "scene.laser.port": "camera"}
 
 
-@pytest.mark.parametrize("changes", [None, PORTS | {"scene.medium.phase_index": "seawater"}], ids=["water", "port"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param(None, id="water"),
+        pytest.param(PORTS | {"scene.medium.phase_index": "seawater"}, id="port", marks=pytest.mark.slow),
+    ],
+)
 def test_label_noisy_and_clean_depth_agree(folder, tmp_path, changes):
     if changes is not None:
         folder = tmp_path / "data"

@@ -39,8 +39,15 @@ def test_frames_of_empty_water(mode):
     np.testing.assert_array_equal(np.isnan(corrected), np.isnan(time))
 
 
-@pytest.mark.parametrize("mode", ["first_photon", "free_running"])
-@pytest.mark.parametrize("wrap", [True, False])
+@pytest.mark.parametrize(
+    ("mode", "wrap"),
+    [
+        ("first_photon", True),
+        ("free_running", False),
+        pytest.param("first_photon", False, marks=pytest.mark.slow),
+        pytest.param("free_running", True, marks=pytest.mark.slow),
+    ],
+)
 def test_the_background_has_its_own_crosstalk_and_afterpulses(mode, wrap):
     """Counts of dark pixels, corrected for pile-up or with little of it, have the mean and the alarms of it."""
     effects = {"crosstalk_probability": 0.03, "afterpulsing_probability": 0.2, "dead_time_ns": 5.0}

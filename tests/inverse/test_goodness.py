@@ -25,12 +25,12 @@ def detected(light, seed=3):
 
 @pytest.mark.parametrize(("level", "photons"), [(0.05, 1e9), (0.2, 50), (1.0, 10)])
 def test_p_of_right_models_is_uniform(level, photons):
-    """200 draws of counts and of a model by so many photons a count: Kolmogorov–Smirnov p above 0.001."""
+    """100 draws of counts and of a model by so many photons a count: Kolmogorov–Smirnov p above 0.001."""
     random, bins = np.random.default_rng(int(photons + 100 * level)), np.arange(100)
     shape = 3 * np.exp(-(((bins - 50) / 6) ** 2)) + 0.5 * np.exp(-bins / 30) + 0.01
     true = level * np.outer(random.uniform(0.5, 1.5, 64), shape)
     p = []
-    for _ in range(200):
+    for _ in range(100):
         counts = random.poisson(true).reshape(8, 8, 100)
         batches = [(random.poisson(true * photons / 8) / photons * 8).astype(np.float32) for _ in range(8)]
         mean = np.mean(batches, axis=0)

@@ -21,7 +21,7 @@ from spadwarp.parallel import Ray, interruptible, run_jobs
 ENGINES = {"here": {"device": "cpu"}, "processes": {"device": "cpu,cpu"}, "ray": {"engine": Ray(workers=2)}}
 
 
-@pytest.fixture(params=ENGINES)
+@pytest.fixture(params=["here", "processes", pytest.param("ray", marks=pytest.mark.slow)])
 def options(request):
     """Of `run_jobs`, for each engine."""
     if request.param == "ray":
@@ -163,15 +163,19 @@ def test_an_interrupted_run_over_ray_keeps_what_is_done(cluster, whole):
     assert spadwarp.merge(parts).tallies.tobytes() == part.tallies.tobytes()
 
 
-def test_what_ray_cannot_do_is_refused(cluster):
-    with pytest.raises(spadwarp.ConfigError, match="cuda:1"):
-        simulate(scene(), **RUN, device="cuda:1", engine=Ray())
-    with pytest.raises(spadwarp.DeviceError, match="no GPU"):
-        simulate(scene(), **RUN, device="cuda", engine=Ray())
+def test_workers_and_address_of_ray_are_checked():
     with pytest.raises(spadwarp.ArgumentError, match="workers = 0 is outside"):
         Ray(workers=0)
     with pytest.raises(spadwarp.ArgumentError, match="address = 5 is not text"):
         Ray(address=5)
+
+
+@pytest.mark.slow
+def test_devices_that_ray_does_not_have_are_refused(cluster):
+    with pytest.raises(spadwarp.ConfigError, match="cuda:1"):
+        simulate(scene(), **RUN, device="cuda:1", engine=Ray())
+    with pytest.raises(spadwarp.DeviceError, match="no GPU"):
+        simulate(scene(), **RUN, device="cuda", engine=Ray())
 
 
 @pytest.mark.slow

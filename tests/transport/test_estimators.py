@@ -18,8 +18,6 @@ from spadwarp.transport.model import build_model, transport_spec
 
 pytestmark = pytest.mark.physics
 
-TABLE = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("axis_threshold", "photons"), [(1.0, {"analog": 40_000, "guided": 20_000}), (0.97, PHOTONS)])
@@ -28,13 +26,6 @@ def test_estimators_agree_in_every_component(axis_threshold, photons, device):
     one = scene(transport={"axis_threshold": axis_threshold})
     cells = agreeing_cells(one, device, photons=photons, clear=photons is PHOTONS)
     assert (cells["guided"].reshape(SEEDS, 3, -1).sum(axis=(0, 2)) > 0).all()
-
-
-@pytest.mark.slow
-def test_estimators_agree_with_a_tabulated_phase_function(device):
-    """Two terms, one of them backward, under a raised near-axis threshold."""
-    one = scene(medium=TABLE, transport={"axis_threshold": 0.97})
-    agreeing_cells(one, device, photons={"analog": 30_000, "guided": 15_000})
 
 
 @pytest.mark.slow
@@ -62,7 +53,7 @@ WATERS = {
     [
         ("one", "next_event"),
         ("one", "guided"),
-        ("layers", "next_event"),
+        pytest.param("layers", "next_event", marks=pytest.mark.slow),
         ("layers", "guided"),
         pytest.param("cells", "guided", marks=pytest.mark.slow),
         ("cells by delta tracking", "next_event"),
@@ -170,7 +161,7 @@ def test_estimators_agree_under_a_cap_on_events(events, device):
     ],
 )
 def test_estimators_share_one_ledger(end, device):
-    """Without directed directions to the unit, seed by seed; guided in its mean over seeds."""
+    """In its mean over seeds; without directed directions, seed by seed and to the unit."""
     box = {"shape": "box", "lower": [-1.3, -0.9, -0.4], "upper": [1.2, 1.1, 3.4]}
     camera, laser = {"port": {"distance": 0.05}}, {"port": "camera"}
     if "termination" in end:  # in a tank, as the tests of its walls
@@ -188,14 +179,16 @@ def test_estimators_share_one_ledger(end, device):
     def with_estimator(name):
         return one.with_overrides({"transport.estimator": name})
 
-    def ledger(estimator):
-        result = simulate(with_estimator(estimator), photons=20_000, seed=0, device=device)
+    def ledger(one):
+        result = simulate(one, photons=20_000, seed=0, device=device)
         assert result.energy_report()["exact"]
         counts = {name: result.counters[name] for name in ("water_collisions", "surface_events")}
         return {**result.energy_balance, **counts}
 
-    entry, found = next(iter(end)), ledger("next_event")
-    assert "termination" in end or found == ledger("analog")
+    entry, found = next(iter(end)), ledger(with_estimator("next_event"))
+    if "termination" not in end:  # without domain, layers and port, whose kernel others take
+        plain = [scene(transport={"max_collisions": 8, **end, "estimator": name}) for name in ("next_event", "analog")]
+        assert ledger(plain[0]) == ledger(plain[1])
     assert all(found[name] > 0 for name in (entry, "exit_y_low", "absorbed_surface"))
     means = [
         [[float(run.energy_balance[entry])] for run in of_seeds(with_estimator(name), device, 4000, range(SEEDS))]

@@ -68,7 +68,7 @@ def test_check_and_the_run_say_what_is_not_seen(device):
     one = peaked(WATER, "next_event", photons=20_000)
     (message,) = [found for found in check(one) if "forward peak" in found.text]
     assert message.level == "warning" and message.field == "transport.estimator"
-    with pytest.warns(spadwarp.SpadwarpWarning, match="next_event: up to 31 % of the scattered light"):
+    with pytest.warns(spadwarp.SpadwarpWarning, match="next_event: up to [0-9.]+ % of the scattered light"):
         result = spadwarp.simulate(one, device=device)
     share = result.summary()["unseen_share"]
     assert share == result.unseen_share == one.unseen_peak(result.photons, 2.2)[1]

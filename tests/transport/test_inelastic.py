@@ -138,10 +138,10 @@ def test_fluorescence_decays():
     """Behind a black plate nothing is lit: there the light falls by exp(-Δt/τ) from bin to bin, and none is lost."""
     gate = {"start_ns": 0.0, "bin_width_ps": 200.0, "bins": 200}
     plate = {"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 2.0], "reflectance": 0.0}
-    one = pencil(GLOW, estimator="next_event").with_overrides({"gate": gate, "targets": [plate]})
+    one = pencil(RAMAN, GLOW).with_overrides({"gate": gate, "targets": [plate]})
     prompt, late = (
         spadwarp.simulate(
-            one.with_overrides({"medium.inelastic[0].decay_time_ns": decay}), photons=20_000, device="cpu"
+            one.with_overrides({"medium.inelastic[1].decay_time_ns": decay}), photons=20_000, device="cpu"
         )
         for decay in (0.0, 1.5)
     )

@@ -10,8 +10,11 @@ from helpers.estimators import PHOTONS, SEEDS, agreeing_cells
 from helpers.opencv import project_points
 from helpers.scenes import PLATE, scene
 from spadwarp import simulate
+from spadwarp.device import pick_device
+from spadwarp.mesh import build_mesh
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_angles, rotation_matrix
+from spadwarp.transport.model import build_model
 from spadwarp.values import ConfigError
 
 pytestmark = pytest.mark.physics
@@ -123,14 +126,16 @@ def test_moving_everything_together_changes_nothing(device):
 
 
 def test_a_camera_outside_the_water_is_refused():
+    """Where the model is built: nothing is compiled."""
     camera = {"domain": {"shape": "slab", "lower": 0.5, "upper": 9.0}, "laser": {"position": [0, 0, 1.0]}}
     laser = {"domain": {"shape": "box", "lower": 1.0, "upper": 9.0}}
     for sections, text in (
         (camera, r"camera\.position: z = 0\.0 is outside \[0\.5, 9\.0\], the domain"),
         (laser, r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\], the domain"),
     ):
+        one = scene(**sections)
         with pytest.raises(ConfigError, match=text):
-            simulate(scene(**sections, transport={"termination": "roulette"}), photons=10, device="cpu")
+            build_model(one, pick_device("cpu"), build_mesh(one))
 
 
 @pytest.mark.slow

@@ -84,7 +84,7 @@ def test_three_points_where_a_warp_has_a_short_queue(kind, device, tmp_path):
 
 
 def test_records_of_photons_have_no_points(device):
-    one, more = (trace(with_points(scene(), points), photons=500, device=device) for points in (1, 3))
+    one, more = (trace(with_points(scene(targets=[]), points), photons=500, device=device) for points in (1, 3))
     assert np.array_equal(one.position, more.position) and np.array_equal(one.weight, more.weight)
 
 

@@ -224,7 +224,13 @@ def single_scatter_of(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "estimator"), [("flat", "next_event"), ("flat", "guided"), ("tilted", "guided"), ("dome", "guided")]
+    ("name", "estimator"),
+    [
+        ("flat", "next_event"),
+        ("flat", "guided"),
+        ("tilted", "guided"),
+        pytest.param("dome", "guided", marks=pytest.mark.slow),
+    ],
 )
 def test_light_scattered_once_behind_a_port_is_what_quadrature_says(name, estimator, device):
     """Within 0.5 % in all, and within its error in each bin. Rays and solid angles of the reference are found by

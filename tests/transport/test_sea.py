@@ -9,8 +9,11 @@ import spadwarp
 from helpers.estimators import cells
 from helpers.scenes import scene
 from helpers.statistics_of_samples import equal_means_p
+from spadwarp.device import pick_device
+from spadwarp.mesh import build_mesh
 from spadwarp.scene.scan import shot_scene
 from spadwarp.scene.sight import depth_from_time, lines_of_sight
+from spadwarp.transport.model import build_model
 
 PLATE = {"builtin": "plane", "size": [4.0, 4.0], "reflectance": 0.7}
 
@@ -144,22 +147,24 @@ def test_waves_without_height_are_the_mean_plane(tmp_path):
     assert runs[1].sum(axis=1).mean() == pytest.approx(runs[0].sum(axis=1).mean(), rel=5e-3)
 
 
-def test_waves_stay_below_lens_and_laser():
-    steep = {"size": 40.0, "cells": 64}
-    with pytest.raises(spadwarp.ConfigError, match=r"camera\.position is 0\.1 m .* waves are up to 0\.\d+ m high"):
-        spadwarp.simulate(
-            sea_scene("both in air", surface={"point": [0.0, 0.0, 0.1], "waves": steep}, laser={"position": [0.0] * 3}),
-            photons=100,
-            device="cpu",
-        )
-    with pytest.raises(spadwarp.ConfigError, match=r"surface\.waves: heights: the waves hold .* outside \[0, 0\.9\]"):
-        spadwarp.simulate(sea_scene("both in air", surface={"waves": {**WAVES, "shortest": 0.0625}}), photons=100)
-
-
-def test_shots_stay_on_their_side():
-    one = sea_scene("both in air", camera={"width": 2, "height": 2}, scan={**SCAN, "velocity": [0.0, 0.0, 400.0]})
-    with pytest.raises(spadwarp.ConfigError, match=r"scan: shot 3 is -0\.2 m from the surface"):
-        spadwarp.simulate(one, photons=100, device="cpu")
+def test_waves_and_shots_stay_on_their_side():
+    """Refused where the model is built: nothing is compiled."""
+    low = {"point": [0.0, 0.0, 0.1], "waves": {"size": 40.0, "cells": 64}}
+    rising = {"camera": {"width": 2, "height": 2}, "scan": {**SCAN, "velocity": [0.0, 0.0, 400.0]}}
+    for sections, text in (
+        (
+            {"surface": low, "laser": {"position": [0.0] * 3}},
+            r"camera\.position is 0\.1 m .* waves are up to 0\.\d+ m high",
+        ),
+        (
+            {"surface": {"waves": {**WAVES, "shortest": 0.0625}}},
+            r"surface\.waves: heights: the waves hold .* outside \[0, 0\.9\]",
+        ),
+        (rising, r"scan: shot 3 is -0\.2 m from the surface"),
+    ):
+        one = sea_scene("both in air", **sections)
+        with pytest.raises(spadwarp.ConfigError, match=text):
+            build_model(one, pick_device("cpu"), build_mesh(one))
 
 
 SCAN = {"mode": "trajectory", "pattern": "conical", "half_angle_deg": 12.0, "velocity": [0.0, 300.0, 40.0]}

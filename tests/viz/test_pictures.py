@@ -231,7 +231,12 @@ PICTURES_OF_THE_DOCS = {
 @pytest.mark.parametrize(
     ("kind", "width"),
     [
-        pytest.param(kind, width, marks=[pytest.mark.slow] * (kind == "sweep_plan"))
+        pytest.param(
+            kind,
+            width,
+            marks=[pytest.mark.slow]
+            * (kind == "sweep_plan" or (width == style.PAGE and draw not in AS_WIDE_AS_A_PAGE)),
+        )
         for kind, draw in PICTURES.items()
         for width in (style.PAGE, style.COLUMN)[: 1 + (draw not in AS_WIDE_AS_A_PAGE)]
     ],

@@ -45,7 +45,7 @@ def first_photons(rng, pixels, background, pulses):
 def test_false_alarms_of_background_alone_are_as_many_as_asked_for(background, options, device):
     """4 standard errors, and a tenth by which the bound on the union of windows may be above. A pixel without a count
     has no alarm where the level is that of its own counts."""
-    rng, pixels = np.random.default_rng(7), 150_000
+    rng, pixels = np.random.default_rng(7), 60_000
     pulses = options.get("pulses", 0)
     counts = first_photons(rng, pixels, background, pulses) if pulses else rng.poisson(background, (pixels, BINS))
     known = {} if "profile" in options else {"background": background}
@@ -120,8 +120,10 @@ def test_rates_have_no_significance():
 SMALL = {"width": 80, "height": 60}
 
 
-@pytest.mark.parametrize("method", ["peak", "centroid", "matched", "likelihood"])
-@pytest.mark.parametrize("world", ["water", "air", "dark counts"])
+@pytest.mark.parametrize(
+    ("method", "world"),
+    [("peak", "water"), ("centroid", "air"), ("matched", "dark counts"), ("likelihood", "water"), ("peak", "air")],
+)
 def test_a_camera_sees_nothing_in_an_empty_world(method, world, device):
     """One false alarm in a hundred pixels, which shows in few of them."""
     clear = {"absorption": 0.0, "scattering": 0.0, "group_index": 1.0003}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import spadwarp_kernels as sk
-from helpers.worlds import SMALL, STILL, garden, transforms
+from helpers.worlds import SMALL, STILL, garden, square, transforms
 
 
 @pytest.mark.slow
@@ -45,12 +45,17 @@ def test_the_map_of_the_view_skips_rays_and_changes_no_bit(device, monkeypatch):
     """With bodies that have moved, and a floor that goes past the lens."""
     from spadwarp_kernels.worlds import spad_tracer
 
+    mesh, uv = square(device)
+
     def trace():
         shapes = sk.make_shapes(
-            ["plane", "plane", "sphere", "box"],
-            [(0, 0, 0), (0, 0, 0), (0.4, 0, 0), (0.4, 0.3, 0.2)],
-            body=[-1, -1, 0, 1],
-            local=[(0, 1, 0, 0.7071068, 0, 0, 0.7071068), (0, 0, 4, 0, 0, 0, 1), *[(0, 0, 0, 0.6, 0, 0, 0.8)] * 2],
+            ["plane", "plane", "sphere", "box", "mesh"],  # the mesh has an image, so that the kernel is the garden's
+            [(0, 0, 0), (0, 0, 0), (0.4, 0, 0), (0.4, 0.3, 0.2), (1, 1, 1)],
+            body=[-1, -1, 0, 1, 1],
+            local=[(0, 1, 0, 0.7071068, 0, 0, 0.7071068), (0, 0, 4, 0, 0, 0, 1), *[(0, 0, 0, 0.6, 0, 0, 0.8)] * 3],
+            mesh=[None] * 4 + [mesh],
+            first_face=[-1] * 4 + [0],
+            textures=sk.make_textures(np.zeros(2, int), uv, [np.array([[0.25, 1.0]])], device=device),
             device=device,
         )
         tracer = sk.SpadTracer(shapes, sk.SpadConfig(**SMALL), photons=20_000, frame="optical")
