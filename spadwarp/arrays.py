@@ -241,19 +241,4 @@ def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
     return pandas.DataFrame(table, index=index)
 
 
-# ---- Errors of kernels.
-
-
-@contextmanager
-def kernel_errors() -> Iterator[None]:
-    """Turns what the kernel library refuses into an `ArgumentError` of spadwarp: numbers that pass one by one, but
-    together leave the range of what is computed with."""
-    import spadwarp_kernels as sk
-
-    try:
-        yield
-    except sk.ArgumentError as error:
-        raise ArgumentError(str(error)) from error
-
-
-guarded(__name__, __all__)
+guarded(__name__)

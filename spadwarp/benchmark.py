@@ -505,4 +505,4 @@ def newest_report(directory: str | Path, *, like: Mapping[str, Any], cases: Sequ
     raise FileError(f"{directory}: no report of {', '.join(cases)} from {like['device_name']}{threads}")
 
 
-guarded(__name__, __all__)
+guarded(__name__)

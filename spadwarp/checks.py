@@ -897,4 +897,4 @@ _CHECKS = (
 )
 
 
-guarded(__name__, __all__)
+guarded(__name__)

@@ -234,4 +234,4 @@ def nvidia_driver() -> str | None:
     return next((word for word in words if word[0].isdigit() and "." in word), None)
 
 
-guarded(__name__, __all__)
+guarded(__name__)

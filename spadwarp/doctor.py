@@ -209,4 +209,4 @@ def _quantities(device: str, photons: int) -> list[Quantity]:
     ]
 
 
-guarded(__name__, __all__)
+guarded(__name__)

@@ -151,14 +151,20 @@ def need_memory(gibibytes: float, name: str) -> None:
 # ---- Arguments of public functions
 
 
-def guarded(module: str, names: Iterable[str]) -> list[str]:
+def guarded(module: str) -> None:
     """Makes `ArgumentError` of what libraries raise when a public function of a module gets an argument that is not of
-    its annotated type, that holds nothing or no finite number, or arrays that do not fit; returns the names.
+    its annotated type, that holds nothing or no finite number, or arrays that do not fit; and of what the kernel
+    library refuses: numbers that pass one by one, but together leave the range of what is computed with.
 
+    The public names of a package are those of its modules that it has imported; they become its `__all__`.
     Nothing is checked before something was raised: calls cost no time for it.
     """
-    space, names = vars(sys.modules[module]), list(names)
-    for name in names:
+    space = vars(sys.modules[module])
+    if "__all__" not in space:
+        modules = [vars(found) for name, found in sys.modules.items() if name.startswith(f"{module}.")]
+        names = {name: one[name] for one in modules for name in one.get("__all__", ())}
+        space["__all__"] = sorted(name for name, found in names.items() if space.get(name) is found)
+    for name in space["__all__"]:
         found = space[name]
         if isinstance(found, types.FunctionType):
             space[name] = _guarded(found, module)
@@ -166,7 +172,6 @@ def guarded(module: str, names: Iterable[str]) -> list[str]:
             for kind in found.__mro__:
                 if kind.__module__.startswith("spadwarp."):
                     _guard_methods(kind)
-    return names
 
 
 def _guard_methods(kind: type) -> None:
@@ -187,6 +192,8 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
             return
         if isinstance(error, OSError) and error.filename is not None and error.errno != errno.ENOMEM:
             raise FileError(in_words(error)) from error
+        if type(error).__name__ == "ArgumentError":  # of the kernel library, which is not loaded here
+            raise ArgumentError(str(error)) from error
         if problem := _wrong_argument(error, function, arguments, named):
             raise UnforeseenArgument(problem) from error
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import kernel_errors
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.scene import daylight_rate, phase_function, water_lines
@@ -61,7 +60,6 @@ def warn_of_model(scene: Scene, stacklevel: int = 3) -> None:
         warnings.warn(text, SpadwarpWarning, stacklevel=stacklevel)
 
 
-@kernel_errors()
 def pixel_maps(
     scene: Scene,
     *,

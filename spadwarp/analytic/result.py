@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, response_sigma, scene_optics, warn_of_model
-from spadwarp.arrays import kernel_errors, labelled
+from spadwarp.arrays import labelled
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.result.file import as_result
@@ -108,7 +108,6 @@ class AnalyticResult(Shown):
         height, width = self.truth.depth.shape
         return f"AnalyticResult({name}: {width} x {height} pixels, {len(self.depth)} depth frames, seed {self.seed})"
 
-    @kernel_errors()
     def sample(
         self, frames: int, *, first: int = 0, seed: int | None = None, device: Any = None
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -4,8 +4,6 @@
 `FrameReader`, `SpadDataset` (for torch) and `iterate_dataset` read it; `export_dataset` writes it for other loaders.
 """
 
-from typing import TYPE_CHECKING
-
 from spadwarp.dataset.export import *
 from spadwarp.dataset.make import *
 from spadwarp.dataset.plan import *
@@ -13,5 +11,4 @@ from spadwarp.dataset.read import *
 from spadwarp.dataset.recipe import *
 from spadwarp.values import guarded
 
-if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = guarded(__name__, [*recipe.__all__, *plan.__all__, *make.__all__, *read.__all__, *export.__all__])
+guarded(__name__)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import pixel_maps, scene_optics
-from spadwarp.arrays import kernel_errors
 from spadwarp.dataset.plan import Plan, SceneDraw
 from spadwarp.device import pick_device
 from spadwarp.frames import Frames, detect
@@ -137,7 +136,6 @@ def render_analytic(plan: Plan, draw: SceneDraw, *, device: str | None) -> Rende
     )
 
 
-@kernel_errors()
 def _draw_frames(
     plan: Plan,
     draw: SceneDraw,

@@ -3,8 +3,6 @@
 torch and the other packages of the extra are loaded when a function needs them: `pip install "spadwarp[denoise]"`.
 """
 
-from typing import TYPE_CHECKING
-
 from spadwarp.denoise.backgrounds import *
 from spadwarp.denoise.files import *
 from spadwarp.denoise.histograms import *
@@ -13,13 +11,4 @@ from spadwarp.denoise.network_files import *
 from spadwarp.denoise.recipe import *
 from spadwarp.values import guarded
 
-if not TYPE_CHECKING:  # type checkers follow the stars
-    _modules = (
-        backgrounds,
-        files,
-        histograms,
-        inference,
-        network_files,
-        recipe,
-    )
-    __all__ = guarded(__name__, sorted(name for module in _modules for name in module.__all__))
+guarded(__name__)

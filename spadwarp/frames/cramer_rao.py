@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import kernel_errors
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
 from spadwarp.result.file import ResultLike, as_result
@@ -45,7 +44,6 @@ def _deviation(information: Map, noise: Map, pulses: float) -> Map:
     return np.where(information > 0, sigma, np.nan)
 
 
-@kernel_errors()
 def information_from_histogram(
     signal_cube: ArrayLike,
     background_cube: ArrayLike,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, kernel_errors, real_array, tensor_of
+from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
 from spadwarp.scene import Camera, Medium, Scene
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
@@ -59,7 +59,6 @@ class Histograms:
         return known if known is not None and known.ndim and known.shape[-1] == self.values.shape[-1] else None
 
 
-@kernel_errors()
 def arrival_time(
     histogram: Any,
     *,

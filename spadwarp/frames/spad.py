@@ -20,7 +20,6 @@ from spadwarp.arrays import (
     histogram_rows,
     in_torch_order,
     is_torch,
-    kernel_errors,
     labelled,
     on_host,
     output_tensor,
@@ -516,7 +515,6 @@ def monte_carlo_noise(
 _LIMITS = {"pulses": "[1, 2147483647]", "frames": "[1, 2147483647]", "first_frame": "[0, 4294967295]", "seed": SEED}
 
 
-@kernel_errors()
 def detect(
     source: Any,
     *,

@@ -4,8 +4,6 @@
 `preset`; the file's own fields lie over it and overrides over both. SI units, except where a name carries its unit.
 """
 
-from typing import TYPE_CHECKING
-
 from spadwarp.scene.ambient_light import *
 from spadwarp.scene.camera import *
 from spadwarp.scene.flux import *
@@ -18,6 +16,4 @@ from spadwarp.scene.sections import *
 from spadwarp.scene.settings import *
 from spadwarp.values import guarded
 
-if not TYPE_CHECKING:  # type checkers follow the stars
-    _MODULES = (ambient_light, camera, flux, laser, medium, pose, scan, scene, sections, settings)
-    __all__ = guarded(__name__, [name for module in _MODULES for name in module.__all__])
+guarded(__name__)

@@ -19,7 +19,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
-from spadwarp.arrays import caller_tallies, kernel_errors
+from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, kernel_thread, pick_device, pick_devices, processor_name
 from spadwarp.mesh import TriangleMesh
 from spadwarp.parallel import Ray, Worker
@@ -375,11 +375,9 @@ def _host_memory(shape: Sequence[int], dtype: Any) -> NDArray[Any]:
 
 @contextmanager
 def device_errors(device: wp.Device) -> Iterator[None]:
-    """Turns an error of Warp into a `DeviceError` that names the device, and what kernels refuse into an
-    `ArgumentError`."""
+    """Turns an error of Warp into a `DeviceError` that names the device."""
     try:
-        with kernel_errors():
-            yield
+        yield
     except RuntimeError as error:
         short = "allocate" in str(error) or "out of memory" in str(error)
         problem = "has too little memory left" if short else "failed"

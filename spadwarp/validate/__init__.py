@@ -10,4 +10,4 @@ from spadwarp.validate.cases import CASES, FAMILY_LEVEL, Case, CaseResult, draw_
 from spadwarp.values import guarded
 
 __all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run"]
-guarded(__name__, __all__)
+guarded(__name__)

@@ -1,7 +1,5 @@
 """Pictures, pages and videos: arrays in, images out."""
 
-from typing import TYPE_CHECKING
-
 from spadwarp.values import guarded
 from spadwarp.viz import style  # noqa: F401 (first: it says what is wrong with Matplotlib)
 from spadwarp.viz.curves import *
@@ -10,5 +8,4 @@ from spadwarp.viz.result import *
 from spadwarp.viz.scenes import *
 from spadwarp.viz.viewer import *
 
-if not TYPE_CHECKING:  # type checkers follow the stars
-    __all__ = guarded(__name__, [*result.__all__, *scenes.__all__, *curves.__all__, *viewer.__all__, *notebook.__all__])
+guarded(__name__)
