@@ -405,10 +405,7 @@ def _part(
     light = light / np.maximum(np.linalg.norm(light, axis=-1, keepdims=True), 1e-9)
     lengths = np.nan_to_num(path + ends + sights.delay[:, None])
     points = sights.start[:, None, :] + middle[..., None] * sights.direction[:, None, :]
-    at = np.nan_to_num(cells.in_cells(to_world(scene.camera, points)), nan=-1.0)
-    index = np.floor(np.clip(at, -1.0, cells.extinction.shape)).astype(np.int32)
-    inside = ((index >= 0) & (index < cells.extinction.shape)).all(axis=-1)
-    place = tuple(np.moveaxis(np.clip(index, 0, np.array(cells.extinction.shape) - 1), -1, 0))
+    place, inside = cells.index_of(np.nan_to_num(cells.in_cells(to_world(scene.camera, points)), nan=-1.0))
     extinction = np.where(inside, cells.extinction[place], medium.extinction)
     scattering = np.where(inside, cells.scattering[place], medium.scattering)
     excess = (extinction - medium.extinction) * np.diff(ends, axis=1)

@@ -163,8 +163,8 @@ class FramesFile(_StoredFrames):
     FORMAT = "spadwarp frames"
     edges: NDArray[np.float64]
     irf: InstrumentResponse
-    expected: NDArray[np.float32] | None  # as of `Frames`, as all others are; None in a file that does not hold them
-    background: NDArray[np.float32] | None  # likewise
+    expected: NDArray[np.float32]  # as of `Frames`, as all others are
+    background: NDArray[np.float32]
     scene: Scene  # of the result that the counts were drawn from
     truth_depth: NDArray[np.float32]  # of that result, float32 `[H, W]` [m]
     monte_carlo_noise: float | None = None
@@ -183,13 +183,12 @@ class FramesFile(_StoredFrames):
             irf = InstrumentResponse(times=times, values=values)
         else:
             irf = InstrumentResponse(sigma=file.real("irf_sigma", "[0, inf)"), tail=file.real("irf_tail", "[0, inf)"))
-        is_even = "background" in file and file.stored("background", np.float32, (*image, None)).shape[2] == 1
-        sizes, expectations = {"expected": bins, "background": 1 if is_even else bins}, dict[str, Any]()
-        for name, size in sizes.items():
-            cube = file.array(name, np.float32, (*image, size)) if name in file else None
-            if cube is not None and not (np.isfinite(cube).all() and (cube >= 0).all()):
+        is_even = file.stored("background", np.float32, (*image, None)).shape[2] == 1
+        cubes = {"expected": bins, "background": 1 if is_even else bins}
+        expectations = {name: file.array(name, np.float32, (*image, size)) for name, size in cubes.items()}
+        for name, cube in expectations.items():
+            if not (np.isfinite(cube).all() and (cube >= 0).all()):
                 file.refuse(name, "is negative or not finite in some bins")
-            expectations[name] = cube
         noise = file.attribute("monte_carlo_noise", None)
         return {
             "edges": edges,
@@ -210,9 +209,7 @@ class FramesFile(_StoredFrames):
         return spadwarp.viz.plot(self, frame=frame, **options)
 
     def frame(self, number: int) -> Frames:
-        """One frame as `Frames`. Raises `ArgumentError` where it is not there or the file holds no expected counts."""
-        if self.expected is None or self.background is None:
-            raise ArgumentError(f"{self.path}: holds no expected counts")
+        """One frame as `Frames`. Raises `ArgumentError` where it is not there."""
         return Frames(
             counts=self.counts(number)[None],
             frames=1,

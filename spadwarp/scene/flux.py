@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from spadwarp.io.hdf5 import Coordinate
-from spadwarp.scene.pose import unit_vector
+from spadwarp.scene.pose import sideways, unit_vector
 from spadwarp.scene.sections import Corner, Direction, Section, Vector, Whole, field, listed
 
 if TYPE_CHECKING:
@@ -178,15 +178,5 @@ class Sun(Section):
     @property
     def direction(self) -> NDArray[np.float64]:
         """Unit vector in which the sun's light goes in the air, in the world."""
-        ahead, zenith, azimuth = azimuth_zero(self.down), math.radians(self.zenith_deg), math.radians(self.azimuth_deg)
-        across = math.cos(azimuth) * ahead + math.sin(azimuth) * np.cross(self.down, ahead)
-        return math.cos(zenith) * self.down + math.sin(zenith) * across
-
-
-def azimuth_zero(down: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vector of azimuth 0 about an axis: the part across it of the world's z axis, or where that is none of x."""
-    for ahead in np.eye(3)[[2, 0]]:
-        across = ahead - (ahead @ down) * down
-        if np.linalg.norm(across) > 1e-6:
-            break
-    return across / np.linalg.norm(across)
+        zenith = math.radians(self.zenith_deg)
+        return math.cos(zenith) * self.down + math.sin(zenith) * sideways(self.down, self.azimuth_deg)

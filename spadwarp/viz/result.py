@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import SymmetricalLogLocator
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.analytic import AnalyticResult
@@ -252,14 +251,12 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
         parts = better.histogram[:, row, column].astype(np.float64) * per_pulse
     time = 1e9 * result.bin_edges
     total = parts.sum(axis=0)
-    known = result.batches > 1
-    error = pixel_standard_error(result, row, column) * per_pulse if known else None
+    error = np.zeros_like(total)  # without batches it is not known, and bins stay as they are
     if better is not None:
         error = better.error[row, column].astype(np.float64) * per_pulse
-    if error is None:
-        weight = typical_weight(total)
-    else:
-        weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
+    elif result.batches > 1:
+        error = pixel_standard_error(result, row, column) * per_pulse
+    weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
     edges = merged_edges(total, weight * total, [int(part.argmax()) for part in parts > 0])  # no light before its time
     curves: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
     for name, part in zip(result.scene.components, parts, strict=True):
@@ -270,7 +267,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
     means = np.concatenate([values for values, *_ in curves])
     top = float(parts.max())
     bottom = float(np.clip(0.5 * means[means > 0].min(), 1e-7 * top, 0.01 * top))
-    if error is not None:  # standard errors of the bins of a group taken as independent
+    if error.any():  # standard errors of the bins of a group taken as independent
         spread = np.sqrt(np.add.reduceat(error**2, edges[:-1])) / np.diff(edges)
         lower, upper = (np.maximum(merged_means(total, edges) + sign * spread, 0.01 * bottom) for sign in (-1, 1))
         label = "all light ± standard error"
@@ -341,32 +338,7 @@ def _water_text(medium: Medium) -> str:
 # Bins wide enough to mean something
 
 _ERROR = 1.0 / 3.0  # relative standard error at which a bin stands alone
-_NEIGHBOURS = 6  # bins on each side that share a weight
-_EVEN = 0.5  # (Σv)² / (n Σv²) of the n neighbours of one side, where light is not sparse
 _NARROW = 8  # bins that are added up before a group may end for its width
-
-
-def typical_weight(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Light that one photon adds to a bin, `[T]`, from how much neighbouring bins differ.
-
-    A bin of n photons of weight w has the mean n w and the variance n w². The second difference of three bins has no
-    part of a slope; its square over the sum of the bins, weighted as the variances are, estimates w. The median over
-    the neighbours keeps peaks out; where a few photons make most of the light on both sides, the largest counts.
-    """
-    padded = np.pad(values, 1)
-    left, middle, right = padded[:-2], padded[1:-1], padded[2:]
-    spread = left + 4.0 * middle + right
-    local = np.divide((left - 2.0 * middle + right) ** 2, spread, out=np.full(len(values), np.nan), where=spread > 0)
-    around = sliding_window_view(np.pad(local, _NEIGHBOURS, constant_values=np.nan), 2 * _NEIGHBOURS + 1)
-    one_side = sliding_window_view(np.pad(values, _NEIGHBOURS), _NEIGHBOURS)
-    squares = np.maximum((one_side**2).mean(axis=1), np.finfo(float).tiny)
-    even = one_side.mean(axis=1) ** 2 / squares
-    sparse = np.maximum(even[: len(values)], even[_NEIGHBOURS + 1 :]) < _EVEN
-    weight = np.zeros(len(values))
-    some = np.isfinite(around).any(axis=1)
-    weight[some] = np.nanmedian(around[some], axis=1)
-    weight[some & sparse] = np.nanmax(around[some & sparse], axis=1, initial=0.0)
-    return weight
 
 
 def merged_edges(
