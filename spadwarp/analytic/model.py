@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.arrays import kernel_errors
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.scene import daylight_rate, phase_function, water_lines
+from spadwarp.scene import Scene, daylight_rate, phase_function, water_lines
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.grid import GridCells
 from spadwarp.scene.medium import grid_cells
@@ -28,9 +28,6 @@ from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import LinesOfSight, depth_per_time, lines_of_sight
 from spadwarp.transport.model import port_kind, port_parameters
 from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["model_notes", "pixel_maps"]
 

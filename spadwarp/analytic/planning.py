@@ -13,7 +13,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -34,8 +34,8 @@ from spadwarp.analytic.pilot import (
 )
 from spadwarp.frames import detector_response
 from spadwarp.frames.depth import METHODS, Method
-from spadwarp.result import CHANNELS, POLARISED, Channel
-from spadwarp.scene import SceneLike, Transport, as_scene
+from spadwarp.result import CHANNELS, POLARISED, Channel, Result
+from spadwarp.scene import Scene, SceneLike, Transport, as_scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import lines_of_sight, port_advance
@@ -53,10 +53,6 @@ from spadwarp.values import (
     time_from_range,
     with_prefix,
 )
-
-if TYPE_CHECKING:
-    from spadwarp.result import Result
-    from spadwarp.scene import Scene
 
 __all__ = ["PILE_UP", "Proposal", "plan"]
 
