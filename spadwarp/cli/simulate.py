@@ -322,8 +322,8 @@ def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
     needed = files.bytes_needed(result.scene, derivatives=len(result.derivatives))
     check_outputs(out, files.RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
     made = files.write_run(result, out, device=device)
-    say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))
     _answer(result, made, photon_ranges=result.photon_ranges)
+    say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))
 
 
 @command()
