@@ -1,9 +1,7 @@
 """An experiment from the depth error that is asked for: gate, pulses, laser power, largest range, what limits it.
 
-A short Monte Carlo run on a window of the image measures counts, background and the error that scattering leaves. The
-window has the pixels of the camera about the target pixel nearest to the optical axis, so that light which is scattered
-from other parts of the target into them is all there. Runs of equal length are compared: what differs between them is
-noise of the runs. Numbers that both ends of their uncertainty judge differently are not judged.
+A short Monte Carlo run on a window of the image measures counts, background and the error that scattering leaves, see
+`spadwarp.analytic.pilot`. Numbers that both ends of their uncertainty judge differently are not judged.
 """
 
 from __future__ import annotations

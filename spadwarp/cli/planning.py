@@ -308,9 +308,11 @@ def sweep(
 
 
 def _budget_cells(row: BudgetRow) -> dict[str, Any]:
+    share = row.outlier_probability
+
     def sigma(value: float) -> str:
         """In brackets where it is not reached."""
-        reached = row.outlier_probability <= spadwarp.analytic.OUTLIERS or math.isnan(value)
+        reached = share <= spadwarp.analytic.OUTLIERS or math.isnan(value)
         return short(value) if reached else f"({short(value)})"
 
     def pulses(value: float) -> str:
@@ -328,16 +330,9 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         "signal/backscatter": row.signal_to_backscatter,
         "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
-        "outliers": _in_percent(row.outlier_probability),
+        "outliers": "-" if math.isnan(share) else "< 0.001 %" if 0 < share < 1e-5 else f"{100 * share:.3g} %",
         "for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
     }
-
-
-def _in_percent(value: float) -> str:
-    """A fraction in per cent."""
-    if math.isnan(value):
-        return "-"
-    return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
 
 
 def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:

@@ -120,9 +120,10 @@ class Flux(Section):
         """Those of its part of the tally, which begins at an entry, by name."""
         unit = 1.0 / self.scale(scene.medium.range.absorption)
         if self.voxels is not None:
-            dimensions: dict[str, Coordinate] = {
-                "gate": (self._gate_centres(), "s", "time of flight, middle of a gate")
-            }
+            width = self.gate_width_ps
+            gates = 0.0 if width is None else self.gate_start_ns * 1e-9 + width * 1e-12 * (np.arange(self.gates) + 0.5)
+            meaning = "time of flight, middle of a gate"
+            dimensions: dict[str, Coordinate] = {"gate": (np.atleast_1d(gates), "s", meaning)}
             for axis, low, edge, count in zip("xyz", self.lower, self.edges, self.voxels, strict=True):
                 centres = low + edge * (np.arange(count) + 0.5) if math.isfinite(edge) else np.zeros(1)
                 dimensions[axis] = (centres, "m", f"middle of a voxel in {axis}; 0 without bounds")
@@ -151,11 +152,6 @@ class Flux(Section):
             first + len(IRRADIANCES), stride, rows | bins, f"{area_unit}/sr", text, unit / area / solid
         )
         return {"irradiance": found, "radiance": radiance}
-
-    def _gate_centres(self) -> NDArray[np.float64]:
-        if self.gate_width_ps is None:
-            return np.zeros(1)
-        return self.gate_start_ns * 1e-9 + self.gate_width_ps * 1e-12 * (np.arange(self.gates, dtype=np.float64) + 0.5)
 
 
 class Sun(Section):

@@ -94,10 +94,7 @@ class Grid(Section):
     @property
     def edges(self) -> tuple[float, float, float] | None:
         """`size` as three numbers [m]."""
-        if self.size is None:
-            return None
-        x, y, z = self.size * 3 if len(self.size) == 1 else self.size
-        return x, y, z
+        return None if self.size is None else vector_of(np.broadcast_to(self.size, 3))
 
     @property
     def cell_counts(self) -> tuple[int, int, int]:
