@@ -153,7 +153,7 @@ def simulate(
                 checkpoint_every=checkpoint,
             ),
         )
-    device = opt.one_device(devices, engine)
+    device = None if devices is None or engine else spadwarp.device.pick_devices(devices)[0].alias
     automatic = reconstruct is None and read.transport.photons == "auto" and read.has_straight_sight
     if (reconstruct or automatic) and result.batches > 1:
         note("the light is reconstructed")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import Variable
+from spadwarp.device import pick_devices
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.response import InstrumentResponse, detector_response
@@ -562,8 +563,7 @@ def simulate_sequence(
     seed = base.transport.seed if seed is None else check_integer("seed", seed, SEED)
     pulses = base.detector.pulses_per_frame if pulses is None else pulses
     asked = base.transport.photons if photons is None else photons
-    # One device for all but the photons.
-    first = None if device is None else "cuda:0" if device == "cuda:all" else device.split(",")[0]
+    first = pick_devices(device)[0]  # for all but the photons
     kept: dict[str, Any] = {}
     with write_hdf5(path) as opened:
         writer = _Writer(opened, len(moves))
