@@ -37,7 +37,6 @@ from spadwarp.values import (
     SEED,
     TIME,
     ArgumentError,
-    Shown,
     SpadwarpWarning,
     check_integer,
     check_real,
@@ -318,7 +317,7 @@ class TimeTags(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Frames(Shown):
+class Frames:
     """Counts that the camera records; `counts`, `expected` and `background` are torch tensors if the source was one."""
 
     counts: NDArray[np.int32]  # int32 `[frames, H, W, T]`, or `[H, W, T]` for the sum of the frames
@@ -357,6 +356,11 @@ class Frames(Shown):
         import spadwarp
 
         return spadwarp.viz.plot(self, frame=frame, **options)
+
+    def _repr_html_(self) -> str:
+        import spadwarp
+
+        return spadwarp.viz.html(self)
 
     def to_xarray(self) -> Any:
         """Counts and what they were drawn from, with coordinates and units: see `spadwarp.frames.to_xarray`."""

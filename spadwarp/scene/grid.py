@@ -314,7 +314,7 @@ class GridCells:
         own = (np.asarray(points, np.float64) - self.centre) @ self.rotation
         return (own / self.size + 0.5) * np.array(self.extinction.shape)
 
-    def index_of(self, places: Floats) -> tuple[tuple[Any, ...], NDArray[np.bool_]]:
+    def index_of(self, places: Floats) -> tuple[tuple[Any, ...], Any]:
         """Indices of the cells at places of `in_cells`, outside the box of the nearest, and whether they are in it."""
         shape = np.array(self.extinction.shape)
         index = np.clip(np.floor(places), -1, shape).astype(np.int32)
