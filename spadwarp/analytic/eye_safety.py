@@ -104,9 +104,9 @@ def eye_limit(of: Laser | Scene, *, distance: float = 0.1, exposure: float = 100
         hazard = 0.0
     elif is_within(_FARTHEST):
         hazard = bare = _first(is_within, _FARTHEST)
-        if isinstance(of, Scene) and laser_port(of) is not None and of.beam.profile != "collimated":
+        if as_if_bare(of, bare) != bare:  # behind a port
             hazard = _first(lambda other: as_if_bare(of, other) >= bare, 1e9)
-    energy = limit * _AREA / _share(laser, _bare(of, distance), densest)
+    energy = limit * _AREA / _share(laser, as_if_bare(of, distance), densest)
     return EyeLimit(
         distance=distance,
         exposure=exposure,
@@ -159,7 +159,7 @@ def axis_fluence(of: Laser | Scene, distance: float) -> float:
     In clear water, at a distance [m] from where the beam begins; infinite for a pencil beam. Of a scene's laser behind
     its port, if it has one.
     """
-    laser, distance = of if isinstance(of, Laser) else of.laser, _bare(of, distance)
+    laser, distance = of if isinstance(of, Laser) else of.laser, as_if_bare(of, distance)
     if laser.profile == "collimated":
         return 1.0 / (math.pi * laser.beam_radius**2) if laser.beam_radius > 0.0 else math.inf
     if laser.profile == "gaussian":
@@ -167,10 +167,6 @@ def axis_fluence(of: Laser | Scene, distance: float) -> float:
     if laser.profile == "measured":
         return _densest(laser) / distance**2
     return 1.0 / (4.0 * math.pi * (math.sin(0.5 * laser.half_angle) * distance) ** 2)
-
-
-def _bare(of: Laser | Scene, distance: float) -> float:
-    return distance if isinstance(of, Laser) else as_if_bare(of, distance)
 
 
 def _pulse_limit(laser: Laser, exposure: float) -> tuple[float, str]:
@@ -223,10 +219,10 @@ def _first(is_reached: Callable[[float], bool], high: float) -> float:
     return high
 
 
-def as_if_bare(scene: Scene, distance: float) -> float:
+def as_if_bare(of: Laser | Scene, distance: float) -> float:
     """The distance [m] at which the middle of the beam has the irradiance that it has at a distance behind the laser's
     port, if there were none: there it is narrower, and a little light is reflected."""
-    port, beam = laser_port(scene), scene.beam
+    port, beam = (None, of) if isinstance(of, Laser) else (laser_port(of), of.beam)
     if port is None or beam.profile == "collimated":
         return distance
     lead = float(port.enter(beam.position, beam.axis)[2])

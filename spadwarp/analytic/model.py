@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.scene import daylight_rate, phase_function, water_lines
+from spadwarp.scene import Scene, daylight_rate, phase_function, water_lines
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.grid import GridCells
 from spadwarp.scene.medium import grid_cells
@@ -27,9 +27,6 @@ from spadwarp.scene.scene import camera_port, laser_port
 from spadwarp.scene.sight import LinesOfSight, depth_per_time, lines_of_sight
 from spadwarp.transport.model import port_kind, port_parameters
 from spadwarp.values import ArgumentError, ConfigError, SpadwarpWarning
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["model_notes", "pixel_maps"]
 
@@ -403,10 +400,7 @@ def _part(
     light = light / np.maximum(np.linalg.norm(light, axis=-1, keepdims=True), 1e-9)
     lengths = np.nan_to_num(path + ends + sights.delay[:, None])
     points = sights.start[:, None, :] + middle[..., None] * sights.direction[:, None, :]
-    at = np.nan_to_num(cells.in_cells(to_world(scene.camera, points)), nan=-1.0)
-    index = np.floor(np.clip(at, -1.0, cells.extinction.shape)).astype(np.int32)
-    inside = ((index >= 0) & (index < cells.extinction.shape)).all(axis=-1)
-    place = tuple(np.moveaxis(np.clip(index, 0, np.array(cells.extinction.shape) - 1), -1, 0))
+    place, inside = cells.index_of(np.nan_to_num(cells.in_cells(to_world(scene.camera, points)), nan=-1.0))
     extinction = np.where(inside, cells.extinction[place], medium.extinction)
     scattering = np.where(inside, cells.scattering[place], medium.scattering)
     excess = (extinction - medium.extinction) * np.diff(ends, axis=1)

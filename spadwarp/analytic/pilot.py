@@ -12,27 +12,22 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.budgets import central_pixel
 from spadwarp.device import pick_device
-from spadwarp.frames import detect, detector_response, first_photon_probabilities, information_from_histogram
+from spadwarp.frames import Frames, detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
-from spadwarp.result import Channel, analyser_channel, merge
-from spadwarp.scene import noise_rate
+from spadwarp.result import Channel, Result, analyser_channel, merge
+from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import RunOptions, simulate, truth_maps
 from spadwarp.transport.reconstruction import known_light
 from spadwarp.values import ConfigError, SpadwarpWarning
-
-if TYPE_CHECKING:
-    from spadwarp.frames import Frames
-    from spadwarp.result import Result
-    from spadwarp.scene import Scene
 
 __all__ = ["Pilot"]
 

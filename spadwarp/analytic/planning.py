@@ -1,9 +1,7 @@
 """An experiment from the depth error that is asked for: gate, pulses, laser power, largest range, what limits it.
 
-A short Monte Carlo run on a window of the image measures counts, background and the error that scattering leaves. The
-window has the pixels of the camera about the target pixel nearest to the optical axis, so that light which is scattered
-from other parts of the target into them is all there. Runs of equal length are compared: what differs between them is
-noise of the runs. Numbers that both ends of their uncertainty judge differently are not judged.
+A short Monte Carlo run on a window of the image measures counts, background and the error that scattering leaves, see
+`spadwarp.analytic.pilot`. Numbers that both ends of their uncertainty judge differently are not judged.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -34,8 +32,8 @@ from spadwarp.analytic.pilot import (
 )
 from spadwarp.frames import detector_response
 from spadwarp.frames.depth import METHODS, Method
-from spadwarp.result import CHANNELS, POLARISED, Channel
-from spadwarp.scene import SceneLike, Transport, as_scene
+from spadwarp.result import CHANNELS, POLARISED, Channel, Result
+from spadwarp.scene import Scene, SceneLike, Transport, as_scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import lines_of_sight, port_advance
@@ -53,10 +51,6 @@ from spadwarp.values import (
     time_from_range,
     with_prefix,
 )
-
-if TYPE_CHECKING:
-    from spadwarp.result import Result
-    from spadwarp.scene import Scene
 
 __all__ = ["PILE_UP", "Proposal", "plan"]
 

@@ -20,7 +20,7 @@ from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import gate_deviation, lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import SEED, ArgumentError, ConfigError, Shown, check_integer
+from spadwarp.values import SEED, ArgumentError, ConfigError, Interval, Shown, check_integer
 
 if TYPE_CHECKING:
     import xarray
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["AnalyticFile", "AnalyticResult", "simulate_analytic"]
 
 _FORMAT, _FORMAT_VERSION = "spadwarp analytic", 1
-_PART_PIXELS = 1 << 28  # of frames that a GPU holds at a time: 1.3 GB
+_PART_PIXELS = 1 << 26  # of frames that are drawn at a time: 0.3 GB
 _PART_BYTES = 1 << 28  # of frames that are held at a time while a file is written
 _PACKED = {"compression": "gzip", "shuffle": True, "compression_opts": 1}
 _READ_ME = (
@@ -133,14 +133,9 @@ class AnalyticResult(Shown):
             wp.array(np.ascontiguousarray(one, np.float32), dtype=kind, device=device)
             for one, kind in ((view.reshape(-1, 3), wp.vec3), *((row, wp.float32) for row in rows))
         ]
-        # On the CPU kernels write into the result itself; a GPU works in parts.
-        part = max(frames, 1) if device.is_cpu else max(_PART_PIXELS // pixels, 2)
+        part = max(_PART_PIXELS // pixels, 2)
         for start in range(0, frames, part):
-            stop = min(start + part, frames)
-            out: list[Any] = [
-                wp.array(whole[start:stop].reshape(stop - start, pixels), dtype=kind, device="cpu", copy=False)
-                for whole, kind in ((depth, wp.float32), (labels, wp.bool))
-            ]
+            number = min(part, frames - start)
             drawn = kernels.sample_frames(
                 *inputs,
                 laser=self.scene.beam.position,
@@ -148,14 +143,11 @@ class AnalyticResult(Shown):
                 ports=ports,
                 gate_paths=(gate.start * speed, gate.stop * speed),
                 first_frame=first + start,
-                frames=stop - start,
+                frames=number,
                 seed=self.seed if seed is None else seed,
-                out=(out[0], out[1]) if device.is_cpu else None,
             )
-            if not device.is_cpu:
-                for row, array in zip(out, drawn, strict=True):
-                    wp.copy(row, array)
-                wp.synchronize_device(device)
+            for whole, array in zip((depth, labels), drawn, strict=True):
+                whole[start : start + number] = array.numpy().reshape(number, *shape)
         return depth, labels
 
     def _array(self, stored: str) -> NDArray[Any]:
@@ -331,8 +323,7 @@ def _check_truth(truth: Truth, scene: Scene) -> None:
         raise ArgumentError("truth.depth is NaN in every pixel: nothing is in view")
     for name, interval in (("depth", "(0, inf)"), ("range", "(0, inf)"), ("reflectance", "[0, 1]")):
         values = getattr(truth, name)[hit]
-        possible = (values >= 0) & (values <= 1) if name == "reflectance" else (values > 0) & np.isfinite(values)
-        if not possible.all():
+        if not (possible := Interval.read(interval).holds(values)).all():
             wrong = int(np.argmin(possible))
             row, column = np.argwhere(hit)[wrong]
             raise ArgumentError(f"truth.{name} = {values[wrong]} at pixel ({row}, {column}) is outside {interval}")

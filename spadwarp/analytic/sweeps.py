@@ -202,6 +202,9 @@ def parse_vary(text: str) -> tuple[str, list[Any]]:
         raise ArgumentError(f"vary = {shown(text)} is not of the form section.field=from:to:count")
     info = locate(Scene, parse_key(field))[1]
     unit = "m" if field == "range" else field_unit(info) if info is not None else None
+    lengths = [part.strip() for part in (spec.split(":")[:2] if ":" in spec else spec.split(","))]
+    if field == "range" and len({part[-1:] in "0123456789." for part in lengths}) > 1:
+        raise ArgumentError(f"vary: range = {shown(spec)} is ambiguous: write the unit of all lengths, or of none")
     values = parse_values(spec, unit, name=f"vary: {field}")
     if ":" in spec and info is not None and takes_integers(info):
         values = list(dict.fromkeys(round(value) for value in values))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from spadwarp import Ray, Result, Scene
 
 __all__ = ["MEASURED", "Channel", "Length", "Measured", "Method", "Part", "Seconds", "command", "from_to", "from_unit"]
-__all__ += ["given", "items", "load_run", "number_or", "numbers", "one_device", "read_engine", "read_measured"]
+__all__ += ["given", "items", "load_run", "number_or", "numbers", "read_engine", "read_measured"]
 __all__ += ["read_scene", "real_number", "refuse", "whole_number"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
@@ -332,10 +332,3 @@ def read_engine(address: str | None, workers: int | None) -> Ray | None:
     if workers is not None:
         wrong("needs --ray", "--workers")
     return None
-
-
-def one_device(devices: str | None, engine: Ray | None) -> str | None:
-    """The device for the work after a run that needs one device."""
-    if devices is None or engine is not None:
-        return None
-    return "cuda:0" if devices == "cuda:all" else devices.split(",")[0]

@@ -58,12 +58,12 @@ def readable(summary: Mapping[str, Any]) -> str:
     """A summary in two columns, its tables below their names."""
     tables = {name: value for name, value in summary.items() if isinstance(value, Mapping) and len(value) > 3}
     flat = {name: value for name, value in summary.items() if name not in tables and value not in ({}, [], ())}
-    parts = [rows(dict(map(spadwarp.io.fact, flat, flat.values())))] if flat else []
-    for name, table in tables.items():
-        parts.append(
-            f"{name.replace('_', ' ')}\n" + rows(dict(map(spadwarp.io.fact, table, table.values())), indent="  ")
-        )
-    return "\n".join(parts)
+
+    def facts(table: Mapping[str, Any], indent: str = "") -> str:
+        return rows(dict(map(spadwarp.io.fact, table, table.values())), indent=indent)
+
+    parts = [facts(flat)] if flat else []
+    return "\n".join([*parts, *(f"{name.replace('_', ' ')}\n{facts(table, '  ')}" for name, table in tables.items())])
 
 
 def show_table(table: Iterable[Mapping[str, Any]], *, keys: int = 1) -> None:

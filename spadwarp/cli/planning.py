@@ -17,7 +17,7 @@ from spadwarp.cli import options as opt
 from spadwarp.cli.app import complain, note, say, wrong
 from spadwarp.cli.options import command
 from spadwarp.cli.outputs import answer, check_outputs, progress, readable, rows, short, show_table, write_json, written
-from spadwarp.values import ArgumentError, count, shown, with_prefix
+from spadwarp.values import count, with_prefix
 
 if TYPE_CHECKING:
     from spadwarp import Scene
@@ -266,7 +266,7 @@ def sweep(
     lines: Any
     draw: Any
     if of_range:
-        values = _ranges(texts[0].partition("=")[2])
+        values = spadwarp.analytic.parse_vary(texts[0])[1] if vary else None
         lines = found = spadwarp.budget(read, values, medium or None, reflectance=reflectance, device=device)
         keys, draw = [{"water": row.medium} for row in found], spadwarp.viz.draw_budget
     else:
@@ -307,23 +307,12 @@ def sweep(
     write_json({**summary, "rows": plain, "notes": spadwarp.analytic.model_notes(read), "files": files})
 
 
-def _ranges(text: str) -> list[float] | None:
-    """Lengths [m] of `1:10:10` or `1,2,5`; both ends have a unit, or none of them."""
-    if not text:
-        return None
-    lengths = [part.strip() for part in (text.split(":")[:2] if ":" in text else text.split(","))]
-    if len({part[-1:] in "0123456789." for part in lengths}) > 1:
-        raise ArgumentError(f"range = {shown(text)} is ambiguous: write the unit of all lengths, or of none")
-    values = spadwarp.analytic.parse_values(text, "m", name="range")
-    if not all(isinstance(value, (int, float)) for value in values):
-        raise ArgumentError(f"range = {shown(text)} is not of the form from:to:count or a,b,c")
-    return [float(value) for value in values]
-
-
 def _budget_cells(row: BudgetRow) -> dict[str, Any]:
+    share = row.outlier_probability
+
     def sigma(value: float) -> str:
         """In brackets where it is not reached."""
-        reached = row.outlier_probability <= spadwarp.analytic.OUTLIERS or math.isnan(value)
+        reached = share <= spadwarp.analytic.OUTLIERS or math.isnan(value)
         return short(value) if reached else f"({short(value)})"
 
     def pulses(value: float) -> str:
@@ -341,16 +330,9 @@ def _budget_cells(row: BudgetRow) -> dict[str, Any]:
         "signal/backscatter": row.signal_to_backscatter,
         "σ* [ps]": sigma(1e12 * row.sigma_time),
         "σ* [mm]": sigma(1e3 * row.sigma_depth),
-        "outliers": _in_percent(row.outlier_probability),
+        "outliers": "-" if math.isnan(share) else "< 0.001 %" if 0 < share < 1e-5 else f"{100 * share:.3g} %",
         "for 1 cm": "never" if math.isinf(row.pulses_for_1cm) else pulses(row.pulses_for_1cm),
     }
-
-
-def _in_percent(value: float) -> str:
-    """A fraction in per cent."""
-    if math.isnan(value):
-        return "-"
-    return "< 0.001 %" if 0 < value < 1e-5 else f"{100 * value:.3g} %"
 
 
 def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:

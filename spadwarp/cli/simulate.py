@@ -153,7 +153,7 @@ def simulate(
                 checkpoint_every=checkpoint,
             ),
         )
-    device = opt.one_device(devices, engine)
+    device = None if devices is None or engine else spadwarp.device.pick_devices(devices)[0].alias
     automatic = reconstruct is None and read.transport.photons == "auto" and read.has_straight_sight
     if (reconstruct or automatic) and result.batches > 1:
         note("the light is reconstructed")
@@ -163,16 +163,13 @@ def simulate(
         note("the photons are traced again for their records")
         traced = spadwarp.transport.trace(read, photons=result.photons, device=device, progress=progress())
         files.written.append(spadwarp.transport.save_records(traced, out / "records.h5", scene=read))
-    if problem := spadwarp.result.noise_problem(result):
-        say(problem)
-    shown = _brief(result, files)
-    error = shown.get("relative_error")
-    answer({**result.summary(), "relative_error": error, "files": files.written}, shown=shown)
+    _answer(result, files)
     if result.partial:
         wanted = "" if read.transport.photons == "auto" else f" of {count(result.requested[1] - result.requested[0])}"
         done = f"{count(result.photons)}{wanted} photons"
         without = "; no records were written" if records else ""
         fail(f"interrupted after {done}, which are written and marked partial{without}", INTERRUPTED)
+    error = result.relative_error if result.batches > 1 else None
     if relative_error is not None and (error is None or error > relative_error):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
         number = read.transport.photons
@@ -267,10 +264,12 @@ def _while_pictures_load(report: Report | None, scene: Scene) -> Iterator[Report
         loading.join()
 
 
-def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
-    """A run in a few numbers."""
+def _answer(result: Result, files: RunFiles, **more: Any) -> None:
+    """Answers with a run in a few numbers."""
     import numpy as np
 
+    if problem := spadwarp.result.noise_problem(result):
+        say(problem)
     summary, error = result.summary(), np.abs(files.depth - result.truth.depth)
     error, returned = error[np.isfinite(error)], files.depth[np.isfinite(files.depth)]
     seconds, balance = result.timing.get("trace", 0.0), summary["energy_balance"]
@@ -281,9 +280,9 @@ def _brief(result: Result, files: RunFiles) -> dict[str, Any]:
         "depth_m": [float(returned.min()), float(returned.max())] if returned.size else None,
         "median_depth_error_mm": 1000.0 * float(np.median(error)) if error.size else None,
     }
-    if result.batches > 1:
-        found |= {"noise_ratio": result.target_noise_ratio, "relative_error": result.relative_error}
-    return {**found, "energy_balance": "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"}
+    found |= {name: summary[name] for name in ("noise_ratio", "relative_error") if result.batches > 1}
+    found["energy_balance"] = "exact" if balance["exact"] else f"OFF BY {balance['difference']} UNITS"
+    answer({**summary, **more, "files": files.written}, shown=found)
 
 
 def _check_records(scene: Scene, *, whole: bool) -> None:
@@ -323,11 +322,8 @@ def merge(runs: list[Path], *, out: Path, device: str | None = None) -> None:
     needed = files.bytes_needed(result.scene, derivatives=len(result.derivatives))
     check_outputs(out, files.RUN_FILES, inputs=(*runs, *result.scene.files), needed=needed)
     made = files.write_run(result, out, device=device)
-    if problem := spadwarp.result.noise_problem(result):
-        say(problem)
+    _answer(result, made, photon_ranges=result.photon_ranges)
     say("photon ids  " + ", ".join(f"{count(start)} to {count(stop - 1)}" for start, stop in result.photon_ranges))
-    summary = {**result.summary(), "photon_ranges": result.photon_ranges, "files": made.written}
-    answer(summary, shown=_brief(result, made))
 
 
 @command()
@@ -351,10 +347,8 @@ def reconstruct(run: Path, *, out: Path | None = None, device: str | None = None
     needed = files.bytes_needed(result.scene, derivatives=len(result.derivatives))
     check_outputs(place, files.RUN_FILES, resume=out is None, inputs=inputs, needed=needed)
     result = spadwarp.reconstruct(result, device=device)
-    if problem := spadwarp.result.noise_problem(result):
-        say(problem)
     made = files.write_run(result, place, device=device, keep=("records.h5",) if out is None else ())
-    answer({**result.summary(), "files": made.written}, shown=_brief(result, made))
+    _answer(result, made)
 
 
 # Of --rendered: arguments of `spadwarp.result.load_truth_exr`.

@@ -143,11 +143,7 @@ def _heading(text: str) -> str:
 
 
 def _list_presets(section: str | None) -> None:
-    everything = spadwarp.scene.presets()
-    sections = list(dict.fromkeys(preset.section for preset in everything.values()))
-    if section is not None and section not in sections:
-        wrong(f"{section!r} is not one of {', '.join(sections)}{suggestion(section, sections)}", "NAME")
-    chosen = [preset for preset in everything.values() if section in (None, preset.section)]
+    chosen = list(spadwarp.scene.presets(section).values())
     groups = itertools.groupby(chosen, lambda preset: f"[{preset.section}] {preset.source}")
     before: list[str] = []
     for number, (source, presets) in enumerate(groups):

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
+from spadwarp.frames.response import InstrumentResponse
+from spadwarp.result import Result
 from spadwarp.scene import Camera, Medium, Scene
 from spadwarp.scene.sections import field_range
 from spadwarp.scene.sight import LinesOfSight, lines_of_camera, lines_of_sight
@@ -24,10 +26,6 @@ from spadwarp.values import (
     path_from_time,
     shown,
 )
-
-if TYPE_CHECKING:
-    from spadwarp.frames.response import InstrumentResponse
-    from spadwarp.result import Result
 
 __all__ = ["METHODS", "Histograms", "Method", "Reduction", "arrival_time", "depth_frame", "depth_of"]
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.arrays import Variable
+from spadwarp.device import pick_devices
 from spadwarp.frames.cramer_rao import ResultBound, bound_of_result, photons_for_noise
 from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.response import InstrumentResponse, detector_response
@@ -163,8 +164,8 @@ class FramesFile(_StoredFrames):
     FORMAT = "spadwarp frames"
     edges: NDArray[np.float64]
     irf: InstrumentResponse
-    expected: NDArray[np.float32] | None  # as of `Frames`, as all others are; None in a file that does not hold them
-    background: NDArray[np.float32] | None  # likewise
+    expected: NDArray[np.float32]  # as of `Frames`, as all others are
+    background: NDArray[np.float32]
     scene: Scene  # of the result that the counts were drawn from
     truth_depth: NDArray[np.float32]  # of that result, float32 `[H, W]` [m]
     monte_carlo_noise: float | None = None
@@ -183,13 +184,12 @@ class FramesFile(_StoredFrames):
             irf = InstrumentResponse(times=times, values=values)
         else:
             irf = InstrumentResponse(sigma=file.real("irf_sigma", "[0, inf)"), tail=file.real("irf_tail", "[0, inf)"))
-        is_even = "background" in file and file.stored("background", np.float32, (*image, None)).shape[2] == 1
-        sizes, expectations = {"expected": bins, "background": 1 if is_even else bins}, dict[str, Any]()
-        for name, size in sizes.items():
-            cube = file.array(name, np.float32, (*image, size)) if name in file else None
-            if cube is not None and not (np.isfinite(cube).all() and (cube >= 0).all()):
+        is_even = file.stored("background", np.float32, (*image, None)).shape[2] == 1
+        cubes = {"expected": bins, "background": 1 if is_even else bins}
+        expectations = {name: file.array(name, np.float32, (*image, size)) for name, size in cubes.items()}
+        for name, cube in expectations.items():
+            if not (np.isfinite(cube).all() and (cube >= 0).all()):
                 file.refuse(name, "is negative or not finite in some bins")
-            expectations[name] = cube
         noise = file.attribute("monte_carlo_noise", None)
         return {
             "edges": edges,
@@ -210,9 +210,7 @@ class FramesFile(_StoredFrames):
         return spadwarp.viz.plot(self, frame=frame, **options)
 
     def frame(self, number: int) -> Frames:
-        """One frame as `Frames`. Raises `ArgumentError` where it is not there or the file holds no expected counts."""
-        if self.expected is None or self.background is None:
-            raise ArgumentError(f"{self.path}: holds no expected counts")
+        """One frame as `Frames`. Raises `ArgumentError` where it is not there."""
         return Frames(
             counts=self.counts(number)[None],
             frames=1,
@@ -565,8 +563,7 @@ def simulate_sequence(
     seed = base.transport.seed if seed is None else check_integer("seed", seed, SEED)
     pulses = base.detector.pulses_per_frame if pulses is None else pulses
     asked = base.transport.photons if photons is None else photons
-    # One device for all but the photons.
-    first = None if device is None else "cuda:0" if device == "cuda:all" else device.split(",")[0]
+    first = pick_devices(device)[0]  # for all but the photons
     kept: dict[str, Any] = {}
     with write_hdf5(path) as opened:
         writer = _Writer(opened, len(moves))

@@ -152,7 +152,7 @@ def _read_own(path: Path, channel: Channel) -> Histograms:
             values=file.counts(),
             bin_width=file.bin_width,
             gate_start=file.gate_start,
-            background=None if file.background is None else file.background * np.float32(file.pulses),
+            background=file.background * np.float32(file.pulses),
             pulses=file.pulses if file.scene.detector.mode == "first_photon" else 0,
             irf=file.irf,
             response=file.irf,

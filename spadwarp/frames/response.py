@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,10 +15,8 @@ from spadwarp.arrays import real_array
 from spadwarp.io.arrays import read_npy
 from spadwarp.io.paths import file_problem
 from spadwarp.io.text import read_columns, read_text
+from spadwarp.scene import Detector, Laser
 from spadwarp.values import BIN_WIDTH, TIME, ArgumentError, ConfigError, FileError, check_integer, check_real, shown
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Detector, Laser
 
 __all__ = ["InstrumentResponse", "detector_response", "instrument_response", "read_response", "response_matrix"]
 

@@ -6,19 +6,16 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.frames import Frames, FramesFile, Histograms, InstrumentResponse, is_frames_file, read_histograms
 from spadwarp.frames.spad import LIMIT, Window
-from spadwarp.scene import phase_function
+from spadwarp.scene import Detector, Scene, phase_function
 from spadwarp.transport import truth_maps
 from spadwarp.values import ArgumentError, check_integer
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Detector, Scene
 
 __all__ = ["Exposure", "lidar_initial_guess", "read_exposure"]
 

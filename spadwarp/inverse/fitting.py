@@ -18,7 +18,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,9 @@ from spadwarp.inverse.exposure import Exposure, lidar_initial_guess, read_exposu
 from spadwarp.inverse.goodness import Goodness, Lost, goodness_of, significance
 from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
-from spadwarp.scene import SceneLike, as_scene
+from spadwarp.scene import Detector, Scene, SceneLike, as_scene
 from spadwarp.transport import truth_maps
 from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, check_real, percent
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Detector, Scene
 
 __all__ = ["Estimate", "EstimateMap", "Fit", "Fitter", "Iteration", "fit"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +12,13 @@ from numpy.typing import NDArray
 from spadwarp.device import pick_device
 from spadwarp.frames import Receiver, detector_response
 from spadwarp.frames.spad import Window
+from spadwarp.inverse.exposure import Exposure
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, moved, with_values
-from spadwarp.scene import noise_rate
+from spadwarp.result import Truth
+from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import ExpectedLight, LightTracer
-
-if TYPE_CHECKING:
-    from spadwarp.inverse.exposure import Exposure
-    from spadwarp.result import Truth
-    from spadwarp.scene import Scene
 
 Rows = NDArray[np.float32]
 _WIDEST_BIN = 0.5  # least width of the response in bins, for a histogram that follows the depth smoothly

@@ -5,16 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_world
 from spadwarp.values import ArgumentError, ConfigError, shown, suggestion
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["Unknown", "read_unknowns"]
 

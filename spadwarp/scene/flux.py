@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from spadwarp.io.hdf5 import Coordinate
-from spadwarp.scene.pose import unit_vector
+from spadwarp.scene.pose import sideways, unit_vector
 from spadwarp.scene.sections import Corner, Direction, Section, Vector, Whole, field, listed
 
 if TYPE_CHECKING:
@@ -120,9 +120,10 @@ class Flux(Section):
         """Those of its part of the tally, which begins at an entry, by name."""
         unit = 1.0 / self.scale(scene.medium.range.absorption)
         if self.voxels is not None:
-            dimensions: dict[str, Coordinate] = {
-                "gate": (self._gate_centres(), "s", "time of flight, middle of a gate")
-            }
+            width = self.gate_width_ps
+            gates = 0.0 if width is None else self.gate_start_ns * 1e-9 + width * 1e-12 * (np.arange(self.gates) + 0.5)
+            meaning = "time of flight, middle of a gate"
+            dimensions: dict[str, Coordinate] = {"gate": (np.atleast_1d(gates), "s", meaning)}
             for axis, low, edge, count in zip("xyz", self.lower, self.edges, self.voxels, strict=True):
                 centres = low + edge * (np.arange(count) + 0.5) if math.isfinite(edge) else np.zeros(1)
                 dimensions[axis] = (centres, "m", f"middle of a voxel in {axis}; 0 without bounds")
@@ -152,11 +153,6 @@ class Flux(Section):
         )
         return {"irradiance": found, "radiance": radiance}
 
-    def _gate_centres(self) -> NDArray[np.float64]:
-        if self.gate_width_ps is None:
-            return np.zeros(1)
-        return self.gate_start_ns * 1e-9 + self.gate_width_ps * 1e-12 * (np.arange(self.gates, dtype=np.float64) + 0.5)
-
 
 class Sun(Section):
     """Sun and sky in place of the laser, through a calm surface: a face of the domain, which has no other bounds along
@@ -178,15 +174,5 @@ class Sun(Section):
     @property
     def direction(self) -> NDArray[np.float64]:
         """Unit vector in which the sun's light goes in the air, in the world."""
-        ahead, zenith, azimuth = azimuth_zero(self.down), math.radians(self.zenith_deg), math.radians(self.azimuth_deg)
-        across = math.cos(azimuth) * ahead + math.sin(azimuth) * np.cross(self.down, ahead)
-        return math.cos(zenith) * self.down + math.sin(zenith) * across
-
-
-def azimuth_zero(down: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vector of azimuth 0 about an axis: the part across it of the world's z axis, or where that is none of x."""
-    for ahead in np.eye(3)[[2, 0]]:
-        across = ahead - (ahead @ down) * down
-        if np.linalg.norm(across) > 1e-6:
-            break
-    return across / np.linalg.norm(across)
+        zenith = math.radians(self.zenith_deg)
+        return math.cos(zenith) * self.down + math.sin(zenith) * sideways(self.down, self.azimuth_deg)

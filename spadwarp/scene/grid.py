@@ -94,10 +94,7 @@ class Grid(Section):
     @property
     def edges(self) -> tuple[float, float, float] | None:
         """`size` as three numbers [m]."""
-        if self.size is None:
-            return None
-        x, y, z = self.size * 3 if len(self.size) == 1 else self.size
-        return x, y, z
+        return None if self.size is None else vector_of(np.broadcast_to(self.size, 3))
 
     @property
     def cell_counts(self) -> tuple[int, int, int]:
@@ -317,12 +314,16 @@ class GridCells:
         own = (np.asarray(points, np.float64) - self.centre) @ self.rotation
         return (own / self.size + 0.5) * np.array(self.extinction.shape)
 
-    def _at(self, places: Floats, outside: float) -> Floats:
-        shape = self.extinction.shape
+    def index_of(self, places: Floats) -> tuple[tuple[Any, ...], Any]:
+        """Indices of the cells at places of `in_cells`, outside the box of the nearest, and whether they are in it."""
+        shape = np.array(self.extinction.shape)
         index = np.clip(np.floor(places), -1, shape).astype(np.int32)
         inside = ((index >= 0) & (index < shape)).all(axis=-1)
-        clipped = np.clip(index, 0, np.array(shape) - 1)
-        return np.where(inside, self.extinction[tuple(np.moveaxis(clipped, -1, 0))], outside)
+        return tuple(np.moveaxis(np.clip(index, 0, shape - 1), -1, 0)), inside
+
+    def _at(self, places: Floats, outside: float) -> Floats:
+        index, inside = self.index_of(places)
+        return np.where(inside, self.extinction[index], outside)
 
     def optical_depths(self, begin: ArrayLike, end: ArrayLike, outside: float) -> Floats:
         """∫c ds along straight lines between points of the world `[..., 3]`, exact for the cells.

@@ -252,7 +252,7 @@ class Water(Section):
     @property
     def is_mixture(self) -> bool:
         """Whether the coefficients are those of constituents."""
-        return False
+        return bool(getattr(self, "constituents", ())) or getattr(self, "concentrations", None) is not None
 
     @property
     def is_natural(self) -> bool:
@@ -272,11 +272,6 @@ class Layer(Water):
     anisotropy: float | None = field(None, "henyey_greenstein: mean cosine; default: the medium's", "(-1, 1)")
     concentrations: Annotated[dict[str, Annotated[float, Field(ge=0, le=1e6)]] | None, Field()] = None
     """in place of coefficients, of the medium's constituents by name: `{algae = 3.0}`; the others as in the medium"""
-
-    @property
-    def is_mixture(self) -> bool:
-        """Whether the coefficients are those of constituents."""
-        return self.concentrations is not None
 
 
 class WaterRange(NamedTuple):
@@ -374,18 +369,10 @@ class Medium(PhaseLaw, Water):
             yield f"constituents have phase functions of their own; {', '.join(others)} cannot be given"
         if self.grid is not None and self.grid.constituent not in names:
             yield f"grid.constituent = {self.grid.constituent!r} is not one of {', '.join(names)}"
-        for place, water in zip(self._places, self.waters, strict=True):
+        for i, water in enumerate(self.waters, -1):
+            place = "" if water is self else f"layers[{i}]."
             if (c := self._sum(water)[2]) not in (allowed := field_range(type(self), "extinction")):
                 yield f"{place}extinction = {c} of the constituents is outside {allowed}"
-
-    @property
-    def _places(self) -> list[str]:
-        return ["", *(f"layers[{i}]." for i in range(len(self.layers)))]
-
-    @property
-    def is_mixture(self) -> bool:
-        """Whether the coefficients are those of constituents."""
-        return bool(self.constituents)
 
     def concentrations_in(self, water: Medium | Layer) -> list[float]:
         """Of the constituents, in the medium or in one of its layers."""

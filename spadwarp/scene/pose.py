@@ -39,14 +39,14 @@ def rotation_angles(matrix: ArrayLike) -> Vector:
         return vector_of(Rotation.from_matrix(matrix).as_euler("XYZ", degrees=True))
 
 
-def interpolated_angles(times: Floats, known: Floats, angles: Floats) -> Floats:
-    """`rotation_deg` `[N, 3]` at times between known ones, by the shortest turn from one to the next."""
+def turned(times: Floats, known: Floats, angles: Floats) -> Floats:
+    """Rotation matrices `[N, 3, 3]` at times between those of known `rotation_deg` `[K, 3]`, by the shortest turns."""
     from scipy.spatial.transform import Rotation, Slerp
 
+    turns = Rotation.from_euler("XYZ", angles, degrees=True)
     if len(known) < 2:
-        return np.repeat(angles, len(times), axis=0)
-    turns = Slerp(known, Rotation.from_euler("XYZ", angles, degrees=True))(times)
-    return np.array([rotation_angles(matrix) for matrix in turns.as_matrix()])
+        return np.repeat(turns.as_matrix(), len(times), axis=0)
+    return Slerp(known, turns)(np.minimum(times, known[-1])).as_matrix()
 
 
 def opencv_pose(rvec: ArrayLike, tvec: ArrayLike) -> dict[str, Vector]:
@@ -84,6 +84,17 @@ def look_at(position: ArrayLike, point: ArrayLike, *, down: ArrayLike = (0.0, 1.
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     axes = np.column_stack([right, np.cross(forward, right), forward])
     return {"position": vector_of(place), "rotation_deg": rotation_angles(axes)}
+
+
+def sideways(down: Floats, azimuth_deg: float = 0.0) -> Floats:
+    """Unit vector across an axis at an azimuth [°], 0 being the world's z axis, or where that has no such part x."""
+    for axis in np.eye(3)[[2, 0]]:
+        ahead = axis - (axis @ down) * down
+        if np.linalg.norm(ahead) > 1e-6:
+            break
+    ahead /= np.linalg.norm(ahead)
+    azimuth = math.radians(azimuth_deg)
+    return math.cos(azimuth) * ahead + math.sin(azimuth) * np.cross(down, ahead)
 
 
 def vector_of(values: NDArray[np.float64]) -> Vector:

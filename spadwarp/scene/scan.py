@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.scene.camera import pixel_directions
-from spadwarp.scene.pose import rotation_angles, rotation_matrix, vector_of
+from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, vector_of
 from spadwarp.scene.scene import Scene, load_trajectory
 from spadwarp.values import ArgumentError, ConfigError, check_integer
 
@@ -82,8 +82,6 @@ def shots_of(scene: Scene) -> Shots:
 
 def _platform(scene: Scene, time: Floats) -> tuple[Floats, Floats]:
     """Positions and attitudes by the file of a trajectory; what it lacks is the camera's own."""
-    from scipy.spatial.transform import Rotation, Slerp
-
     flown = load_trajectory(str(scene.scan.path))
     if other := [name for name in flown.fields if name not in _POSE]:
         raise ConfigError(f"{other[0]} is no part of the camera's pose: {', '.join(_POSE)}", source=flown.source)
@@ -95,10 +93,7 @@ def _platform(scene: Scene, time: Floats) -> tuple[Floats, Floats]:
     own = dict(zip(_POSE, (*scene.camera.position, *scene.camera.rotation_deg), strict=True))
     pose = np.stack([columns.get(name, np.full(len(flown), own[name])) for name in _POSE], axis=1)
     position = np.stack([np.interp(at, flown.times, values) for values in pose[:, :3].T], axis=1)
-    turns = Rotation.from_euler("XYZ", pose[:, 3:], degrees=True)
-    if len(flown) == 1:
-        return position, np.broadcast_to(turns.as_matrix(), (len(time), 3, 3))
-    return position, Slerp(flown.times, turns)(np.minimum(at, flown.times[-1])).as_matrix()
+    return position, turned(at, flown.times, pose[:, 3:])
 
 
 def _deflections(scene: Scene, count: int) -> Floats:
@@ -115,7 +110,7 @@ def _deflections(scene: Scene, count: int) -> Floats:
         x, y = edge * np.cos(azimuth), math.tan(math.radians(along)) * np.sin(azimuth)
     elif scan.pattern == "rosette":
         other = -scan.rosette_ratio * azimuth
-        x, y = (0.5 * edge * (turned(azimuth) + turned(other)) for turned in (np.cos, np.sin))
+        x, y = (0.5 * edge * (of(azimuth) + of(other)) for of in (np.cos, np.sin))
     axis = np.stack([x, y, np.ones(count)], axis=1)
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     # By Rodrigues' formula about z × axis, of sine |z × axis| and cosine axis_z.

@@ -24,7 +24,7 @@ from spadwarp.scene.flux import Flux, Sun
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.port import Port, PortGeometry
-from spadwarp.scene.pose import interpolated_angles, rotation_matrix, vector_of
+from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, vector_of
 from spadwarp.scene.sea import Surface
 from spadwarp.scene.sections import Document, Overrides, listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
@@ -441,12 +441,10 @@ def mean_plane(scene: Scene, *, from_below: bool = False) -> PortGeometry:
     assert surface is not None
     down = -np.array(surface.normal) @ rotation_matrix(camera.rotation_deg)
     height = surface.height_of(camera.position)
-    (index, group), water = surface.air(scene.laser.wavelength_nm), (medium.phase_index, medium.group_index)
-    if from_below:
-        indices, groups = (water[0], water[0], index), (water[1], water[1], group)
-        return PortGeometry("flat", -height, vector_of(-down), 0.0, (0.0, 0.0, 0.0), 0.0, indices, groups)
-    indices, groups = (index, index, water[0]), (group, group, water[1])
-    return PortGeometry("flat", height, vector_of(down), 0.0, (0.0, 0.0, 0.0), 0.0, indices, groups)
+    air, water = surface.air(scene.laser.wavelength_nm), (medium.phase_index, medium.group_index)
+    before, behind, sign = (water, air, -1.0) if from_below else (air, water, 1.0)
+    index, group_index = zip(before, before, behind, strict=True)
+    return PortGeometry("flat", sign * height, vector_of(sign * down), 0.0, (0.0,) * 3, 0.0, index, group_index)
 
 
 def _placed(scene: Scene, port: Port, origin: Any, normal: Any) -> PortGeometry:
@@ -494,11 +492,12 @@ class Trajectory:
         check_integer("frames of the trajectory", count, f"[1, {_MOST_ROWS}]")
         times = np.minimum(self.times[0] + np.arange(count) / frame_rate, self.times[-1])
         values = np.stack([np.interp(times, self.times, column) for column in self.values.T], axis=1)
-        for name in self.fields:
+        for name in self.fields if len(self) > 1 else ():
             angles = [f"{name[:-3]}[{axis}]" for axis in range(3)]
             if name.endswith("rotation_deg[0]") and set(angles) <= set(self.fields):
                 columns = [self.fields.index(angle) for angle in angles]
-                values[:, columns] = interpolated_angles(times, self.times, self.values[:, columns])
+                turns = turned(times, self.times, self.values[:, columns])
+                values[:, columns] = [rotation_angles(turn) for turn in turns]
         return Trajectory(times=times, fields=self.fields, values=values, source=self.source)
 
 

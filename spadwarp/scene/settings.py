@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from spadwarp.scene.pose import unit_vector
+from spadwarp.scene.pose import sideways, unit_vector
 from spadwarp.scene.sections import Corner, CsvFile, Direction, FilePath, Scale, Section, Size, Vector, Whole, field
 from spadwarp.values import SEED, bounds
 from spadwarp.water.daylight import refracted_cosine
@@ -132,15 +132,8 @@ class Daylight(Section):
 
     def sun_direction(self, index: float) -> NDArray[np.float64]:
         """Unit vector in which the sun's light goes in water of a refractive index, in the world."""
-        down = self.down
-        ahead = np.array([0.0, 0.0, 1.0]) - down[2] * down
-        if np.linalg.norm(ahead) < 1e-6:
-            ahead = np.array([1.0, 0.0, 0.0]) - down[0] * down
-        ahead /= np.linalg.norm(ahead)
-        azimuth = math.radians(self.sun_azimuth_deg)
-        towards_sun = math.cos(azimuth) * ahead + math.sin(azimuth) * np.cross(down, ahead)
         cosine = refracted_cosine(self.sun_elevation_deg, index)
-        return cosine * down - math.sqrt(1.0 - cosine**2) * towards_sun
+        return cosine * self.down - math.sqrt(1.0 - cosine**2) * sideways(self.down, self.sun_azimuth_deg)
 
 
 class Detector(Section):

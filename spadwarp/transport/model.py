@@ -18,11 +18,11 @@ from spadwarp.mesh import build_mesh, focus_distance
 from spadwarp.result import Truth
 from spadwarp.scene import Camera, Laser, Medium, Scene, SceneLike, as_scene, phase_function, scattering_matrix
 from spadwarp.scene.camera import pixel_directions, pixel_views, to_camera, to_world, view_box
-from spadwarp.scene.flux import Sun, azimuth_zero
+from spadwarp.scene.flux import Sun
 from spadwarp.scene.laser import load_profile, profile_extent
 from spadwarp.scene.medium import MIXTURE, cell_shares, constituent_order, grid_cells
 from spadwarp.scene.port import PortGeometry
-from spadwarp.scene.pose import rotation_matrix, vector_of
+from spadwarp.scene.pose import rotation_matrix, sideways, vector_of
 from spadwarp.scene.scan import Shots, shots_of
 from spadwarp.scene.scene import camera_port, laser_port, mean_plane
 from spadwarp.scene.sea import Surface
@@ -361,7 +361,7 @@ def _flux(scene: Scene, device: wp.Device) -> Any:
             box: Any = {"lower": lower, "edge": section.edges, "estimator": section.estimator}
             sections.append(sk.make_flux_volume(section.voxels, **box, **frame))
             continue
-        axis, right = section.normal, azimuth_zero(section.normal)
+        axis, right = section.normal, sideways(section.normal)
         bins: Any = {"polar": section.polar_bins, "azimuth": section.azimuth_bins if section.polar_bins else 0}
         frame = {"axis": axis @ rotation, "right": right @ rotation, "centre": to_camera(camera, section.centre)}
         count = len(section.positions or ())

@@ -73,7 +73,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
         for number, group in enumerate(groups):
             own = np.array([repr(other) == group for other in others])
             place = x[own] + (0.0 if numeric else 0.12 * (number - 0.5 * (len(groups) - 1)))
-            words = ", ".join(_value_text(value) for value in others[int(own.argmax())])
+            words = ", ".join(f"{x:.5g}" if isinstance(x, float) else str(x) for x in others[int(own.argmax())])
             style_of: dict[str, Any] = {"color": SERIES[number % len(SERIES)], "label": words or None}
             spread = None
             if name == "pulses":
@@ -88,7 +88,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
                 axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
             beyond, top = place[np.isinf(y[own])][::every], axis.get_xaxis_transform()
             axis.plot(beyond, np.full(len(beyond), 0.97), "x", transform=top, color=style_of["color"])
-        axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=_broken(label))
+        label = label if len(label) < 26 else label.replace(" [", "\n[")  # longer than an axis
+        axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=label)
         _value_axis(axis, y)
         if np.isnan(y).all():
             axis.text(0.5, 0.5, "not enough photons\nto judge", transform=axis.transAxes, ha="center", va="center")
@@ -107,15 +108,6 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     if path is not None:
         save(figure, path)
     return figure
-
-
-def _value_text(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
-def _broken(label: str) -> str:
-    """The unit on a line of its own where both together are longer than an axis."""
-    return label if len(label) < 26 else label.replace(" [", "\n[")
 
 
 def _unit(field: str) -> str:

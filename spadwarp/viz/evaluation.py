@@ -121,8 +121,8 @@ def draw_samples(
     marks: set[str] = set()
     for row, (clean, gate, images, caption) in zip(axes, samples, strict=True):
         part = _detail(clean, gate) if enlarged else (slice(None), slice(None))
-        low, high = _limits(clean[part], gate) if rescaled else gate
         target = np.isfinite(clean) & (clean < gate[1])
+        low, high = style.shown_limits(np.where(target, clean, np.nan)[part], margin=0.05) if rescaled else gate
         for axis, (name, image) in zip(row, [("truth", clean), *((n, images.get(n)) for n in methods)], strict=True):
             axis.set(xticks=[], yticks=[])
             axis.spines[:].set_color("0.8")
@@ -243,12 +243,6 @@ def draw_reliability(tables: Mapping[tuple[str, str], NDArray[np.int64]], path: 
 def _line(method: str, bold: bool) -> dict[str, Any]:
     title, colour, marker, line = METHODS[method]
     return {"label": title, "color": colour, "marker": marker, "linestyle": line, "linewidth": 1.8 if bold else 1.0}
-
-
-def _limits(clean: NDArray[np.float32], gate: tuple[float, float]) -> tuple[float, float]:
-    depths = clean[np.isfinite(clean) & (clean < gate[1])]
-    low, high = (float(depths.min()), float(depths.max())) if depths.size else gate
-    return low - 0.05 * (high - low) - 0.01, high + 0.05 * (high - low) + 0.01
 
 
 def _detail(clean: NDArray[np.float32], gate: tuple[float, float]) -> tuple[slice, slice]:

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import SymmetricalLogLocator
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.analytic import AnalyticResult
@@ -20,8 +20,10 @@ from spadwarp.inverse import Fit
 from spadwarp.result import (
     POLARISED,
     Channel,
+    FluxValues,
     Result,
     analyser_channel,
+    apparent,
     degree_of_polarisation,
     unclear_pixels,
 )
@@ -29,9 +31,8 @@ from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.transport import truth_maps
-from spadwarp.values import ArgumentError, check_integer, count, percent, rounded
+from spadwarp.values import ArgumentError, ConfigError, check_integer, count, percent, rounded
 from spadwarp.viz import style
-from spadwarp.viz.flux import flux_figure
 from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits
 
 __all__ = ["draw", "draw_denoised", "draw_depth", "draw_result", "plot"]
@@ -161,7 +162,7 @@ def _result_figure(
     if kind == "histogram":
         return _histogram_figure(result, width, pixel)
     if kind == "flux":
-        return flux_figure(result, _caption(result), width)
+        return _flux_figure(result, width)
     truth, unclear = result.truth, unclear_pixels(result)
     shown_channels = POLARISED if result.scene.camera.channels else ()
     count_of = 2 + len(shown_channels) + bool(shown_channels) if kind == "intensity" else 3
@@ -252,14 +253,12 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
         parts = better.histogram[:, row, column].astype(np.float64) * per_pulse
     time = 1e9 * result.bin_edges
     total = parts.sum(axis=0)
-    known = result.batches > 1
-    error = pixel_standard_error(result, row, column) * per_pulse if known else None
+    error = np.zeros_like(total)  # without batches it is not known, and bins stay as they are
     if better is not None:
         error = better.error[row, column].astype(np.float64) * per_pulse
-    if error is None:
-        weight = typical_weight(total)
-    else:
-        weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
+    elif result.batches > 1:
+        error = pixel_standard_error(result, row, column) * per_pulse
+    weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
     edges = merged_edges(total, weight * total, [int(part.argmax()) for part in parts > 0])  # no light before its time
     curves: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
     for name, part in zip(result.scene.components, parts, strict=True):
@@ -270,7 +269,7 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
     means = np.concatenate([values for values, *_ in curves])
     top = float(parts.max())
     bottom = float(np.clip(0.5 * means[means > 0].min(), 1e-7 * top, 0.01 * top))
-    if error is not None:  # standard errors of the bins of a group taken as independent
+    if error.any():  # standard errors of the bins of a group taken as independent
         spread = np.sqrt(np.add.reduceat(error**2, edges[:-1])) / np.diff(edges)
         lower, upper = (np.maximum(merged_means(total, edges) + sign * spread, 0.01 * bottom) for sign in (-1, 1))
         label = "all light ± standard error"
@@ -338,35 +337,85 @@ def _water_text(medium: Medium) -> str:
     return f"water c = {medium.extinction:.3g} 1/m, albedo {albedo}, {law}{grid}"
 
 
+# Light inside the water
+
+_PROPERTIES = {"attenuation": "K_d [1/m]", "reflectance": "R", "mean_cosine": "mean cosine"}
+_LEAST = 1e-5  # of the brightest voxel, that a slice shows
+
+
+def _flux_figure(result: Result, width: float) -> Figure:
+    """A row for each section of `[[flux]]`. Raises `ConfigError` without any."""
+    sections = result.scene.flux
+    if not sections:
+        raise ConfigError("kind = 'flux' needs a result with [[flux]]", source=result.scene.source)
+    figure = style.new_figure(width, 2.7 * len(sections))
+    figure.caption(_caption(result))
+    axes = figure.subplots(len(sections), 2, squeeze=False)
+    for section, (left, right) in zip(sections, axes, strict=True):
+        if section.positions is None:
+            for axis, planes in ((left, "zx"), (right, "zy")):
+                _slice(figure, axis, section.name, result.flux[section.name]["fluence"], planes)
+        else:
+            _profiles(result, section.name, left, right)
+    return figure
+
+
+def _profiles(result: Result, section: str, left: Axes, right: Axes) -> None:
+    """Irradiances over the planes, and what follows from them."""
+    light = result.flux[section]["irradiance"]
+    position, kinds = light.dimensions["position"][0], light.dimensions["kind"][0]
+    for axis in (left, right):
+        style.plain_axis(axis)
+        axis.set(ylabel="along the axis [m]", ylim=(position[-1], position[0]) if len(position) > 1 else None)
+    for k, kind in enumerate(kinds):
+        values = np.where(light.values[:, k] > 0, light.values[:, k], np.nan)
+        label = kind.replace("_", " ")
+        error = None if light.errors is None else light.errors[:, k]
+        left.errorbar(values, position, xerr=error, fmt=".-", color=style.SERIES[k], label=label, linewidth=0.9)
+    left.set(xlabel=f"irradiance per photon [{light.unit}]", title=section)
+    log_axis(left, "x")
+    left.legend(fontsize=6.5)
+    if light.errors is None:
+        style.middle_text(right, "too few batches")
+        return
+    found = apparent(result, section)
+    for k, (name, label) in enumerate(_PROPERTIES.items()):
+        places = found.middle if name == "attenuation" else found.position
+        error = found.errors[name]
+        right.errorbar(
+            getattr(found, name), places, xerr=error, fmt=".-", color=style.SERIES[k], label=label, linewidth=0.9
+        )
+    right.set(xlabel="K_d, R, mean cosine", title="apparent optical properties")
+    log_axis(right, "x")
+    right.legend(fontsize=6.5)
+
+
+def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: str) -> None:
+    """Fluence in all gates on the middle plane across the third axis; z to the right."""
+    across = next(name for name in "xyz" if name not in planes)
+    cube = light.values.sum(axis=0)
+    image = np.take(cube, cube.shape["xyz".index(across)] // 2, axis="xyz".index(across))
+    sides = [np.asarray(light.dimensions[name][0]) for name in planes]
+    steps = [float(side[1] - side[0]) if len(side) > 1 else 1.0 for side in sides]
+    ends = [(side[0] - 0.5 * step, side[-1] + 0.5 * step) for side, step in zip(sides, steps, strict=True)]
+    axis.set(xlabel=f"{planes[0]} [m]", ylabel=f"{planes[1]} [m]", title=f"{section}, across {across}")
+    top = float(cube.max())
+    if not top > 0.0:
+        style.middle_text(axis, "no light")
+        return
+    look: Any = {
+        "norm": LogNorm(_LEAST * top, top),
+        "cmap": style.colour_map(INTENSITY_MAP),
+        "interpolation": "nearest",
+    }
+    shown = axis.imshow(np.maximum(image, _LEAST * top), extent=(*ends[0], ends[1][1], ends[1][0]), **look)
+    figure.colorbar(shown, ax=axis, label=f"fluence [{light.unit}]", shrink=0.6)
+
+
 # Bins wide enough to mean something
 
 _ERROR = 1.0 / 3.0  # relative standard error at which a bin stands alone
-_NEIGHBOURS = 6  # bins on each side that share a weight
-_EVEN = 0.5  # (Σv)² / (n Σv²) of the n neighbours of one side, where light is not sparse
 _NARROW = 8  # bins that are added up before a group may end for its width
-
-
-def typical_weight(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Light that one photon adds to a bin, `[T]`, from how much neighbouring bins differ.
-
-    A bin of n photons of weight w has the mean n w and the variance n w². The second difference of three bins has no
-    part of a slope; its square over the sum of the bins, weighted as the variances are, estimates w. The median over
-    the neighbours keeps peaks out; where a few photons make most of the light on both sides, the largest counts.
-    """
-    padded = np.pad(values, 1)
-    left, middle, right = padded[:-2], padded[1:-1], padded[2:]
-    spread = left + 4.0 * middle + right
-    local = np.divide((left - 2.0 * middle + right) ** 2, spread, out=np.full(len(values), np.nan), where=spread > 0)
-    around = sliding_window_view(np.pad(local, _NEIGHBOURS, constant_values=np.nan), 2 * _NEIGHBOURS + 1)
-    one_side = sliding_window_view(np.pad(values, _NEIGHBOURS), _NEIGHBOURS)
-    squares = np.maximum((one_side**2).mean(axis=1), np.finfo(float).tiny)
-    even = one_side.mean(axis=1) ** 2 / squares
-    sparse = np.maximum(even[: len(values)], even[_NEIGHBOURS + 1 :]) < _EVEN
-    weight = np.zeros(len(values))
-    some = np.isfinite(around).any(axis=1)
-    weight[some] = np.nanmedian(around[some], axis=1)
-    weight[some & sparse] = np.nanmax(around[some & sparse], axis=1, initial=0.0)
-    return weight
 
 
 def merged_edges(

@@ -149,8 +149,8 @@ def _of_frames(file: FramesFile, method: str | None, frame: int) -> _Page:
     if method is not None and method not in file.methods:
         raise ArgumentError(f"method = {method!r} is not one of {', '.join(file.methods)}, which {file.path} holds")
     counts = file.counts(frame)
-    if file.expected is None or file.background is None or file.best_method is None:
-        raise FileError(f"{file.path}: without expected counts and depth there is nothing to compare")
+    if file.best_method is None:
+        raise FileError(f"{file.path}: without depth there is nothing to compare")
     chosen: Any = method or file.best_method
     background = np.broadcast_to(file.background, counts.shape)
     mode = file.scene.detector.mode.replace("_", "-")

@@ -53,7 +53,7 @@ def test_what_can_be_foreseen_is_a_sentence(error, code, text, monkeypatch):
 
 
 def test_a_bug_keeps_its_traceback_in_a_file(monkeypatch, tmp_path):
-    monkeypatch.setattr("spadwarp.scene.presets", lambda: {}["missing"])
+    monkeypatch.setattr("spadwarp.scene.presets", lambda _: {}["missing"])
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     complaint = run("list", "presets", code=70).stderr
     (kept,) = tmp_path.glob("spadwarp-bug-*.txt")

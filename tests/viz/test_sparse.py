@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from spadwarp.viz.result import merged_edges, merged_means, typical_weight
+from spadwarp.viz.result import merged_edges, merged_means
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -26,13 +26,6 @@ def test_light_stays_in_its_time_and_a_peak_in_its_bin():
     assert {40, 41, 61} <= set(edges) and not set(range(1, 40)) & set(edges)
     edges = merged_edges(0.0 * light, 0.0 * light)  # nothing is one group of nothing
     assert merged_means(0.0 * light, edges).sum() == 0 and edges[-1] == 100
-
-
-@pytest.mark.parametrize("weight", [1e-3, 5.0])
-def test_the_weight_of_a_photon_is_found_on_a_slope(weight):
-    counts = np.random.default_rng(2).poisson(np.geomspace(2000.0, 20.0, 300))
-    # The median of the square of a normal variable is 0.45 of its mean.
-    assert np.median(typical_weight(weight * counts)) == pytest.approx(0.45 * weight, rel=0.25)
 
 
 def test_no_group_of_the_sum_goes_across_the_first_light_of_a_component():
