@@ -123,14 +123,28 @@ def vector(name: str, value: Sequence[float], *, unit: bool = False, size: int =
         raise ArgumentError(f"{name} = {tuple(components)} has the length {length:g}; a unit vector is needed")
 
 
-def numbers(name: str, values: Any, dimensions: int | None = None) -> NDArray[np.float64]:
-    """An array of numbers in NumPy, with so many dimensions (None: any)."""
+def numbers(
+    name: str, values: Any, shape: Sequence[int | None] | None = None, interval: str = "", *, whole: bool = False
+) -> NDArray[np.float64]:
+    """Numbers of lists or of an array of NumPy or Warp: of a shape, with the sizes given (None: any); finite and in an
+    interval, see `number`, if there is one; integers, if `whole`. Those on a GPU are waited for."""
     try:
-        found = np.asarray(values, np.float64)
+        found = np.asarray(values.numpy() if isinstance(values, wp.array) else values, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ArgumentError(f"{name} is {_kind(values)} and not an array of numbers") from None
-    if dimensions is not None and found.ndim != dimensions:
-        raise ArgumentError(f"{name} has shape {found.shape}; {dimensions} dimensions are needed")
+    if shape is not None and not _fits(found.shape, shape):
+        raise ArgumentError(f"{name} has shape {found.shape}; {_sizes(shape)} is needed")
+    if interval:
+        low, high, low_open, high_open = _limits(interval)
+        # What float32 makes of the ends counts as these.
+        low_slack, high_slack = (6e-8 * abs(end) if math.isfinite(end) else 0.0 for end in (low, high))
+        above = found > low + low_slack if low_open else found >= low - low_slack
+        below = found < high - high_slack if high_open else found <= high + high_slack
+        inside = above & below & np.isfinite(found) & (not whole or found == np.rint(found))
+        if not inside.all():
+            at = np.unravel_index(int(inside.argmin()), found.shape)
+            place = f"[{', '.join(map(str, at))}]" if at else ""
+            raise ArgumentError(f"{name}{place} = {found[at]:.9g} is {'not whole or ' * whole}outside {interval}")
     return found
 
 
@@ -148,11 +162,7 @@ def array(
     allowed = dtypes if isinstance(dtypes, tuple) else (dtypes,)
     if not isinstance(value, wp.array):
         problem = f"is {_kind(value)}"
-    elif not (
-        len(value.shape) == len(shape)
-        and all(needed in (None, size) for size, needed in zip(value.shape, shape, strict=True))
-        and any(wp.types.types_equal(value.dtype, dtype) for dtype in allowed)
-    ):
+    elif not (_fits(value.shape, shape) and any(wp.types.types_equal(value.dtype, dtype) for dtype in allowed)):
         problem = f"is a wp.array of {_dtype_name(value.dtype)}, shape {tuple(value.shape)}"
     elif device is not None and value.device != device:
         problem = f"is on {value.device} and not on {device}"
@@ -161,8 +171,7 @@ def array(
     else:
         return value
     kinds = " or ".join(map(_dtype_name, allowed))
-    sizes = ", ".join("any" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
-    raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape ({sizes}), is needed")
+    raise ArgumentError(f"{name} {problem}; a wp.array of {kinds}, shape {_sizes(shape)}, is needed")
 
 
 def arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **values: Any) -> None:
@@ -171,16 +180,12 @@ def arrays(dtypes: Any, shape: Sequence[int | None], device: Any = None, **value
         array(name, value, dtypes, shape, device)
 
 
-def values(name: str, array: wp.array, interval: str) -> None:
-    """Every number of an array of float32, int32 or vectors of float32 is finite and within a closed interval; waits
-    for the device."""
-    low, high, *_ = _limits(interval)
-    found = array.numpy().ravel()
-    ends = np.array([low, high], np.float64 if found.dtype.kind == "i" else found.dtype)
-    outside = ~((found >= ends[0]) & (found <= ends[1]))
-    if outside.any():
-        k = int(outside.argmax())
-        raise ArgumentError(f"{name}[{k // (found.size // array.size)}] = {found[k]} is outside {interval}")
+def _fits(shape: Sequence[int], needed: Sequence[int | None]) -> bool:
+    return len(shape) == len(needed) and all(each in (None, size) for size, each in zip(shape, needed, strict=True))
+
+
+def _sizes(shape: Sequence[int | None]) -> str:
+    return f"({', '.join('any' if size is None else str(size) for size in shape)}{',' * (len(shape) == 1)})"
 
 
 def _kind(value: Any) -> str:

@@ -131,11 +131,9 @@ def tabulate(density: Callable[[Floats], Floats]) -> Floats:
     finite or zero everywhere.
     """
     z, weight = folded_quadrature()
-    values = check.numbers("density(t)", density(z))
-    if values.shape != z.shape:
-        raise ArgumentError(f"density(t) has shape {values.shape}; that of t, {z.shape}, is needed")
-    if not (np.isfinite(values).all() and values.min() >= 0.0 and values.any()):
-        raise ArgumentError("a density must be finite, not negative and not zero everywhere")
+    values = check.numbers("density(t)", density(z), z.shape, "[0, inf)")
+    if not values.any():
+        raise ArgumentError("density(t) is zero everywhere")
     width = np.diff(_NODES)
     mass = (values * weight).sum(axis=2)
     middle = 0.5 * (_NODES[1:] + _NODES[:-1])[:, None]

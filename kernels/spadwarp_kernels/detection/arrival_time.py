@@ -270,14 +270,9 @@ class ArrivalEstimator:
         if method in ("matched", "likelihood"):
             if response is None:
                 raise ArgumentError(f"method = {method!r} needs a response")
-            taps = check.numbers("response", response)
-            if taps.ndim != 2 or taps.shape[0] != PHASES or taps.size == 0:
-                raise ArgumentError(f"response has shape {taps.shape}; ({PHASES}, taps) is needed")
-            largest = taps.max()
+            taps = check.numbers("response", response, (int(PHASES), None), "[0, inf)")
+            largest = check.number("largest of response", taps.max(initial=0.0), "(0, inf)")
             width = np.count_nonzero(taps[0] >= 0.5 * taps[0].max()) if width is None else width
-            if not (np.isfinite(taps).all() and taps.min() >= 0.0 and largest > 0.0):
-                limits = "finite values >= 0 are needed, and one above"
-                raise ArgumentError(f"response holds {taps.min()} to {largest}; {limits}")
             search.floor = floor = RESPONSE_FLOOR * float(largest)
             # A narrow response loses signal between the delays of the coarse search, a wide one does not.
             search.coarse_step = PHASES if largest < 0.25 else PHASES // 2 if largest < 0.5 else PHASES // 4

@@ -129,23 +129,14 @@ def expected_detections(
     check.array("source", source, RATES, (None, None))
     device = source.device
     check.array("noise_rate", noise_rate, wp.float32, (source.shape[0],), device)
-    given = {"row_start": row_start, "source_bin": source_bin, "weight": weight, "width": width}
-    rows, entries, factors, widths = (check.numbers(name, values, 1) for name, values in given.items())
-    if rows.size != widths.size + 1:
-        raise ArgumentError(f"row_start has shape {rows.shape}; one entry more than width, {widths.shape}, is needed")
-    if factors.shape != entries.shape:
-        raise ArgumentError(f"source_bin {entries.shape} and weight {factors.shape} are not two equal lists")
+    widths = check.numbers("width", width, (None,), "[0, inf)")
+    entries = check.numbers("source_bin", source_bin, (None,), f"[0, {source.shape[1] - 1}]", whole=True)
+    factors = check.numbers("weight", weight, entries.shape, "[0, inf)")
+    rows = check.numbers("row_start", row_start, (widths.size + 1,), f"[0, {entries.size}]", whole=True)
     if rows[0] != 0 or rows[-1] != entries.size or (np.diff(rows) < 0).any():
         raise ArgumentError(f"row_start does not rise from 0 to {entries.size}, the number of entries")
-    if entries.size and not (entries.min() >= 0 and entries.max() < source.shape[1]):
-        raise ArgumentError(
-            f"source_bin holds {entries.min():g} to {entries.max():g}, outside [0, {source.shape[1] - 1}]"
-        )
-    for name, values in {"weight": factors, "width": widths}.items():
-        if not np.isfinite(values).all() or np.min(values, initial=0.0) < 0.0:
-            raise ArgumentError(f"{name} holds numbers that are negative or not finite")
-    hazard = wp.empty((source.shape[0], len(width)), dtype=float, device=device)
-    kinds = zip(given.values(), (int, int, float, float), strict=True)
+    hazard = wp.empty((source.shape[0], widths.size), dtype=float, device=device)
+    kinds = ((rows, int), (entries, int), (factors, float), (widths, float))
     matrix = [wp.array(values, dtype=kind, device=device) for values, kind in kinds]
     return _by_row(_response_kernel(source.dtype), [source, *matrix, noise_rate], hazard)
 
@@ -680,9 +671,7 @@ def event_counts(
     detector.dead_time = check.number("dead_time", dead_time, "[0, inf)")
     detector.afterpulsing = check.number("afterpulsing_probability", afterpulsing_probability, "[0, 1)")
     detector.time_constant = afterpulsing_time_constant
-    rising = check.numbers("edges", edges)
-    if rising.shape != (bins + 1,):
-        raise ArgumentError(f"edges has shape {rising.shape}; ({bins + 1},), one more than the bins, is needed")
+    rising = check.numbers("edges", edges, (bins + 1,))
     if not (rising[0] == 0.0 and (np.diff(rising) > 0.0).all() and rising[-1] <= period * (1.0 + 1e-9)):
         raise ArgumentError(f"edges do not rise from 0 to at most the period, {period} s")
     detector.edges = wp.array(rising[None, :], dtype=wp.float64, device=device)

@@ -132,13 +132,9 @@ def profile_tables(image: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.fl
     Raises:
         ArgumentError: Another shape, or values that cannot be.
     """
-    power = check.numbers("profile", image)
-    if power.ndim != 2 or power.size == 0:
-        raise ArgumentError(f"profile has shape {power.shape}; [height, width] is needed")
-    if not (np.isfinite(power).all() and power.min() >= 0 and power.max() > 0):
-        raise ArgumentError(
-            f"profile holds {power.min()} to {power.max()}; finite values >= 0 are needed, and one above"
-        )
+    power = check.numbers("profile", image, (None, None), "[0, inf)")
+    if not power.any():
+        raise ArgumentError("profile: one value above 0 is needed")
     power = power / power.max()
     rows = np.cumsum(power.sum(axis=1))
     columns = np.cumsum(power, axis=1)
@@ -210,7 +206,7 @@ def make_sun(
     for a sun below the horizon.
     """
     height = max(_ABOVE, _ABOVE * abs(check.number("distance", distance, "(-inf, inf)")))
-    position = (distance - height) * check.numbers("normal", normal, 1)
+    position = (distance - height) * check.numbers("normal", normal, (3,))
     laser = make_laser("collimated", radius=0.0, axis=direction, position=position)
     indices = (1.0, 1.0, check.number("index", index, "[1, 1e3]"))
     laser.port = make_flat_port(

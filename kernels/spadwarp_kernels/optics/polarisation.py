@@ -63,33 +63,20 @@ def make_polarisation(
     """
     device = check.device("device", device)
     polarisation = Polarisation()
-    stokes = check.numbers("laser", laser)
-    if stokes.shape != (4,) or not np.isfinite(stokes).all() or stokes[0] != 1.0:
-        raise ArgumentError(f"laser = {laser!r} is not a Stokes vector with I = 1")
-    if float(np.linalg.norm(stokes[1:])) > 1.0 + 1e-6:
-        raise ArgumentError(f"laser = {laser!r} is polarised by more than 1")
+    stokes = check.numbers("laser", laser, (4,), "(-inf, inf)")
+    if stokes[0] != 1.0 or float(np.linalg.norm(stokes[1:])) > 1.0 + 1e-6:
+        raise ArgumentError(f"laser = {laser!r} is not a Stokes vector with I = 1, polarised by 1 at most")
     polarisation.laser = wp.vec4(*stokes.tolist())
     cosines = matrix_cosines()
     table = np.tile([0.0, 1.0, 1.0, 0.0, 1.0], (cosines.size, 1))
-    if not (matrix is None or callable(matrix)):
-        raise ArgumentError(f"matrix = {matrix!r} is not a function of cosines")
     if matrix is not None:
-        table = check.numbers("matrix", matrix(cosines))
-    if table.shape != (cosines.size, 5):
-        raise ArgumentError(f"matrix gives {table.shape} for {cosines.size} cosines; [cosines, 5] is needed")
-    if not (np.isfinite(table).all() and np.abs(table).max() <= 1.0 + 1e-6):
-        raise ArgumentError("matrix holds elements that are not finite or beyond m11: outside [-1, 1]")
+        check.kind("matrix", matrix, Callable)
+        table = check.numbers("matrix(cosines)", matrix(cosines), table.shape, "[-1.000001, 1.000001]")
     polarisation.first = wp.array(table[:, :4].astype(np.float32), dtype=wp.vec4, device=device)
     polarisation.last = wp.array(table[:, 4].astype(np.float32), dtype=float, device=device)
-    given = [check.items(f"channels[{k}]", row) for k, row in enumerate(check.items("channels", channels))]
-    if len(given) > MOST_CHANNELS or any(len(row) != 4 for row in given):
-        raise ArgumentError(f"channels are not up to {MOST_CHANNELS} rows of 4 numbers")
-    rows = np.zeros((MOST_CHANNELS, 4))
-    for k, row in enumerate(given):
-        rows[k] = [check.number(f"channels[{k}]", one, "[-1, 1]") for one in row]
+    rows, count = np.zeros((MOST_CHANNELS, 4)), check.integer("channels", len(channels), 0, MOST_CHANNELS)
+    rows[:count] = check.numbers("channels", channels, (count, 4) if count else (0,), "[-1, 1]").reshape(count, 4)
     polarisation.channels = Channels(*rows.ravel().tolist())
-    facets = np.ravel(check.numbers("facet_index", facet_index))
-    if facets.size and not (np.isfinite(facets).all() and facets.min() > 0.0):
-        raise ArgumentError("facet_index holds numbers outside (0, inf)")
+    facets = check.numbers("facet_index", np.ravel(facet_index), (None,), "(0, inf)")
     polarisation.facet_index = wp.array(facets.astype(np.float32), dtype=float, device=device)
     return polarisation

@@ -113,8 +113,7 @@ def make_derivatives(
     for p, kind in enumerate(kinds):
         check.choice(f"kinds[{p}]", kind, DERIVATIVES)
         check.number(f"value[{p}], {kind},", value[p], DERIVATIVES[kind])
-    for p, one in enumerate(scale):
-        check.number(f"scale[{p}]", one, "(0, inf)")
+    check.numbers("scale", scale, None, "(0, inf)")
     if len(extinction) != len(constituent) or ("concentration" in kinds and len(extinction) != count):
         raise ArgumentError(
             f"{count} derivatives, {len(extinction)} extinctions, {len(constituent)} constituents: of concentrations "
@@ -127,10 +126,7 @@ def make_derivatives(
     derivatives.value = LogDerivatives(*value, *[0.0] * (MOST_DERIVATIVES - count))
     derivatives.scale = LogDerivatives(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
     for name, parts in (("waters", waters), ("faces", faces)):
-        numbers = check.numbers(name, parts, 1)
-        whole = np.nan_to_num(numbers).astype(np.int32) if np.abs(numbers).max(initial=0.0) < 2**31 else None
-        if whole is None or not np.array_equal(whole, numbers):
-            raise ArgumentError(f"{name} holds numbers that are not whole or beyond 2^31")
+        whole = check.numbers(name, parts, (None,), "[-2147483648, 2147483647]", whole=True).astype(np.int32)
         setattr(derivatives, name, wp.array(whole, dtype=int, device=device, shape=whole.size))
     if blocks is not None:
         check.kind("blocks", blocks, Blocks)
@@ -152,10 +148,8 @@ def make_blocks(grid: Grid, shape: Sequence[int], scale: Sequence[float]) -> Blo
     check.kind("grid", grid, Grid)
     shape, scale = check.items("shape", shape), check.items("scale", scale)
     kinds = check.integer("kinds of derivatives by block", len(scale), 1, len(BLOCK_DERIVATIVES))
-    for q, value in enumerate(scale):
-        check.number(f"scale[{q}]", value, "(0, inf)")
-    if len(shape) != 3:
-        raise ArgumentError(f"blocks = {list(shape)} has {len(shape)} numbers; 3 are needed")
+    check.numbers("scale", scale, None, "(0, inf)")
+    check.numbers("blocks", shape, (3,))
     for edge, (blocks, cells) in enumerate(zip(shape, list(grid.size), strict=True)):
         check.integer(f"blocks[{edge}]", blocks, 1, cells)
         if cells % blocks:

@@ -99,7 +99,7 @@ def make_surfaces(
         check.kind("mesh", mesh, wp.Mesh)
         if mesh.indices.size < 3:
             raise ArgumentError(f"mesh.indices has {mesh.indices.size} entries; 3 for each face are needed")
-        check.values("mesh.indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+        check.numbers("mesh.indices", mesh.indices, None, f"[0, {mesh.points.size - 1}]")
         device, face_count = mesh.device, mesh.indices.size // 3
 
     def by_face(name: str, value: Any, dtype: type, interval: str = "[0, 1]") -> wp.array:
@@ -110,7 +110,7 @@ def make_surfaces(
         if isinstance(value, wp.array) and value.ndim == 1 and value.size != face_count:
             raise ArgumentError(f"{name} has {value.size} entries; the mesh has {face_count} faces")
         check.array(name, value, dtype, (face_count,), device, contiguous=True)
-        check.values(name, value, interval)
+        check.numbers(name, value, None, interval)
         return value
 
     surfaces.reflectance = by_face("reflectance", reflectance, float)
@@ -142,8 +142,7 @@ def make_surfaces(
 def _set_tree(surfaces: Surfaces, mesh: wp.Mesh, extent: float | None, use_warp_bvh: bool) -> None:
     """Box, tree and patches of a mesh; an extent for one that will move."""
     points, device, face_count = mesh.points.numpy(), mesh.device, mesh.indices.size // 3
-    if not np.isfinite(points).all():
-        raise ArgumentError(f"mesh.points[{int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])}] is not finite")
+    check.numbers("mesh.points", points, None, "(-inf, inf)")
     lower, upper, still = points.min(axis=0), points.max(axis=0), extent is None
     if not still:
         upper = np.full(3, check.number("extent", extent, "(0, inf)"))
@@ -282,24 +281,11 @@ def make_textures(
     """
     check.kind("images", images, Sequence)
     device = check.device("device", device)
-    images = [check.numbers(f"images[{k}]", image, 2).astype(np.float32) for k, image in enumerate(images)]
-    if not images:
-        raise ArgumentError("images has no entries; one image or more is needed")
-    for k, image in enumerate(images):
-        if image.size == 0:
-            raise ArgumentError(f"images[{k}] has shape {image.shape}; one texel or more is needed")
-        if not (image.min() >= 0.0 and image.max() <= 1.0):
-            raise ArgumentError(f"images[{k}] holds {image.min()} to {image.max()}, outside [0, 1]")
-    face, coordinates = np.asarray(face), check.numbers("coordinates", coordinates)
-    if face.ndim != 1 or face.dtype.kind not in "iu" or coordinates.shape != (face.size, 3, 2):
-        raise ArgumentError(
-            f"face {face.dtype} {face.shape} and coordinates {coordinates.shape} are not integers [faces] and "
-            "numbers [faces, 3, 2]"
-        )
-    if face.size and not (face.min() >= -1 and face.max() < len(images)):
-        raise ArgumentError(f"face holds {face.min()} to {face.max()}, outside [-1, {len(images) - 1}]")
-    if not np.isfinite(coordinates).all():
-        raise ArgumentError("coordinates are not all finite")
+    check.integer("number of images", len(images), 1)
+    images = [check.numbers(f"images[{k}]", image, (None, None), "[0, 1]") for k, image in enumerate(images)]
+    check.integer("smallest number of texels", min(image.size for image in images), 1)
+    face = check.numbers("face", face, (None,), f"[-1, {len(images) - 1}]", whole=True)
+    coordinates = check.numbers("coordinates", coordinates, (face.size, 3, 2), "(-inf, inf)")
     ends = np.cumsum([0, *(image.size for image in images)])
     region = [(start, image.shape[1], image.shape[0]) for start, image in zip(ends, images, strict=False)]
     return _textures(face, coordinates, region, np.concatenate([image.ravel() for image in images]), device)

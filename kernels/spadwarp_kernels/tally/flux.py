@@ -211,16 +211,14 @@ def make_flux_volume(
         raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
     volume: Any = FluxVolume()
     rows, shift = [], []
-    edge, turn = check.numbers("edge", edge, 1), check.numbers("rotation", rotation, 2)
-    if edge.shape != (3,) or turn.shape != (3, 3):
-        raise ArgumentError(f"edge, rotation have shapes {edge.shape}, {turn.shape}; (3,), (3, 3) are needed")
+    edge, turn = check.numbers("edge", edge, (3,)), check.numbers("rotation", rotation, (3, 3))
     for k, width in enumerate(edge.tolist()):
         check.number(f"edge[{k}]", min(width, 1e30), "(0, inf)")
         check.integer(f"shape[{k}]", shape[k], 1, 1 if width == math.inf else 1 << 20)
         rows += [x / width for x in turn[k].tolist()]
         shift.append((origin[k] - lower[k]) / width)
     volume.turn, volume.shift, volume.size = wp.mat33(*rows), wp.vec3(*shift), wp.vec3i(*shape)
-    gate_path = float(check.numbers("gate_path", gate_path, 0))
+    gate_path = float(check.numbers("gate_path", gate_path, ()))
     check.number("gate_path", min(gate_path, 1e30), "(0, inf)")
     volume.gates = check.integer("gates", gates, 1, 1 if gate_path == math.inf else 1 << 20)
     volume.gate_start = check.number("gate_start", gate_start, "(-inf, inf)")

@@ -467,24 +467,16 @@ def make_grid(
         ArgumentError: Another shape, a number out of range, or more than 2^30 cells.
     """
     device = check.device("device", device)
-    columns = {"extinction": (extinction, "[0, inf)"), "albedo": (albedo, "[0, 1]")}
-    if anisotropy is not None:
-        columns["anisotropy"] = (anisotropy, "(-1, 1)")
-    arrays = {name: check.numbers(name, values, 3).astype(np.float32) for name, (values, _) in columns.items()}
+    arrays = {"extinction": check.numbers("extinction", extinction, (None,) * 3, "[0, inf)").astype(np.float32)}
     shape = arrays["extinction"].shape
-    if not 0 < math.prod(shape) <= LARGEST_CELL_COUNT:
-        raise ArgumentError(f"extinction has cells {shape}; 1 to 2^30 of them are needed")
-    for name, array in arrays.items():
-        if array.shape != shape:
-            raise ArgumentError(f"{name} has cells {array.shape}, extinction {shape}")
-        for value in (array.min(), array.max()):
-            check.number(name, float(value), columns[name][1])
-    check.vector("size", size)
-    for edge in size:
-        check.number("size", edge, "(0, inf)")
+    check.integer("number of cells", math.prod(shape), 1, LARGEST_CELL_COUNT)
+    arrays["albedo"] = check.numbers("albedo", albedo, shape, "[0, 1]").astype(np.float32)
+    if anisotropy is not None:
+        arrays["anisotropy"] = check.numbers("anisotropy", anisotropy, shape, "(-1, 1)").astype(np.float32)
+    check.numbers("size", size, (3,), "(0, inf)")
     check.vector("centre", centre)
-    axes = check.numbers("rotation", rotation, 2)
-    if axes.shape != (3, 3) or not np.allclose(axes.T @ axes, np.eye(3), atol=1e-5):
+    axes = check.numbers("rotation", rotation, (3, 3))
+    if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-5):
         raise ArgumentError(f"rotation = {axes.tolist()} is not a rotation matrix")
     longest = max(shape)
     edge_cells = max(1, math.ceil(longest / 6)) if block_edge is None else block_edge

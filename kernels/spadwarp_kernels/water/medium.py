@@ -15,7 +15,6 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp_kernels.base import check
-from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
@@ -119,19 +118,16 @@ def make_inelastic(
     Raises:
         ArgumentError: A number out of range, or lists of several lengths.
     """
+    lines, count = Inelastic(), check.integer("number of lines", len(check.items("source", source)), 1, MOST_LINES)
     given = {"source": source, "anisotropy": anisotropy, "extinction": extinction, "scattering": scattering}
     given["passed"] = passed
-    lines, numbers = Inelastic(), {name: [float(x) for x in check.numbers(name, v, 1)] for name, v in given.items()}
-    count = check.integer("number of lines", len(numbers["source"]), 1, MOST_LINES)
-    if any(len(values) != count for values in numbers.values()):
-        raise ArgumentError(f"lines: {', '.join(f'{name} {len(v)}' for name, v in numbers.items())} entries differ")
+    columns = [check.numbers(name, column, (count,), "[0, inf)").tolist() for name, column in given.items()]
     b = check.number("scattering of the medium", medium.extinction * medium.albedo, "(0, inf)")
-    for k in range(count):
-        row = {name: check.number(f"{name}[{k}]", values[k], "[0, inf)") for name, values in numbers.items()}
-        lines.source[k], lines.passed[k] = row["source"], row["passed"]
-        lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + row["anisotropy"] / 3.0))
-        lines.squared[k] = row["anisotropy"] * lines.even[k]
-        lines.more[k], lines.again[k] = row["extinction"] - medium.extinction, row["scattering"] / b
+    for k, (made, anisotropic, extinct, scattered, kept) in enumerate(zip(*columns, strict=True)):
+        lines.source[k], lines.passed[k] = made, kept
+        lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + anisotropic / 3.0))
+        lines.squared[k] = anisotropic * lines.even[k]
+        lines.more[k], lines.again[k] = extinct - medium.extinction, scattered / b
     return lines
 
 
@@ -320,10 +316,9 @@ def mixture_shares(shares: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.floa
     values = check.numbers("shares", shares)
     if not values.size:
         return np.zeros((0, MOST_CONSTITUENTS), np.float32)
-    if values.shape[:-1] != shape or values.shape[-1] > MOST_CONSTITUENTS:
-        raise ArgumentError(f"shares {values.shape} are not those of up to {MOST_CONSTITUENTS} for each of {shape}")
-    if not (values.min() >= 0.0 and np.allclose(values.sum(axis=-1), 1.0, atol=1e-5)):
-        raise ArgumentError("shares: numbers from 0 on whose sum is 1 are needed")
+    check.numbers("shares", values, (*shape, None), "[0, 1]")
+    check.integer("number of constituents", values.shape[-1], 1, MOST_CONSTITUENTS)
+    check.numbers("sum of shares", values.sum(axis=-1), None, "[0.99999, 1.00001]")
     filled = np.zeros((values[..., 0].size, MOST_CONSTITUENTS), np.float32)
     filled[:, : values.shape[-1]] = values.reshape(-1, values.shape[-1])
     return filled
@@ -343,19 +338,14 @@ def make_layers(
 
     `shares`: of mixtures, see `mixture_shares`. Raises `ArgumentError`.
     """
+    device, count = check.device("device", device), len(check.items("start", start))
+    check.integer("number of layers", count, 1)
     columns = {"start": start, "extinction": extinction, "albedo": albedo, "anisotropy": anisotropy}
     for name, column in columns.items():
-        check.numbers(name, column, 1)
-    device = check.device("device", device)
-    if len({len(column) for column in columns.values()}) > 1:
-        sizes = ", ".join(f"{name} {len(column)}" for name, column in columns.items())
-        raise ArgumentError(f"layers: {sizes} entries; one each for every layer are needed")
-    check.integer("number of layers", len(start), 1)
+        check.numbers(name, column, (count,), _RANGES[name])
+    for k in range(2, count):
+        check.number(f"start[{k}]", start[k], f"[{float(start[k - 1])}, inf)")
     check.vector("axis", axis, unit=True)
-    for name, interval in _RANGES.items():
-        for k, value in enumerate(columns[name]):
-            above = name == "start" and k > 1
-            check.number(f"{name}[{k}]", value, f"[{float(start[k - 1])}, inf)" if above else interval)
     layers = Layers()
     layers.axis = wp.vec3(*axis)
     layers.shares = wp.array(mixture_shares(shares, (len(start),)), dtype=wp.vec4, device=device)

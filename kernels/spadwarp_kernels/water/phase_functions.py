@@ -109,15 +109,12 @@ def interpolated_density(angles: ArrayLike, values: ArrayLike) -> Callable[[Arra
     Raises:
         ArgumentError: Angles or values are not of that kind.
     """
-    theta, value = check.numbers("angles", angles), check.numbers("values", values)
-    if theta.ndim != 1 or theta.size < 2 or value.shape != theta.shape:
-        raise ArgumentError(f"angles {theta.shape} and values {value.shape} are not two equal lists of two or more")
-    if not (np.isfinite(theta).all() and (np.diff(theta) > 0.0).all()):
-        raise ArgumentError("angles of a phase function must be finite and ascending")
-    if theta[0] < 0.0 or theta[-1] > np.pi * (1.0 + 1e-12):
-        raise ArgumentError(f"angles [{theta[0]:g}, {theta[-1]:g}] rad are outside [0, pi]")
-    if not (np.isfinite(value).all() and value.min() >= 0.0 and value.any()):
-        raise ArgumentError(f"values ({value.min():g} ... {value.max():g}) must be finite, not negative and not all 0")
+    theta = check.numbers("angles", angles, (None,), f"[0, {np.pi}]")
+    value = check.numbers("values", values, theta.shape, "[0, inf)")
+    if theta.size < 2 or not (np.diff(theta) > 0.0).all():
+        raise ArgumentError("angles of a phase function must be two or more, ascending")
+    if not value.any():
+        raise ArgumentError("values are all 0")
     logs = np.log(np.maximum(theta, 1e-300)), np.log(np.maximum(value, 1e-300))
     straight = (value[:-1] > 0.0) & (value[1:] > 0.0) & (theta[:-1] > 0.0)
     slope = np.diff(logs[1]) / np.diff(logs[0])

@@ -141,14 +141,10 @@ def make_shapes(
     if textures is not None:
         check.kind("textures", textures, Textures)
     table.textures = no_textures(device) if textures is None else textures
-    world = _plain_array("world", np.full(count, 0 if worlds == 1 else -1) if world is None else world)
-    if world.shape != (count,) or world.dtype.kind not in "iu" or world.min() < -1 or world.max() >= worlds:
-        raise ArgumentError(f"world is not one of -1 to {worlds - 1} for each of {count} shapes")
-    visible = _plain_array("visible", True if visible is None else visible)
-    if visible.shape not in ((), (count,)) or visible.dtype.kind not in "biu":
-        kind_given = f"{visible.dtype} of shape {visible.shape}"
-        raise ArgumentError(f"visible is {kind_given}; true or false for each of {count} shapes is needed")
-    seen = np.flatnonzero(np.broadcast_to(visible, (count,)))
+    world = np.full(count, 0 if worlds == 1 else -1) if world is None else world
+    world = check.numbers("world", world, (count,), f"[-1, {worlds - 1}]", whole=True).astype(np.int64)
+    visible = np.full(count, True if visible is None else visible) if np.ndim(visible) == 0 else visible
+    seen = np.flatnonzero(check.numbers("visible", visible, (count,)))
     used = _check_shapes(table, seen, given)
     slot = np.where(world < 0, worlds, world)[seen]
     table.member = wp.array(seen[np.argsort(slot, kind="stable")], dtype=int, device=device)
@@ -176,13 +172,6 @@ def _column(name: str, value: Any, count: int, device: wp.Device) -> wp.array:
     return wp.array(rows.astype(scalar), dtype=dtype, device=device)
 
 
-def _plain_array(name: str, value: Any) -> np.ndarray:
-    try:
-        return np.asarray(value.numpy() if isinstance(value, wp.array) else value)
-    except ValueError:
-        raise ArgumentError(f"{name} is not an array: its rows have different lengths") from None
-
-
 # ---- Values that are read on the host, once: kernels trust them, and would crash or hang on others.
 
 
@@ -203,7 +192,7 @@ def _check_shapes(table: ShapeTable, seen: np.ndarray, given: dict[int, wp.Mesh]
     """Shapes that are in range; returns the meshes that they use."""
     ranges = {"kind": f"[0, {len(SHAPE_KINDS) - 1}]", "reflectance": "[0, 1]", "body": "[-1, 2147483647]"}
     for name, interval in ranges.items():
-        check.values(name, getattr(table, name), interval)
+        check.numbers(name, getattr(table, name), None, interval)
     check_poses("local", table.local)
     kind, size = table.kind.numpy(), table.size.numpy()
     needed = np.array([_COMPONENTS[name] for name in SHAPE_KINDS])[kind]
@@ -229,7 +218,7 @@ def _checked_faces(k: int, id: int, mesh: wp.Mesh | None) -> int:
         raise ArgumentError(f"kind[{k}] is a mesh and mesh[{k}] = 0 is none")
     if mesh is None:
         raise ArgumentError(f"mesh[{k}] is not the id of a wp.Mesh in meshes; give the wp.Mesh itself, or it in meshes")
-    check.values(f"mesh[{k}].indices", mesh.indices, f"[0, {mesh.points.size - 1}]")
+    check.numbers(f"mesh[{k}].indices", mesh.indices, None, f"[0, {mesh.points.size - 1}]")
     return mesh.indices.size // 3
 
 

@@ -443,10 +443,8 @@ class WorldCameras:
 
     def _checked_rays(self, rays: Any) -> np.ndarray:
         shape = (self.config.height, self.config.width, 3)
-        lines = check.numbers("rays", rays.numpy() if isinstance(rays, wp.array) else rays)
-        length = np.linalg.norm(lines, axis=-1, keepdims=True)
-        if lines.shape != shape or not (length > 0.0).all():
-            raise ArgumentError(f"rays have shape {lines.shape}; directions (height, width, 3) = {shape} are needed")
+        lines = check.numbers("rays", rays, shape)
+        length = check.numbers("length of rays", np.linalg.norm(lines, axis=-1, keepdims=True), None, "(0, inf)")
         return (lines / length).reshape(-1, 3)
 
     def _set_worlds(self, world: wp.array | Sequence[int] | None) -> None:
@@ -454,11 +452,9 @@ class WorldCameras:
         if isinstance(world, wp.array):
             self._world = check.array("world", world, wp.int32, (self.cameras,), self.device)
             return
-        items = range(self.cameras) if world is None else check.items("world", world)
-        worlds = [check.integer("world", one, 0) for one in items]
-        if len(worlds) != self.cameras:
-            raise ArgumentError(f"world has {len(worlds)} entries; one for each of {self.cameras} cameras is needed")
-        self._world, self._most_worlds = wp.array(worlds, dtype=int, device=self.device), max(worlds) + 1
+        items = range(self.cameras) if world is None else world
+        worlds = check.numbers("world", items, (self.cameras,), "[0, 2147483646]", whole=True).astype(np.int32)
+        self._world, self._most_worlds = wp.array(worlds, dtype=int, device=self.device), int(worlds.max()) + 1
 
     def _set_mount(self, body: Any, offset: Any) -> None:
         self._bodies = 0
@@ -466,15 +462,13 @@ class WorldCameras:
             if offset is not None:
                 raise ArgumentError("offset is a pose on a body; body is needed with it")
             return
-        rows = check.numbers("body", body.numpy() if isinstance(body, wp.array) else np.array(body))
-        if rows.shape not in ((), (self.cameras,)) or (rows < 0).any() or (rows != np.rint(rows)).any():
-            raise ArgumentError(f"body = {rows.tolist()} is not the index of a body for each of {self.cameras} cameras")
-        rows = np.broadcast_to(rows, self.cameras).astype(np.int32)
+        rows = np.full(self.cameras, body) if np.ndim(body) == 0 else body
+        rows = check.numbers("body", rows, (self.cameras,), "[0, 2147483647]", whole=True).astype(np.int32)
         self._body, self._bodies = wp.array(rows, dtype=int, device=self.device), int(rows.max()) + 1
-        poses = np.array((0, 0, 0, 0, 0, 0, 1) if offset is None else offset, np.float32)
-        if poses.shape not in ((7,), (self.cameras, 7)):
-            raise ArgumentError(f"offset has shape {poses.shape}; (x, y, z, qx, qy, qz, qw) for each camera is needed")
-        self._offset = wp.array(np.broadcast_to(poses, (self.cameras, 7)), dtype=wp.transform, device=self.device)
+        offset = (0, 0, 0, 0, 0, 0, 1) if offset is None else offset
+        poses = np.tile(offset, (self.cameras, 1)) if np.ndim(offset) == 1 else offset
+        poses = check.numbers("offset", poses, (self.cameras, 7))
+        self._offset = wp.array(poses, dtype=wp.transform, device=self.device)
         check_poses("offset", self._offset)
         self._camera_q = wp.zeros(self.cameras, dtype=wp.transform, device=self.device)
 

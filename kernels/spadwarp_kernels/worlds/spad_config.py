@@ -117,10 +117,8 @@ class SpadConfig:
         for name in set(found) - {"camera_matrix"}:
             check.number(f"config.{name}", getattr(self, name), "(0, 3.1)")
         if self.camera_matrix is not None:
-            k = check.numbers("config.camera_matrix", self.camera_matrix)
-            if k.shape != (3, 3) or not (
-                k[0, 0] > 0.0 < k[1, 1] and (k * [[0, 1, 0], [1, 0, 0], [1, 1, 0]] == 0).all()
-            ):
+            k = check.numbers("config.camera_matrix", self.camera_matrix, (3, 3))
+            if not (k[0, 0] > 0.0 < k[1, 1] and (k * [[0, 1, 0], [1, 0, 0], [1, 1, 0]] == 0).all()):
                 form = "(f_x, 0, c_x), (0, f_y, c_y), (0, 0, 1) of f > 0 [pixels]"
                 raise ArgumentError(f"config.camera_matrix = {k.tolist()} is not {form}")
 
@@ -289,7 +287,7 @@ def world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.Dev
         check.choice("by_world", name, WorldValues.vars)
         dtype = WorldValues.vars[name].type.dtype
         if not isinstance(given, wp.array):
-            rows = check.numbers(f"by_world[{name!r}]", given, 1)
+            rows = check.numbers(f"by_world[{name!r}]", given, (None,))
             given = wp.array(rows.astype(wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
         check.array(f"by_world[{name!r}]", given, dtype, (worlds or None,), device)
         high = (
@@ -299,7 +297,7 @@ def world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.Dev
             if name == "pulses"
             else 1e6
         )
-        check.values(f"by_world[{name!r}]", given, f"[0, {high}]")
+        check.numbers(f"by_world[{name!r}]", given, None, f"[0, {high}]")
         setattr(values, name, given)
         worlds = given.size
     return values, worlds

@@ -66,7 +66,7 @@ def test_worlds_that_differ(device):
         assert camera.counts.numpy()[world].mean() == pytest.approx(alone.counts.numpy().mean(), rel=0.02)
     with pytest.raises(sk.ArgumentError, match=r"by_world = 'water' is not one of 'absorption'"):
         look(CONFIG, device, by_world={"water": [0.1]})
-    with pytest.raises(sk.ArgumentError, match=r"by_world\['gate_delay'\]\[0\] = 9.0 is outside \[0, 5.5\]"):
+    with pytest.raises(sk.ArgumentError, match=r"by_world\['gate_delay'\]\[0\] = 9 is outside \[0, 5.5\]"):
         look(CONFIG, device, by_world={"gate_delay": [9.0]})
 
 
@@ -112,7 +112,7 @@ def test_fields_of_view(device):
     assert rays == pytest.approx(np.sqrt(1 + ((column - 8) / 20) ** 2 + ((row - 10) / 30) ** 2), rel=1e-5)
     with pytest.raises(sk.ArgumentError, match=r"config\.horizontal_fov and config\.vertical_fov: only one"):
         sk.SpadConfig(horizontal_fov=1.0, vertical_fov=1.0)
-    with pytest.raises(sk.ArgumentError, match=r"config.camera_matrix = \[\[1.0\]\] is not"):
+    with pytest.raises(sk.ArgumentError, match=r"config.camera_matrix has shape \(1, 1\)"):
         sk.SpadConfig(camera_matrix=[[1.0]])
 
 
