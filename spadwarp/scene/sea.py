@@ -147,7 +147,7 @@ class Surface(Section):
         if waves is None:
             return None
         if waves.heights is not None:
-            return _read_heights(waves.heights, waves.size)
+            return _read_heights(waves.heights, waves.size, _version(waves.heights))
         total = self._slopes_along(self.wave_axis)
         return _draw_waves(self.wind or 0.0, total, waves)
 
@@ -241,7 +241,17 @@ def _largest_number(
     return float(length.ravel()[order[kept - 1]]) if kept else 0.0
 
 
-def _read_heights(path: str, size: float) -> WaveField:
+def _version(path: str) -> tuple[int, int] | None:
+    """Of a file, by which it is read anew after a change; None: there is none."""
+    try:
+        status = Path(path).stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
+
+
+@lru_cache(2)
+def _read_heights(path: str, size: float, version: tuple[int, int] | None) -> WaveField:
     where = f"surface.waves.heights = {path!r}"
     try:
         heights = np.load(existing_file(Path(path)), allow_pickle=False)

@@ -146,7 +146,7 @@ def test_waves_without_height_are_the_mean_plane(tmp_path):
 
 def test_waves_stay_below_lens_and_laser():
     steep = {"size": 40.0, "cells": 64}
-    with pytest.raises(spadwarp.ConfigError, match=r"camera\.position is 0\.1 m .* waves are up to 0\.\d+ m high"):
+    with pytest.raises(spadwarp.ConfigError, match=r"camera\.position: .* is 0\.1 m .* waves are up to 0\.\d+ m high"):
         spadwarp.simulate(
             sea_scene("both in air", surface={"point": [0.0, 0.0, 0.1], "waves": steep}, laser={"position": [0.0] * 3}),
             photons=100,
