@@ -30,8 +30,6 @@ Floats = NDArray[np.float64]
 # Nearest to a port that is asked for [m], and steps of Newton's method, which has converged after a few.
 _LEAST = 1e-9
 _STEPS = 30
-
-
 _GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
 
 

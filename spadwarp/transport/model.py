@@ -405,13 +405,8 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
 
 def _camera(scene: Scene, mesh: TriangleMesh | None, sea: Any) -> Any:
     camera = scene.camera
-    lens = _filled(
-        sk.Camera(),
-        width=camera.width,
-        height=camera.height,
-        pixel_tangent=scene.receiver.pixel_tangent,
-        aperture_area=camera.aperture_area,
-    )
+    size, area = {"width": camera.width, "height": camera.height}, camera.aperture_area
+    lens = _filled(sk.Camera(), **size, pixel_tangent=scene.receiver.pixel_tangent, aperture_area=area)
     if (focus := focus_distance(scene, mesh)) is not None:
         lens.aperture_radius, lens.inverse_focus = camera.aperture_radius, 1.0 / focus
     if _lens(scene) is not sk.PLAIN:
@@ -484,12 +479,7 @@ def port_kind(port: PortGeometry | None) -> Any:
 
 
 def port_parameters(
-    scene: Scene,
-    port: PortGeometry,
-    origin: tuple[float, float, float],
-    aperture_radius: float,
-    inverse_focus: float,
-    sea: Any = None,
+    scene: Scene, port: PortGeometry, origin: Any, aperture_radius: float, inverse_focus: float, sea: Any = None
 ) -> Any:
     """A port as the kernels take it; `sea`: what it is the mean plane of."""
     left, top, right, bottom = view_box(scene.receiver)
@@ -759,9 +749,7 @@ def _rays_by_sea(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[
     return (origin, view), (start, direction, lead)
 
 
-def wave_errors(
-    scene: SceneLike, depth: ArrayLike | None = None, *, device: str | None = None
-) -> NDArray[np.float64]:
+def wave_errors(scene: SceneLike, depth: ArrayLike | None = None, *, device: str | None = None) -> NDArray[np.float64]:
     """By how much depths by the mean plane of the sea are too large, `[H, W]` [m]: of light that goes from the lens by
     the waves before each pixel to a point in the water and back.
 

@@ -230,7 +230,7 @@ def test_a_file_of_heights_is_opened_by_check(tmp_path):
     one = scene(**{**BAY, "surface": {**BAY["surface"], **waves}}, targets=[BOTTOM])
     with pytest.raises(FileError, match=r"surface\.waves\.heights = '.*swell\.npy': "):
         spadwarp.check(one)
-    np.save(path, np.zeros((4, 4)) + [0.0, 0.1, 0.0, -0.1])
+    np.save(path, np.tile([0.0, 0.1, 0.0, -0.1], (4, 1)))
     spadwarp.check(one)
     assert one.surface.wave_field.amplitude == 0.1
     np.save(path, np.zeros((4, 8)))
