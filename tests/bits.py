@@ -40,6 +40,7 @@ CELLS = {"shape": "plume", "size": 1.2, "cells": 12, "extinction": 3.0, "seed": 
 DOME = {"shape": "dome", "radius": 0.3, "thickness": 0.01, "material": "acrylic"}
 TWO_TERMS = {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.3, "alpha": 0.9}
 LAYERS = {"layers": [{"start": 1.2, "extinction": 1.5, "albedo": 0.6}]}
+SEA = {"point": [0.0, 0.0, 1.0], "up": [0.0, 0.0, -1.0]}
 STOKES = {"medium": {"scattering_matrix": "scaled_rayleigh"}, "camera": {"polarisation": "stokes"}}
 
 # Sections that make a scene of those of `helpers.scenes.scene`.
@@ -61,6 +62,9 @@ SCENES = {
     "near axis": {"transport": {"axis_threshold": 0.97}},
     "random albedo and roulette": {"medium": {"albedo": "lu2024"}, "transport": {"termination": "roulette"}},
     "thin lens": {"camera": {"focus_distance": 2.0, "aperture_diameter": 0.1}, "targets": [TREE]},
+    "calm sea": {"surface": {**SEA, "preset": "calm"}},
+    "facets": {"surface": {**SEA, "preset": "breeze"}},
+    "waves": {"surface": {**SEA, "preset": "breeze", "waves": {"size": 2.0, "cells": 64, "fetch": 300.0}}},
     "confocal": {"scan": {"mode": "confocal"}, "laser": {"half_angle_deg": 2.0}},
 }  # fmt: skip
 EVERY = ("water", "plate", "tree", "flat port", "walls", "cells", "layers", "polarised")

@@ -236,64 +236,49 @@ class PortGeometry:
         """
         points, origin = np.asarray(points, np.float64), np.asarray(origin, np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
-            u = self._start_flat(points, origin) if self.shape == "flat" else self._start_dome(points, origin)
+            u = self._aim(points, origin)
         start, v, length, path = self.enter(origin, u)
         water = np.linalg.norm(points - start, axis=-1)
         return u, v, length + water, path + water
 
-    def _start_flat(self, points: Floats, origin: Floats) -> Floats:
-        """Directions inside, by Newton's method in t = k/√(m² − k²), k Snell's invariant, m the least index."""
-        normal = np.array(self.normal)
-        y = points - origin
-        along = y @ normal
-        across = y - along[..., None] * normal
-        aside = np.linalg.norm(across, axis=-1)
-        inside = self.distance - origin @ normal
-        water = along - inside - self.thickness
-        h: list[Any] = [inside, self.thickness, np.where(water > 0.0, water, np.nan)]
-        n = (self.index[0], self.index[1] if self.thickness > 0.0 else self.index[0], self.index[2])
-        m = min(n)
-        t = np.zeros_like(aside)
+    def _aim(self, points: Floats, origin: Floats) -> Floats:
+        """Directions inside, by Newton's method: in t = k/√(m² − k²) of a flat port, k Snell's invariant, m the least
+        index; in the angle t to the radius of a dome."""
+        flat, n, outer = self.shape == "flat", self.index, self.radius + self.thickness
+        z = origin - np.array(self.centre)
+        d = 0.0 if flat else float(np.linalg.norm(z))
+        axis = np.array(self.normal) if flat else z / d if d > 0.0 else np.array([0.0, 0.0, 1.0])
+        y = points - (origin if flat else np.array(self.centre))
+        along = y @ axis
+        across = y - along[..., None] * axis
+        aside, r = np.linalg.norm(across, axis=-1), np.linalg.norm(y, axis=-1)
+        sideways = across / np.maximum(aside, 1e-300)[..., None]
+        if flat:
+            inside = self.distance - origin @ axis
+            water = along - inside - self.thickness
+            h: list[Any] = [inside, self.thickness, np.where(water > 0.0, water, np.nan)]
+            layers = (n[0], n[1] if self.thickness > 0.0 else n[0], n[2])
+            t, goal, m = np.zeros_like(aside), aside, min(layers)
+        else:
+            t, goal = np.arctan2(aside, along - d), np.arctan2(aside, along)
+            faces = ((n[0] * self.radius, -1.0), (n[1] * self.radius, 1.0), (n[1] * outer, -1.0), (n[2] * outer, 1.0))
+            faces += ((n[2] * np.where(r > outer, r, np.nan), -1.0),)
         for _ in range(_STEPS):
-            roots = [np.sqrt(k * k + (k - m) * (k + m) * t * t) for k in n]
-            value = np.sum([m * t * d / root for d, root in zip(h, roots, strict=True)], axis=0)
-            slope = np.sum([m * d * k * k / root**3 for d, k, root in zip(h, n, roots, strict=True)], axis=0)
-            step = (aside - value) / slope
+            if flat:
+                roots = [np.sqrt(k * k + (k - m) * (k + m) * t * t) for k in layers]
+                value = np.sum([m * t * d / root for d, root in zip(h, roots, strict=True)], axis=0)
+                slope = np.sum([m * d * k * k / root**3 for d, k, root in zip(h, layers, roots, strict=True)], axis=0)
+            else:
+                p = n[0] * d * np.sin(t)
+                value = t + sum(sign * np.arcsin(p / size) for size, sign in faces)
+                slope = 1.0 + n[0] * d * np.cos(t) * sum(sign / np.sqrt(size * size - p * p) for size, sign in faces)
+            step = (goal - value) / slope
             t = t + step
             if not (np.abs(step) > _CONVERGED * (1.0 + t)).any():
                 break
-        sine = m / n[0] * t / np.sqrt(1.0 + t * t)
-        sideways = across / np.maximum(aside, 1e-300)[..., None]
-        return sine[..., None] * sideways + np.sqrt(1.0 - sine * sine)[..., None] * normal
-
-    def _start_dome(self, points: Floats, origin: Floats) -> Floats:
-        """Directions inside, by Newton's method in the angle i to the radius."""
-        z = origin - np.array(self.centre)
-        d = float(np.linalg.norm(z))
-        y = points - np.array(self.centre)
-        r = np.linalg.norm(y, axis=-1)
-        to_point = y / r[..., None]
-        e = z / d if d > 0.0 else np.array([0.0, 0.0, 1.0])
-        cosine = to_point @ e
-        across = to_point - cosine[..., None] * e
-        sine = np.linalg.norm(across, axis=-1)
-        beta = np.arctan2(sine, cosine)
-        n, outer = self.index, self.radius + self.thickness
-        r = np.where(r > outer, r, np.nan)
-        faces = ((n[0] * self.radius, -1.0), (n[1] * self.radius, 1.0), (n[1] * outer, -1.0), (n[2] * outer, 1.0))
-        i = np.arctan2(r * sine, r * cosine - d)
-        for _ in range(_STEPS):
-            p = n[0] * d * np.sin(i)
-            angle, slope = i - np.arcsin(p / (n[2] * r)), -1.0 / np.sqrt((n[2] * r) ** 2 - p * p)
-            for size, sign in faces:
-                angle = angle + sign * np.arcsin(p / size)
-                slope = slope + sign / np.sqrt(size * size - p * p)
-            step = (beta - angle) / (1.0 + n[0] * d * np.cos(i) * slope)
-            i = i + step
-            if not (np.abs(step) > _CONVERGED).any():
-                break
-        sideways = across / np.maximum(sine, 1e-300)[..., None]
-        return np.cos(i)[..., None] * e + np.sin(i)[..., None] * sideways
+        sine = m / n[0] * t / np.sqrt(1.0 + t * t) if flat else np.sin(t)
+        cosine = np.sqrt(1.0 - sine * sine) if flat else np.cos(t)
+        return cosine[..., None] * axis + sine[..., None] * sideways
 
     def apparent_distance(self, point: ArrayLike) -> float:
         """Distance from the lens centre at which it sees a point in the water, by the spread of its rays there [m].

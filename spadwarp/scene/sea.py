@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -147,7 +148,8 @@ class Surface(Section):
         if waves is None:
             return None
         if waves.heights is not None:
-            return _read_heights(waves.heights, waves.size)
+            path = waves.heights
+            return _read_heights(path, waves.size, os.path.getmtime(path) if os.path.exists(path) else 0.0)
         total = self._slopes_along(self.wave_axis)
         return _draw_waves(self.wind or 0.0, total, waves)
 
@@ -241,7 +243,8 @@ def _largest_number(
     return float(length.ravel()[order[kept - 1]]) if kept else 0.0
 
 
-def _read_heights(path: str, size: float) -> WaveField:
+@lru_cache(2)
+def _read_heights(path: str, size: float, changed: float) -> WaveField:
     where = f"surface.waves.heights = {path!r}"
     try:
         heights = np.load(existing_file(Path(path)), allow_pickle=False)

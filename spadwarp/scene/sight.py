@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.scene.camera import Camera, pixel_directions, to_camera
+from spadwarp.scene.camera import Camera, pixel_directions, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
-from spadwarp.scene.pose import rotation_matrix
+from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.scan import shots_of
 from spadwarp.scene.scene import Scene, camera_port, laser_port
+from spadwarp.scene.sea import Surface
 from spadwarp.values import path_from_time
 
 __all__: list[str] = []
@@ -29,8 +30,6 @@ Floats = NDArray[np.float64]
 # Nearest to a port that is asked for [m], and steps of Newton's method, which has converged after a few.
 _LEAST = 1e-9
 _STEPS = 30
-
-
 _GAUSSIAN_EDGE = 1.5  # tan of the outermost angle over tan θ: holds 98.9 % of a gaussian beam
 
 
@@ -342,7 +341,9 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
     """What is in the housing or the window of the camera's port and is not meant for it, a laser that shines through no
     port, or parts of triangles: the field, and a text about it."""
     port, camera, laser = camera_port(scene), scene.camera, scene.beam
-    if port is None or scene.surface is not None or len(set(port.index)) == 1:
+    if scene.surface is not None:
+        return _within_waves(scene, scene.surface)
+    if port is None or len(set(port.index)) == 1:
         return None
     radius = 0.0 if camera.pinhole else camera.aperture_radius
     wide = 0.5 * camera.pixel_tangent * math.hypot(camera.width, camera.height)
@@ -364,6 +365,17 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
         return None
     place = inside[0].round(6).tolist()
     return "camera.port", f"a target is within the housing or the window, at {place} m in the camera's frame"
+
+
+def _within_waves(scene: Scene, surface: Surface) -> tuple[str, str] | None:
+    """As `within_port`, for a lens or a laser as near to the mean plane as the waves of the sea are high."""
+    waves = None if scene.scan.mode == "trajectory" else surface.wave_field
+    ends = {"camera": scene.camera.position, "laser": vector_of(to_world(scene.camera, scene.beam.position))}
+    for section, place in ends.items() if waves is not None else ():
+        if abs(height := surface.height_of(place)) <= waves.amplitude:
+            text = f"{list(place)} is {height:.4g} m from the mean plane of the surface"
+            return f"{section}.position", f"{text}, whose waves are up to {waves.amplitude:.3g} m high"
+    return None
 
 
 def _spread(triangles: Floats) -> Floats:

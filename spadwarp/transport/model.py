@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
@@ -29,7 +29,7 @@ from spadwarp.scene.sea import Surface
 from spadwarp.scene.sight import lines_of_sight, scan_axes, view_directions, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_scale
-from spadwarp.values import ConfigError, DeviceError
+from spadwarp.values import ArgumentError, ConfigError, DeviceError
 
 if TYPE_CHECKING:
     from spadwarp.mesh import TriangleMesh
@@ -74,7 +74,8 @@ def build_model(
         _check_gate(scene)
     if scale is None:
         scale = tally_scale(scene, mesh) if camera else 1.0
-    lens, limits = _camera(scene, mesh), _limits(scene, device, camera)
+    sea = None if scene.surface is None else _sea(scene, device)
+    lens, limits = _camera(scene, mesh, sea), _limits(scene, device, camera)
     # Behind a port, light bends: the map of what the lens sees for certain is of straight lines to a lens at rest.
     straight = scene.camera.port is None and scene.surface is None and scene.scan.mode != "trajectory"
     mapped = lens if camera and straight else None
@@ -87,8 +88,8 @@ def build_model(
     if derivatives:
         grid = parts.get("layers", sk.Layers()).grid
         parts["derivatives"] = make_derivatives(scene, derivatives, mesh, scale, device, grid)
-    if scene.surface is not None:
-        parts["sea"] = _sea(scene, device)
+    if sea is not None:
+        parts["sea"] = sea
     if scene.polarised:
         parts |= _polarised(scene, mesh, scale, device)
     if scene.medium.inelastic:
@@ -402,15 +403,10 @@ def _laser(scene: Scene, device: wp.Device) -> Any:
     return _filled(laser, profile=sk.LASER_PROFILES.index(beam.profile), radius=beam.beam_radius)
 
 
-def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
+def _camera(scene: Scene, mesh: TriangleMesh | None, sea: Any) -> Any:
     camera = scene.camera
-    lens = _filled(
-        sk.Camera(),
-        width=camera.width,
-        height=camera.height,
-        pixel_tangent=scene.receiver.pixel_tangent,
-        aperture_area=camera.aperture_area,
-    )
+    size, area = {"width": camera.width, "height": camera.height}, camera.aperture_area
+    lens = _filled(sk.Camera(), **size, pixel_tangent=scene.receiver.pixel_tangent, aperture_area=area)
     if (focus := focus_distance(scene, mesh)) is not None:
         lens.aperture_radius, lens.inverse_focus = camera.aperture_radius, 1.0 / focus
     if _lens(scene) is not sk.PLAIN:
@@ -424,7 +420,7 @@ def _camera(scene: Scene, mesh: TriangleMesh | None) -> Any:
         port = mean_plane(scene, from_below=True)
     if port is not None:
         of_port = _plane_of_shots if scene.scan.mode == "trajectory" else port_parameters
-        lens.port = of_port(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus)
+        lens.port = of_port(scene, port, (0.0, 0.0, 0.0), lens.aperture_radius, lens.inverse_focus, sea)
     return lens
 
 
@@ -483,9 +479,9 @@ def port_kind(port: PortGeometry | None) -> Any:
 
 
 def port_parameters(
-    scene: Scene, port: PortGeometry, origin: tuple[float, float, float], aperture_radius: float, inverse_focus: float
+    scene: Scene, port: PortGeometry, origin: Any, aperture_radius: float, inverse_focus: float, sea: Any = None
 ) -> Any:
-    """A port as the kernels take it."""
+    """A port as the kernels take it; `sea`: what it is the mean plane of."""
     left, top, right, bottom = view_box(scene.receiver)
     corners = np.array([[x, y, 1.0] for x in (left, right) for y in (top, bottom)])
     normal = np.array(port.normal if port.shape == "flat" else (0.0, 0.0, 1.0))
@@ -496,20 +492,10 @@ def port_parameters(
     choices |= {"origin": origin, "aperture_radius": aperture_radius, "largest_angle": min(angle, 1.55)}
     try:
         if port.shape == "flat":
-            choices |= {"distance": port.distance, "normal": port.normal}
-            return sk.make_flat_port(**choices, **({} if scene.surface is None else _roughness(scene.surface)))
+            return sk.make_flat_port(**choices, distance=port.distance, normal=port.normal, sea=sea)
         return sk.make_dome_port(radius=port.radius, centre=port.centre, **choices)
     except sk.ArgumentError as error:
         raise ConfigError(f"camera.port or laser.port: {error}", source=scene.source) from None
-
-
-def _roughness(surface: Surface) -> dict[str, Any]:
-    """What a port that stands for a sea's mean plane allows for."""
-    if (field := surface.wave_field) is None:
-        return {"slope_variance": max(surface.slope_variances)}
-    # Facets about waves hold no more than all slopes do; together with the steepest wave that is a bound.
-    steepest = sk.steepest_facet(field.heights, field.size)
-    return {"slope_variance": max(surface.slope_variances), "amplitude": field.amplitude, "steepest": steepest}
 
 
 def _lens(scene: Scene) -> Any:
@@ -611,7 +597,7 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
     """Refuses a laser or a target within the camera's port; a camera or a laser, or the way out of its port, outside
     the domain; and a lens or a beam that reaches through a face that reflects: beyond it nothing is mirrored."""
     corners = np.zeros((0, 3, 3)) if mesh is None or scene.camera.port is None else mesh.vertices[mesh.faces]
-    if camera and scene.surface is None and (found := within_port(scene, corners.astype(np.float64))):
+    if (camera or scene.surface) and (found := within_port(scene, corners.astype(np.float64))):
         raise ConfigError(": ".join(found), source=scene.source)
     beam, lens, domain = scene.beam, scene.camera, scene.domain
     radius = beam.beam_radius if beam.profile == "collimated" else 0.0
@@ -619,11 +605,6 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
     if scene.surface is not None and scene.scan.mode == "trajectory":
         ends, camera = [], False  # the places are those of the shots
         _check_shots(scene, scene.surface)
-    elif scene.surface is not None and (waves := scene.surface.wave_field) is not None:
-        for section, place in {"camera": lens.position, "laser": vector_of(to_world(lens, beam.position))}.items():
-            if abs(height := scene.surface.height_of(place)) <= waves.amplitude:
-                text = f"{section}.position is {height:.4g} m from the mean plane of the surface"
-                raise ConfigError(f"{text}, whose waves are up to {waves.amplitude:.3g} m high", source=scene.source)
     if camera:
         radius, origin = 0.0 if lens.pinhole else lens.aperture_radius, (0.0, 0.0, 0.0)
         ends.append(("camera", camera_port(scene), origin, (0.0, 0.0, 1.0), "aperture_diameter", radius))
@@ -768,23 +749,40 @@ def _rays_by_sea(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[
     return (origin, view), (start, direction, lead)
 
 
-def wave_errors(scene: SceneLike, *, device: str | None = None) -> NDArray[np.float64]:
+def wave_errors(scene: SceneLike, depth: ArrayLike | None = None, *, device: str | None = None) -> NDArray[np.float64]:
     """By how much depths by the mean plane of the sea are too large, `[H, W]` [m]: of light that goes from the lens by
-    the waves before each pixel to a target and back; NaN where none is seen below them.
+    the waves before each pixel to a point in the water and back.
 
-    Raises `ConfigError`: a scene without `surface.waves`, or with a camera in the water.
+    `depth`: by the mean plane, such as `Result.depth` finds them, `[H, W]` [m]; less their errors they are depths by
+    the true surface. By default those of the targets, NaN where none is seen below the waves.
+
+    Raises `ConfigError`: a scene without `surface.waves`, or with a camera in the water; `ArgumentError`: depths of
+    another shape.
     """
     scene = as_scene(scene)
     plane = camera_port(scene)
     if scene.surface is None or scene.surface.waves is None or plane is None:
         raise ConfigError("surface.waves, and a camera in the air above them, are needed", source=scene.source)
     model = build_model(scene, pick_device(device), build_mesh(scene), camera=False)
-    truth, lead = trace_truth(scene, model), _rays_by_sea(scene, model)[1][2]
-    in_water = truth.range - lead
-    path = 2.0 * (lead * plane.group_index[0] / plane.group_index[2] + in_water)
+    (origin, _), (start, direction, lead) = _rays_by_sea(scene, model)
+    in_air = lead * plane.group_index[0] / plane.group_index[2]  # as a length in water
     lines = dataclasses.replace(lines_of_sight(scene), laser=np.zeros(3), laser_port=plane)
-    depth = lines.depth_from_range(lines.range_from_path(np.where(in_water > 0.0, path, np.nan)))
-    return np.asarray(depth - truth.depth, np.float64)
+    if depth is None:
+        truth = trace_truth(scene, model)
+        in_water, actual = truth.range - lead, truth.depth
+        path = np.where(in_water > 0.0, 2.0 * (in_air + in_water), np.nan)
+        found = lines.depth_from_range(lines.range_from_path(path))
+    else:
+        found = np.asarray(depth, np.float64)
+        if found.shape != lead.shape:
+            raise ArgumentError(f"depth has the shape {found.shape}; that of the image, {lead.shape}, is needed")
+        in_water = 0.5 * lines.path_from_range(lines.range_from_depth(found)) - in_air
+        axis = np.array([0.0, 0.0, 1.0])
+        if scene.scan.mode == "trajectory":
+            shots, _, axes = shot_poses(scene)
+            axis = axes[shots.number][..., 2]
+        actual = ((start - origin + np.where(in_water > 0.0, in_water, np.nan)[..., None] * direction) * axis).sum(-1)
+    return np.asarray(found - actual, np.float64)
 
 
 def first_hits(

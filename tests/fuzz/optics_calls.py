@@ -16,6 +16,7 @@ def valid_calls(mesh: wp.Mesh) -> dict:
     grid = sk.make_grid(cells, 0.5 * np.ones_like(cells), size=(2.0, 2.0, 6.0), centre=(0, 0, 4.0), device="cpu")
     flat = dict(distance=0.05, thickness=0.01, normal=(0.0, 0.0, 1.0), **window)
     lens = dict(aperture_radius=0.0, largest_angle=0.6)
+    sea = dict(variances=(0.01, 0.02), index=1.34, normal=(0.0, 0.0, -1.0), height=-3.0)
     calls = {
         "make_blocks": (sk.make_blocks, dict(grid=grid, shape=(2, 1, 1), scale=[1.0, 2.0])),
         "make_boundary": (sk.make_boundary, dict(low=[0.75, 0.0, 0.0], high=[0.0, 0.0, 0.0], device="cpu", **walls)),
@@ -24,10 +25,8 @@ def valid_calls(mesh: wp.Mesh) -> dict:
             faces=[0] * 12, blocks=None, device="cpu")),
         "make_dome_port": (sk.make_dome_port, dict(
             radius=0.08, thickness=0.01, centre=(0.0, 0.0, 0.01), origin=(0.0, 0.0, 0.0), **window, **lens)),
-        "make_flat_port": (sk.make_flat_port, flat | lens | dict(slope_variance=0.01)),
-        "make_sea": (sk.make_sea, dict(
-            variances=(0.01, 0.02), index=1.34, normal=(0.0, 0.0, -1.0), height=-3.0, along=(1.0, 0.0, 0.0),
-            delay=0.73, extinction=0.1)),
+        "make_flat_port": (sk.make_flat_port, flat | lens | dict(sea=sk.make_sea(**sea))),
+        "make_sea": (sk.make_sea, sea | dict(along=(1.0, 0.0, 0.0), delay=0.73, extinction=0.1)),
         "slope_variances": (sk.slope_variances, dict(wind=5.0, by_direction=True)),
         "make_polarisation": (sk.make_polarisation, dict(
             laser=(1.0, 1.0, 0.0, 0.0), matrix=lambda c: np.tile([0.0, 1, 1, 0, 1], (len(c), 1)),

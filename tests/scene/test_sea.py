@@ -14,7 +14,7 @@ from spadwarp.scene.scene import mean_plane
 from spadwarp.scene.sea import jonswap, peak_length
 from spadwarp.scene.sight import depth_from_time, lines_of_sight
 from spadwarp.transport import wave_errors
-from spadwarp.values import ConfigError
+from spadwarp.values import ConfigError, FileError
 
 BAY = {"surface": {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, -1.0], "wind": 5.0}}
 BOTTOM = {"builtin": "plane", "size": [40.0, 40.0], "translation": [0.0, 0.0, 8.0], "reflectance": 0.4}
@@ -218,5 +218,23 @@ def test_depths_by_the_mean_plane_are_wrong_by_the_waves(tmp_path):
     )
     expected = 0.1 * (1.0 - one.surface.air(532.0)[1] / 1.3638)
     assert wave_errors(one, device="cpu")[0, 0] == pytest.approx(expected, rel=2e-3)
+    assert wave_errors(one, [[8.0 + expected]], device="cpu")[0, 0] == pytest.approx(expected, rel=2e-3)
     with pytest.raises(ConfigError, match=r"surface\.waves, and a camera in the air"):
         wave_errors(scene(**BAY, targets=[BOTTOM]), device="cpu")
+
+
+def test_a_file_of_heights_is_opened_by_check(tmp_path):
+    """One that is missing or damaged is no valid scene; one that changed is read anew."""
+    path = tmp_path / "swell.npy"
+    waves = {"waves": {"heights": str(path), "size": 8.0}}
+    one = scene(**{**BAY, "surface": {**BAY["surface"], **waves}}, targets=[BOTTOM])
+    with pytest.raises(FileError, match=r"surface\.waves\.heights = '.*swell\.npy': "):
+        spadwarp.check(one)
+    np.save(path, np.tile([0.0, 0.1, 0.0, -0.1], (4, 1)))
+    spadwarp.check(one)
+    assert one.surface.wave_field.amplitude == 0.1
+    np.save(path, np.zeros((4, 8)))
+    assert one.surface.wave_field.amplitude == 0.0
+    path.write_bytes(b"\x93NUMPY")
+    with pytest.raises(FileError, match="damaged or not readable"):
+        spadwarp.check(one)

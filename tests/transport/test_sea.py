@@ -154,7 +154,7 @@ def test_waves_and_shots_stay_on_their_side():
     for sections, text in (
         (
             {"surface": low, "laser": {"position": [0.0] * 3}},
-            r"camera\.position is 0\.1 m .* waves are up to 0\.\d+ m high",
+            r"camera\.position: .* is 0\.1 m .* waves are up to 0\.\d+ m high",
         ),
         (
             {"surface": {"waves": {**WAVES, "shortest": 0.0625}}},

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -468,9 +468,7 @@ def make_flat_port(
     origin: Sequence[float] = (0.0, 0.0, 0.0),
     aperture_radius: float = 0.0,
     largest_angle: float = 1.5,
-    slope_variance: float = 0.0,
-    amplitude: float = 0.0,
-    steepest: float = 0.0,
+    sea: Any = None,
 ) -> Port:
     """The parameters of a plane window.
 
@@ -482,20 +480,20 @@ def make_flat_port(
         origin: The lens centre, or the position of a laser, which must be inside [m].
         aperture_radius: Of the camera [m]: all of the lens must be inside.
         largest_angle: Between the normal and any ray of the view, inside, in [0, pi/2) [rad].
-        slope_variance: Of facets of a sea's surface in place of a window, along the axis where it is largest.
-        amplitude: Bound of the heights of resolved waves [m]; all of the lens must be farther away.
-        steepest: Bound of the slopes of resolved waves.
+        sea: The surface of a sea, see `make_sea`, if the port is its mean plane; all of the lens must be farther away
+            than its waves are high.
 
     Raises:
         ArgumentError: A number out of its range.
     """
     check.number("distance", distance, "(-inf, inf)")
-    check.number("slope_variance", slope_variance, "[0, 0.5]")
-    check.within("[0, 1e4]", amplitude=amplitude, steepest=steepest)
     check.vector("normal", normal, unit=True)
+    if sea is not None and not hasattr(sea, "waves"):
+        raise ArgumentError(f"sea = {sea!r} is not the surface of a sea")
     port = _port(thickness, index, group_index, origin, aperture_radius, largest_angle)
     tilt = aperture_radius * math.hypot(normal[0], normal[1])
     inside = distance - sum(x * n for x, n in zip(origin, normal, strict=True))
+    amplitude = 0.0 if sea is None else max(sea.waves.high, -sea.waves.low)
     if tilt >= inside - amplitude:
         waves = f", whose waves are up to {amplitude:.3g} m high" if amplitude > 0.0 else ""
         raise ArgumentError(
@@ -509,7 +507,10 @@ def make_flat_port(
     tangent = max(1.0, slopes[0][1]) * math.tan(largest_angle)  # the largest inside and in the window
     longest = min(math.hypot(1.0, tangent), _FAR)
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
-    _widen(port, _STEEPEST * math.sqrt(slope_variance) + steepest, largest_angle)
+    if sea is not None:
+        # Facets about waves hold no more than all slopes do; together with the steepest wave that is a bound.
+        deviation = math.sqrt(0.5) * max(*sea.slope, *sea.waves.spread)
+        _widen(port, _STEEPEST * deviation + sea.waves.steepest, largest_angle)
     if amplitude > 0.0:
         between = 2.0 * amplitude / max(math.cos(largest_angle), 0.02)
         port.amplitude, port.straight = amplitude, between * math.sin(largest_angle)

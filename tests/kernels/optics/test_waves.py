@@ -164,7 +164,7 @@ def test_ways_through_waves_to_the_lens(aside, depth):
 def test_a_view_is_widened_by_the_steepest_wave():
     """By nothing without slopes, by facets, and more by facets that stand on waves."""
     index = {"distance": 5.0, "index": (1.0, 1.0, INDEX), "group_index": (1.0, 1.0, INDEX), "largest_angle": 0.3}
-    facets = {"slope_variance": 0.0143}
-    window, calm, rough = (sk.make_flat_port(**index, **more) for more in ({}, facets, {**facets, "steepest": 0.48}))
+    seas = None, sea_of(np.zeros((8, 8)), 0.03), sea_of(ripples(0.005), 0.03)
+    window, calm, rough = (sk.make_flat_port(**index, sea=sea) for sea in seas)
     assert window.margin == 0.0 < calm.margin < rough.margin
     assert window.late < calm.late < rough.late
