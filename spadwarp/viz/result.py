@@ -593,9 +593,10 @@ def draw_denoised(
     With the truth also that, the error, and in colours of their own the pixels in which a target was missed or
     invented, and their parts of the target and of the water: NaN stands for no target. `width`: of the picture [inch].
     """
-    known = truth is not None and np.isfinite(truth).any()
-    scale = truth if truth is not None and known else denoised if np.isfinite(denoised).any() else noisy
-    low, high = shown_limits(scale, beyond=0.0 if known else 1.0, margin=0.05 * known)
+    if truth is not None and np.isfinite(truth).any():
+        low, high = style.target_limits(truth, denoised)
+    else:
+        low, high = shown_limits(denoised if np.isfinite(denoised).any() else noisy, beyond=1.0)
     limits = max(low, gate[0] - 1.0), min(high, gate[1] + 1.0)
     panels = Panels(noisy.shape, 2 if truth is None else 4, width=width)
     panels.show_depth(noisy, "Input", limits)
