@@ -51,7 +51,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
 
     Of budgets those of `draw_budget`; of plans pulses for the depth error, bound, largest range. Linear axes begin
     at 0, and a curve that varies by less than a tenth has its span written into the panel. Dashed: a bound that is not
-    reached, since more than 1 % of the fits would be outliers. A cross at the top: out of reach. Returns the figure of
+    reached, since more than 1 % of the fits would be outliers. Hollow: of a gate that was moved to the return, which
+    leaves the light of near water out. A cross at the top: out of reach. Returns the figure of
     this width [inch], and writes it where `path` is given.
     """
     names = list(_OF_BUDGETS)
@@ -66,6 +67,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     groups = list(dict.fromkeys(map(repr, others)))
     budgets = isinstance(curves.rows[0], BudgetRow)
     missed = curves.column("outlier_probability") > OUTLIERS if budgets else np.zeros(len(at), bool)
+    moved = curves.column("gate_moved").astype(bool) if budgets else np.zeros(len(at), bool)
     for axis, name in zip(axes, names, strict=True):
         label, scale, (least, most) = _COLUMNS[name]
         y = curves.column(name) * scale
@@ -84,6 +86,8 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
                 axis.plot(place, shown, "--", color=style_of["color"], linewidth=0.8)
                 shown = np.where(missed[own], np.nan, shown)
             axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, markevery=every, **style_of)
+            hollow = np.where(moved[own], shown, np.nan)
+            axis.plot(place, hollow, "o", color=style_of["color"], markerfacecolor="white", markevery=every, zorder=3)
             if name == "sigma_depth" and curves.fields == ("range", "water"):
                 axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
             beyond, top = place[np.isinf(y[own])][::every], axis.get_xaxis_transform()
@@ -103,7 +107,9 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
     if missed.any():
         label = f"not reached: over {100 * OUTLIERS:g} % false peaks"
         axes[0].plot([], [], color="0.4", linestyle="--", linewidth=0.8, label=label)
-    if len(groups) > 1 or missed.any():
+    if moved.any():
+        axes[0].plot([], [], "o", color="0.4", markerfacecolor="white", label="gate moved to the return")
+    if len(groups) > 1 or missed.any() or moved.any():
         figure.key(axes, 2.3, title=", ".join(curves.fields[1:]))
     if path is not None:
         save(figure, path)
