@@ -25,6 +25,7 @@ from spadwarp.denoise.frames import (
 from spadwarp.denoise.histograms import features_of_histograms, target_bins, without_defects
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
 from spadwarp.frames.depth import arrival_time
+from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse
 from spadwarp.values import ArgumentError, SpadwarpWarning, check_choice, check_real
 
 __all__ = ["METHODS", "Estimate", "apply", "estimate"]
@@ -208,7 +209,9 @@ def detected(
     known = np.maximum(summed(np.broadcast_to(background, frames.shape[1:]).astype(np.float64)), 0.0)
     significance = np.empty(frames.shape[:-1], np.float32)
     options: dict[str, Any] = {"background": known, "level_known": level_known, "device": "cpu"}
-    options["irf"] = np.maximum(response, 0.0)  # which a convolution has rounded below
+    half = np.flatnonzero(response >= 0.5 * np.max(response))
+    width = (half[-1] - half[0] + 1) * (1.0 - 1e-9)  # bins, and not one more by rounding
+    options["irf"] = InstrumentResponse(sigma=width * 1e-12 / FWHM_PER_SIGMA)
     for cube, out in zip(frames, significance, strict=True):
         arrival_time(summed(cube.astype(np.int64)), gate_start=0.0, bin_width=1e-12, significance=out, **options)
     significance = significance.reshape(found.depth.shape)

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.device import pick_device
-from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse, detector_response
+from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.result.file import ResultLike, as_result
 from spadwarp.result.result import Result
 from spadwarp.scene import noise_rate
-from spadwarp.values import BIN_WIDTH, ArgumentError, check_choice, check_real, percent
+from spadwarp.values import BIN_WIDTH, ArgumentError, check_choice, check_real, percent, shown
 
 __all__ = ["crlb", "crlb_from_histogram", "information_from_histogram"]
 
@@ -49,7 +49,7 @@ def information_from_histogram(
     background_cube: ArrayLike,
     *,
     bin_width: float,
-    irf: InstrumentResponse | float | ArrayLike | None = None,
+    irf: InstrumentResponse | None = None,
     law: Literal["poisson", "first_photon"] = "poisson",
     signal_variance: ArrayLike | None = None,
     signal_halves: tuple[ArrayLike, ArrayLike] | None = None,
@@ -62,8 +62,8 @@ def information_from_histogram(
         signal_cube: Expected signal detections per pulse and bin, `[..., T]`, ≥ 0.
         background_cube: The same for what does not move with the target: a number, `[T]`, or `signal_cube`'s shape.
         bin_width: [s], > 0.
-        irf: Response still to be applied to both cubes: an `InstrumentResponse`, the FWHM of a Gaussian [s], or one
-            value per bin (odd number, centred); None if they hold it already. A bin's light is spread evenly over it.
+        irf: Response still to be applied to both cubes; None if they hold it already. A bin's light is spread evenly
+            over it.
         law: `"poisson"`: every photon counts. `"first_photon"`: the first of a pulse, pile-up included.
         signal_variance: Square of the standard error of `signal_cube`, of the same shape, where it is a Monte Carlo
             estimate, whose noise would count as information: a slope that is a sum of bins with weights w has Σ w² var
@@ -88,7 +88,14 @@ def information_from_histogram(
     _check_cube("background_cube", background, background.shape)
     bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
     check_choice("law", law, ("poisson", "first_photon"))
-    taps, slope_taps = _response_taps(irf, bin_width)
+    # Response per bin, and the derivative by the delay in bins of what one bin's photons leave in the others.
+    taps, slope_taps = np.ones(1), np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0  # of fourth order
+    if irf is not None:
+        if not isinstance(irf, InstrumentResponse):
+            raise ArgumentError(f"irf = {shown(irf)} is not an InstrumentResponse")
+        if not irf.is_smooth:
+            raise ArgumentError("irf has no width: a step has no derivative")
+        taps, slope_taps = irf.per_bin(bin_width), irf.per_bin_slope(bin_width)
     device = pick_device(device)
     rows = np.ascontiguousarray(background.reshape(-1, bins) if background.ndim else background.reshape(1, 1))
     inputs: list[Any] = [wp.array(cube, dtype=wp.float32, device=device) for cube in (signal.reshape(-1, bins), rows)]
@@ -211,22 +218,3 @@ def crlb(
     if bound.problem is not None:
         raise ArgumentError(f"result: {bound.problem}")
     return bound.sigma
-
-
-def _response_taps(irf: InstrumentResponse | float | ArrayLike | None, bin_width: float) -> tuple[Map, Map]:
-    """Response per bin, and the derivative by the delay in bins of what one bin's photons leave in the others."""
-    stencil = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / 12.0  # fourth order
-    if irf is None:
-        return np.ones(1), stencil
-    if not isinstance(irf, InstrumentResponse) and np.ndim(irf) == 0:
-        fwhm = check_real("irf", irf, BIN_WIDTH)
-        irf = InstrumentResponse(sigma=fwhm / FWHM_PER_SIGMA)
-    if isinstance(irf, InstrumentResponse):
-        if not irf.is_smooth:
-            raise ArgumentError("irf has no width: a step has no derivative")
-        return irf.per_bin(bin_width), irf.per_bin_slope(bin_width)
-    taps = np.asarray(irf, np.float64)
-    if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and (taps >= 0).all() and taps.sum() > 0):
-        raise ArgumentError(f"irf has shape {taps.shape}; an odd number of values ≥ 0 is needed")
-    taps = taps / taps.sum()
-    return taps, np.convolve(taps, stencil)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
 from spadwarp.frames.response import InstrumentResponse
@@ -63,7 +63,7 @@ def arrival_time(
     gate_start: float,
     bin_width: float,
     method: Method = "centroid",
-    irf: Any = None,
+    irf: InstrumentResponse | None = None,
     device: Any = None,
     background: Any = None,
     level_known: bool = True,
@@ -84,8 +84,8 @@ def arrival_time(
             bins without one). `"matched"`: log-matched filter, argmax over μ of Σ n_k ln h_k(μ): maximum likelihood
             where there is no background. `"likelihood"`: argmax over μ and the signal S of
             Σ n_k ln(S·h_k(μ) + B_k) − S·Σ h_k(μ), B = `background`. The last two resolve fractions of a bin.
-        irf: An `InstrumentResponse`, or an array of response per bin, whose time zero is then its mean. Needed by
-            `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its mode and its mean.
+        irf: The response. Needed by `"matched"` and `"likelihood"`; `"peak"` and `"centroid"` subtract its mode and its
+            mean.
         device: Warp device; default: where the array lies, for NumPy the first GPU or else the CPU.
         background: Expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
             number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
@@ -111,19 +111,21 @@ def arrival_time(
     filtered = method in ("matched", "likelihood")
     if irf is None and filtered:
         raise ArgumentError(
-            f"method = {method!r} needs an irf, the instrument response of the histogram: an InstrumentResponse, or an "
-            "array of response per bin. Histograms of `simulate` have none yet: `detect` adds it, or take 'centroid'"
+            f"method = {method!r} needs an irf, the instrument response of the histogram. Those of `simulate` have "
+            "none yet: `detect` adds it, or take 'centroid'"
         )
+    if not isinstance(irf, InstrumentResponse | None):
+        raise ArgumentError(f"irf = {shown(irf)} is not an InstrumentResponse")
     with in_torch_order(histogram, background):
         rows, shape = histogram_rows(histogram, name="histogram", device=device, dimensions=range(2, 16))
         frame, bins = shape[:-1], shape[-1]
         first, stop = (0, bins) if gate is None else _bins_of_gate(gate, gate_start, bin_width, bins)
         response, lowest_tap, half_width, offset, fwhm = None, 0, 3, 0.0, 2.0
         if irf is not None:
-            mean, mode, fwhm = _moments(irf, bin_width)
+            fwhm = irf.fwhm / bin_width
             half_width = max(1, int(np.ceil(1.5 * fwhm)))
-            offset = {"peak": mode, "centroid": mean}.get(method, 0.0)
-        if filtered:
+            offset = {"peak": irf.mode / bin_width, "centroid": irf.mean / bin_width}.get(method, 0.0)
+        if irf is not None and filtered:
             response, lowest_tap = _response_table(irf, bin_width, kernels.PHASES)
         known = None if background is None else _background_rows(background, rows, frame)
         options: dict[str, Any] = {"first": first, "stop": stop, "half_width": half_width, "lowest_tap": lowest_tap}
@@ -192,52 +194,13 @@ def _background_profile(rows: Any, first: int, stop: int, fwhm: float) -> Any:
     return wp.array(profile[None], dtype=wp.float32, device=rows.device)
 
 
-def _moments(irf: Any, bin_width: float) -> tuple[float, float, float]:
-    """Mean, mode and FWHM of the response [bins], relative to its time zero."""
-    if hasattr(irf, "cumulative"):
-        return irf.mean / bin_width, irf.mode / bin_width, irf.fwhm / bin_width
-    weights = _array_response(irf)
-    taps = np.arange(weights.size)
-    mean = float(weights @ taps)
-    top = np.flatnonzero(weights == weights.max())
-    half = np.flatnonzero(weights >= 0.5 * weights.max())
-    return 0.0, float(top.mean()) - mean, float(half[-1] - half[0] + 1)
-
-
-def _response_table(irf: Any, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:
+def _response_table(irf: InstrumentResponse, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:
     """Fraction of the response per bin for returns at every sub-bin phase, and the bin of the first tap."""
-    curve = None
-    if hasattr(irf, "cumulative"):
-        lower, upper = (edge / bin_width for edge in irf.support)
-    else:
-        weights = _array_response(irf)
-        zero = float(weights @ (np.arange(weights.size) + 0.5))
-        lower, upper = -zero, weights.size - zero
-        curve = _monotone_cubic(np.arange(weights.size + 1) - zero, np.concatenate([[0.0], np.cumsum(weights)]))
+    lower, upper = (edge / bin_width for edge in irf.support)
     lowest = int(np.floor(lower))
     taps = int(np.ceil(upper)) + 1 - lowest
     edges = lowest + np.arange(taps + 1)[None, :] - np.arange(phases)[:, None] / phases
-    below = irf.cumulative(edges * bin_width) if curve is None else curve(np.clip(edges, lower, upper))
-    return np.clip(np.diff(below, axis=1), 0.0, None), lowest
-
-
-def _array_response(irf: ArrayLike) -> NDArray[np.float64]:
-    weights = real_array("irf", irf, np.float64)
-    if weights.ndim != 1 or weights.size == 0:
-        raise ArgumentError(f"irf has shape {weights.shape}; one value per bin is needed")
-    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
-        raise ArgumentError("irf must be finite and not negative, and its sum larger than 0")
-    return weights / weights.sum()
-
-
-def _monotone_cubic(x: NDArray[np.floating], y: NDArray[np.floating]) -> Any:
-    """Cubic Hermite curve through increasing data that stays increasing (Fritsch and Butland 1984)."""
-    from scipy.interpolate import CubicHermiteSpline
-
-    rise = np.diff(y) / np.diff(x)
-    both = rise[:-1] * rise[1:]
-    inner = np.divide(2.0 * both, rise[:-1] + rise[1:], out=np.zeros_like(both), where=both > 0)
-    return CubicHermiteSpline(x, y, np.concatenate([[0.0], inner, [0.0]]))
+    return np.clip(np.diff(irf.cumulative(edges * bin_width), axis=1), 0.0, None), lowest
 
 
 # Depth

@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import real_array
 from spadwarp.io.arrays import read_npy
-from spadwarp.io.paths import file_problem
 from spadwarp.io.text import read_columns, read_text
 from spadwarp.scene import Detector, Laser
 from spadwarp.values import BIN_WIDTH, TIME, ArgumentError, ConfigError, FileError, check_integer, check_real, shown
@@ -205,40 +204,26 @@ def _gaussian_cumulative(t: Floats, sigma: float) -> Floats:
     return ndtr(t / sigma)
 
 
-def instrument_response(
-    *,
-    pulse_fwhm: float,
-    jitter_fwhm: float,
-    shape: Literal["gaussian", "exponentially_modified_gaussian"] | str | Path = "gaussian",
-    tail: float = 0.0,
-) -> InstrumentResponse:
-    """Pulse ⊗ jitter. Raises `ArgumentError`, which names the argument, or the file and the line.
+def instrument_response(*, pulse_fwhm: float, jitter_fwhm: float, tail: float = 0.0) -> InstrumentResponse:
+    """Pulse ⊗ jitter. Raises `ArgumentError`, which names the argument.
 
-    Args:
-        pulse_fwhm, jitter_fwhm: Of laser pulse and detector [s], ≥ 0; as Gaussians their squares add.
-        shape: `"gaussian"`; `"exponentially_modified_gaussian"`, with `tail`; or the path of a CSV file with columns
-            time_ps and value, a measured response (pulse included, so that the two widths are not used). The file's
-            time 0 is the arrival of the photon; lines that start with # and one line of names are skipped.
-        tail: Time constant of the exponential diffusion tail [s].
+    `pulse_fwhm`, `jitter_fwhm`: of laser pulse and detector [s], ≥ 0; as Gaussians their squares add. `tail`: time
+    constant of the exponential diffusion tail [s], 0: none.
     """
     for name, value in {"pulse_fwhm": pulse_fwhm, "jitter_fwhm": jitter_fwhm, "tail": tail}.items():
         check_real(name, value, "[0, 1e6] s")
-    if shape not in ("gaussian", "exponentially_modified_gaussian"):
-        if file_problem(shape) is not None:
-            name = repr(str(shape)) if len(str(shape)) < 300 else shown(str(shape))
-            raise ArgumentError(f"irf = {name} is neither a known shape nor a file")
-        return read_response(shape)
-    sigma = math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA
-    return InstrumentResponse(sigma=sigma, tail=0.0 if shape == "gaussian" else tail)
+    return InstrumentResponse(sigma=math.hypot(pulse_fwhm, jitter_fwhm) / FWHM_PER_SIGMA, tail=tail)
 
 
 def detector_response(detector: Detector, laser: Laser | None = None) -> InstrumentResponse:
-    """The instrument response of a scene's detector and laser pulse; without a laser, of the detector alone."""
+    """The instrument response of a scene's detector and laser pulse; without a laser, of the detector alone. That of a
+    file is of both."""
+    if detector.irf.lower().endswith(".csv"):
+        return read_response(detector.irf)
     return instrument_response(
         pulse_fwhm=0.0 if laser is None else laser.pulse_fwhm_ps * 1e-12,
         jitter_fwhm=detector.jitter_fwhm_ps * 1e-12,
-        shape=detector.irf,
-        tail=detector.irf_tail_ps * 1e-12,
+        tail=0.0 if detector.irf == "gaussian" else detector.irf_tail_ps * 1e-12,
     )
 
 

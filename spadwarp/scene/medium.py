@@ -158,10 +158,6 @@ class Constituent(PhaseLaw):
         return self.absorption + self.scattering
 
 
-RAMAN_SHIFT = 3400.0  # wavenumber of water's band, less at the new wavelength [1/cm]
-_RAMAN_DEPOLARISATION = 0.17
-
-
 class Inelastic(Section):
     """Light of the laser that the water gives off at another wavelength, as a channel of the result by this name."""
 
@@ -191,8 +187,7 @@ class Inelastic(Section):
     @property
     def anisotropy(self) -> float:
         """A of the phase function, ~ 1 + A cos²θ: of Raman scattering (1 − ρ)/(1 + 3ρ), ρ its depolarisation, 0.17."""
-        rho = _RAMAN_DEPOLARISATION
-        return (1.0 - rho) / (1.0 + 3.0 * rho) if self.process == "raman" else 0.0
+        return (1.0 - 0.17) / (1.0 + 3.0 * 0.17) if self.process == "raman" else 0.0
 
 
 class Water(Section):

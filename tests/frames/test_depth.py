@@ -18,7 +18,7 @@ from spadwarp.scene.pose import rotation_matrix
 from spadwarp.scene.sight import lines_of_camera
 
 GATE = dict(gate_start=100e-9, bin_width=50e-12)
-IRF = np.exp(-0.5 * ((np.arange(15) - 7) / 2.0) ** 2)
+IRF = spadwarp.frames.InstrumentResponse(sigma=2.0 * 50e-12)
 
 
 DELAYS = np.array([20.25, 33.5, 41.0, np.nan])  # of four pixels [bins]; one has no light
@@ -74,8 +74,7 @@ def test_a_gate_leaves_out_what_lies_before_it():
         ({"background": np.zeros(7)}, r"background has shape \(7,\)"),
         ({"background": -1.0}, "background holds a negative"),
         ({"gate": (0.0, 1e-9)}, "gate = "),
-        ({"irf": [-1.0, 2.0], "method": "matched"}, "irf must be"),
-        ({"irf": np.ones((2, 2)), "method": "matched"}, "irf has shape"),
+        ({"irf": [1.0, 2.0], "method": "matched"}, "irf = .* is not an InstrumentResponse"),
     ],
 )
 def test_wrong_input_is_named(changes, message):
