@@ -201,6 +201,7 @@ def fill_missing(image: NDArray[np.float32], otherwise: float) -> NDArray[np.flo
 _BINS = 200  # into which a gate is divided
 _NEAR = (0.01, 0.04)  # parts of the gate within which two depths agree, on flat surfaces and on steep ones
 _AGREEING = 4  # of the 24 pixels around a pixel
+_CLUSTER = 5  # pixels that agree by chance agree together
 _KEPT = 0.7  # a gate is narrowed only to less than this part of its width
 
 
@@ -213,6 +214,7 @@ def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Ten
     those of backscatter would by chance, and more would be noticed.
     """
     import torch
+    import torch.nn.functional as F
 
     reported = (depth >= 0.0) & (depth < 1.0)
     inside = torch.where(reported, depth, torch.nan)
@@ -222,9 +224,14 @@ def gates_of_target(depth: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Ten
     pixels = _sums(one, place)
 
     def unnoticed(observed: Tensor, expected: Tensor) -> Tensor:
-        """How many bins can be left out from the first on, `[N]`."""
-        more = observed.cumsum(1) > expected.cumsum(1) + 2.0 * expected.cumsum(1).sqrt() + 2.0
-        return torch.where(more.any(dim=1), more.int().argmax(dim=1), _BINS)
+        """How many bins there are before the first that begin an excess, `[N]`: a cumulative sum with resets."""
+        total = F.pad(expected.cumsum(1), (1, 0))
+        excess = F.pad((observed - 1.1 * expected).cumsum(1), (1, 0))
+        least, before = excess.cummin(1)
+        deviation = (_CLUSTER * (total - total.gather(1, before))).clamp_min(0.0).sqrt()
+        noticed = excess - least > 2.0 * deviation + 2.0
+        begin = before.gather(1, noticed.int().argmax(dim=1, keepdim=True))[:, 0]
+        return torch.where(noticed.any(dim=1), begin, _BINS)
 
     first, stop = (torch.full_like(share, bin) for bin in (_BINS, 0))
     for near in _NEAR[::-1]:
