@@ -2,8 +2,8 @@
 
 Each scene has open water, a wall or a slanted floor, and up to ten things before it: plates, ellipsoids, rods, ropes,
 nets, ladders, plants, chains, rocks, blocks, slabs, sieves and waves, at depths of their own or close together as parts
-of one body, with a texture of reflectance. Half of the scenes are up to four times farther away, and smaller; in some
-things are up to three times as steep. The shapes of `spadwarp.evaluation` and the built-in meshes are not among them.
+of one body, with a texture of reflectance. The shapes of `spadwarp.evaluation` and the built-in meshes are not among
+them.
 
 A noisy frame is never stored. Each step draws crops, gates, waters and photons anew, so no two frames of a training are
 alike. Depth is over the gate: 0 at its start, 1 at its end.
@@ -58,10 +58,7 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
     """Depth and its deviation `[S, side, side]`, NaN where there is only water, and gates around it `[S, 2]` [m]."""
     random = Random(count, generator)
     relief = random.log_between((0.08, 2.5), 1, 1)  # of the whole scene [m]
-    # Far away, things are small in the image, and their depth changes much from pixel to pixel.
-    away = torch.where(random.coin(0.5), random.log_between((1.0, 4.0)), 1.0)
-    steep = torch.where(random.coin(0.4), random.between((1.0, 3.0)), 1.0)[:, None, None]
-    depth = _background(side, away, random)
+    depth = _background(side, random)
     together = random.coin(0.35)  # things that are parts of one body
     centre, place = 0.3 * side * (2 * random.uniform(2) - 1), random.between((0.15, 0.85))
     paint = 0.5 * random.normal(torch.Size((count, 1, 1))) * torch.ones_like(depth)  # ln of reflectance, negative
@@ -75,8 +72,8 @@ def draw_scenes(count: int, side: int, generator: torch.Generator) -> tuple[Tens
             chosen = ((kind == index) & (slot < number)).nonzero()[:, 0]
             if len(chosen):
                 part = Random(len(chosen), generator)
-                inside, surface = draw(*_turned(at[chosen], side, away[chosen], part), part)
-                surface = z[chosen, None, None] + steep[chosen] * surface
+                inside, surface = draw(*_turned(at[chosen], side, part), part)
+                surface = z[chosen, None, None] + surface
                 drawn = inside & (surface > -0.1) & ~(surface >= depth[chosen])
                 depth[chosen] = torch.where(drawn, surface, depth[chosen])
                 paint[chosen] = torch.where(drawn, 0.5 * part.normal(torch.Size((len(chosen), 1, 1))), paint[chosen])
@@ -103,10 +100,10 @@ def smooth_noise(count: int, side: int, generator: torch.Generator) -> Tensor:
     return total[:, 0]
 
 
-def _background(side: int, away: Tensor, random: Random) -> Tensor:
+def _background(side: int, random: Random) -> Tensor:
     """Relative depth of what is behind: NaN (water), a wall about 1, or a floor that comes near at one side."""
     count, device = random.size, random.generator.device
-    y, x = _turned(torch.zeros(count, 2, device=device), side, away, random)
+    y, x = _turned(torch.zeros(count, 2, device=device), side, random)
     kind = random.uniform()[:, None, None]
     rough = 0.15 * random.uniform(1, 1) * random.coin(0.6, 1, 1) * smooth_noise(count, side, random.generator)
     slope = 0.6 * (2 * random.uniform(1, 1) - 1) * random.coin(0.7, 1, 1)
@@ -118,13 +115,10 @@ def _background(side: int, away: Tensor, random: Random) -> Tensor:
     return torch.where(kind < 0.42, torch.full_like(wall, math.nan), torch.where(kind < 0.75, wall, floor))
 
 
-def _turned(at: Tensor, side: int, away: Tensor, random: Random) -> tuple[Tensor, Tensor]:
-    """Image coordinates about `at`, turned by a random angle, often a right one, `[S, side, side]` [pixels].
-
-    What is so many times farther `away`, `[S]`, looks as many times smaller.
-    """
-    line = away[:, None] * (torch.arange(side, device=at.device) - 0.5 * (side - 1))
-    y, x = line[:, :, None] - at[:, 0, None, None], line[:, None, :] - at[:, 1, None, None]
+def _turned(at: Tensor, side: int, random: Random) -> tuple[Tensor, Tensor]:
+    """Image coordinates about `at`, turned by a random angle, often a right one, `[S, side, side]` [pixels]."""
+    line = torch.arange(side, device=at.device) - 0.5 * (side - 1)
+    y, x = line[None, :, None] - at[:, 0, None, None], line[None, None, :] - at[:, 1, None, None]
     angle = 2 * math.pi * random.uniform(1, 1)
     right = torch.round(angle * (2 / math.pi)) * (math.pi / 2)
     angle = torch.where(random.coin(0.35, 1, 1), right, angle)
@@ -133,8 +127,7 @@ def _turned(at: Tensor, side: int, away: Tensor, random: Random) -> tuple[Tensor
 
 def _pattern(side: int, random: Random) -> Tensor:
     """Stripes or squares of reflectance, ±1, or nothing, `[S, side, side]`."""
-    still = torch.zeros(random.size, 2, device=random.generator.device)
-    y, x = _turned(still, side, torch.ones_like(still[:, 0]), random)
+    y, x = _turned(torch.zeros(random.size, 2, device=random.generator.device), side, random)
     pitch = random.log_between((3.0, 40.0), 1, 1)
     stripes = torch.sign(torch.sin(x / pitch * math.pi))
     squares = stripes * torch.sign(torch.sin(y / pitch * math.pi))
