@@ -110,19 +110,6 @@ def fields(name: str, struct: Any, needs: Mapping[str, Need], device: Any = None
             number(path, value, need)
 
 
-def vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
-    """Finite components, of a unit vector if asked."""
-    try:
-        components = [float(x) for x in value]
-    except (TypeError, ValueError):
-        components = []
-    length = math.hypot(*components)
-    if len(components) != size or not math.isfinite(length):
-        raise ArgumentError(f"{name} = {value} is not a vector of {size} finite numbers")
-    if unit and abs(length - 1.0) > 1e-3:
-        raise ArgumentError(f"{name} = {tuple(components)} has the length {length:g}; a unit vector is needed")
-
-
 def numbers(
     name: str, values: Any, shape: Sequence[int | None] | None = None, interval: str = "", *, whole: bool = False
 ) -> NDArray[np.float64]:
@@ -146,6 +133,13 @@ def numbers(
             place = f"[{', '.join(map(str, at))}]" if at else ""
             raise ArgumentError(f"{name}{place} = {found[at]:.9g} is {'not whole or ' * whole}outside {interval}")
     return found
+
+
+def vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
+    """Finite components, of a unit vector if asked."""
+    length = float(np.linalg.norm(numbers(name, value, (size,), "(-inf, inf)")))
+    if unit and abs(length - 1.0) > 1e-3:
+        raise ArgumentError(f"{name} = {tuple(value)} has the length {length:g}; a unit vector is needed")
 
 
 def items(name: str, value: Any) -> list[Any]:
