@@ -260,31 +260,19 @@ def make_pose(moves: bool) -> Pose:
 
     @wp.func
     def point_in(scan: Scan, target: int, x: wp.vec3) -> wp.vec3:
-        y = wp.vec3(x)
-        if wp.static(moves):
-            y = wp.transform_point(wp.transform_inverse(scan.pose[target]), x)
-        return y
+        return wp.transform_point(wp.transform_inverse(scan.pose[target]), x) if wp.static(moves) else x
 
     @wp.func
     def turn_in(scan: Scan, target: int, u: wp.vec3) -> wp.vec3:
-        v = wp.vec3(u)
-        if wp.static(moves):
-            v = wp.quat_rotate_inv(wp.transform_get_rotation(scan.pose[target]), u)
-        return v
+        return wp.quat_rotate_inv(wp.transform_get_rotation(scan.pose[target]), u) if wp.static(moves) else u
 
     @wp.func
     def point_out(scan: Scan, target: int, x: wp.vec3) -> wp.vec3:
-        y = wp.vec3(x)
-        if wp.static(moves):
-            y = wp.transform_point(scan.pose[target], x)
-        return y
+        return wp.transform_point(scan.pose[target], x) if wp.static(moves) else x
 
     @wp.func
     def turn_out(scan: Scan, target: int, u: wp.vec3) -> wp.vec3:
-        v = wp.vec3(u)
-        if wp.static(moves):
-            v = wp.normalize(wp.transform_vector(scan.pose[target], u))
-        return v
+        return wp.normalize(wp.transform_vector(scan.pose[target], u)) if wp.static(moves) else u
 
     return Pose(point_in, turn_in, point_out, turn_out)
 
@@ -308,10 +296,7 @@ def make_beam(measured: bool, port: PortKind | None, scans: bool, moves: bool = 
 
     @wp.func
     def axis(laser: Laser, scan: Scan, target: int) -> wp.vec3:
-        along = laser.axis
-        if wp.static(scans and not moves):
-            along = scan.axis[target]
-        return along
+        return scan.axis[target] if wp.static(scans and not moves) else laser.axis
 
     @wp.func
     def emit(laser: Laser, scan: Scan, seed: wp.uint64, id: wp.uint64) -> wp.spatial_vector:
