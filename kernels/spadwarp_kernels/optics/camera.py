@@ -210,10 +210,9 @@ def toward_axis(view: wp.vec4, x: wp.vec3) -> wp.vec2:
 def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     """A camera that images something; raises `ArgumentError`."""
     check.kind(name, camera, Camera)
-    for field_name in ("width", "height"):
-        check.integer(f"{name}.{field_name}", getattr(camera, field_name), 1)
-    check.fields(name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)"})
-    check.fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
+    check.fields(name, camera, dict.fromkeys(("width", "height"), "[1, inf)"))
+    check.fields(name, camera, dict.fromkeys(("pixel_tangent", "aperture_area"), "(0, inf)"))
+    check.fields(name, camera, dict.fromkeys(("aperture_radius", "inverse_focus"), "[0, inf)"))
     if not calibrated:
         return
     finite = dict.fromkeys(("principal", "radial", "tangential", "view"), "(-inf, inf)")
