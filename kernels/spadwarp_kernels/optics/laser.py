@@ -85,14 +85,7 @@ def make_laser(
 
 
 @wp.func
-def emit_photon(laser: Laser, seed: wp.uint64, id: wp.uint64):
-    """Start position [m] and unit direction of photon `id`; see `emit_along`."""
-    position, direction = emit_along(laser, laser.axis, seed, id)
-    return position, direction
-
-
-@wp.func
-def emit_along(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
+def emit_photon(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
     """Start position [m] and unit direction of photon `id` from a laser turned to an axis of its own; no measured
     profile.
 
@@ -292,7 +285,7 @@ class Beam(NamedTuple):
 @memoised
 def make_beam(measured: bool, port: PortKind | None, scans: bool, moves: bool = False, sun: bool = False) -> Beam:
     """The beam of a spec."""
-    emit_from = emit_sun if sun else emit_measured if measured else emit_along
+    emit_from = emit_sun if sun else emit_measured if measured else emit_photon
 
     @wp.func
     def axis(laser: Laser, scan: Scan, target: int) -> wp.vec3:
