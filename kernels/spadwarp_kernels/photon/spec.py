@@ -231,10 +231,7 @@ def check_spec(spec: Any) -> None:
             f"points = {spec.points}: more than 1 needs spec.estimator = 'guided', and cannot be combined with "
             "spec.reflecting, spec.blocks and DELTA_TRACKING",
         ),
-        (
-            spec.flux and (guided or spec.estimator == "analog"),
-            "flux: spec.estimator = 'analog' and 'guided' have none",
-        ),
+        (spec.flux and (guided or spec.estimator == "analog"), "flux cannot be combined with analog and guided"),
         (spec.sun and spec.laser_port != FLAT_PORT, "sun needs spec.laser_port = FLAT_PORT"),
     ):
         if wrong:
