@@ -122,16 +122,16 @@ LINES = {
     "kernels/spadwarp_kernels": (50, 45),
     "kernels/analytic": (1650, 1614),
     "kernels/base": (950, 1214),
-    "kernels/detection": (1000, 1356),
+    "kernels/detection": (1000, 1349),
     "kernels/estimators": (1300, 1101),
-    "kernels/optics": (1350, 2918),
-    "kernels/photon": (850, 1272),
+    "kernels/optics": (1350, 2880),
+    "kernels/photon": (850, 1245),
     "kernels/riders": (750, 677),
-    "kernels/surface": (1700, 1899),
+    "kernels/surface": (1700, 1886),
     "kernels/tally": (450, 934),
-    "kernels/transport": (1450, 1791),
-    "kernels/water": (1350, 1669),
-    "kernels/worlds": (1600, 2182),
+    "kernels/transport": (1450, 1759),
+    "kernels/water": (1350, 1661),
+    "kernels/worlds": (1600, 2173),
 }
 
 

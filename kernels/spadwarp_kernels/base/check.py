@@ -1,8 +1,7 @@
 """What public functions check of their arguments before anything is launched, and the error that they raise.
 
-Used as a module, `check.number("g", g, "(-1, 1)")`: each function takes the argument's name and value, and most return
-it. Kinds, shapes, dtypes, devices and numbers are read on the host and cost microseconds. Values of arrays are read
-only where something is built from them once: a check of every call would wait for a GPU.
+Used as a module, `check.number("g", g, "(-1, 1)")`. Kinds, shapes, dtypes, devices and numbers are read on the host and
+cost microseconds. Values of arrays are read only where something is built from them once: a GPU has to be waited for.
 """
 
 import math
@@ -64,11 +63,6 @@ def integer(name: str, value: Any, low: int, high: int = 2**31 - 1) -> int:
     if not low <= found <= high:
         raise ArgumentError(f"{name} = {value} is outside [{low}, {high}]")
     return found
-
-
-def seed(value: Any) -> int:
-    """A seed of 64 bits."""
-    return integer("seed", value, 0, 2**64 - 1)
 
 
 def choice(name: str, value: Any, choices: Iterable[Any]) -> None:

@@ -469,7 +469,7 @@ def prepare_transport(
     check.kind("model", model, Model)
     check.kind("data", data, Data)
     most = check.integer("photon_count", photon_count, 1, _MOST_PHOTONS)
-    seed = check.seed(seed)
+    seed = check.integer("seed", seed, 0, 2**64 - 1)
     blocks = check.integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE
     check_launch(spec, model, data, most)
     device, split_accumulators = model.device, _split_accumulators(spec, model, data, most)
