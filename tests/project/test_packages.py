@@ -120,7 +120,7 @@ LINES = {
     "viz": (2200, 2442),
     "water": (800, 855),
     "kernels/spadwarp_kernels": (50, 45),
-    "kernels/analytic": (1650, 1614),
+    "kernels/analytic": (1650, 1617),
     "kernels/base": (950, 1214),
     "kernels/detection": (1000, 1349),
     "kernels/estimators": (1300, 1101),
