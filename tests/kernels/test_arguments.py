@@ -160,10 +160,10 @@ def polarised(**arguments):
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda: sk.make_boundary([1, 0, 0], [0, 0]), r"high = \[0, 0\] is not three numbers"),
-        (lambda: sk.make_boundary(None, [0, 0, 0]), "low is .* a list is needed"),
+        (lambda: sk.make_boundary([1, 0, 0], [0, 0]), r"high has shape \(2,\); \(3,\)"),
+        (lambda: sk.make_boundary(None, [0, 0, 0]), r"low has shape \(\)"),
         (lambda: sk.make_boundary([0, 0, 0], [0, 0, 0]), "all faces let all light out"),
-        (lambda: sk.make_boundary([0, -1, 0], [0, 0, 0]), "low, y, = -1 is outside"),
+        (lambda: sk.make_boundary([0, -1, 0], [0, 0, 0]), r"low\[1\] = -1 is outside"),
         (lambda: sk.make_boundary([0, 1, 0], [0, 0, 0], max_reflections=9), "max_reflections = 9 is outside"),
         (
             lambda: sk.make_grid(**GRID | {"extinction": np.ones((2, 2))}),
@@ -201,7 +201,7 @@ def polarised(**arguments):
         (lambda: sk.sphere_integral(3.0), "function = 3.0 is not a function"),
         (lambda: sk.sphere_integral(lambda t: None), "what function returns has shape"),
         (lambda: sk.surface_choices(None), "surfaces is .* a Surfaces is needed"),
-        (lambda: sk.surface_choices(sk.Surfaces()), "surfaces.corner_reflectance is missing"),
+        (lambda: sk.surface_choices(sk.Surfaces()), "surfaces.corner_reflectance is None"),
         (
             lambda: sk.make_textures(np.array([3]), CORNERS, [CORNERS[0]]),
             r"face\[0\] = 3 is not whole or outside \[-1, 0\]",

@@ -197,7 +197,10 @@ def sample_frames(
     optics, drawn = _pixel_maps(optics, ports, laser, gate_paths, view, **maps)
     pixels, device = view.shape[0], view.device
     frames = check.integer("frames", frames, 0)
-    first_frame, seed = check.integer("first_frame", first_frame, 0, 2**31 - 1 - frames), check.seed(seed)
+    first_frame, seed = (
+        check.integer("first_frame", first_frame, 0, 2**31 - 1 - frames),
+        check.integer("seed", seed, 0, 2**64 - 1),
+    )
     kinds = (wp.float32, wp.bool)
     made: Any = tuple(wp.empty((frames, pixels), dtype=kind, device=device) for kind in kinds) if out is None else out
     if not (isinstance(made, tuple) and len(made) == 2):

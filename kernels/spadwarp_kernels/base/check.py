@@ -1,8 +1,7 @@
 """What public functions check of their arguments before anything is launched, and the error that they raise.
 
-Used as a module, `check.number("g", g, "(-1, 1)")`: each function takes the argument's name and value, and most return
-it. Kinds, shapes, dtypes, devices and numbers are read on the host and cost microseconds. Values of arrays are read
-only where something is built from them once: a check of every call would wait for a GPU.
+Used as a module, `check.number("g", g, "(-1, 1)")`. Kinds, shapes, dtypes, devices and numbers are read on the host and
+cost microseconds. Values of arrays are read only where something is built from them once: a GPU has to be waited for.
 """
 
 import math
@@ -66,11 +65,6 @@ def integer(name: str, value: Any, low: int, high: int = 2**31 - 1) -> int:
     return found
 
 
-def seed(value: Any) -> int:
-    """A seed of 64 bits."""
-    return integer("seed", value, 0, 2**64 - 1)
-
-
 def choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """One of a few values."""
     if value not in tuple(choices):
@@ -110,19 +104,6 @@ def fields(name: str, struct: Any, needs: Mapping[str, Need], device: Any = None
             number(path, value, need)
 
 
-def vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
-    """Finite components, of a unit vector if asked."""
-    try:
-        components = [float(x) for x in value]
-    except (TypeError, ValueError):
-        components = []
-    length = math.hypot(*components)
-    if len(components) != size or not math.isfinite(length):
-        raise ArgumentError(f"{name} = {value} is not a vector of {size} finite numbers")
-    if unit and abs(length - 1.0) > 1e-3:
-        raise ArgumentError(f"{name} = {tuple(components)} has the length {length:g}; a unit vector is needed")
-
-
 def numbers(
     name: str, values: Any, shape: Sequence[int | None] | None = None, interval: str = "", *, whole: bool = False
 ) -> NDArray[np.float64]:
@@ -146,6 +127,13 @@ def numbers(
             place = f"[{', '.join(map(str, at))}]" if at else ""
             raise ArgumentError(f"{name}{place} = {found[at]:.9g} is {'not whole or ' * whole}outside {interval}")
     return found
+
+
+def vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
+    """Finite components, of a unit vector if asked."""
+    length = float(np.linalg.norm(numbers(name, value, (size,), "(-inf, inf)")))
+    if unit and abs(length - 1.0) > 1e-3:
+        raise ArgumentError(f"{name} = {tuple(value)} has the length {length:g}; a unit vector is needed")
 
 
 def items(name: str, value: Any) -> list[Any]:

@@ -98,6 +98,18 @@ def one_with_sign(number: float) -> float:
 
 
 @wp.func
+def inverse_of(d: float) -> float:
+    """1/d, finite."""
+    return 1.0 / wp.where(wp.abs(d) < 1.0e-18, 1.0e-18, d)
+
+
+@wp.func
+def inverse_direction(u: wp.vec3) -> wp.vec3:
+    """1/u by components, finite."""
+    return wp.vec3(inverse_of(u[0]), inverse_of(u[1]), inverse_of(u[2]))
+
+
+@wp.func
 def orthonormal_basis(n: wp.vec3):
     """Two unit vectors that complete the unit vector n to a right-handed basis (Duff et al. 2017)."""
     s = wp.where(n[2] < 0.0, -1.0, 1.0)

@@ -325,21 +325,15 @@ class ArrivalEstimator:
 def arrival_bins(
     histogram: wp.array,
     *,
-    method: str = "centroid",
-    background: wp.array | None = None,
-    response: np.ndarray | None = None,
-    lowest_tap: int = 0,
-    first: int = 0,
-    stop: int | None = None,
-    half_width: int = 3,
     min_significance: float | None = None,
     significance: wp.array | None = None,
-    **test: Any,
+    **search: Any,
 ) -> wp.array:
     """Arrival time of every pixel [bins from the start of bin 0], NaN where there is none.
 
     Args:
         histogram: `[pixel, bin]`, int32, int64, float32 or float64, not negative.
+        search: Any of what follows, by name.
         method: `"peak"`: centre of the largest bin. `"centroid"`: mean over the peak ± `half_width` bins.
             `"matched"`: the delay μ that maximises Σ n_k ln h_k(μ), the log-matched filter, which is maximum
             likelihood without background. `"likelihood"`: the maximum over delay and signal of
@@ -355,8 +349,8 @@ def arrival_bins(
             looked for where they have detected something. 0: every pixel reports, from all bins. Default: 4, one false
             alarm in 10^4 pixels; 0 for rates, which have no significance.
         significance: array to write that of each pixel into, float32 `[pixel]`.
-        test: `width` (default: that of the response, or `half_width` / 1.5), `profile` (in place of the background, for
-            the test), `pulses` and `pixels` of `DetectionTest`.
+        width, profile, pulses, pixels: of `DetectionTest`. By default the width is that of the response, or 2/3 of
+            `half_width`; the profile takes the background's place in the test.
 
     Returns:
         float32 `[pixel]` on the histogram's device. NaN: nothing detected, or no counts above the background.
@@ -365,10 +359,9 @@ def arrival_bins(
         ArgumentError: An array of another kind, bins outside the histogram, or a method without its response.
     """
     check.array("histogram", histogram, RATES, (None, None))
-    bins, device = histogram.shape[1], histogram.device
     if min_significance is None:
         min_significance = MIN_SIGNIFICANCE if histogram.dtype in COUNTS else 0.0
-    search = (method, background, response, lowest_tap, first, stop, half_width, min_significance)
-    arrival = wp.empty(histogram.shape[0], dtype=float, device=device)
-    ArrivalEstimator(bins, device, *search, **test)(histogram, arrival, significance)
+    arrival = wp.empty(histogram.shape[0], dtype=float, device=histogram.device)
+    estimate = ArrivalEstimator(histogram.shape[1], histogram.device, min_significance=min_significance, **search)
+    estimate(histogram, arrival, significance)
     return arrival

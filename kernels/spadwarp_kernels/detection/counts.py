@@ -182,7 +182,7 @@ def dark_count_rates(
     Lognormal about `median` with `spread` the standard deviation of ln(rate); hot pixels, a `hot_fraction` of all, have
     `hot_rate`; `offset` is added to all. The seed is of the camera, not of the exposure. Raises `ArgumentError`.
     """
-    pixels, seed = check.integer("pixels", pixels, 0), check.seed(seed)
+    pixels, seed = check.integer("pixels", pixels, 0), check.integer("seed", seed, 0, 2**64 - 1)
     check.within("[0, 1e12]", median=median, hot_rate=hot_rate, offset=offset)
     check.number("spread", spread, "[0, 10]")
     check.number("hot_fraction", hot_fraction, "[0, 1]")
@@ -316,7 +316,7 @@ def _check_exposure(
         check.integer("pulses", pulses, 0),
         check.integer("frames", frames, 1, (2**31 - 1) // max(hazard.shape[0], 1)),
         check.integer("counter_depth", counter_depth, 0) or 2**31 - 1,
-        check.seed(seed),
+        check.integer("seed", seed, 0, 2**64 - 1),
     )
 
 

@@ -210,10 +210,9 @@ def toward_axis(view: wp.vec4, x: wp.vec3) -> wp.vec2:
 def check_camera(name: str, camera: Any, *, calibrated: bool) -> None:
     """A camera that images something; raises `ArgumentError`."""
     check.kind(name, camera, Camera)
-    for field_name in ("width", "height"):
-        check.integer(f"{name}.{field_name}", getattr(camera, field_name), 1)
-    check.fields(name, camera, {"pixel_tangent": "(0, inf)", "aperture_radius": "[0, inf)"})
-    check.fields(name, camera, {"aperture_area": "(0, inf)", "inverse_focus": "[0, inf)"})
+    check.fields(name, camera, dict.fromkeys(("width", "height"), "[1, inf)"))
+    check.fields(name, camera, dict.fromkeys(("pixel_tangent", "aperture_area"), "(0, inf)"))
+    check.fields(name, camera, dict.fromkeys(("aperture_radius", "inverse_focus"), "[0, inf)"))
     if not calibrated:
         return
     finite = dict.fromkeys(("principal", "radial", "tangential", "view"), "(-inf, inf)")
@@ -275,33 +274,18 @@ def make_camera(
     return camera
 
 
-def make_gate(
-    bins: int,
-    *,
-    one_way_metres: tuple[float, float] | None = None,
-    two_way_seconds: tuple[float, float] | None = None,
-    group_index: float | None = None,
-) -> Gate:
-    """A gate of equal bins between distances from the camera, or between times of flight there and back.
-
-    Args:
-        bins: Their number.
-        one_way_metres: Distances at which it opens and closes [m].
-        two_way_seconds: In their place, times after the pulse [s], with the `group_index` of the water.
+def make_gate(bins: int, *, one_way_metres: tuple[float, float]) -> Gate:
+    """A gate of equal bins, so many, between two distances from the camera [m].
 
     Raises:
-        ArgumentError: A number out of range, or both or neither of the two.
+        ArgumentError: A number out of range.
     """
-    if (one_way_metres is None) == (two_way_seconds is None) or (two_way_seconds is None) != (group_index is None):
-        raise ArgumentError("one_way_metres, or two_way_seconds and group_index: one of the two is needed")
-    name, ends = ("one_way_metres", one_way_metres) if one_way_metres else ("two_way_seconds", two_way_seconds)
-    check.vector(name, ends, size=2)
-    scale = 2.0 if group_index is None else C0 / check.number("group_index", group_index, "[1, inf)")
-    start = check.number(f"{name}[0]", ends[0], "[0, inf)")
-    stop = check.number(f"{name}[1]", ends[1], f"({start}, inf)")
+    check.vector("one_way_metres", one_way_metres, size=2)
+    start = check.number("one_way_metres[0]", one_way_metres[0], "[0, inf)")
+    stop = check.number("one_way_metres[1]", one_way_metres[1], f"({start}, inf)")
     gate = Gate()
     gate.bins = check.integer("bins", bins, 1)
-    gate.start, gate.stop, gate.bins_per_metre = scale * start, scale * stop, gate.bins / (scale * (stop - start))
+    gate.start, gate.stop, gate.bins_per_metre = 2.0 * start, 2.0 * stop, gate.bins / (2.0 * (stop - start))
     return gate
 
 

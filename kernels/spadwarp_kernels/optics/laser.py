@@ -85,14 +85,7 @@ def make_laser(
 
 
 @wp.func
-def emit_photon(laser: Laser, seed: wp.uint64, id: wp.uint64):
-    """Start position [m] and unit direction of photon `id`; see `emit_along`."""
-    position, direction = emit_along(laser, laser.axis, seed, id)
-    return position, direction
-
-
-@wp.func
-def emit_along(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
+def emit_photon(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
     """Start position [m] and unit direction of photon `id` from a laser turned to an axis of its own; no measured
     profile.
 
@@ -260,31 +253,19 @@ def make_pose(moves: bool) -> Pose:
 
     @wp.func
     def point_in(scan: Scan, target: int, x: wp.vec3) -> wp.vec3:
-        y = wp.vec3(x)
-        if wp.static(moves):
-            y = wp.transform_point(wp.transform_inverse(scan.pose[target]), x)
-        return y
+        return wp.transform_point(wp.transform_inverse(scan.pose[target]), x) if wp.static(moves) else x
 
     @wp.func
     def turn_in(scan: Scan, target: int, u: wp.vec3) -> wp.vec3:
-        v = wp.vec3(u)
-        if wp.static(moves):
-            v = wp.quat_rotate_inv(wp.transform_get_rotation(scan.pose[target]), u)
-        return v
+        return wp.quat_rotate_inv(wp.transform_get_rotation(scan.pose[target]), u) if wp.static(moves) else u
 
     @wp.func
     def point_out(scan: Scan, target: int, x: wp.vec3) -> wp.vec3:
-        y = wp.vec3(x)
-        if wp.static(moves):
-            y = wp.transform_point(scan.pose[target], x)
-        return y
+        return wp.transform_point(scan.pose[target], x) if wp.static(moves) else x
 
     @wp.func
     def turn_out(scan: Scan, target: int, u: wp.vec3) -> wp.vec3:
-        v = wp.vec3(u)
-        if wp.static(moves):
-            v = wp.normalize(wp.transform_vector(scan.pose[target], u))
-        return v
+        return wp.normalize(wp.transform_vector(scan.pose[target], u)) if wp.static(moves) else u
 
     return Pose(point_in, turn_in, point_out, turn_out)
 
@@ -304,14 +285,11 @@ class Beam(NamedTuple):
 @memoised
 def make_beam(measured: bool, port: PortKind | None, scans: bool, moves: bool = False, sun: bool = False) -> Beam:
     """The beam of a spec."""
-    emit_from = emit_sun if sun else emit_measured if measured else emit_along
+    emit_from = emit_sun if sun else emit_measured if measured else emit_photon
 
     @wp.func
     def axis(laser: Laser, scan: Scan, target: int) -> wp.vec3:
-        along = laser.axis
-        if wp.static(scans and not moves):
-            along = scan.axis[target]
-        return along
+        return scan.axis[target] if wp.static(scans and not moves) else laser.axis
 
     @wp.func
     def emit(laser: Laser, scan: Scan, seed: wp.uint64, id: wp.uint64) -> wp.spatial_vector:

@@ -100,29 +100,21 @@ def make_derivatives(
     kind that is not one of DERIVATIVES, or a number out of range.
     """
     channels = check.integer("channels", channels, 0, MOST_DERIVATIVES)
-    given = {"kinds": kinds, "value": value, "scale": scale}
-    kinds, value, scale = (check.items(name, items) for name, items in given.items())
-    device, count = check.device("device", device), check.integer("derivatives", len(kinds), 0, MOST_DERIVATIVES)
+    kinds, device = check.items("kinds", kinds), check.device("device", device)
+    count = check.integer("derivatives", len(kinds), 0, MOST_DERIVATIVES)
     least = 1 if blocks is None else 0
     tallies = check.integer("derivatives and channels", count + channels, least, MOST_DERIVATIVES)
-    if len(value) != count or len(scale) != tallies:
-        raise ArgumentError(
-            f"{count} derivatives, {channels} channels, {len(value)} values, {len(scale)} scales: each needs a scale, "
-            "derivatives a value"
-        )
+    value = check.numbers("value", value, (count,))
     for p, kind in enumerate(kinds):
         check.choice(f"kinds[{p}]", kind, DERIVATIVES)
         check.number(f"value[{p}], {kind},", value[p], DERIVATIVES[kind])
-    check.numbers("scale", scale, None, "(0, inf)")
-    if len(extinction) != len(constituent) or ("concentration" in kinds and len(extinction) != count):
-        raise ArgumentError(
-            f"{count} derivatives, {len(extinction)} extinctions, {len(constituent)} constituents: of concentrations "
-            "each needs both"
-        )
+    scale = check.numbers("scale", scale, (tallies,), "(0, inf)")
+    both = (count if "concentration" in kinds else None,)
+    extinction = check.numbers("extinction", extinction, both, "[0, inf)")
+    rows = check.numbers("constituent", constituent, extinction.shape, f"[0, {MOST_CONSTITUENTS - 1}]", whole=True)
     derivatives = Derivatives()
-    for p, (one, row) in enumerate(zip(extinction, constituent, strict=True)):
-        derivatives.extinction[p] = check.number(f"extinction[{p}]", one, "[0, inf)")
-        derivatives.constituent[p] = check.integer(f"constituent[{p}]", row, 0, MOST_CONSTITUENTS - 1)
+    for p, (one, row) in enumerate(zip(extinction, rows, strict=True)):
+        derivatives.extinction[p], derivatives.constituent[p] = one, int(row)
     derivatives.value = LogDerivatives(*value, *[0.0] * (MOST_DERIVATIVES - count))
     derivatives.scale = LogDerivatives(*scale, *[0.0] * (MOST_DERIVATIVES - tallies))
     for name, parts in (("waters", waters), ("faces", faces)):

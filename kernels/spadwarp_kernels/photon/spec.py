@@ -33,11 +33,19 @@ _WORDS = {
     Water | None: "REGULAR_TRACKING, DELTA_TRACKING or None",
 }
 
-# What light through the surface of a sea, and light of other wavelengths, cannot be combined with.
+# Fields that cannot be combined, and those that need another.
 _EXCLUDED = {
     "sea": ("port", "laser_port", "reflecting", "grid", "merged", "signed", "blocks", "polarised", "flux"),
     "inelastic": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
+    "grid": ("layered", "random_albedo"),
+    "merged": ("reflecting", "derivatives", "channels"),
+    "blocks": ("reflecting", "merged"),
+    "derivatives": ("random_albedo",),  # which has no scattering coefficient
+    "polarised": ("derivatives", "blocks"),
+    "flux": ("polarised", "random_albedo"),
+    "sun": ("measured_beam", "confocal", "polarised"),
 }
+_NEEDED = {"reflecting": "bounded", "blocks": "grid"}
 
 
 class TransportSpec(NamedTuple):
@@ -193,37 +201,22 @@ def check_spec(spec: Any) -> None:
     # A block has 48 KiB of shared memory for queues.
     check.integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
     check.integer("spec.channels", spec.channels, 0, MOST_CHANNELS * spec.polarised + MOST_LINES * spec.inelastic)
+    for one, others in _EXCLUDED.items():
+        if getattr(spec, one) and any(getattr(spec, other) for other in others):
+            raise ArgumentError(f"spec.{one} cannot be combined with spec." + ", spec.".join(others))
+    for one, other in _NEEDED.items():
+        if getattr(spec, one) and not getattr(spec, other):
+            raise ArgumentError(f"spec.{one} needs spec.{other}")
+    scanned, guided = spec.lens.name == SCANNED.name, spec.estimator == "guided"
     for wrong, text in (
         (spec.confocal and spec.lens.name == PLAIN.name, "confocal = True needs spec.lens = CALIBRATED"),
-        (spec.sea and spec.confocal and spec.lens.name != SCANNED.name, "sea: a scan needs spec.lens = SCANNED"),
+        (spec.sea and spec.confocal and not scanned, "sea: a scan needs spec.lens = SCANNED"),
         (
-            spec.lens.name == SCANNED.name and (not spec.confocal or spec.polarised or spec.reflecting),
+            scanned and (not spec.confocal or spec.polarised or spec.reflecting),
             "lens = SCANNED needs spec.confocal = True, and cannot be combined with spec.polarised and spec.reflecting",
         ),
-        *(
-            (any(getattr(spec, x) for x in others), f"{one} cannot be combined with spec." + ", spec.".join(others))
-            for one, others in _EXCLUDED.items()
-            if getattr(spec, one)
-        ),
-        (spec.reflecting and not spec.bounded, "reflecting = True needs spec.bounded = True"),
-        (
-            spec.grid and (spec.layered or spec.random_albedo),
-            "grid cannot be combined with spec.layered and spec.random_albedo",
-        ),
-        (
-            spec.merged and (spec.estimator not in ("guided", "next_event") or spec.reflecting or spec.signed),
-            "merged needs guided or next_event, and cannot be combined with spec.reflecting, spec.derivatives and "
-            "spec.channels",
-        ),
+        (spec.merged and not (guided or spec.estimator == "next_event"), "merged needs guided or next_event"),
         (len(set(spec.blocks)) < len(spec.blocks), f"blocks = {spec.blocks!r} names one twice"),
-        (
-            spec.blocks and (not spec.grid or spec.reflecting or spec.merged),
-            "blocks need spec.grid, and cannot be combined with spec.reflecting and spec.merged",
-        ),
-        (
-            spec.derivatives and spec.random_albedo,
-            "derivatives cannot be combined with spec.random_albedo, which has no scattering coefficient",
-        ),
         (
             spec.grid and {*spec.derivatives} - {"reflectance"},
             "derivatives: with spec.grid, whose water has no one value, they are of reflectance",
@@ -234,24 +227,12 @@ def check_spec(spec: Any) -> None:
         ),
         ("reflectance" in spec.derivatives and not spec.mesh, "derivatives: reflectance needs spec.mesh = True"),
         (
-            spec.points > 1
-            and (spec.estimator != "guided" or spec.reflecting or spec.blocks or spec.scores_collisions),
+            spec.points > 1 and (not guided or spec.reflecting or spec.blocks or spec.scores_collisions),
             f"points = {spec.points}: more than 1 needs spec.estimator = 'guided', and cannot be combined with "
             "spec.reflecting, spec.blocks and DELTA_TRACKING",
         ),
-        (
-            spec.polarised and (spec.derivatives or spec.blocks),
-            "polarised cannot be combined with spec.derivatives and spec.blocks",
-        ),
-        (
-            spec.flux and (spec.estimator in ("analog", "guided") or spec.polarised or spec.random_albedo),
-            "flux cannot be combined with spec.estimator = 'analog' or 'guided', spec.polarised and spec.random_albedo",
-        ),
-        (
-            spec.sun and (spec.laser_port != FLAT_PORT or spec.measured_beam or spec.confocal or spec.polarised),
-            "sun needs spec.laser_port = FLAT_PORT, and cannot be combined with spec.measured_beam, spec.confocal and "
-            "spec.polarised",
-        ),
+        (spec.flux and (guided or spec.estimator == "analog"), "flux cannot be combined with analog and guided"),
+        (spec.sun and spec.laser_port != FLAT_PORT, "sun needs spec.laser_port = FLAT_PORT"),
     ):
         if wrong:
             raise ArgumentError(f"spec.{text}")

@@ -45,7 +45,7 @@ class Rider(NamedTuple):
     """What becomes of what rides along, as Warp functions."""
 
     begin: wp.Function = _begin
-    """``(carried, world, target, emitted, x, u)``, for a photon that was emitted, see `make_emit`, and is in the water
+    """``(carried, world, target, emitted, x, u)``, for a photon that was emitted, see `Beam.emit`, and is in the water
     at x on its way along u."""
     fork: wp.Function = _fork  # ``(carried, world)``: what follows is of a contribution, no longer of the photon
     fly: wp.Function = _fly  # ``(carried, world, x, u, length)``, a way in the water

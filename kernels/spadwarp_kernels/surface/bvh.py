@@ -68,17 +68,6 @@ def segment_meets_box(x: wp.vec3, u: wp.vec3, length: float, lower: wp.vec3, upp
     ...
 
 
-@wp.func
-def _inverse(d: float) -> float:
-    return 1.0 / wp.where(wp.abs(d) < 1.0e-18, 1.0e-18, d)
-
-
-@wp.func
-def inverse_direction(u: wp.vec3) -> wp.vec3:
-    """1/u by components, finite."""
-    return wp.vec3(_inverse(u[0]), _inverse(u[1]), _inverse(u[2]))
-
-
 # ---- The tree of a `wp.Mesh`, read from Warp's private structs: what the trees of GPUs and CPUs are made of.
 
 

@@ -187,9 +187,8 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     check.kind("mesh", mesh, wp.Mesh)
     if surfaces.mesh != mesh.id:
         raise ArgumentError("surfaces are not those of mesh")
-    for name in ("near_depth", "nodes", "faces", "order", "depth", "levels", "patches", "normals"):
-        if getattr(surfaces, name) is None:
-            raise ArgumentError(f"surfaces.{name} is None; make_surfaces fills it")
+    filled: dict[str, check.Need] = dict.fromkeys(("nodes", "faces", "order", "depth", "patches", "normals"), (None,))
+    check.fields("surfaces", surfaces, {"near_depth": (None, None), **filled})
     if (surfaces.near_depth.size > 0) != (camera is not None):
         made = "with" if surfaces.near_depth.size else "without"
         raise ArgumentError(f"surfaces were made {made} a camera; update_surfaces needs the same")
@@ -242,11 +241,9 @@ def _check_sum(surfaces: Surfaces) -> None:
 def surface_choices(surfaces: Surfaces) -> dict[str, bool]:
     """The fields of `TransportSpec` that surfaces need: `pattern`, `specular` and `use_warp_bvh`."""
     check.kind("surfaces", surfaces, Surfaces)
-    arrays = {name: getattr(surfaces, name) for name in ("corner_reflectance", "specular", "nodes")}
-    for name, array in arrays.items():
-        if not isinstance(array, wp.array):
-            raise ArgumentError(f"surfaces.{name} is missing; see make_surfaces")
-    pattern, specular, nodes = (array.size > 0 for array in arrays.values())
+    names = ("corner_reflectance", "specular", "nodes")
+    check.fields("surfaces", surfaces, dict.fromkeys(names, (None,)))
+    pattern, specular, nodes = (getattr(surfaces, name).size > 0 for name in names)
     return {"pattern": pattern, "specular": specular, "use_warp_bvh": not nodes}
 
 

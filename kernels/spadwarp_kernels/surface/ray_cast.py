@@ -6,9 +6,10 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import bits_of
+from spadwarp_kernels.base.rotations import inverse_direction
 from spadwarp_kernels.optics.camera import Camera, pixel_direction
 
-from .bvh import NO_NODE, Stack, TreeWalk, inverse_direction, place, step_leaf, step_node
+from .bvh import NO_NODE, Stack, TreeWalk, place, step_leaf, step_node
 from .mesh import Surfaces
 from .patches import load_row, nearest_patch, patch_faces
 from .reflectance import (

@@ -15,26 +15,14 @@ from spadwarp_kernels.photon.state import PhotonRef, SinkRef, WorldRef, is_plann
 from spadwarp_kernels.riders.flux import make_flux_score
 from spadwarp_kernels.surface.bvh import segment_meets_box
 
-from .stages import (
-    make_begin,
-    make_collide,
-    make_cross,
-    make_emit,
-    make_finish,
-    make_flush,
-    make_fly,
-    make_meet,
-    make_prepare,
-    make_scatter,
-    make_trace,
-)
+from . import stages
 
 
 class Stages(NamedTuple):
     """What becomes of a photon, as Warp functions; states are changed in place."""
 
     prepare: wp.Function  # ``(draws, world, thread, launch) -> int``, of a thread
-    emit: wp.Function  # ``(world, id) -> spatial_vector``
+    emit: wp.Function  # see `Beam.emit`
     begin: wp.Function  # ``(s, world, sink, emitted, id)``, to FLIGHT
     fly: wp.Function  # ``(s, world, draws, words)``, to EVENT or RAY
     trace: wp.Function  # ``(s, world)``, from RAY to EVENT, without other threads
@@ -77,23 +65,23 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     in_tree, flies_on = spec.mesh and not spec.faces.tried, estimator.cross is not None
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)
-    meet = make_meet(estimator.meet)
+    meet = stages.make_meet(estimator.meet)
     deposit = make_deposit(spec.signed, len(spec.blocks), split, spec.sea is not None)
     memory, push, pop = make_queue(spec, flights, scores, two_requests, in_tree)
     serve = _make_serve(spec, split, deposit, waits=in_tree and not alone) if scores else push
     ask_flight, ask_event = _make_asks(spec, _make_serve_now(serve) if alone and scores else push)
     return Stages(
-        prepare=make_prepare(spec.stepped, bool(spec.blocks), cuda),
-        emit=make_emit(spec),
-        begin=make_begin(spec),
-        fly=make_fly(spec, estimator.plan_flight, meet, spec.random_albedo, cuda),
-        trace=make_trace(meet, in_tree),
+        prepare=stages.make_prepare(spec.stepped, bool(spec.blocks), cuda),
+        emit=spec.beam.emit,
+        begin=stages.make_begin(spec),
+        fly=stages.make_fly(spec, estimator.plan_flight, meet, spec.random_albedo, cuda),
+        trace=stages.make_trace(meet, in_tree),
         meet=meet,
-        cross=make_cross(spec, estimator.cross, deposit),
-        collide=make_collide(spec, estimator.meet is not None, flies_on, make_flux_score(spec)),
-        scatter=make_scatter(spec, estimator.direct, flies_on),
-        finish=make_finish(spec.records, len(spec.derivatives)),
-        flush=make_flush(not cuda and estimator.scores, spec.reflecting, spec.sea is not None),
+        cross=stages.make_cross(spec, estimator.cross, deposit),
+        collide=stages.make_collide(spec, estimator.meet is not None, flies_on, make_flux_score(spec)),
+        scatter=stages.make_scatter(spec, estimator.direct, flies_on),
+        finish=stages.make_finish(spec.records, len(spec.derivatives)),
+        flush=stages.make_flush(not cuda and estimator.scores, spec.reflecting, spec.sea is not None),
         ask_flight=ask_flight,
         ask_event=ask_event,
         deposit=deposit,

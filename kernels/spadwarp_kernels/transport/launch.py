@@ -33,19 +33,8 @@ from spadwarp_kernels.photon.spec import TransportSpec, check_spec
 from spadwarp_kernels.photon.state import Launch, Records, Sink, World, make_records
 from spadwarp_kernels.surface.mesh import Surfaces, check_faces, check_patches, surface_choices
 from spadwarp_kernels.surface.patches import BRUTE_FORCE_FACES
+from spadwarp_kernels.tally import ledger
 from spadwarp_kernels.tally.flux import FLUX_KINDS, Flux
-from spadwarp_kernels.tally.ledger import (
-    ALL_ENTRIES,
-    BOUNDARY_COUNTERS,
-    COUNTERS,
-    LEDGER_ENTRIES,
-    LEDGER_SLOTS,
-    LEDGER_WIDTH,
-    OUTSIDE_SHIFT,
-    PORT_ENTRY,
-    SEA_COUNTERS,
-    SEA_ENTRIES,
-)
 from spadwarp_kernels.tally.tally import (
     COMPONENTS,
     exact_sums,
@@ -176,7 +165,7 @@ def make_data(
     signed = check.integer("bins of data.gradients", size * derivatives, 0)
     return Data(
         tally=tally,
-        ledger=wp.zeros(LEDGER_SLOTS * LEDGER_WIDTH, dtype=wp.int64, device=model.device),
+        ledger=wp.zeros(ledger.LEDGER_SLOTS * ledger.LEDGER_WIDTH, dtype=wp.int64, device=model.device),
         records=make_records(record_count, device=model.device, derivatives=derivatives),
         cursor=wp.zeros(1, dtype=int, device=model.device),
         offset=wp.zeros(1, dtype=wp.uint64, device=model.device),
@@ -380,7 +369,7 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, photon_count: int
         fits("flux", wp.int64, check.integer("model.flux.size", model.flux.size, 1))
     if data.split_accumulators is not None:
         fits("split_accumulators", wp.uint32, data.tally.size)
-    fits("ledger", wp.int64, LEDGER_SLOTS * LEDGER_WIDTH)
+    fits("ledger", wp.int64, ledger.LEDGER_SLOTS * ledger.LEDGER_WIDTH)
     fits("cursor", wp.int32, 1)
     if spec.stepped or data.offset is not None:
         fits("offset", wp.uint64, 1)
@@ -480,7 +469,7 @@ def prepare_transport(
     check.kind("model", model, Model)
     check.kind("data", data, Data)
     most = check.integer("photon_count", photon_count, 1, _MOST_PHOTONS)
-    seed = check.seed(seed)
+    seed = check.integer("seed", seed, 0, 2**64 - 1)
     blocks = check.integer("threads", threads, BLOCK_SIZE) // BLOCK_SIZE
     check_launch(spec, model, data, most)
     device, split_accumulators = model.device, _split_accumulators(spec, model, data, most)
@@ -543,14 +532,14 @@ def read_ledger(data: Data) -> tuple[dict[str, int], dict[str, int]]:
     where faces of the domain reflect, BOUNDARY_COUNTERS; with the surface of a sea SEA_ENTRIES and SEA_COUNTERS, too.
     """
     check.kind("data", data, Data)
-    check.array("data.ledger", data.ledger, wp.int64, (LEDGER_SLOTS * LEDGER_WIDTH,))
+    check.array("data.ledger", data.ledger, wp.int64, (ledger.LEDGER_SLOTS * ledger.LEDGER_WIDTH,))
     for name in ("reflecting", "has_sea"):
         check.kind(f"data.{name}", getattr(data, name), bool)
-    sums = exact_sums(data.ledger.numpy().reshape(LEDGER_WIDTH, LEDGER_SLOTS))
-    values = dict(zip(ALL_ENTRIES, sums, strict=True))
+    sums = exact_sums(data.ledger.numpy().reshape(ledger.LEDGER_WIDTH, ledger.LEDGER_SLOTS))
+    values = dict(zip(ledger.ALL_ENTRIES, sums, strict=True))
     for name in ("before_gate", "after_gate"):
-        values[name] <<= int(OUTSIDE_SHIFT)
-    entries = (*LEDGER_ENTRIES, PORT_ENTRY) if values[PORT_ENTRY] else LEDGER_ENTRIES
-    entries += SEA_ENTRIES if data.has_sea else ()
-    counters = COUNTERS + BOUNDARY_COUNTERS * data.reflecting + SEA_COUNTERS * data.has_sea
+        values[name] <<= int(ledger.OUTSIDE_SHIFT)
+    entries = (*ledger.LEDGER_ENTRIES, ledger.PORT_ENTRY) if values[ledger.PORT_ENTRY] else ledger.LEDGER_ENTRIES
+    entries += ledger.SEA_ENTRIES if data.has_sea else ()
+    counters = ledger.COUNTERS + ledger.BOUNDARY_COUNTERS * data.reflecting + ledger.SEA_COUNTERS * data.has_sea
     return {name: values[name] for name in entries}, {name: values[name] for name in counters}

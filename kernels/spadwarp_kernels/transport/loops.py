@@ -9,6 +9,7 @@ import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import PREFETCHED_WORDS
+from spadwarp_kernels.base.rotations import inverse_direction
 from spadwarp_kernels.photon.queue import (
     MOST_LEFT,
     READ_SIZE,
@@ -41,7 +42,7 @@ from spadwarp_kernels.photon.state import (
     first_state,
     is_planned,
 )
-from spadwarp_kernels.surface.bvh import NO_NODE, Stack, inverse_direction, place, step_leaf, step_node
+from spadwarp_kernels.surface.bvh import NO_NODE, Stack, place, step_leaf, step_node
 from spadwarp_kernels.surface.ray_cast import surface_hit
 
 from .compose import Stages, compose
@@ -89,7 +90,7 @@ def _make_loop_alone(stages: Stages, cuda: bool, options: dict) -> wp.Kernel:
         for number in range(wp.tid(), launch.photon_count, launch.threads):
             s.photon = number
             id = draws.base + wp.uint64(number)
-            stages.begin(s, world, sink, stages.emit(world, id), id)
+            stages.begin(s, world, sink, stages.emit(world.laser, world.scan, world.seed, id), id)
             while s.stage != END:
                 stages.fly(s, world, draws, words)
                 stages.trace(s, world)
@@ -132,7 +133,8 @@ def _make_renew(stages: Stages) -> wp.Function:
         if s.taken >= 32:
             s.first = take_photons(launch.cursor)
             s.taken = 0
-            exchange(memory, True, lane, stages.emit(world, base + wp.uint64(s.first + lane)))
+            own = stages.emit(world.laser, world.scan, world.seed, base + wp.uint64(s.first + lane))
+            exchange(memory, True, lane, own)
         entry += s.taken
         s.taken += votes[1]
         if wanting and entry < 32:

@@ -76,19 +76,8 @@ def make_prepare(stepped: bool, in_blocks: bool, cuda: bool) -> wp.Function:
     return prepare
 
 
-def make_emit(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(world, id) -> spatial_vector``: start position [m], then unit direction."""
-    emit_photon = spec.beam.emit
-
-    @wp.func
-    def emit(world: WorldRef, id: wp.uint64) -> wp.spatial_vector:
-        return emit_photon(world.laser, world.scan, world.seed, id)
-
-    return emit
-
-
 def make_begin(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(s, world, sink, emitted, id)``: the photon that `emit` has emitted, in the water."""
+    """The Warp function ``(s, world, sink, emitted, id)``: the photon that `Beam.emit` has emitted, in the water."""
     beam, rider, sight, surface = spec.beam, make_rider(spec), spec.sight, spec.sight.sea or FACETS
     has_port, sea = beam.enter is not None, sight.sea is not None
 

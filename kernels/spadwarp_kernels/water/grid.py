@@ -21,6 +21,7 @@ from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.native import load_float, load_vec2
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_sequence, u01, u01_open
+from spadwarp_kernels.base.rotations import inverse_direction, inverse_of
 
 from .medium import Grid, Layers, Medium, Profile, ProfileSample, Water, mixture_shares
 
@@ -56,18 +57,13 @@ class GridPlace:
 
 
 @wp.func
-def _inverse(d: float) -> float:
-    return 1.0 / wp.where(wp.abs(d) < 1.0e-18, 1.0e-18, d)
-
-
-@wp.func
 def grid_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> GridLine:
     """The part of the line x + t u, 0 <= t <= length, in the box."""
     line = GridLine()
     size = grid.size
     p = grid.turn * x + grid.shift
     d = grid.turn * u
-    line.inverse = wp.vec3(_inverse(d[0]), _inverse(d[1]), _inverse(d[2]))
+    line.inverse = inverse_direction(d)
     line.shift = -wp.cw_mul(p, line.inverse)
     line.end = length
     for i in range(3):
@@ -179,7 +175,7 @@ def block_line(grid: Grid, x: wp.vec3, u: wp.vec3, length: float) -> BlockLine:
     line.d = grid.turn * u
     line.end = length
     for i in range(3):
-        inverse = _inverse(line.d[i])
+        inverse = inverse_of(line.d[i])
         low = -line.p[i] * inverse
         high = (float(grid.size[i]) - line.p[i]) * inverse
         line.begin = wp.max(line.begin, wp.min(low, high))
@@ -203,7 +199,7 @@ def first_block(grid: Grid, line: BlockLine) -> BlockPlace:
         number = wp.clamp(wp.floor((line.p[i] + line.begin * line.d[i]) / edge), 0.0, float(grid.block_size[i] - 1))
         place.block = place.block * grid.block_size[i] + int(number)
         plane = edge * wp.where(line.d[i] < 0.0, number, number + 1.0)
-        place.at[i] = (plane - line.p[i]) * _inverse(line.d[i])
+        place.at[i] = (plane - line.p[i]) * inverse_of(line.d[i])
     place.stop = wp.min(wp.min(place.at[0], line.end), wp.min(place.at[1], place.at[2]))
     return place
 

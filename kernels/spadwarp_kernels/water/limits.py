@@ -10,7 +10,7 @@ which it meets the faces, and crosses each on the face.
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import warp as wp
 
@@ -136,23 +136,19 @@ def make_boundary(
     Raises:
         ArgumentError: A number out of range, or all faces let light out.
     """
-    sides: dict[str, list[Any]] = {"low": check.items("low", low), "high": check.items("high", high)}
-    for name, indices in sides.items():
-        if len(indices) != 3:
-            raise ArgumentError(f"{name} = {indices!r} is not three numbers")
-        sides[name] = [check.number(f"{name}, {axis},", indices[k], "[0, 1e9]") for k, axis in enumerate("xyz")]
+    sides = [check.numbers(name, one, (3,), "[0, 1e9]").tolist() for name, one in (("low", low), ("high", high))]
     most = check.integer("max_reflections", max_reflections, 0, 8)
-    if not any((*sides["low"], *sides["high"])):
+    if not any(map(any, sides)):
         raise ArgumentError("low and high: all faces let all light out; such a spec is not `reflecting`")
     # A face without its opposite is met once. Ways of few reflections come first.
     numbers = [
         [k for k in range(-most, most + 1) if k == 0 or (pair[k > 0] > 0 and (abs(k) == 1 or min(pair) > 0))]
-        for pair in zip(*sides.values(), strict=True)
+        for pair in zip(*sides, strict=True)
     ]
     chains = [chain for chain in itertools.product(*numbers) if 0 < sum(map(abs, chain)) <= most]
     images = sorted(chains, key=lambda chain: (sum(map(abs, chain)), chain))
     boundary = Boundary()
-    boundary.low, boundary.high = (wp.vec3(*indices) for indices in sides.values())
+    boundary.low, boundary.high = (wp.vec3(*indices) for indices in sides)
     boundary.images = wp.array(images, dtype=wp.vec3i, device=check.device("device", device), shape=len(images))
     boundary.max_reflections = most
     return boundary

@@ -150,21 +150,21 @@ def _mujoco_mesh(model: Any, kind: int, index: int, device: wp.DeviceLike) -> wp
     return wp.Mesh(points, wp.array(np.asarray(faces, np.int32).ravel(), dtype=int, device=device))
 
 
-@wp.kernel(enable_backward=False)
-def _from_matrix_kernel(position: wp.array2d[wp.vec3], rotation: wp.array2d[wp.mat33], out: wp.array2d[wp.transform]):
-    """Launch: (worlds, things)."""
-    w, k = wp.tid()
-    out[w, k] = wp.transform(position[w, k], wp.normalize(wp.quat_from_matrix(rotation[w, k])))
+@wp.func
+def _quaternion(rotation: wp.mat33):
+    return wp.quat_from_matrix(rotation)
+
+
+@wp.func
+def _quaternion(rotation: wp.quat):
+    return wp.quat(rotation[1], rotation[2], rotation[3], rotation[0])
 
 
 @wp.kernel(enable_backward=False)
-def _from_quaternion_kernel(
-    position: wp.array2d[wp.vec3], rotation: wp.array2d[wp.quat], out: wp.array2d[wp.transform]
-):
+def _poses_kernel(position: wp.array2d[wp.vec3], rotation: wp.array2d[Any], out: wp.array2d[wp.transform]):
     """Launch: (worlds, things)."""
     w, k = wp.tid()
-    q = rotation[w, k]
-    out[w, k] = wp.transform(position[w, k], wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
+    out[w, k] = wp.transform(position[w, k], wp.normalize(_quaternion(rotation[w, k])))
 
 
 def write_poses(position: wp.array, rotation: wp.array, out: wp.array) -> None:
@@ -180,7 +180,6 @@ def write_poses(position: wp.array, rotation: wp.array, out: wp.array) -> None:
     """
     check.array("position", position, wp.vec3, (None,) * (2 if getattr(position, "ndim", 1) == 2 else 1))
     shape = (position.shape[0], 1) if position.ndim == 1 else position.shape
-    matrix = isinstance(rotation, wp.array) and wp.types.types_equal(rotation.dtype, wp.mat33)
     check.array("rotation", rotation, (wp.mat33, wp.quat), position.shape, position.device)
     check.array("out", out, wp.transform, (shape[0] * shape[1],), position.device, contiguous=True)
     if position.ndim == 1:
@@ -189,5 +188,4 @@ def write_poses(position: wp.array, rotation: wp.array, out: wp.array) -> None:
             wp.array(ptr=x.ptr, dtype=x.dtype, shape=shape, strides=(x.strides[0], 0), device=x.device)
             for x in (position, rotation)
         )
-    kernel = _from_matrix_kernel if matrix else _from_quaternion_kernel
-    wp.launch(kernel, shape, [position, rotation], [out.reshape(shape)], device=out.device)
+    wp.launch(_poses_kernel, shape, [position, rotation], [out.reshape(shape)], device=out.device)

@@ -93,8 +93,7 @@ class SpadConfig:
         for name in ("width", "height", "bins"):
             check.integer(f"config.{name}", getattr(self, name), 1)
         check.integer("config.pulses", self.pulses, 0)
-        for name, within in _RANGES.items():
-            check.number(f"config.{name}", getattr(self, name), within)
+        check.fields("config", self, _RANGES)
         self._check_field_of_view()
         check.vector("config.gate_distance", self.gate_distance, size=2)
         check.number("config.gate_distance[0]", self.gate_distance[0], "[0, inf)")
@@ -114,8 +113,7 @@ class SpadConfig:
         found = [name for name in _FIELDS_OF_VIEW if getattr(self, name) is not None]
         if len(found) > 1:
             raise ArgumentError(f"config.{found[0]} and config.{found[1]}: only one says what the image shows")
-        for name in set(found) - {"camera_matrix"}:
-            check.number(f"config.{name}", getattr(self, name), "(0, 3.1)")
+        check.fields("config", self, dict.fromkeys(set(found) - {"camera_matrix"}, "(0, 3.1)"))
         if self.camera_matrix is not None:
             k = check.numbers("config.camera_matrix", self.camera_matrix, (3, 3))
             if not (k[0, 0] > 0.0 < k[1, 1] and (k * [[0, 1, 0], [1, 0, 0], [1, 1, 0]] == 0).all()):
@@ -290,13 +288,8 @@ def world_values(by_world: Mapping[str, Any], config: SpadConfig, device: wp.Dev
             rows = check.numbers(f"by_world[{name!r}]", given, (None,))
             given = wp.array(rows.astype(wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
         check.array(f"by_world[{name!r}]", given, dtype, (worlds or None,), device)
-        high = (
-            config.gate_distance[1] - config.gate_distance[0]
-            if name == "gate_delay"
-            else 2**31 - 1
-            if name == "pulses"
-            else 1e6
-        )
+        gate = config.gate_distance
+        high = {"gate_delay": gate[1] - gate[0], "pulses": 2**31 - 1}.get(name, 1e6)
         check.numbers(f"by_world[{name!r}]", given, None, f"[0, {high}]")
         setattr(values, name, given)
         worlds = given.size

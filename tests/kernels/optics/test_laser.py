@@ -22,7 +22,7 @@ def photons(profile, device, **sizes):
     for name, value in sizes.items():
         setattr(laser, name, value)
     ids = on_device(np.arange(sample_count(device)), device, wp.uint64)
-    x, u = each(emit_photon, [laser, 4, ids], (wp.vec3, wp.vec3), device)
+    x, u = each(emit_photon, [laser, laser.axis, 4, ids], (wp.vec3, wp.vec3), device)
     return x - [1, 2, 3], u
 
 
