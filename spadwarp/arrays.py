@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from spadwarp.values import ArgumentError, FileError, guarded, shown
+from spadwarp.values import ArgumentError, guarded, shown
 
 __all__ = ["Variable", "as_warp", "caller_tallies", "histogram_rows", "in_torch_order", "is_torch", "labelled"]
 __all__ += ["on_host", "output_tensor", "real_array", "tensor_of", "to_pandas"]
@@ -201,10 +201,7 @@ def labelled(
     variables: Mapping[str, Variable], coordinates: Mapping[str, Variable], attributes: Mapping[str, Any]
 ) -> xarray.Dataset:
     """An xarray data set whose arrays have `units` and `long_name`. Raises `FileError` without xarray."""
-    try:
-        import xarray
-    except ModuleNotFoundError as error:
-        raise FileError("labelled arrays need xarray: pip install 'spadwarp[xarray]'") from error
+    import xarray
 
     def array(variable: Variable) -> tuple[tuple[str, ...], Any, dict[str, str]]:
         dimensions, values, unit, meaning = variable
@@ -224,10 +221,8 @@ def to_pandas(rows: Iterable[Any] | Any) -> pandas.DataFrame:
 
     Raises `FileError`: pandas is not installed; `ArgumentError`: rows that are neither data classes nor dicts.
     """
-    try:
-        import pandas
-    except ModuleNotFoundError as error:
-        raise FileError("data frames need pandas: pip install 'spadwarp[xarray]'") from error
+    import pandas
+
     index = None
     if hasattr(rows, "rows") and hasattr(rows, "values") and hasattr(rows, "fields"):
         rows, index = rows.rows, pandas.MultiIndex.from_tuples(rows.values, names=rows.fields)

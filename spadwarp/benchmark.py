@@ -22,7 +22,7 @@ import numpy as np
 from spadwarp.analytic import simulate_analytic
 from spadwarp.device import core_count, nvidia_driver, pick_device, processor_name
 from spadwarp.frames import detect
-from spadwarp.io.text import parse_json, read_text
+from spadwarp.io.text import read_json
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Detector, Laser, Scene
 from spadwarp.transport import provenance, simulate, trace, truth_maps
@@ -160,10 +160,7 @@ def report(results: Sequence[BenchResult]) -> dict[str, Any]:
 
 def load_report(path: str | Path) -> dict[str, Any]:
     """Reads what `spadwarp bench --json` wrote. Raises `FileError`."""
-    try:
-        stored = parse_json(read_text(path))
-    except ValueError as error:
-        raise FileError(f"{path}: not JSON: {error}") from error
+    stored = read_json(path)
     if not isinstance(stored, dict) or stored.get("format") != FORMAT or not isinstance(stored.get("results"), list):
         raise FileError(f"{path}: not a file that `spadwarp bench --json` wrote")
     if (version := stored.get("format_version")) != FORMAT_VERSION:

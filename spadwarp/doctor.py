@@ -19,16 +19,12 @@ from spadwarp.scene import Scene
 from spadwarp.transport import simulate
 from spadwarp.validate import references
 from spadwarp.validate.cases import PENCIL, Estimate, Quantity, Run, scene, slab_faces
-from spadwarp.values import __version__, guarded
+from spadwarp.values import EXTRAS, __version__, guarded
 
 __all__ = ["Diagnosis", "SelfTest", "diagnose"]
 
 NEEDED = ["warp-lang", "numpy", "scipy", "trimesh", "manifold3d", "OpenEXR", "pydantic", "typer", "h5py", "matplotlib"]
 NEEDED += ["tomli-w", "PyYAML", "jinja2"]
-
-# Package → extra that brings it.
-OPTIONAL = {"torch": "torch", "ray": "ray", "bmnd": "bm3d", "ptufile": "formats", "laspy": "las", "plotly": "view"}
-OPTIONAL["imageio-ffmpeg"] = "video"
 
 _OLDEST_CUDA = 13000  # of the driver, R580: the CUDA that Warp is built with
 
@@ -85,11 +81,11 @@ def _system() -> dict[str, str]:
 
 def _packages(problems: list[str]) -> dict[str, str]:
     found = {}
-    for name in (*NEEDED, *OPTIONAL):
+    for name in (*NEEDED, *EXTRAS):
         try:
-            found[name] = importlib.metadata.version(name)
+            found[name] = importlib.metadata.version(name if name != "pxr" else "usd-core")
         except importlib.metadata.PackageNotFoundError:
-            extra = OPTIONAL.get(name)
+            extra = EXTRAS.get(name)
             found[name] = f"not installed (optional: pip install 'spadwarp[{extra}]')" if extra else "MISSING"
             problems += [] if extra else [f"{name} is not installed: pip install spadwarp"]
     return found

@@ -148,22 +148,30 @@ def need_memory(gibibytes: float, name: str) -> None:
         raise MemoryError(f"{name} needs {gibibytes:g} GiB")
 
 
-# ---- Arguments of public functions
+# ---- Arguments of public functions, and packages that they need
+
+
+EXTRAS = {"torch": "torch", "ray": "ray", "xarray": "xarray", "pandas": "xarray", "ptufile": "formats", "laspy": "las"}
+"""Optional packages, as they are imported, and the extra that brings each."""
+EXTRAS |= {"lazrs": "las", "pyarrow": "datasets", "zarr": "datasets", "pxr": "usd", "miepython": "mie", "bmnd": "bm3d"}
+EXTRAS |= {"plotly": "view", "imageio_ffmpeg": "video"}
 
 
 def guarded(module: str) -> None:
     """Makes `ArgumentError` of what libraries raise when a public function of a module gets an argument that is not of
     its annotated type, that holds nothing or no finite number, or arrays that do not fit; and of what the kernel
-    library refuses: numbers that pass one by one, but together leave the range of what is computed with.
+    library refuses: numbers that pass one by one, but together leave the range of what is computed with. Makes
+    `FileError` of files that cannot be opened and optional packages that are missing.
 
     The public names of a package are those of its modules that it has imported; they become its `__all__`.
     Nothing is checked before something was raised: calls cost no time for it.
     """
     space = vars(sys.modules[module])
     if "__all__" not in space:
-        modules = [vars(found) for name, found in sys.modules.items() if name.startswith(f"{module}.")]
-        names = {name: one[name] for one in modules for name in one.get("__all__", ())}
-        space["__all__"] = sorted(name for name, found in names.items() if space.get(name) is found)
+        loaded = list(sys.modules.items())  # to which other threads may add
+        modules = [vars(found) for name, found in loaded if name.startswith(f"{module}.")]
+        names = {name for one in modules for name in one.get("__all__", ()) if space.get(name) is one[name]}
+        space["__all__"] = sorted(names)
     for name in space["__all__"]:
         found = space[name]
         if isinstance(found, types.FunctionType):
@@ -192,6 +200,10 @@ def _guarded(function: Callable[..., Any], module: str) -> Callable[..., Any]:
             return
         if isinstance(error, OSError) and error.filename is not None and error.errno != errno.ENOMEM:
             raise FileError(in_words(error)) from error
+        package = str(error.name).partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+        if extra := EXTRAS.get(package):
+            needed = f"{function.__name__} needs the package {package}: pip install 'spadwarp[{extra}]'"
+            raise FileError(needed) from error
         if type(error).__name__ == "ArgumentError":  # of the kernel library, which is not loaded here
             raise ArgumentError(str(error)) from error
         if problem := _wrong_argument(error, function, arguments, named):

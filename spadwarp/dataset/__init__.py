@@ -1,7 +1,7 @@
 """Datasets of labelled depth frames: recipes, the generator, and readers.
 
 `load_recipe` reads what a dataset is drawn from, `make_dataset` makes it, `verify_dataset` checks its files;
-`FrameReader`, `SpadDataset` (for torch) and `iterate_dataset` read it; `export_dataset` writes it for other loaders.
+`FrameReader` and `SpadDataset` (for torch) read it; `export_dataset` writes it for other loaders.
 """
 
 from spadwarp.dataset.export import *

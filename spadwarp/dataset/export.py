@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import io
 import itertools
-import json
 import os
 import shutil
 import tarfile
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -22,9 +21,10 @@ from spadwarp.dataset.card import card, croissant
 from spadwarp.dataset.read import FrameReader
 from spadwarp.dataset.recipe import SPLITS
 from spadwarp.dataset.shards import FIELDS, HISTOGRAM_FIELDS, Column, checksum, columns_of
-from spadwarp.io.text import write_json, write_text
+from spadwarp.io.text import json_text, write_json, write_text
 from spadwarp.scene import Scene
 from spadwarp.scene.sight import depth_from_time
+from spadwarp.transport import Progress
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer
 
 __all__ = ["EXPORT_FIELDS", "EXPORT_FORMATS", "export_dataset"]
@@ -40,8 +40,6 @@ EXPORT_FIELDS, _NUMBERS = FIELDS | columns_of("exported"), columns_of("numbers")
 _DEFAULT = ("noisy", "clean", "label", "intensity", "bound")
 _OF_HISTOGRAMS = ("features", *HISTOGRAM_FIELDS)
 _ZARR_FRAMES = 16  # of a chunk
-
-Progress = Callable[[str, int, int], None]
 
 
 def export_dataset(
@@ -90,8 +88,6 @@ def export_dataset(
         made.mkdir()
         try:
             write(source, made, frames_per_file)
-        except ModuleNotFoundError as error:
-            raise FileError(f"{out}: {format} needs {error.name}: pip install 'spadwarp[datasets]'") from error
         except OSError as error:
             raise FileError(f"{out}: cannot be written: {error}") from error
         # Of a Zarr store, which has a file for each chunk, its metadata.
@@ -207,14 +203,7 @@ def _write_webdataset(source: _Source, out: Path, size: int) -> None:
                     packed = io.BytesIO()
                     np.save(packed, np.asarray(row[name], source.columns[name].kind))
                     add(file, f"{key}.{name}.npy", packed.getvalue())
-                numbers = {name: _plain(row[name]) for name in _NUMBERS}
-                add(file, f"{key}.json", json.dumps(numbers).encode())
-
-
-def _plain(value: Any) -> Any:
-    """A number as JSON can hold it; NaN is null."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(plain, float) and not np.isfinite(plain) else plain
+                add(file, f"{key}.json", json_text({name: row[name] for name in _NUMBERS}, indent=None).encode())
 
 
 def _write_zarr(source: _Source, out: Path, size: int) -> None:

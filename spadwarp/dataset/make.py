@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -26,8 +26,9 @@ from spadwarp.dataset.recipe import SPLITS, Recipe, load_recipe
 from spadwarp.dataset.shards import FORMAT_VERSION, checksum, write_scene_index, write_shard
 from spadwarp.device import core_count, pick_devices
 from spadwarp.io.paths import file_problem, lock, remove_temporaries, sha256
-from spadwarp.io.text import parse_json, parse_toml, read_text, read_toml, write_json, write_text
+from spadwarp.io.text import parse_toml, read_json, read_toml, write_json, write_text
 from spadwarp.parallel import Ray, Worker, interruptible, run_jobs
+from spadwarp.transport import Progress
 from spadwarp.values import ConfigError, FileError, check_integer, check_part, shown
 
 __all__ = ["DatasetReport", "make_dataset", "read_manifest", "verify_dataset"]
@@ -88,10 +89,7 @@ def read_manifest(folder: str | os.PathLike[str]) -> dict[str, Any]:
         if file_problem(path.parent / "recipe.toml") is None:
             raise FileError(f"{folder}: not finished; `spadwarp dataset` makes the missing shards")
         raise FileError(f"{folder}: no dataset there (no manifest.json)")
-    try:
-        manifest = parse_json(read_text(path, largest=_LARGEST_MANIFEST))
-    except ValueError as error:
-        raise FileError(f"{path}: cannot be read: {error}") from error
+    manifest = read_json(path, largest=_LARGEST_MANIFEST)
     if not isinstance(manifest, dict) or manifest.get("format") != "spadwarp dataset":
         raise FileError(f"{path}: not the manifest of a spadwarp dataset")
     if (version := manifest.get("format_version")) != FORMAT_VERSION:
@@ -138,12 +136,11 @@ def _record_path(folder: Path, shard: Shard) -> Path:
 
 def _read_record(path: Path) -> dict[str, Any]:
     """Sizes and checksums of a shard's files by name. Raises `FileError`."""
+    record = read_json(path)
     try:
-        record = parse_json(read_text(path))
         _RECORD.validate_python(record)
-    except ValueError as error:
-        problem = _first_problem(error) if isinstance(error, ValidationError) else error
-        raise FileError(f"{path}: cannot be read: {problem}") from error
+    except ValidationError as error:
+        raise FileError(f"{path}: not a whole record: {_first_problem(error)}") from error
     return record
 
 
@@ -232,9 +229,6 @@ def _finish(plan: Plan, folder: Path) -> tuple[str, ...]:
     return ()
 
 
-Progress = Callable[[str, int, int], None]
-
-
 @dataclass(frozen=True)
 class DatasetReport:
     """The work of a call of `make_dataset`."""
@@ -318,18 +312,12 @@ def _make_shard(job: tuple[Recipe, Path, int], worker: Worker) -> int:
         plan = worker.state["plan"] = Plan(recipe)
     shard = plan.shards[index]
     record = _record_path(folder, shard)
-    try:
-        record.parent.mkdir(exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{record.parent}: cannot be made: {error.strerror}") from error
+    record.parent.mkdir(exist_ok=True)
     with lock(record.with_suffix(".lock"), wait=lambda: not worker.stopped.is_set()) as obtained:
         if not obtained:  # interrupted while another process was making it
             return 0
         if _state(plan, folder, shard):
-            try:
-                record.unlink(missing_ok=True)
-            except OSError as error:
-                raise FileError(f"{record}: cannot be replaced: {error.strerror}") from error
+            record.unlink(missing_ok=True)
             remove_temporaries(record)
             written = write_shard(plan, shard, folder, device=worker.device, threads=worker.threads)
             write_json(written, record, indent=1)
@@ -375,9 +363,9 @@ def _holds(plan: Plan, folder: Path) -> bool:
     if not same:
         raise ConfigError(f"{folder} holds the dataset of another recipe ({path}); give another folder")
     try:
-        before = parse_json(read_text(folder / _INPUTS))
+        before = read_json(folder / _INPUTS)
         changed = [name for name, content in _inputs(plan).items() if before[name] != content]
-    except (ValueError, TypeError, KeyError) as error:
+    except (TypeError, KeyError) as error:
         raise FileError(f"{folder / _INPUTS}: not the hashes of the recipe's files; give another folder") from error
     if changed:
         text = f"its content has changed since {folder} was begun; give another folder"

@@ -22,7 +22,7 @@ from spadwarp.values import SEED, ArgumentError, FileError, check_choice, check_
 if TYPE_CHECKING:
     from torch import Tensor  # noqa: F401, in the text of `TensorItem`
 
-__all__ = ["FIELDS", "FrameItem", "FrameReader", "SpadDataset", "TensorItem", "iterate_dataset"]
+__all__ = ["FIELDS", "FrameItem", "FrameReader", "SpadDataset", "TensorItem"]
 
 Integer = TypeVar("Integer")
 Real = TypeVar("Real")
@@ -277,21 +277,3 @@ def _collate(items: list[SpadItem], *, collate_fn_map: Any = None) -> dict[str, 
         batch[name] = memory[start : start + size].view(items[0][name].dtype).view(shape)
         torch.stack([item[name] for item in items], out=batch[name])
     return batch
-
-
-def iterate_dataset(
-    path: str | os.PathLike[str],
-    split: str = "train",
-    *,
-    fields: Sequence[str] = ("noisy", "clean", "label", "intensity"),
-    shuffle: int | None = None,
-) -> Iterator[FrameItem]:
-    """The frames of a split, one dict of NumPy arrays each, as `FrameReader` has them.
-
-    `shuffle`: seed of a random order; in their own order if None. Raises as `FrameReader`, before the first frame.
-    """
-    reader = FrameReader(path, split, fields=fields)
-    order = np.arange(len(reader))
-    if shuffle is not None:
-        np.random.Generator(np.random.Philox(shuffle)).shuffle(order)
-    return (reader[int(index)] for index in order)

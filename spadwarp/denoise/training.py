@@ -32,7 +32,7 @@ from spadwarp.denoise.samples import Samples, Sizes
 from spadwarp.denoise.synthetic_noise import Batch, CleanScenes, draw_batch, procedural_scenes
 from spadwarp.io.paths import atomic_path
 from spadwarp.io.text import parse_json
-from spadwarp.parallel.worker import interruptible
+from spadwarp.parallel import interruptible
 from spadwarp.values import ConfigError, FileError, SpadwarpWarning, environment_integer
 
 # The loss: the error of depth, and of the network's other answers.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ from spadwarp.files.lidar import LIDAR_FORMATS, write_lidar
 from spadwarp.files.loader import load, locate
 from spadwarp.frames import Frames, FramesFile, SequenceFile
 from spadwarp.io.arrays import write_array, write_exr
-from spadwarp.io.paths import atomic_path
+from spadwarp.io.paths import atomic_path, write_file
 from spadwarp.io.text import write_text
 from spadwarp.result import Channel, analyser_channel
 from spadwarp.result.result import Result
@@ -55,6 +56,11 @@ class SequenceFrame:
     scene: Scene | None = None  # what the camera looked at
     depth: NDArray[np.float32] | None = None  # true depth [m] `[H, W]`
     content: str = ""  # what the images are, in words
+
+    @property
+    def main(self) -> NDArray[Any]:
+        """Counts, or depth where there are none."""
+        return self.images["Z"] if self.counts is None else self.counts
 
     def bins_of(self, scene: Scene, depth: NDArray[np.float32]) -> NDArray[np.float64]:
         """Time of flight in bins from the start of the gate, with its fraction, of depth [m] that a scene's camera sees
@@ -277,28 +283,25 @@ def export(
     if ending not in FORMATS:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(FORMATS)}")
     source = Path(source) if isinstance(source, os.PathLike) else source
-    try:
-        opened = open_source(source, result=result, split=split)
-        if ending in CALIBRATION_ENDINGS:
-            return [_write_calibration(opened, path)]
-        if ending in LIDAR_FORMATS and not isinstance(opened, Result):
-            raise ArgumentError(f"{ending} is for a result: its photons have the truth that frames do not hold")
-        if isinstance(opened, Result) and ending in LIDAR_FORMATS:
-            return write_lidar(analyser_channel(opened, channel), path, seed=seed)
-        if isinstance(opened, Result):
-            return [_write_result(analyser_channel(opened, channel), path, ending, frames)]
-        if channel != "I":
-            raise ArgumentError(f"channel = {channel!r}: only results have channels")
-        chosen = _chosen(opened, frames)
-        whole = {".npy": _write_npy, ".npz": _write_npz, ".ptu": _write_ptu}
-        if ending in whole:
-            return [whole[ending](opened, path, chosen)]
-        write = {".mat": _write_mat, ".exr": _write_exr_frame, ".png": _write_png}[ending]
-        numbered = {number: path.with_name(f"{path.stem}-{number:05}{path.suffix}") for number in chosen}
-        return [write(opened, numbered[number] if len(chosen) > 1 else path, number) for number in chosen]
-    except ModuleNotFoundError as error:
-        extra = {"pyarrow": "datasets", "laspy": "las", "lazrs": "las"}.get(error.name or "", "formats")
-        raise FileError(f"{path}: writing it needs {error.name}: pip install 'spadwarp[{extra}]'") from error
+    opened = open_source(source, result=result, split=split)
+    if ending in CALIBRATION_ENDINGS:
+        return [_write_calibration(opened, path)]
+    if isinstance(opened, Result):
+        light = analyser_channel(opened, channel)
+        if ending in LIDAR_FORMATS:
+            return write_lidar(light, path, seed=seed)
+        return [_write_result(light, path, ending, frames)]
+    if ending in LIDAR_FORMATS:
+        raise ArgumentError(f"{ending} is for a result: its photons have the truth that frames do not hold")
+    if channel != "I":
+        raise ArgumentError(f"channel = {channel!r}: only results have channels")
+    chosen = _chosen(opened, frames)
+    whole = {".npy": _write_npy, ".npz": _write_npz, ".ptu": _write_ptu}
+    if ending in whole:
+        return [whole[ending](opened, path, chosen)]
+    write = {".mat": _write_mat, ".exr": _write_exr_frame, ".png": _write_png}[ending]
+    numbered = {number: path.with_name(f"{path.stem}-{number:05}{path.suffix}") for number in chosen}
+    return [write(opened, numbered[number] if len(chosen) > 1 else path, number) for number in chosen]
 
 
 def export_sensor_fusion(
@@ -404,8 +407,8 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
         return write_array(path, result.histogram)
     if ending == ".npz":
         gate = result.scene.gate
-        axes = _time_axis(gate.start, gate.bin_width, gate.bins)
-        return _save_npz(path, {"histogram": result.histogram, **axes, "true_depth": result.truth.depth})
+        arrays = {"histogram": result.histogram, **_time_axis(gate.start, gate.bin_width, gate.bins)}
+        return write_file(path, partial(np.savez_compressed, **arrays, true_depth=result.truth.depth))
     if ending == ".png":
         return _save_png(path, result.depth())
     if ending == ".exr":
@@ -427,17 +430,12 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
 
 def _write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:
     """Counts `[H, W, T]`, or depth `[H, W]` where there are none; of several frames with these before."""
-
-    def array_of(number: int) -> NDArray[Any]:
-        frame = frames.frame(number)
-        return frame.images["Z"] if frame.counts is None else frame.counts
-
-    first, several = array_of(chosen[0]), len(chosen) > 1
+    first, several = frames.frame(chosen[0]).main, len(chosen) > 1
     with atomic_path(path) as temporary:
         shape = (len(chosen), *first.shape) if several else first.shape
         array = np.lib.format.open_memmap(temporary, mode="w+", dtype=first.dtype, shape=shape)
         for row, number in enumerate(chosen):
-            array[row if several else ...] = array_of(number)
+            array[row if several else ...] = frames.frame(number).main
         array.flush()
         del array
     return path
@@ -447,23 +445,15 @@ def _time_axis(start: float, width: float, bins: int) -> dict[str, Any]:
     return {"time": start + (np.arange(bins) + 0.5) * width, "bin_width": width, "gate_start": start}
 
 
-def _save_npz(path: Path, arrays: Mapping[str, Any]) -> Path:
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
-    return path
-
-
 def _write_npz(frames: FrameSequence, path: Path, chosen: range) -> Path:
     """As `_write_npy`, with axes."""
-    every = [frames.frame(number) for number in chosen]
-    first, name = every[0], "depth" if every[0].counts is None else "counts"
-    images = [one.images["Z"] if one.counts is None else one.counts for one in every]
-    arrays: dict[str, Any] = {name: images[0] if len(images) == 1 else np.stack(images)}
-    if first.counts is None:
-        return _save_npz(path, arrays)
-    arrays |= _time_axis(first.gate_start, first.bin_width, first.counts.shape[-1])
-    arrays |= {"pulses": first.pulses} | ({} if first.depth is None else {"true_depth": first.depth})
-    return _save_npz(path, arrays)
+    first, cubes = frames.frame(chosen[0]), [frames.frame(number).main for number in chosen]
+    whole = cubes[0] if len(cubes) == 1 else np.stack(cubes)
+    arrays: dict[str, Any] = {"depth": whole}
+    if first.counts is not None:
+        arrays = {"counts": whole, **_time_axis(first.gate_start, first.bin_width, whole.shape[-1])}
+        arrays |= {"pulses": first.pulses} | ({} if first.depth is None else {"true_depth": first.depth})
+    return write_file(path, partial(np.savez_compressed, **arrays))
 
 
 def _save_png(path: Path, depth: NDArray[Any]) -> Path:
@@ -471,9 +461,7 @@ def _save_png(path: Path, depth: NDArray[Any]) -> Path:
 
     millimetres = np.nan_to_num(np.rint(1e3 * np.asarray(depth, np.float64)))
     millimetres[(millimetres < 0) | (millimetres > 65535)] = 0
-    with atomic_path(path) as temporary:
-        Image.fromarray(millimetres.astype(np.uint16)).save(temporary, format="PNG")
-    return path
+    return write_file(path, partial(Image.fromarray(millimetres.astype(np.uint16)).save, format="PNG"))
 
 
 def _write_png(frames: FrameSequence, path: Path, number: int) -> Path:
@@ -525,9 +513,7 @@ def _write_mat(
 def _save_mat(path: Path, variables: Mapping[str, Any]) -> Path:
     from scipy.io import savemat
 
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        savemat(file, variables, do_compression=True)
-    return path
+    return write_file(path, lambda file: savemat(file, variables, do_compression=True))
 
 
 def _write_ptu(frames: FrameSequence, path: Path, chosen: range) -> Path:

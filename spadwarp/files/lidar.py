@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.frames import Frames, Receiver, detect
-from spadwarp.io.paths import atomic_path
+from spadwarp.io.paths import write_file
 from spadwarp.result import Result
 from spadwarp.scene import shots_of
 from spadwarp.scene.camera import to_world
@@ -153,9 +154,7 @@ def write_lidar(result: Result, path: Path, *, seed: int = 0) -> list[Path]:
         import pyarrow
         import pyarrow.parquet
 
-        with atomic_path(path) as temporary:
-            pyarrow.parquet.write_table(pyarrow.table(cloud.columns()), temporary)
-        return [path]
+        return [write_file(path, partial(pyarrow.parquet.write_table, pyarrow.table(cloud.columns())))]
     return [_write_las(cloud, path)]
 
 
@@ -183,13 +182,7 @@ def _write_las(cloud: PhotonCloud, path: Path) -> Path:
     las.return_number, las.number_of_returns = _returns(cloud)
     for name, array in extra.items():
         las[name] = array
-    return _save(las, path)
-
-
-def _save(las: Any, path: Path) -> Path:
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        las.write(file, do_compress=path.suffix.lower() == ".laz")
-    return path
+    return write_file(path, lambda file: las.write(file, do_compress=path.suffix.lower() == ".laz"))
 
 
 def _returns(cloud: PhotonCloud) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -239,7 +232,6 @@ def _write_waveforms(result: Result, path: Path, seed: int) -> list[Path]:
     end: Floats = np.full(len(peak), frames.gate_start + frames.edges[-1])
     step = _positions(result, at, end) - _positions(result, at, end - frames.bin_width)
     las.x_t, las.y_t, las.z_t = (step / spacing).T
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(struct.pack("<H16sHQ32s", 0, b"LASF_Spec", 65535, samples.nbytes, b"waveform data packets"))
-        samples.tofile(file)
-    return [_save(las, path.with_suffix(".las")), path]
+    head = struct.pack("<H16sHQ32s", 0, b"LASF_Spec", 65535, samples.nbytes, b"waveform data packets")
+    write_file(path, lambda file: file.write(head + samples.tobytes()))
+    return [write_file(path.with_suffix(".las"), partial(las.write, do_compress=False)), path]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import secrets
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spadwarp.frames import Reduction, detector_response
 from spadwarp.io.arrays import point_cloud, write_array, write_exr, write_ply
-from spadwarp.io.paths import atomic_path, file_within, remove_temporaries
+from spadwarp.io.paths import file_within, remove_temporaries, write_file
 from spadwarp.io.text import write_text
 from spadwarp.parallel import Forked
 from spadwarp.result import Result, load_result, save_depth_exr, save_truth_maps
@@ -85,7 +85,10 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
     folder, scene, output = Path(out), result.scene, result.scene.output
     written: list[Path] = []
     try:
-        depth = _depth(result, device)
+        method, options = output.depth_method, dict[str, Any]()
+        if method in ("matched", "likelihood"):
+            options["irf"] = detector_response(scene.detector, scene.laser)
+        depth = result.depth(method=method, device=device, **options)
         calls = _pictures(result, folder, depth)
     except BaseException:
         if output.result:  # photons must not be lost
@@ -109,21 +112,13 @@ def write_run(result: Result, out: str | Path, *, device: str | None = None, kee
     return RunFiles(written, depth)
 
 
-def _depth(result: Result, device: str | None) -> NDArray[np.float64]:
-    scene, method = result.scene, result.scene.output.depth_method
-    options: dict[str, Any] = {}
-    if method in ("matched", "likelihood"):
-        options["irf"] = detector_response(scene.detector, scene.laser)
-    return result.depth(method=method, device=device, **options)
-
-
 def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[Callable[[], list[Path]]]:
     output = result.scene.output
     formats = [ending for ending in _ENDINGS if getattr(output, ending)]
-    draw = functools.partial(_Pictures.plot, result, folder, depth=depth, method=output.depth_method, formats=formats)
+    draw = partial(_Pictures.plot, result, folder, depth=depth, method=output.depth_method, formats=formats)
     kinds: tuple[str, ...] = _KINDS[:-1] if result.scene.transport.estimator != "none" else ()
     kinds += _KINDS[-1:] if result.scene.flux else ()
-    return [functools.partial(draw, kinds=(kind,)) for kind in kinds] if formats else []
+    return [partial(draw, kinds=(kind,)) for kind in kinds] if formats else []
 
 
 def _save(result: Result, path: Path) -> Path:
@@ -254,9 +249,8 @@ def write_fit(fit: Fit, directory: str | Path) -> list[Path]:
     Raises `FileError`.
     """
     folder = Path(directory)
-    with atomic_path(folder / "fit.png") as temporary:
-        fit.plot().savefig(temporary, format="png")
-    written = [folder / "fit.png", write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml")]
+    written = [write_file(folder / "fit.png", partial(fit.plot().savefig, format="png"))]
+    written.append(write_text(fit.scene.to_toml(folder=folder), folder / "scene.toml"))
     for estimate in fit.maps.values():
         name = _file_name(estimate.name)
         written += [write_array(folder / f"{name}.npy", estimate.value)]

@@ -24,10 +24,10 @@ from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.io.arrays import read_npy
 from spadwarp.io.hdf5 import hdf5_format, open_hdf5
 from spadwarp.io.mat import SparseMatrix, Variable, open_mat
-from spadwarp.io.paths import existing_file
+from spadwarp.io.paths import existing_file, reading
 from spadwarp.result import Channel, analyser_channel, noise_problem
 from spadwarp.result.file import load_result
-from spadwarp.values import ArgumentError, FileError, SpadwarpError, SpadwarpWarning, check_real, shown
+from spadwarp.values import ArgumentError, FileError, SpadwarpWarning, check_real, shown
 
 __all__ = ["read_histograms"]
 
@@ -175,14 +175,8 @@ def _reading(path: Path, read: Callable[..., _Raw], *facts: Any) -> _Raw:
     """What a reader reads from a path; whatever it raises becomes a `FileError`."""
     if path.suffix.lower() not in ENDINGS:
         raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(ENDINGS)}")
-    try:
+    with reading(path):
         return read(path, *facts)
-    except (SpadwarpError, MemoryError):
-        raise
-    except ModuleNotFoundError as error:
-        raise FileError(f"{path}: reading it needs {error.name}: pip install 'spadwarp[formats]'") from error
-    except Exception as error:  # what a reader raises depends on the format
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
 def _checked(values: NDArray[Any], path: Path) -> NDArray[Any]:

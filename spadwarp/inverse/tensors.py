@@ -16,7 +16,7 @@ from spadwarp.scene.grid import Grid
 from spadwarp.scene.medium import grid_cells
 from spadwarp.transport import RunOptions, resolve_derivatives, simulate
 from spadwarp.transport.derivatives import is_block_name
-from spadwarp.values import SEED, ArgumentError, FileError, check_integer
+from spadwarp.values import SEED, ArgumentError, check_integer
 
 if TYPE_CHECKING:
     import torch
@@ -54,10 +54,8 @@ def render(
         ConfigError: Cells that cannot be divided so, or have no slope.
         FileError: torch is not installed.
     """
-    try:
-        import torch
-    except ModuleNotFoundError as error:
-        raise FileError("render needs torch: pip install 'spadwarp[torch]'") from error
+    import torch
+
     base, seed = as_scene(scene), check_integer("seed", seed, SEED)
     names, shape = _checked(base, parameters)
     of_grid = [name for name in names if is_block_name(name)]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.io.paths import atomic_path, existing_file
+from spadwarp.io.paths import existing_file, reading, write_file
 from spadwarp.values import ArgumentError, FileError
 
 __all__ = ["point_cloud", "read_exr", "read_npy", "read_npz", "write_array", "write_exr", "write_ply"]
@@ -48,11 +48,10 @@ def write_exr(
         if name in _STRUCTURE:
             raise ArgumentError(f"metadata name {name!r} is one that EXR uses itself")
         header[name] = str(value)
-    with atomic_path(path) as temporary, OpenEXR.File(header, pixels) as file:
-        content = io.BytesIO()  # OpenEXR takes no names that are not Unicode
+    content = io.BytesIO()  # OpenEXR takes no names that are not Unicode
+    with OpenEXR.File(header, pixels) as file:
         file.write(content)
-        temporary.write_bytes(content.getvalue())
-    return Path(path)
+    return write_file(path, lambda file: file.write(content.getvalue()))
 
 
 def _exr_pixels(name: str, array: ArrayLike) -> NDArray[Any]:
@@ -102,9 +101,7 @@ def _value_count(part: Any) -> int:
 
 def write_array(path: str | Path, array: ArrayLike) -> Path:
     """Writes a `.npy` file, whole or not at all; returns its path. Raises `FileError`."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.save(file, array)
-    return Path(path)
+    return write_file(path, lambda file: np.save(file, array))
 
 
 def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
@@ -114,16 +111,11 @@ def read_npy(path: str | Path, *, largest: int | None = None) -> NDArray[Any]:
     its header says, of another type, or too large.
     """
     place = existing_file(path)
-    try:
-        with place.open("rb") as file:
-            if file.read(4)[:2] == b"PK":
-                raise FileError(f"{path}: a .npz archive, not a .npy file; write one array with numpy.save")
-            file.seek(0)
-            return _array(file, f"{path}:", place.stat().st_size, "biufc", largest)
-    except FileError:
-        raise
-    except Exception as error:  # a damaged header is parsed by Python's own parser
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
+    with reading(path), place.open("rb") as file:
+        if file.read(4)[:2] == b"PK":
+            raise FileError(f"{path}: a .npz archive, not a .npy file; write one array with numpy.save")
+        file.seek(0)
+        return _array(file, f"{path}:", place.stat().st_size, "biufc", largest)
 
 
 def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
@@ -134,16 +126,11 @@ def read_npz(path: str | Path, *, names: Collection[str], largest: int) -> dict[
     """
     place = existing_file(path)
     arrays: dict[str, NDArray[Any]] = {}
-    try:
-        with zipfile.ZipFile(place) as archive:
-            for info in archive.infolist():
-                if (name := info.filename.removesuffix(".npy")) in names:
-                    with archive.open(info) as file:
-                        arrays[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
-    except FileError:
-        raise
-    except Exception as error:  # a damaged header is parsed by Python's own parser
-        raise FileError(f"{path}: damaged or not a .npz archive: {error}") from error
+    with reading(path, "damaged or not a .npz archive"), zipfile.ZipFile(place) as archive:
+        for info in archive.infolist():
+            if (name := info.filename.removesuffix(".npy")) in names:
+                with archive.open(info) as file:
+                    arrays[name] = _array(file, f"{path}: {name}", info.file_size, "biuf", largest)
     return arrays
 
 
@@ -216,6 +203,4 @@ def write_ply(path: str | Path, columns: Mapping[str, ArrayLike], *, comment: st
     table = np.column_stack([np.asarray(column, "<f4") for column in columns.values()])
     header = ["ply", "format binary_little_endian 1.0", f"comment {' '.join(comment.split())}"]
     header += [f"element vertex {len(table)}", *(f"property float {name}" for name in columns), "end_header", ""]
-    with atomic_path(path) as temporary:
-        temporary.write_bytes("\n".join(header).encode("ascii", "replace") + table.tobytes())
-    return Path(path)
+    return write_file(path, lambda file: file.write("\n".join(header).encode("ascii", "replace") + table.tobytes()))

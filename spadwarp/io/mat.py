@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5
-from spadwarp.values import FileError, SpadwarpError
+from spadwarp.io.paths import reading
 
 __all__ = ["SparseMatrix", "Variable", "open_mat"]
 
@@ -60,17 +60,13 @@ def open_mat(path: Path) -> Iterator[dict[str, Variable]]:
     """
     import h5py
 
-    try:
+    with reading(path):
         if h5py.is_hdf5(path):
             with closing(open_hdf5(path)) as file:
                 yield dict(_version_7(file))
         else:
             with open(path, "rb") as source, mmap.mmap(source.fileno(), 0, access=mmap.ACCESS_READ) as content:
                 yield dict(_version_5(content))
-    except (SpadwarpError, MemoryError):
-        raise
-    except (OSError, ValueError, TypeError, LookupError, struct.error, zlib.error, OverflowError) as error:
-        raise FileError(f"{path}: damaged or not readable: {error}") from error
 
 
 def _sparse(shape: tuple[int, ...], row: NDArray[Any], start: NDArray[Any], value: NDArray[Any]) -> SparseMatrix:

@@ -14,12 +14,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from spadwarp.values import FileError, SpadwarpError, suggestion
 
 __all__ = ["MESH_ENDINGS", "atomic_path", "check_apart", "example_or_path", "examples", "existing_file", "file_problem"]
-__all__ += ["file_within", "is_stream", "lock", "remove_temporaries", "sha256", "similar", "used"]
+__all__ += ["file_within", "is_stream", "lock", "remove_temporaries", "sha256", "similar", "used", "write_file"]
 
 KINDS = ("scenes", "datasets", "training")
 """Kinds of examples."""
@@ -101,6 +101,17 @@ def existing_file(path: str | Path) -> Path:
     return Path(path)
 
 
+@contextmanager
+def reading(path: str | Path, problem: str = "damaged or not readable") -> Iterator[None]:
+    """Makes a `FileError` of whatever a library raises of a file."""
+    try:
+        yield
+    except (SpadwarpError, MemoryError, ModuleNotFoundError):
+        raise
+    except Exception as error:
+        raise FileError(f"{path}: {problem}: {error}") from error
+
+
 def file_within(path: str | Path, names: Sequence[str]) -> Path:
     """A file itself, or the only one of `names` in a directory. Raises `FileError` where there are none or several."""
     folder = Path(path)
@@ -115,11 +126,8 @@ def file_within(path: str | Path, names: Sequence[str]) -> Path:
 
 def sha256(path: str | Path) -> str:
     """Of a file's content, in hexadecimal digits. Raises `FileError`."""
-    try:
-        with existing_file(path).open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
+    with existing_file(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def check_apart(output: str | Path, source: Any) -> None:
@@ -160,6 +168,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
     except (OSError, RuntimeError) as error:  # h5py and OpenEXR report a full disk as either
         raise FileError(f"{target}: cannot be written: {error}") from error
+
+
+def write_file(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
+    """A file by a function that writes to it once it is open; see `atomic_path`. Returns its path."""
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        write(file)
+    return Path(path)
 
 
 @contextmanager

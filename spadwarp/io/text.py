@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.io.paths import atomic_path, similar, used
+from spadwarp.io.paths import similar, used, write_file
 from spadwarp.values import UNITS, ArgumentError, ConfigError, FileError, Interval, count, parse_number, shown
 
-__all__ = ["fact", "json_text", "parse_json", "parse_toml", "progress_report", "read_columns", "read_text", "read_toml"]
-__all__ += ["write_csv", "write_json", "write_text"]
+__all__ = ["fact", "json_text", "parse_json", "parse_toml", "progress_report", "read_columns", "read_json", "read_text"]
+__all__ += ["read_toml", "write_csv", "write_json", "write_text"]
 
 _LARGEST_TEXT = 4 << 20  # bytes; a table of 100 000 rows has 2 MiB
 _DEEPEST = 32  # tables and lists in each other; a recipe has 6
@@ -126,6 +126,14 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("lists or tables are nested too deeply") from None
 
 
+def read_json(path: str | os.PathLike[str], *, largest: int = _LARGEST_TEXT) -> Any:
+    """The value of a JSON file of `largest` bytes at most. Raises `FileError`."""
+    try:
+        return parse_json(read_text(path, largest=largest))
+    except ValueError as error:
+        raise FileError(f"{path}: not JSON: {error}") from error
+
+
 def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> NDArray[np.float64]:
     """The first columns of a .csv file, `[rows, columns]`; `columns`: name → range, such as "[0, 180]".
 
@@ -159,8 +167,8 @@ def read_columns(path: str | os.PathLike[str], columns: Mapping[str, str]) -> ND
 # Writing
 
 
-def json_text(value: Any, *, indent: int = 2) -> str:
-    """A value as JSON with a line end; numbers that are not finite become null, paths text."""
+def json_text(value: Any, *, indent: int | None = 2) -> str:
+    """A value as JSON with a line end; numbers that are not finite become null, paths text, those of NumPy numbers."""
     try:
         return json.dumps(_plain(value), indent=indent, allow_nan=False) + "\n"
     except TypeError as error:
@@ -169,9 +177,7 @@ def json_text(value: Any, *, indent: int = 2) -> str:
 
 def write_text(text: str, path: str | Path) -> Path:
     """Writes UTF-8 text; returns the path. Raises `FileError`."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return Path(path)
+    return write_file(path, lambda file: file.write(text.encode()))
 
 
 def write_json(value: Any, path: str | Path, *, indent: int = 2) -> Path:
@@ -181,11 +187,11 @@ def write_json(value: Any, path: str | Path, *, indent: int = 2) -> Path:
 
 def write_csv(table: Sequence[Mapping[str, Any]], path: str | Path) -> Path:
     """Writes rows with the same names as CSV with a header; returns the path. Raises `FileError`."""
-    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(table[0]))
-        writer.writeheader()
-        writer.writerows(table)
-    return Path(path)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(table[0]))
+    writer.writeheader()
+    writer.writerows(table)
+    return write_text(text.getvalue(), path)
 
 
 def _plain(value: Any) -> Any:
@@ -193,6 +199,7 @@ def _plain(value: Any) -> Any:
         return {str(name): _plain(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
+    value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return os.fspath(value) if isinstance(value, os.PathLike) else value
@@ -255,14 +262,15 @@ def progress_report(
             text = f"{100 * done / total:3.0f} %  {count(done)} of {count(total)} {unit}"
             if seconds > 0.05 and (rate := (done - began[1]) / seconds):
                 text += f", {rate:.3g} {unit}/s"
-                text += f", {_duration((total - done) / rate)} left" if done < total else f" in {_duration(seconds)}"
+                text += f", {duration((total - done) / rate)} left" if done < total else f" in {duration(seconds)}"
             show(done / total, text)
             shown_at, shown_done, ended, patience = now, done, done == total, min(2.0 * patience, 60.0)
 
     return report
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time [s] for people: "8.5 s", "3 min 20 s", "2 h 5 min"."""
     if seconds < 100:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     minutes, seconds = divmod(round(seconds), 60)

@@ -313,14 +313,11 @@ def read_usd(path: Path, name: str) -> trimesh.Trimesh:
 
     Transforms of the prims, instances, point instancers and `metersPerUnit` are applied; polygons are divided into
     triangles. Layers and payloads that the file refers to are read, too. `name`: how errors name the target.
-    Raises `MeshError` where there is no readable stage, nothing to see in it, or usd-core is not installed.
+    Raises `MeshError` where there is no readable stage or nothing to see in it.
     """
     import trimesh
+    from pxr import Tf, Usd, UsdGeom
 
-    try:
-        from pxr import Tf, Usd, UsdGeom
-    except ModuleNotFoundError as error:
-        raise MeshError(f"{name}: USD needs usd-core: pip install 'spadwarp[usd]'") from error
     try:
         stage = Usd.Stage.Open(str(path))
         time = Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.Default()

@@ -27,8 +27,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from spadwarp.device import core_count, pick_devices
-from spadwarp.parallel.ray import RETRIES, RayWorkers
-from spadwarp.parallel.worker import Ray, Worker
+from spadwarp.parallel.workers import RETRIES, Ray, RayWorkers, Worker
 from spadwarp.values import DeviceError, address_space
 
 __all__ = ["Forked", "run_jobs"]

@@ -4,7 +4,6 @@ from spadwarp.result.conversion import *
 from spadwarp.result.file import *
 from spadwarp.result.flux import *
 from spadwarp.result.noise import *
-from spadwarp.result.rendered_truth import *
 from spadwarp.result.result import *
 from spadwarp.result.tallies import *
 from spadwarp.values import guarded

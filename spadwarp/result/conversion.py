@@ -12,13 +12,12 @@ import numpy as np
 from spadwarp.arrays import Variable, is_torch, labelled
 from spadwarp.result.flux import flux_arrays
 from spadwarp.result.result import ARRAYS, Component, Result, coordinates_of
+from spadwarp.scene import Scene
 from spadwarp.values import ArgumentError, check_choice
 
 if TYPE_CHECKING:
     import torch
     import xarray
-
-    from spadwarp.scene import Scene
 
 __all__ = ["TorchResult", "to_torch", "to_xarray"]
 

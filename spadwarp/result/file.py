@@ -1,16 +1,18 @@
-"""A result as one HDF5 file; results added up; depth and truth as EXR."""
+"""A result as one HDF5 file; results added up; depth and truth as EXR, also from other programs."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.io.arrays import read_exr, write_exr
 from spadwarp.io.hdf5 import PIXELS, Coordinate, Hdf5File, name_dimensions, read_hdf5, write_hdf5, write_packed
@@ -31,11 +33,11 @@ from spadwarp.result.result import (
 )
 from spadwarp.result.tallies import FluxTallies, Range, SignedTallies, added, joined, moments_of, rebatched, total_of
 from spadwarp.scene import Scene
-from spadwarp.scene.camera import camera_attributes
+from spadwarp.scene.camera import camera_attributes, pixel_directions
 from spadwarp.scene.scan import shots_of
-from spadwarp.values import ArgumentError, ConfigError, FileError, check_integer, shown
+from spadwarp.values import ArgumentError, ConfigError, FileError, check_choice, check_integer, check_real, shown
 
-__all__ = ["ResultLike", "as_result", "load_result", "load_truth_maps", "merge"]
+__all__ = ["ResultLike", "as_result", "load_result", "load_truth_exr", "load_truth_maps", "merge"]
 __all__ += ["save_depth_exr", "save_result", "save_truth_maps"]
 
 FORMAT = "spadwarp result"
@@ -48,22 +50,15 @@ _RECORDS = ("energy_balance", "counters", "batch_moments", "timing", "provenance
 _READ_ME = (
     "Expected fraction of emitted photons per pixel and time bin = tallies * unit / photons, summed over component; "
     "times laser_photons_per_pulse * detector_pde (with the filter before it) it is the expected detections per pulse. "
-    "tallies: [component, height, width, bin]. In a scan photons_per_position [height, width] stands for photons. "
-    "shot: of a scan along a trajectory, when and where each pixel sees; its truth is in the frame of that shot. "
+    "In a scan photons_per_position stands for photons. What else an array holds is in its long_name. "
     "Bin k covers [gate_start + k * bin_width, gate_start + (k + 1) * bin_width) seconds of flight; "
     "time * 299792458 / group_index is the path in metres, laser to target to lens. "
-    "second_moment, where errors are kept: low and high 64 bits of the sum over batches of the squared tally over the "
-    "photons of the batch in units of batch_size; half: the tallies of the half of the batches whose number is even. "
-    "derivatives/tallies, where they were asked for: [parameter, component, height, width, bin], signed; times "
-    "derivatives/unit over photons it is the derivative of the fraction with respect to the parameter. "
-    "flux/SECTION/NAME, of [[flux]]: tallies whose attribute unit, over photons, makes them what long_name says. "
-    "channels/tallies, of a camera that records polarisation: the same for each channel, the fraction that it gets. "
-    "truth/depth is planar (z), truth/range along the line of sight; metres, NaN where nothing is hit. "
+    "Of second moments, where errors are kept, each batch counts by its photons in units of batch_size. "
+    "truth is NaN where nothing is hit; in a scan along a trajectory it is in the frame of the pixel's shot. "
     "Camera frame: +x right, +y down, +z forward; camera_matrix and camera_distortion are OpenCV's, the columns of "
     "camera_rotation are the camera's axes in the world, camera_position its lens; laser_position and laser_axis are "
     "in the camera frame."
 )
-
 
 _DIMENSIONS = {name: entry[1:] for name, entry in ARRAYS.items()} | {
     "photons_per_position": (PIXELS, "1", "photons emitted at the position of the pixel"),
@@ -93,8 +88,10 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
     arrays = arrays_of(result)
     if result.scene.scan_positions > 1:
         arrays["photons_per_position"] = result.unit / result.tally_value
-    if result.scene.scan.mode == "trajectory":
-        arrays |= _shots(result.scene)
+    if result.scene.scan.mode == "trajectory":  # when and where each pixel sees, for readers of the file alone
+        shots = shots_of(result.scene)
+        position, line = shots.lines()
+        arrays |= {"shot/time": shots.time[shots.number], "shot/position": position, "shot/line_of_sight": line}
     arrays |= {name: np.array(getattr(result, name), dtype=np.uint64) for name in ("photon_ranges", "requested")}
     coordinates: dict[str, Coordinate | int | None] = {
         **coordinates_of(result),
@@ -121,13 +118,6 @@ def save_result(result: Result, path: str | Path, *, compression: int = 1) -> Pa
             file.create_dataset(name, data=json.dumps(dict(getattr(result, name))))
         name_dimensions(file, coordinates | axes, _DIMENSIONS | described)
     return Path(path)
-
-
-def _shots(scene: Scene) -> dict[str, Any]:
-    """When and where each pixel of a scan along a trajectory sees, for readers of the file alone."""
-    shots = shots_of(scene)
-    position, line = shots.lines()
-    return {"shot/time": shots.time[shots.number], "shot/position": position, "shot/line_of_sight": line}
 
 
 def load_result(path: str | Path) -> Result:
@@ -168,11 +158,6 @@ def load_result(path: str | Path) -> Result:
         components = head.scene.components
         if not moments.keys() <= moments_of(components, [0] * len(components), 1, 1).keys():
             file.refuse("batch_moments", "are not those of the components")
-        batches, half_photons = (file.integer(name, default=0) for name in ("batches", "half_photons"))
-        if (head.batch_size > 0) != (batches > 0) or not 0 <= batches <= head.photons:
-            file.refuse("batches", f"= {batches} of {head.batch_size} photons cannot be those of {head.photons}")
-        if not 0 <= half_photons <= head.photons:
-            file.refuse("half_photons", f"= {half_photons} are more than the {head.photons} photons")
         made = file.table("provenance")
         parts = made.get("parts", [])
         if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
@@ -180,9 +165,9 @@ def load_result(path: str | Path) -> Result:
         return Result(
             **vars(head),
             tallies=tallies,
-            batches=batches,
+            batches=file.integer("batches", default=0),
             half=moment("half") if "half" in file else None,
-            half_photons=half_photons,
+            half_photons=file.integer("half_photons", default=0),
             second_moment=moment("second_moment"),
             truth=Truth(**maps),
             reconstruction=Reconstruction(**light) if light else None,
@@ -288,15 +273,10 @@ def _attributes(result: Result) -> dict[str, Any]:
     """What readers of the file alone need, in SI units."""
     scene = result.scene
     medium, laser, camera, detector, gate = scene.medium, scene.laser, scene.camera, scene.detector, scene.gate
+    own = ("unit", "photons", "energy_balance_unit", "partial", "batch_size", "batches", "half_photons")
     values = {
-        "unit": result.unit,
-        "photons": result.photons,
+        **{name: getattr(result, name) for name in own},
         "seed": str(result.seed),
-        "energy_balance_unit": result.energy_balance_unit,
-        "partial": result.partial,
-        "batch_size": result.batch_size,
-        "batches": result.batches,
-        "half_photons": result.half_photons,
         "file_hashes": " ".join(result.file_hashes),
         "components": list(scene.components),
         "gate_start": gate.start,
@@ -345,10 +325,7 @@ def merge(results: Iterable[ResultLike]) -> Result:
     for other in parts[1:]:
         if problem := difference(first, other):
             raise ConfigError(f"merge: {problem}")
-    try:
-        ranges = joined(ids for part in parts for ids in part.photon_ranges)
-    except ConfigError as error:
-        raise ConfigError(f"merge: {error}") from error
+    ranges = joined(ids for part in parts for ids in part.photon_ranges)
     size = max(part.batch_size for part in parts)
     total = total_of(*(rebatched(part, size // part.batch_size if size else 1) for part in parts))
     return replace(
@@ -415,3 +392,112 @@ def _exr_notes(result: Result) -> dict[str, str | int | float]:
         "seed": result.seed,
         "config": scene.to_toml(),
     }
+
+
+# Truth maps from the EXR files that a game engine or Blender writes
+
+_HALF_MAX = 65504.0  # the largest float16, which stands for infinity in files of float16
+_PRESETS = tomllib.loads((files("spadwarp.result") / "exr_presets.toml").read_text(encoding="utf-8"))
+
+
+def load_truth_exr(
+    *,
+    depth: str | Path,
+    camera: Any,
+    preset: Literal["unreal", "blender"] = "unreal",
+    depth_channel: str | None = None,
+    depth_scale: float | None = None,
+    radial: bool = False,
+    normal: str | Path | None = None,
+    albedo: str | Path | float = 0.5,
+    albedo_channel: str | None = None,
+    axes: ArrayLike | None = None,
+) -> Truth:
+    """Truth maps from a program's EXR export, in the camera frame (+x right, +y down, +z forward) and in metres.
+
+    Args:
+        depth: File with the depth; float16 and float32 are read as they are.
+        camera: The camera that the images were rendered with (`scene.camera`).
+        preset: Which program's channels, units and axes hold.
+        depth_channel: Name of the depth channel, or the last parts of it (`Depth.Z` finds `ViewLayer.Depth.Z`).
+        depth_scale: Metres per unit of depth, > 0.
+        radial: Whether depth is the distance from the camera instead of planar depth.
+        normal: File with world normals; without, every surface faces the camera.
+        albedo: File with the diffuse reflectance, or one number in [0, 1].
+        albedo_channel: Its channel.
+        axes: `[3, 3]`, the camera's right, down and forward as unit vectors of the program's world; the preset's are
+            those of a camera without rotation.
+
+    Returns Truth; NaN where the file has NaN, infinity, 0 or the sky's value. Raises `FileError`: a file that cannot be
+    read, without the channel (the message names those it has), of another size than the camera's image, with negative
+    depth or albedo outside [0, 1], or with nothing in view; `ArgumentError`: an argument out of range.
+    """
+    check_choice("preset", preset, [*_PRESETS])
+    if camera.port is not None:
+        raise ArgumentError("camera.port: rendered truth is of cameras that see along straight lines")
+    how, shape, view = _PRESETS[preset], (camera.height, camera.width), pixel_directions(camera)
+    scale = check_real("depth_scale", how["depth_scale"] if depth_scale is None else depth_scale, "[1e-9, 1e9]")
+
+    stored = _channel(depth, (depth_channel,) if depth_channel else how["depth_channels"], shape)
+    sky = min(how["sky"], _HALF_MAX) if stored.dtype == np.float16 else how["sky"]
+    raw = stored.astype(np.float64)
+    raw[~np.isfinite(raw) | (raw >= sky) | (raw == 0)] = np.nan
+    hit = ~np.isnan(raw)
+    if not hit.any():
+        raise FileError(f"{depth}: no pixel has a depth: everything is sky, 0 or NaN")
+    if (raw[hit] < 0).any():
+        raise FileError(f"{depth}: depth {raw[hit].min():g} is outside (0, inf)")
+    distance = raw * scale if radial else raw * scale / view[..., 2]
+
+    if isinstance(albedo, (str, Path)):
+        wanted = (albedo_channel,) if albedo_channel else how["albedo_channels"]
+        reflectance = _channel(albedo, wanted, shape).astype(np.float64)
+        wrong = hit & ~((reflectance >= 0) & (reflectance <= 1))
+        if wrong.any():
+            raise FileError(f"{albedo}: albedo {reflectance[wrong][0]:g} is outside [0, 1]")
+    else:
+        reflectance = np.full(shape, check_real("albedo", albedo, "[0, 1]"))
+
+    normals = -view if normal is None else _normals(normal, how, axes, view, hit)
+    return Truth(
+        depth=(distance * view[..., 2]).astype(np.float32),
+        range=distance.astype(np.float32),
+        normal=np.where(hit[..., None], normals, np.nan).astype(np.float32),
+        reflectance=np.where(hit, reflectance, np.nan).astype(np.float32),
+    )
+
+
+def _normals(
+    path: str | Path, how: dict[str, Any], axes: ArrayLike | None, view: NDArray[np.float64], hit: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Unit normals in the camera frame, on the camera's side."""
+    rows = np.asarray(how["axes"] if axes is None else axes, np.float64)
+    if rows.shape != (3, 3) or not np.allclose(rows @ rows.T, np.eye(3), atol=1e-4):
+        raise ArgumentError(f"axes = {rows.tolist()} are not three orthogonal unit vectors")
+    components = [_channel(path, names, hit.shape) for names in zip(*how["normal_channels"], strict=True)]
+    normals = np.stack(components, axis=-1).astype(np.float64) @ rows.T
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    if (missing := hit & ~(length[..., 0] > 0.1)).any():
+        row, column = np.argwhere(missing)[0]
+        raise FileError(f"{path}: no normal at pixel ({row}, {column}), which has a depth")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals = normals / length
+    return np.where(((normals * view).sum(axis=-1) > 0)[..., None], -normals, normals)
+
+
+def _channel(path: str | Path, names: Sequence[str], shape: tuple[int, ...]) -> NDArray[Any]:
+    """The first of the named channels, or the only one that ends in `.name`; float, `[H, W]`."""
+    path = Path(path)
+    other = path.with_suffix(path.suffix.swapcase())  # engines write `.EXR`
+    channels, _ = read_exr(other if other.exists() and not path.exists() else path)
+    for name in names:
+        found = [key for key in channels if key == name] or [key for key in channels if key.endswith(f".{name}")]
+        if len(found) > 1:
+            raise FileError(f"{path}: channel {name!r} could be {' or '.join(found)}; name one of them in full")
+        if found:
+            values = channels[found[0]]
+            if values.shape != shape:
+                sizes = f"{values.shape[1]} x {values.shape[0]} pixels; the camera has {shape[1]} x {shape[0]}"
+                raise FileError(f"{path}: {sizes}")
+            return values
+    raise FileError(f"{path}: no channel {' or '.join(map(repr, names))}; it has {', '.join(channels)}")

@@ -11,13 +11,13 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from spadwarp.io.hdf5 import Coordinate
-from spadwarp.result.tallies import FluxTallies, standard_error
+from spadwarp.result.tallies import FluxTallies
+from spadwarp.scene import Scene
 from spadwarp.scene.flux import FluxArray
 from spadwarp.values import ArgumentError, ConfigError, check_choice
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
-    from spadwarp.scene import Scene
 
 __all__ = ["Apparent", "FluxValues", "apparent"]
 
@@ -75,8 +75,7 @@ def flux_of(result: Result) -> dict[str, dict[str, FluxValues]]:
         value, errors = array.value / result.photons, None
         counts = part_of(tallies.tallies, array)
         if tallies.second_moment is not None and result.batches > 1:
-            moments, ratio = part_of(tallies.second_moment, array), result.photons / result.batch_size
-            errors = standard_error(counts[None], moments, result.batches, ratio) * value
+            errors = result.batch_error(counts[None], part_of(tallies.second_moment, array)) * value
         made = FluxValues(values=counts * value, errors=errors, dimensions=array.dimensions, unit=array.unit)
         sections.setdefault(section, {})[kind] = made
     return sections

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.result.tallies import standard_error
-from spadwarp.scene.ambient_light import noise_rate
+from spadwarp.io.text import duration
+from spadwarp.scene import Scene, noise_rate
 from spadwarp.values import check_real
 
 if TYPE_CHECKING:
     from spadwarp.result.result import Result
-    from spadwarp.scene import Scene
 
 __all__ = ["NOISE_GOAL", "PhotonsNeeded", "noise_problem", "photons_needed", "unclear_pixels"]
 
@@ -32,10 +31,10 @@ _SAMPLE = 1024  # pixels whose median stands for the target
 Floats = NDArray[np.float64]
 
 
-def noise_ratios(result: Result, second_moment: NDArray[np.uint64], pixels: NDArray[np.intp]) -> Floats:
+def noise_ratios(result: Result, pixels: NDArray[np.intp]) -> Floats:
     """`Result.noise_ratio` of pixels, by their numbers in the image; `[P]`."""
     components, _, _, bins = result.tallies.shape
-    tallies, moments = result.tallies.reshape(components, -1, bins), second_moment.reshape(2, -1, bins)
+    tallies, moments = result.tallies.reshape(components, -1, bins), result.known_moment.reshape(2, -1, bins)
     size = max(1, _PART_VOXELS // bins)
     scene, value, better = result.scene, result.tally_value.reshape(-1), result.reconstruction
     target = np.isfinite(result.truth.depth).reshape(-1)
@@ -46,7 +45,7 @@ def noise_ratios(result: Result, second_moment: NDArray[np.uint64], pixels: NDAr
         mine = tallies[:, part]
         scale = (value[part] * (scene.laser.photons_per_pulse * scene.detections_per_photon))[:, None]
         if better is None:
-            error = standard_error(mine, moments[:, part], result.batches, result.photons / result.batch_size) * scale
+            error = result.batch_error(mine, moments[:, part]) * scale
         else:
             scale = np.full((1, 1), scene.laser.photons_per_pulse * scene.detections_per_photon)
             mine = better.histogram.reshape(components, -1, bins)[:, part].astype(np.float64)
@@ -103,13 +102,13 @@ def unclear_pixels(result: Result) -> NDArray[np.bool_]:
     return (value > 0) & (error > _KNOWN * value)
 
 
-def target_noise_ratio(result: Result, second_moment: NDArray[np.uint64]) -> float:
+def target_noise_ratio(result: Result) -> float:
     """`Result.target_noise_ratio`."""
     target = np.isfinite(result.truth.depth)
     returned = result.tallies.any(axis=(0, 3)) & (target | ~target.any())
     pixels = np.flatnonzero(returned)
     pixels = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), _SAMPLE)).astype(np.intp)]
-    ratios = noise_ratios(result, second_moment, pixels)
+    ratios = noise_ratios(result, pixels)
     ratios = ratios[np.isfinite(ratios)]
     return float(np.median(ratios)) if ratios.size else math.inf
 
@@ -143,16 +142,9 @@ def noise_problem(result: Result) -> str:
     if ratio == math.inf:
         return f"not enough photons: none of {result.photons:.3g} brought light back"
     photons, seconds = photons_needed(result)
-    time = f", {_duration(seconds)} here" if math.isfinite(seconds) else ""
+    time = f", {duration(seconds)} here" if math.isfinite(seconds) else ""
     return (
         f"not enough photons: the simulation's noise shows, {ratio:.2g} times the variance of a frame's "
         f"photons in the median pixel; about {photons:.1e} photons instead of {result.photons:.1e} would make it "
         f"{NOISE_GOAL:g} times{time}"
     )
-
-
-def _duration(seconds: float) -> str:
-    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2.0 * size:
-            return f"{float(f'{seconds / size:.2g}'):g} {unit}"
-    return f"{seconds:.2g} s"

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
 from spadwarp.result.flux import FluxValues, check_flux, flux_arrays, flux_of
 from spadwarp.result.noise import noise_ratios, photons_needed, target_noise_ratio
-from spadwarp.result.tallies import SignedTallies, Tallies, count, photons_per_position, standard_error
+from spadwarp.result.tallies import NO_BATCHES, SignedTallies, Tallies, count, photons_per_position
+from spadwarp.scene import Scene
 from spadwarp.scene.medium import NOTABLE_UNSEEN
 from spadwarp.scene.scene import Component
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, ConfigError, FileError, Shown, check_choice, percent
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["CHANNELS", "COMPONENTS", "POLARISED", "Channel", "Component", "Half", "Reconstruction", "Result", "Truth"]
 __all__ += ["analyser_channel", "component_errors", "degree_of_polarisation"]
@@ -47,7 +45,6 @@ _FALSE_ALARM = 1e-4
 # Relative standard errors that are smaller are good enough whatever carries them.
 _SMALL_ERROR = 0.005
 
-_NO_BATCHES = "the result has no errors: fewer than two batches of photons were kept; simulate with more photons"
 _CAMERAS = "simulate with camera.polarisation = 'analyser' or 'stokes'"
 
 
@@ -288,7 +285,19 @@ class Result(Shown, ResultHead, Tallies):
 
         Raises `ConfigError`: the run has no batches, or only one.
         """
-        return standard_error(self.tallies, *_batches_of(self)) * self.tally_value[..., None]
+        return self.batch_error(self.tallies, self.known_moment) * self.tally_value[..., None]
+
+    def batch_error(self, tallies: NDArray[np.int64], second_moment: NDArray[np.uint64]) -> Floats:
+        """Standard error of the sum over components of tallies `[3, ...]`, in their unit, from the spread of batches.
+
+        With x of a batch of n photons, N photons and X in all B batches, Σ (x - n X/N)²/n = Σ x²/n - X²/N has the mean
+        (B - 1) times the variance of a photon's light, whatever the sizes of the batches.
+        """
+        if self.batches < 2:
+            raise ConfigError(NO_BATCHES)
+        total = tallies.sum(axis=0).astype(np.float64)
+        squares = (second_moment[1] * 2.0**64 + second_moment[0]) * (self.photons / self.batch_size)
+        return np.sqrt(np.maximum(squares - total**2, 0.0) / (self.batches - 1))
 
     @property
     def derivative_errors(self) -> Mapping[str, Floats]:
@@ -322,7 +331,7 @@ class Result(Shown, ResultHead, Tallies):
         Raises `ConfigError`: the run has no batches, or only one.
         """
         if self.half is None or not 0 < self.half_photons < self.photons:
-            raise ConfigError(_NO_BATCHES)
+            raise ConfigError(NO_BATCHES)
         rest = self.photons - self.half_photons
         return Half(self.half, self.half_photons, self.tally_value * (self.photons / self.half_photons)), Half(
             self.tallies - self.half, rest, self.tally_value * (self.photons / rest)
@@ -339,28 +348,27 @@ class Result(Shown, ResultHead, Tallies):
 
         Raises as `standard_error` does.
         """
-        pixels = np.arange(self.truth.depth.size)
-        return noise_ratios(self, _batches_of(self)[0], pixels).reshape(self.truth.depth.shape)
+        return noise_ratios(self, np.arange(self.truth.depth.size)).reshape(self.truth.depth.shape)
 
     @cached_property
     def target_noise_ratio(self) -> float:
         """Median of `noise_ratio` over the pixels of the target in which light returned, or over all without a target;
         of 1024 of them spread over the image where there are more. Infinite if nothing returned. Raises as
         `standard_error` does."""
-        return target_noise_ratio(self, _batches_of(self)[0])
+        return target_noise_ratio(self)
 
     @property
     def relative_error(self) -> float:
         """Relative error of the bins that decide the depth: each pixel's brightest, at the 95th percentile of the
         pixels that hold a target, or of all without any, in which anything returned. The standard error, plus what is
         missing if `unseen_share` of the scattered light is. Infinite if nothing returned."""
-        moments, batches, ratio = _batches_of(self)
+        moments = self.known_moment
         # Row by row: of a large histogram nothing is copied.
         peak = np.stack([row.sum(axis=0).argmax(axis=1) for row in self.tallies.swapaxes(0, 1)])[None, ..., None]
         tallies = np.take_along_axis(self.tallies, peak, axis=3)[..., 0]
         value, unseen = tallies.sum(axis=0), self.unseen_share
         missing = tallies[1:].sum(axis=0) * (unseen / max(1.0 - unseen, 1e-12))
-        error = missing + standard_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0], batches, ratio)
+        error = missing + self.batch_error(tallies, np.take_along_axis(moments, peak, axis=3)[..., 0])
         target = np.isfinite(self.truth.depth)
         returned = (value > 0) & (target | ~target.any())
         return float(np.quantile(error[returned] / value[returned], 0.95)) if returned.any() else math.inf
@@ -600,7 +608,7 @@ class _Cube(NamedTuple):
 
     tallies: NDArray[np.int64]
     unit: float
-    second_moment: NDArray[np.uint64] | None
+    second_moment: Any
 
 
 def _cubes_of(result: Result, group: str) -> dict[str, _Cube]:
@@ -652,11 +660,7 @@ class _SignedValues(Mapping[str, Floats]):
             raise KeyError(f"{name!r} is not one of the {self._group}: {', '.join(self) or 'none were asked for'}")
         result, (tallies, unit, moments) = self._result, self._cubes[name]
         value = (unit / result.unit * result.tally_value)[..., None]
-        if not self._errors:
-            return tallies * value
-        _, batches, ratio = _batches_of(result)
-        assert moments is not None
-        return standard_error(tallies, moments, batches, ratio) * value
+        return tallies * value if not self._errors else result.batch_error(tallies, moments) * value
 
     def __repr__(self) -> str:
         return f"{{{', '.join(map(repr, self))}}}"
@@ -745,17 +749,9 @@ def _spreads(result: Result) -> dict[Component, tuple[int, int, int, int]]:
     return found
 
 
-def _batches_of(result: Result) -> tuple[NDArray[np.uint64], int, float]:
-    """The last arguments of `standard_error`. Raises `ConfigError` where there are too few batches."""
-    if result.second_moment is None or result.batches < 2:
-        raise ConfigError(_NO_BATCHES)
-    return result.second_moment, result.batches, result.photons / result.batch_size
-
-
 def pixel_standard_error(result: Result, row: int, column: int) -> Floats:
     """`Result.standard_error` of one pixel, float64 `[T]`, without that of the others."""
-    moments, batches, ratio = _batches_of(result)
-    error = standard_error(result.tallies[:, row, column], moments[:, row, column], batches, ratio)
+    error = result.batch_error(result.tallies[:, row, column], result.known_moment[:, row, column])
     return np.asarray(error * result.tally_value[row, column])
 
 
@@ -800,11 +796,12 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
         problem = f"the result holds {own!r} alone; take that of the run" if own else problem
         raise ConfigError(f"channel = {channel!r}: {problem}", source=result.scene.source)
     tallies, unit = _channel_tallies(result, channel)
+    lines_left_out = result.scene.with_overrides({"medium.inelastic": []})  # light of another wavelength alone comes
     cube = _cubes_of(result, "channels").get(channel)
     moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
     return replace(
         result,
-        scene=_behind_analyser(result.scene) if of_polarisation else _behind_filter(result.scene),
+        scene=_behind_analyser(result.scene) if of_polarisation else lines_left_out,
         tallies=tallies,
         unit=unit,
         half=None,
@@ -882,11 +879,6 @@ def _degree(result: Result, sums: dict[str, Floats]) -> Floats:
         ratio = (sums["co"] - sums["cross"]) / (sums["co"] + sums["cross"])
         degree: Floats = np.clip(ratio * np.divide(1.0 + leak, 1.0 - leak), -1.0, 1.0)
         return degree
-
-
-def _behind_filter(scene: Scene) -> Scene:
-    """The scene of a receiver that light of another wavelength alone reaches."""
-    return scene.with_overrides({"medium.inelastic": []})
 
 
 def _behind_analyser(scene: Scene) -> Scene:

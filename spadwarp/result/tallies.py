@@ -5,15 +5,13 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.scene import Scene
 from spadwarp.values import ConfigError, SpadwarpError
-
-if TYPE_CHECKING:
-    from spadwarp.scene import Scene
 
 __all__ = ["FluxTallies", "SignedTallies", "Tallies"]
 
@@ -21,6 +19,10 @@ OVERFLOW = (
     "a histogram bin overflowed: the scene is brighter than the tally's unit allows for; run fewer photons at a time "
     "and average their histograms"
 )
+
+NO_BATCHES = "the result has no errors: fewer than two batches of photons were kept; simulate with more photons"
+
+GROUPS = ("derivative_tallies", "channel_tallies", "flux_tallies")
 
 Number = TypeVar("Number", int, float)
 
@@ -72,6 +74,13 @@ class Tallies:
     channel_tallies: SignedTallies | None = None  # of the camera's channels but "I", the histogram; None: no others
     flux_tallies: FluxTallies | None = None  # of the scene's sections of flux; None if there are none
 
+    @property
+    def known_moment(self) -> NDArray[np.uint64]:
+        """`second_moment`. Raises `ConfigError` where there are fewer than two batches."""
+        if self.second_moment is None or self.batches < 2:
+            raise ConfigError(NO_BATCHES)
+        return self.second_moment
+
 
 def total_of(*parts: Tallies) -> Tallies:
     """The sum of tallies of disjoint photons, with arrays of its own.
@@ -79,7 +88,7 @@ def total_of(*parts: Tallies) -> Tallies:
     Raises `ConfigError` where they count different things, `SpadwarpError` where a bin overflows.
     """
     check_capacity(*(part.tallies for part in parts))
-    counts = {}
+    counts: dict[str, Any] = {}
     for name in ("energy_balance", "counters"):
         each = [getattr(part, name) for part in parts]
         if strange := set[str]().union(*each) - set(each[0]).intersection(*each):
@@ -95,34 +104,26 @@ def total_of(*parts: Tallies) -> Tallies:
         half_photons=sum(part.half_photons for part in parts),
         second_moment=second_moment,
         batch_moments=joined_moments(*(part.batch_moments for part in parts)),
-        derivative_tallies=_signed_total([part.derivative_tallies for part in parts]),
-        channel_tallies=_signed_total([part.channel_tallies for part in parts]),
-        flux_tallies=_flux_total([part.flux_tallies for part in parts if part.flux_tallies is not None]),
+        **{name: _group_total([getattr(part, name) for part in parts]) for name in GROUPS},
     )
 
 
-def _signed_total(parts: Sequence[SignedTallies | None]) -> SignedTallies | None:
+def _group_total(parts: Sequence[Any]) -> Any:
+    """Of derivatives, channels or flux; None where there are none."""
     found = [part for part in parts if part is not None]
     if not found:
         return None
-    first = found[0]
-    if len(found) < len(parts) or any((part.names, part.units) != (first.names, first.units) for part in found):
-        raise ConfigError("the results have tallies of different derivatives or channels")
+    first, of_flux = found[0], isinstance(found[0], FluxTallies)
+    kinds = set() if of_flux else {(part.names, part.units) for part in found}
+    if len(found) < len(parts) or len(kinds) > 1:
+        raise ConfigError("the results have tallies of different derivatives, channels or flux")
     tallies, second_moment = _added_arrays(found)
-    if np.abs(tallies.sum(axis=1, dtype=np.float64)).max(initial=0.0) >= 2.0**62:
-        raise SpadwarpError(
-            "a bin of a derivative or a channel overflowed; run fewer photons at a time and average the results"
-        )
+    # Flux is never negative; a negative integer is large without its sign.
+    light = tallies.view(np.uint64) if of_flux else np.abs(tallies.sum(axis=1, dtype=np.float64))
+    if light.max(initial=0) >= 2**62:
+        text = "a bin of a derivative, a channel or flux overflowed"
+        raise SpadwarpError(f"{text}; run fewer photons at a time and average the results")
     return replace(first, tallies=tallies, second_moment=second_moment)
-
-
-def _flux_total(parts: Sequence[FluxTallies]) -> FluxTallies | None:
-    if not parts:
-        return None
-    tallies, second_moment = _added_arrays(parts)
-    if tallies.min(initial=0) < 0 or tallies.max(initial=0) >= 2**62:
-        raise SpadwarpError("a voxel or plane of flux overflowed; run fewer photons at a time and average the results")
-    return FluxTallies(tallies, second_moment)
 
 
 def _added_arrays(
@@ -190,7 +191,7 @@ def rebatched(part: Tallies, ratio: int) -> Tallies:
     shift = np.uint64(ratio.bit_length() - 1)
     moments = {name: value * ratio for name, value in part.batch_moments.items() if name.endswith("_squares")}
     others = {}
-    for name in ("derivative_tallies", "channel_tallies", "flux_tallies"):
+    for name in GROUPS:
         if (group := getattr(part, name)) is not None:
             assert group.second_moment is not None
             others[name] = replace(group, second_moment=_shifted(group.second_moment, shift))
@@ -201,20 +202,6 @@ def _shifted(wide: NDArray[np.uint64], shift: np.uint64) -> NDArray[np.uint64]:
     """128-bit integers, low and high halves, times a power of two > 1."""
     low, high = wide
     return np.stack([low << shift, high << shift | low >> np.uint64(64) - shift])
-
-
-def standard_error(
-    tallies: NDArray[np.int64], second_moment: NDArray[np.uint64], batches: int, ratio: float
-) -> NDArray[np.float64]:
-    """Standard error of the sum over components of tallies `[3, ...]`, in their unit, from the spread of batches;
-    `ratio`: all photons over `batch_size`.
-
-    With x of a batch of n photons, N photons and X in all B batches, Σ (x - n X/N)²/n = Σ x²/n - X²/N has the mean
-    (B - 1) times the variance of a photon's light, whatever the sizes of the batches.
-    """
-    total = tallies.sum(axis=0).astype(np.float64)
-    squares = second_moment[1] * 2.0**64 + second_moment[0]
-    return np.sqrt(np.maximum(squares * ratio - total**2, 0.0) / (batches - 1))
 
 
 # Photon ids, as [start, stop)

@@ -6,19 +6,16 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import warp as wp
 
 import spadwarp_kernels as sk
+from spadwarp.mesh import TriangleMesh
 from spadwarp.scene import Scene
 from spadwarp.scene.medium import constituent_order, grid_cells
 from spadwarp.values import ArgumentError, ConfigError, shown, suggestion
-
-if TYPE_CHECKING:
-    import warp as wp
-
-    from spadwarp.mesh import TriangleMesh
 
 __all__ = ["derivative_names", "resolve_derivatives"]
 

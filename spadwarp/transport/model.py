@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import physical_memory, pick_device
-from spadwarp.mesh import build_mesh, focus_distance
+from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.result import Truth
-from spadwarp.scene import Camera, Laser, Medium, Scene, SceneLike, as_scene, phase_function, scattering_matrix
+from spadwarp.scene import Camera, Laser, Scene, SceneLike, as_scene, phase_function, scattering_matrix
 from spadwarp.scene.camera import pixel_directions, pixel_views, to_camera, to_world, view_box
 from spadwarp.scene.flux import Sun
 from spadwarp.scene.laser import load_profile, profile_extent
@@ -28,11 +28,8 @@ from spadwarp.scene.scene import camera_port, laser_port, mean_plane
 from spadwarp.scene.sea import Surface
 from spadwarp.scene.sight import lines_of_sight, scan_axes, view_directions, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
-from spadwarp.transport.plan import tally_scale
+from spadwarp.transport.plan import tally_limits
 from spadwarp.values import ArgumentError, ConfigError, DeviceError
-
-if TYPE_CHECKING:
-    from spadwarp.mesh import TriangleMesh
 
 __all__ = ["points_per_flight", "target_map", "truth_maps", "wave_errors"]
 
@@ -73,7 +70,7 @@ def build_model(
     if camera:
         _check_gate(scene)
     if scale is None:
-        scale = tally_scale(scene, mesh) if camera else 1.0
+        scale = tally_limits(scene, mesh).scale if camera else 1.0
     sea = None if scene.surface is None else _sea(scene, device)
     lens, limits = _camera(scene, mesh, sea), _limits(scene, device, camera)
     # Behind a port, light bends: the map of what the lens sees for certain is of straight lines to a lens at rest.
@@ -189,7 +186,10 @@ def _guiding(scene: Scene, max_path: float) -> Any:
         far_point = [p + 0.5 * max_path * u for p, u in zip(beam.position, beam.axis, strict=True)]
         thickness = max(2.0 * scene.optical_depth(beam.position, far_point), 1e-6)
     else:
-        thickness = max(scene.medium.extinction * (max_path - _path_in_air(scene)), 1e-6)
+        ports = [camera_port(scene), laser_port(scene)] if scene.surface is not None else []
+        # Of the path down to the sea and back what is in the air, as a length in water.
+        in_air = sum(port.distance * port.group_index[0] / port.group_index[2] for port in ports if port is not None)
+        thickness = max(scene.medium.extinction * (max_path - in_air), 1e-6)
     in_grid = scene.medium.grid is not None
     return _filled(
         sk.Guiding(),
@@ -199,12 +199,6 @@ def _guiding(scene: Scene, max_path: float) -> Any:
         return_probability=0.1 * min(1.0, 5.0 / thickness),
         return_anisotropy=0.5,
     )
-
-
-def _path_in_air(scene: Scene) -> float:
-    """Of the path down to the sea and back what is in the air, as a length in water [m]."""
-    ports = [camera_port(scene), laser_port(scene)] if scene.surface is not None else []
-    return sum(port.distance * port.group_index[0] / port.group_index[2] for port in ports if port is not None)
 
 
 def _device_mesh(mesh: TriangleMesh, device: wp.Device, cache: MeshCache | None) -> wp.Mesh:
@@ -276,9 +270,12 @@ def _layers(scene: Scene, device: wp.Device) -> Any:
 def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequence[str] = (), **choices: Any) -> Any:
     """The compile-time choices of a scene and of the derivatives asked for; `choices` override them."""
     kinds, by_block = derivative_kinds(scene, derivatives)
+    phase = sk.TABULATED if scene.medium.has_phase_table else sk.HENYEY_GREENSTEIN
+    if scene.medium.phase_function == MIXTURE:
+        phase = sk.make_mixture(len(scene.medium.constituents))
     spec = sk.TransportSpec(
         estimator=scene.transport.estimator,
-        phase=_phase(scene.medium),
+        phase=phase,
         random_albedo=scene.medium.albedo == "lu2024",
         mesh=mesh is not None,
         brute_force=mesh is not None and mesh.face_count <= sk.BRUTE_FORCE_FACES,
@@ -293,7 +290,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         rotated_domain=_has_rotated_domain(scene),
         port=None if scene.surface else port_kind(camera_port(scene)),
         laser_port=sk.FLAT_PORT if scene.sun else None if scene.surface else port_kind(laser_port(scene)),
-        sea=_sea_kind(scene),
+        sea=None if scene.surface is None else sk.FACETS if scene.surface.waves is None else sk.WAVES,
         reflecting=bool(scene.domain.reflecting),
         grid=_grid_tracking(scene),
         derivatives=kinds,
@@ -307,13 +304,6 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         sun=scene.sun is not None,
     )
     return spec._replace(**choices)
-
-
-def _phase(medium: Medium) -> Any:
-    """How the kernels draw the directions of scattered light."""
-    if medium.phase_function == MIXTURE:
-        return sk.make_mixture(len(medium.constituents))
-    return sk.TABULATED if medium.has_phase_table else sk.HENYEY_GREENSTEIN
 
 
 def _grid_tracking(scene: Scene) -> Any:
@@ -426,25 +416,18 @@ def _camera(scene: Scene, mesh: TriangleMesh | None, sea: Any) -> Any:
 
 def _plane_of_shots(scene: Scene, plane: PortGeometry, *lens: Any) -> Any:
     """`port_parameters` of the mean plane of a sea, with bounds that hold for all shots of a scan."""
-    _, position, axes = shot_poses(scene)
+    shots = _shots(scene)
     left, top, right, bottom = view_box(scene.receiver)
     corners = np.array([[x, y, 1.0] for x in (left, right) for y in (top, bottom)])
-    normals = np.einsum("nij,i->nj", axes, plane.normal)
+    normals = np.einsum("nij,i->nj", shots.rotation, plane.normal)
     steepest = normals[(normals @ (corners / np.linalg.norm(corners, axis=1, keepdims=True)).T).min(axis=1).argmin()]
-    heights = plane.distance - position @ plane.normal
+    heights = plane.distance - shots.position @ plane.normal
     ends = [
         port_parameters(scene, dataclasses.replace(plane, distance=float(height), normal=vector_of(steepest)), *lens)
         for height in (heights.min(), heights.max())
     ]
     late = max(end.late for end in ends)
     return _filled(ends[1], normal=wp.vec3(*plane.normal), distance=plane.distance, late=late)
-
-
-def _sea_kind(scene: Scene) -> Any:
-    """The kernels' kind of the scene's surface; None: there is none."""
-    if scene.surface is None:
-        return None
-    return sk.FACETS if scene.surface.waves is None else sk.WAVES
 
 
 def _sea(scene: Scene, device: wp.Device) -> Any:
@@ -505,12 +488,11 @@ def _lens(scene: Scene) -> Any:
     return sk.PLAIN if scene.camera.is_plain and scene.scan.mode == "none" else sk.CALIBRATED
 
 
-def shot_poses(scene: Scene) -> tuple[Shots, NDArray[np.float64], NDArray[np.float64]]:
-    """The shots of a scan along a trajectory, and their positions `[N, 3]` and axes `[N, 3, 3]` in the frame of the
-    scene's camera, in which light is traced."""
-    shots = shots_of(scene)
-    turn = rotation_matrix(scene.camera.rotation_deg).T
-    return shots, to_camera(scene.camera, shots.position), turn @ shots.rotation
+def _shots(scene: Scene) -> Shots:
+    """The shots of a scan along a trajectory in the frame of the scene's camera, in which light is traced."""
+    shots, turn = shots_of(scene), rotation_matrix(scene.camera.rotation_deg).T
+    position = to_camera(scene.camera, shots.position)
+    return dataclasses.replace(shots, position=position, rotation=turn @ shots.rotation)
 
 
 def _scan(scene: Scene, device: wp.Device) -> Any:
@@ -518,8 +500,8 @@ def _scan(scene: Scene, device: wp.Device) -> Any:
     if scene.scan.mode == "trajectory":
         from scipy.spatial.transform import Rotation
 
-        _, position, axes = shot_poses(scene)
-        poses = np.concatenate([position, Rotation.from_matrix(axes).as_quat()], axis=1)
+        shots = _shots(scene)
+        poses = np.concatenate([shots.position, Rotation.from_matrix(shots.rotation).as_quat()], axis=1)
         pose: wp.array = wp.array(poses.astype(np.float32), dtype=wp.transform, device=device)
         return _filled(sk.Scan(), count=len(poses), pose=pose)
     axes, views = scan_axes(scene).reshape(-1, 3), pixel_views(scene.camera).reshape(-1, 4)
@@ -702,16 +684,19 @@ def trace_truth(scene: Scene, model: sk.Model) -> Truth:
         return Truth(depth=nothing, range=nothing, normal=np.full((*shape, 3), np.nan, np.float32), reflectance=nothing)
     if scene.surface is not None:
         return _truth_by_sea(scene, model, shape)
-    nowhere = np.zeros((0, 0, 3))
-    origins, directions, lead = nowhere, nowhere if camera.is_plain else pixel_directions(camera), None
-    if scene.scan.mode == "trajectory":
-        return _trace_shots(scene, model)
+    if scene.scan.mode == "trajectory":  # in the frame of each pixel's shot
+        shots = _shots(scene)
+        _, ranges, normal, reflectance = trace_rays(model, *shots.lines(), shape)
+        normal = np.einsum("hwij,hwi->hwj", shots.rotation[shots.number], normal).astype(np.float32)
+        depth = (ranges * view_directions(scene)[..., 2]).astype(np.float32)
+        return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
+    nowhere, lead = np.zeros((0, 0, 3)), 0.0  # type: tuple[Any, Any]
+    origins, directions = nowhere, nowhere if camera.is_plain else pixel_directions(camera)
     if camera.port is not None:
         lines = lines_of_sight(scene)
         origins, directions, lead = lines.start, lines.direction, lines.lead
     depth, ranges, normal, reflectance = trace_rays(model, origins, directions, shape)
-    ranges = ranges if lead is None else (ranges + lead).astype(np.float32)
-    return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
+    return Truth(depth=depth, range=(ranges + lead).astype(np.float32), normal=normal, reflectance=reflectance)
 
 
 def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Truth:
@@ -719,8 +704,8 @@ def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Trut
     (origin, view), (start, direction, lead) = _rays_by_sea(scene, model)
     near, far = (trace_rays(model, *rays, shape) for rays in ((origin, view), (start, direction)))
     if scene.scan.mode == "trajectory":  # in the frame of each pixel's shot
-        shots, _, axes = shot_poses(scene)
-        turns, from_lens = axes[shots.number], start - origin
+        shots = _shots(scene)
+        turns, from_lens = shots.rotation[shots.number], start - origin
         for found, begin, along in ((near, np.zeros(3), view), (far, from_lens, direction)):
             depth = np.einsum("hwi,hwi->hw", turns[..., 2], begin + found[1][..., None] * along)
             normal = np.einsum("hwij,hwi->hwj", turns, found[2])
@@ -734,11 +719,11 @@ def _truth_by_sea(scene: Scene, model: sk.Model, shape: tuple[int, int]) -> Trut
 def _rays_by_sea(scene: Scene, model: sk.Model) -> tuple[tuple[Any, Any], tuple[Any, Any, Any]]:
     """Rays of pixels `[H, W, 3]`: begin and direction at the lens; and where they meet the surface of the sea, how they
     go on, and their lengths up to there."""
-    view = pixel_directions(scene.camera)
-    origin = np.zeros(view.shape)
     if scene.scan.mode == "trajectory":
-        shots, position, axes = shot_poses(scene)
-        origin, view = dataclasses.replace(shots, position=position, rotation=axes).lines()
+        origin, view = _shots(scene).lines()
+    else:
+        view = pixel_directions(scene.camera)
+        origin = np.zeros(view.shape)
     if scene.surface is None or scene.surface.waves is None:
         plane = camera_port(scene) or mean_plane(scene, from_below=True)
         return (origin, view), plane.enter(origin, view)[:3]
@@ -779,8 +764,8 @@ def wave_errors(scene: SceneLike, depth: ArrayLike | None = None, *, device: str
         in_water = 0.5 * lines.path_from_range(lines.range_from_depth(found)) - in_air
         axis = np.array([0.0, 0.0, 1.0])
         if scene.scan.mode == "trajectory":
-            shots, _, axes = shot_poses(scene)
-            axis = axes[shots.number][..., 2]
+            shots = _shots(scene)
+            axis = shots.rotation[shots.number][..., 2]
         actual = ((start - origin + np.where(in_water > 0.0, in_water, np.nan)[..., None] * direction) * axis).sum(-1)
     return np.asarray(found - actual, np.float64)
 
@@ -795,16 +780,6 @@ def first_hits(
     model: Any = SimpleNamespace(device=device, camera=sk.Camera(), surfaces=sk.make_surfaces(mesh, 0.5), mesh=mesh)
     origins = np.broadcast_to(np.asarray(start, np.float64), direction.shape)
     return trace_rays(model, origins[None], direction[None], (1, len(direction)))[1][0].astype(np.float64)
-
-
-def _trace_shots(scene: Scene, model: sk.Model) -> Truth:
-    """The truth of a scan along a trajectory, in the frame of each pixel's shot."""
-    shots, position, axes = shot_poses(scene)
-    origins, directions = dataclasses.replace(shots, position=position, rotation=axes).lines()
-    _, ranges, normal, reflectance = trace_rays(model, origins, directions, shots.shape)
-    normal = np.einsum("hwij,hwi->hwj", axes[shots.number], normal).astype(np.float32)
-    depth = (ranges * view_directions(scene)[..., 2]).astype(np.float32)
-    return Truth(depth=depth, range=ranges, normal=normal, reflectance=reflectance)
 
 
 def target_map(scene: SceneLike, *, device: str | None = None) -> NDArray[np.int32]:

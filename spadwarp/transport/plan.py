@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
-from spadwarp.mesh import build_mesh, focus_distance
+from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance
 from spadwarp.result import Result, ResultLike
 from spadwarp.result.result import ResultHead, difference
 from spadwarp.result.tallies import count, shard_of
@@ -27,10 +27,7 @@ from spadwarp.scene.sight import nearest_points, view_planes
 from spadwarp.transport.derivatives import resolve_derivatives
 from spadwarp.values import SEED, ConfigError, check_integer, check_part, check_real
 
-if TYPE_CHECKING:
-    from spadwarp.mesh import TriangleMesh
-
-__all__ = ["PHOTON_CAPACITY", "RunOptions", "photon_capacity", "tally_scale"]
+__all__ = ["PHOTON_CAPACITY", "RunOptions", "TallyLimits", "tally_limits"]
 
 # Photons in one launch: large enough to fill the device, small enough for progress and Ctrl-C.
 LAUNCH_SIZE = {"cpu": 1 << 16, "cuda": 1 << 26}
@@ -61,12 +58,6 @@ MOST_BINS_WITH_ERRORS = 1 << 27
 # Of a scan along a trajectory: 20 000 shots of 800 bins. Each shot has few photons of its own, and what its counts are
 # drawn from is noisy beside their shot noise or not whatever its errors; 1e5 shots of 500 bins take 1.2 GB without.
 _MOST_BINS_OF_SHOTS = 1 << 24
-
-
-def keeps_errors(scene: Scene) -> bool:
-    """Whether a run of a scene keeps standard errors, see `MOST_BINS_WITH_ERRORS`."""
-    most = _MOST_BINS_OF_SHOTS if scene.scan.mode == "trajectory" else MOST_BINS_WITH_ERRORS
-    return _bins(scene) <= most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +148,7 @@ def make_plan(
         names = had
     photons = scene.transport.photons if photons is None else photons
     mesh = build_mesh(scene)
-    scale, capacity = scale_and_capacity(scene, mesh)
+    scale, capacity = tally_limits(scene, mesh)
     most = min(capacity, int(_PHOTONS.high))
     # A run by its error is interrupted with all the photons that there can be still asked for.
     is_auto = photons == "auto" or (resume is not None and photons == most)
@@ -167,7 +158,7 @@ def make_plan(
     if is_auto and shard is not None:
         raise ConfigError("photons = 'auto' cannot be combined with shard: no part knows the error of the whole")
     if batches:
-        wanted = _auto_batch_size(scene, kind) if is_auto else _batch_size(scene, photons, relative_error, shard, kind)
+        wanted = _batch_size(scene, None if is_auto else photons, relative_error, shard, kind)
         batch_size = max(0 if resume is None else resume.batch_size, wanted)
     if is_auto and not batch_size:
         raise ConfigError("photons = 'auto' needs errors, which a histogram this large does not keep; give a number")
@@ -200,35 +191,27 @@ def make_plan(
     return plan
 
 
-def _bins(scene: Scene) -> int:
-    """Of the histogram, and entries of flux."""
-    bins = scene.camera.width * scene.camera.height * scene.gate.bins
-    return bins + sum(section.size for section in scene.flux)
-
-
 def _batch_size(
-    scene: Scene, photons: int, relative_error: float | None, shard: tuple[int, int] | None, kind: str
+    scene: Scene, photons: int | None, relative_error: float | None, shard: tuple[int, int] | None, kind: str
 ) -> int:
-    """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches."""
-    bins = _bins(scene)
-    if not keeps_errors(scene) and relative_error is None:
+    """A power of two, times the positions of a scan so that every batch has whole rounds of it; 0: no batches.
+
+    Where the number of photons is not known, None, some hundredths of a second.
+    """
+    bins = scene.camera.width * scene.camera.height * scene.gate.bins + sum(section.size for section in scene.flux)
+    most_bins = _MOST_BINS_OF_SHOTS if scene.scan.mode == "trajectory" else MOST_BINS_WITH_ERRORS
+    if bins > most_bins and (photons is None or relative_error is None):
         return 0
+    positions, voxels = scene.scan_positions, len(scene.components) * bins
+    if photons is None:
+        least = max(_AUTO_BATCH[kind], voxels // _AUTO_VOXELS_PER_PHOTON[kind])
+        return positions << max(0, (least // positions - 1).bit_length())
     fewest, most = _BATCHES if relative_error is None else _STOPPING_BATCHES
     if kind == "cuda" and relative_error is None:
         most = min(max(photons // _GPU_BATCH, fewest), most)
-    least = min(max(photons * _VOXELS_PER_PHOTON // (len(scene.components) * bins), fewest), most)
+    least = min(max(photons * _VOXELS_PER_PHOTON // voxels, fewest), most)
     least = least if shard is None else max(least, shard[1])
-    positions = scene.scan_positions
     return positions * min(1 << max(0, (photons // positions // least).bit_length() - 1), _LARGEST_BATCH[kind])
-
-
-def _auto_batch_size(scene: Scene, kind: str) -> int:
-    """As `_batch_size`, for a number of photons that is not known: some hundredths of a second."""
-    bins = _bins(scene)
-    if not keeps_errors(scene):
-        return 0
-    least = max(_AUTO_BATCH[kind], len(scene.components) * bins // _AUTO_VOXELS_PER_PHOTON[kind])
-    return scene.scan_positions << max(0, (least // scene.scan_positions - 1).bit_length())
 
 
 def _check_resumed(resume: Result, run: RunOptions, seed: int | None) -> None:
@@ -244,8 +227,8 @@ def _check_resumed(resume: Result, run: RunOptions, seed: int | None) -> None:
 # The unit of the tallies, between the brightest bin that they hold and the faintest light that they resolve
 
 PHOTON_CAPACITY = 2**40
-"""Photons that a tally holds, where the faintest light does not ask for a finer unit; else `photon_capacity`, which is
-at least 1/16 of it."""
+"""Photons that a tally holds, where the faintest light does not ask for a finer unit; else `TallyLimits.photons`, at
+least 1/16 of it."""
 
 _LEAST_CAPACITY = 2**36
 
@@ -256,24 +239,22 @@ _FAINT_UNITS = 4.0
 _LARGEST_BIN = 2.0**62
 
 
-def tally_scale(scene: Scene, mesh: TriangleMesh | None) -> float:
-    """Tally units per emitted photon, a power of two; a function of the scene alone, so that parts of a run add up.
+class TallyLimits(NamedTuple):
+    """What a scene's tally is made for."""
+
+    scale: float  # tally units per emitted photon, a power of two
+    photons: int  # in all parts of a run together, that keep the brightest bin below 2^62
+
+
+def tally_limits(scene: Scene, mesh: TriangleMesh | None) -> TallyLimits:
+    """The unit of a scene's tally and the photons that it holds: functions of the scene alone, so that parts of a run
+    add up.
 
     From both ends: `PHOTON_CAPACITY` photons keep the brightest bin below 2^62; or fewer, down to 1/16, where a finer
     unit is needed to resolve the faintest light, the next event of one photon on the furthest target.
     """
-    return scale_and_capacity(scene, mesh)[0]
-
-
-def photon_capacity(scene: Scene, mesh: TriangleMesh | None) -> int:
-    """Photons, in all parts of a run together, that keep the brightest bin of a scene's tally below 2^62."""
-    return scale_and_capacity(scene, mesh)[1]
-
-
-def scale_and_capacity(scene: Scene, mesh: TriangleMesh | None) -> tuple[float, int]:
-    """`tally_scale` and `photon_capacity`, which share their work."""
     if scene.transport.estimator == "none":
-        return 1.0, PHOTON_CAPACITY
+        return TallyLimits(1.0, PHOTON_CAPACITY)
     density = _phase_density(scene)
     brightest, faintest = (min(max(bound(scene, mesh, density), 1e-30), 1.0) for bound in (_brightest, _faintest))
     coarsest, finest = (
@@ -282,7 +263,7 @@ def scale_and_capacity(scene: Scene, mesh: TriangleMesh | None) -> tuple[float, 
     wanted = math.ceil(math.log2(_FAINT_UNITS / faintest))
     # Finer than 2^-52, light that by chance scatters right before the lens would not fit into one contribution.
     scale = 2.0 ** min(max(coarsest, min(wanted, finest)), 52)
-    return scale, min(PHOTON_CAPACITY, int(_LARGEST_BIN / (brightest * scale)))
+    return TallyLimits(scale, min(PHOTON_CAPACITY, int(_LARGEST_BIN / (brightest * scale))))
 
 
 Density = Callable[[NDArray[np.float64]], NDArray[np.float64]]

@@ -47,11 +47,7 @@ _ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
         "derivative of the logarithm of what the history has met",
     ),
 }
-_READ_ME = (
-    "One row per photon, as its history ended: position [m] and direction in the world (for a camera without pose its "
-    "frame, +x right, +y down, +z forward), weight, geometric path [m], collisions (surfaces included), reason (index "
-    "into reasons)."
-)
+_READ_ME = "One row per photon. World: for a camera without pose its frame, +x right, +y down, +z forward."
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,24 +8,24 @@ import platform
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import accumulate
-from typing import Any, Literal, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.device import pick_device, pick_devices, processor_name
-from spadwarp.parallel import Ray, interruptible
-from spadwarp.parallel.worker import Event
+from spadwarp.parallel.workers import Event, Ray, interruptible
 from spadwarp.result import Result, as_result, merge, save_result
 from spadwarp.result.noise import NOISE_GOAL
 from spadwarp.result.result import TARGETS_DIFFER, ResultHead, largest_share, same_targets, unseen_warnings
 from spadwarp.result.tallies import IdQueue, Range, Ranges, check_capacity, count, joined, without
-from spadwarp.scene import SceneLike, as_scene
+from spadwarp.scene import Scene, SceneLike, as_scene, spectral_lines
 from spadwarp.transport.plan import Plan, RunOptions, make_plan
 from spadwarp.transport.workers import ClusterWorkers, LocalWorkers, trace_block
 from spadwarp.values import (
@@ -39,7 +39,10 @@ from spadwarp.values import (
     shown,
 )
 
-__all__ = ["Progress", "provenance", "simulate"]
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["Progress", "Spectrum", "provenance", "simulate", "simulate_spectrum"]
 
 Progress = Callable[[str, int, int], None]
 
@@ -228,7 +231,7 @@ class _Run:
         """Of all photons, of those that reach a goal, or of those done when the run was stopped."""
         try:
             if relative_error is not None or self._plan.is_auto:
-                return self._known_result(Goal.of(relative_error), seconds if self._plan.is_auto else math.inf)
+                return self._known_result(StoppingRule(relative_error), seconds if self._plan.is_auto else math.inf)
             self._trace(self._plan.requested)
             if not self._done:
                 raise KeyboardInterrupt
@@ -239,10 +242,10 @@ class _Run:
             saved = f"{self._place}: the {self._saved} photons that were done are here; resume it"
             raise DeviceError(f"{error}\n{saved}") from error
 
-    def _known_result(self, goal: Goal, seconds: float) -> Result:
+    def _known_result(self, rule: StoppingRule, seconds: float) -> Result:
         """Traces until the error is known to be small enough, looking at it where it may be, or for so many seconds."""
         size, (start, stop), began = self._plan.batch_size, self._plan.requested, time.monotonic()
-        earlier, spent, rule = count(self._earlier), 0.0, StoppingRule(goal.error)
+        earlier, spent = count(self._earlier), 0.0
         if limited := seconds < math.inf:  # and it first finds out how fast it is
             end = min(start + earlier + 2 * len(self._workers.workers) * size, stop)
         else:
@@ -260,10 +263,13 @@ class _Run:
             batches, left, needed = result.photons // size, stop - end, math.inf
             wanted: int | None = max(FIRST_LOOK, 2 * batches)
             if not limited or batches >= FIRST_LOOK:
-                error = goal.error_of(result)
+                error = rule.error_of(result)
                 wanted = rule.next_look(batches, error, partial(largest_share, result))
-                self._report(goal.remark(result, error), result.photons, self._photons)
-                needed = result.photons * (error / goal.error) ** 2
+                needed = result.photons * (error / rule.goal) ** 2
+                text = f"error {100 * error:.3g} %" if rule.is_relative else f"noise ratio {error * error:.3g}"
+                text += f" after {result.batches} batches"
+                text += f"; about {needed:.2g} photons are needed" if rule.goal < error < math.inf else ""
+                self._report(text, result.photons, self._photons)
                 left = 0 if wanted is None else left
             if limited:
                 rate = (result.photons - earlier) / spent
@@ -288,7 +294,8 @@ class _Run:
                     self._workers.stop()
                     stop_sent = True
                 ending = stop_sent or not self._unfinished()
-                if self._collecting is None and not ending and self._checkpoint_is_due():
+                pause = math.inf if self._place is None else max(self._every, self._cost / _LARGEST_SHARE)
+                if self._collecting is None and not ending and time.monotonic() >= self._written + pause:
                     # None again if no worker has done or begun anything yet.
                     self._collecting = {*self._held, *self._running} or None
                 self._assign(ending, stop_sent)
@@ -376,10 +383,6 @@ class _Run:
             raise DeviceError(f"the energy balance is off by {difference} units: a device has lost counts")
         return result
 
-    def _checkpoint_is_due(self) -> bool:
-        pause = max(self._every, self._cost / _LARGEST_SHARE)
-        return self._place is not None and time.monotonic() >= self._written + pause
-
     def _write_checkpoint(self) -> None:
         """Writes what is done; where that fails the run continues, as the disk may have space again later."""
         assert self._place is not None
@@ -394,32 +397,8 @@ class _Run:
         self._cost = self._written - began
 
 
-class Goal(NamedTuple):
-    """The error that ends a run, which falls as the root of its photons; relative, or the root of the noise ratio."""
-
-    error: float
-    is_relative: bool
-
-    @classmethod
-    def of(cls, relative_error: float | None) -> Goal:
-        return cls(math.sqrt(NOISE_GOAL), False) if relative_error is None else cls(relative_error, True)
-
-    def error_of(self, result: Result) -> float:
-        """Infinite: not known."""
-        if result.batches < 2:
-            return math.inf
-        return result.relative_error if self.is_relative else math.sqrt(result.target_noise_ratio)
-
-    def remark(self, result: Result, error: float) -> str:
-        text = f"error {100 * error:.3g} %" if self.is_relative else f"noise ratio {error * error:.3g}"
-        text += f" after {result.batches} batches"
-        if self.error < error < math.inf:
-            text += f"; about {result.photons * (error / self.error) ** 2:.2g} photons are needed"
-        return text
-
-
 class StoppingRule:
-    """The rule of one run.
+    """The rule of one run, whose error falls as the root of its photons: relative, or the root of the noise ratio.
 
     It looks for the number of photons at which the error reaches the goal. A run that ended there would end where rare
     bright photons have not come yet: too dark, with an error that is too small. So it goes on by a part of these
@@ -427,18 +406,25 @@ class StoppingRule:
     matter equally, 40 to 80 batches; where few decide it is as many photons again, so that half had no say in it.
     """
 
-    def __init__(self, goal: float) -> None:
-        self._goal, self.found = goal, False
+    def __init__(self, relative_error: float | None) -> None:
+        self.is_relative, self.found = relative_error is not None, False
+        self.goal = math.sqrt(NOISE_GOAL) if relative_error is None else relative_error
+
+    def error_of(self, result: Result) -> float:
+        """Infinite: not known."""
+        if result.batches < 2:
+            return math.inf
+        return result.relative_error if self.is_relative else math.sqrt(result.target_noise_ratio)
 
     def next_look(self, batches: int, error: float, share: Callable[[], float]) -> int | None:
         """Batches at the next look, None if the run ends; from those so far, the relative error after these (infinite:
         not known) and the part of the variance between batches that one of them has, in [0, 1]."""
         if self.found:
             return None
-        if error <= self._goal:
+        if error <= self.goal:
             self.found = True
             return batches + math.ceil(batches * min(1.0, _GOING_ON * share()))
-        most, excess = _MOST * batches, error / self._goal
+        most, excess = _MOST * batches, error / self.goal
         wanted = math.ceil(_RESERVE * batches * excess**2) if excess < math.inf else most
         return min(max(wanted, batches + max(1, batches // 16)), most)
 
@@ -460,3 +446,86 @@ def provenance(device: Any = None) -> dict[str, Any]:
         return made
     device = pick_device(device)
     return {**made, "device": device.alias, "device_name": processor_name(device)}
+
+
+# Runs at several wavelengths with the same photons: an axis of wavelength, and the light of a broad laser
+
+_MOST_LINES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Results by wavelength, of `simulate_spectrum`."""
+
+    scene: Scene
+    """The scene with its laser and filter; those of the results have lasers of one line."""
+    results: Mapping[float, Result]
+    """Wavelength in vacuum [nm], ascending → the run at it, with the photons of all the others."""
+
+    @property
+    def wavelengths(self) -> tuple[float, ...]:
+        """In vacuum [nm], ascending."""
+        return tuple(self.results)
+
+    def combined(self) -> Result:
+        """The result of the scene's laser: the sum of the lines by what the spectrum and the filter leave of each, for
+        all that takes a result (eq 7 of the paper by Monte Carlo).
+
+        It has no standard errors: those of runs with the same photons are not independent. Raises `ConfigError` where
+        the wavelengths are others than those of the spectrum.
+        """
+        shares = {line.wavelength_nm: line.share for line in spectral_lines(self.scene.laser, self.scene.detector)}
+        if set(shares) != set(self.results):
+            text = f"{len(self.results)} wavelengths are not the {len(shares)} lines of the spectrum"
+            raise ConfigError(f"laser.spectrum: {text}; simulate_spectrum without wavelengths takes those")
+        whole, first = math.fsum(shares.values()), next(iter(self.results.values()))
+        light = np.zeros(first.tallies.shape)
+        for wavelength, one in self.results.items():
+            # A bin is as long at all wavelengths; what a tally unit stands for may differ from line to line.
+            light += shares[wavelength] / max(whole, 1e-300) * (one.unit * one.photons) * one.tallies
+        unit = min(one.unit for one in self.results.values())
+        tallies: NDArray[np.int64] = np.rint(light / (unit * first.photons)).astype(np.int64)
+        none: dict[str, Any] = dict.fromkeys(("half", "second_moment", "reconstruction", "derivative_tallies"))
+        return replace(
+            first, scene=self.scene, tallies=tallies, unit=unit, batches=0, batch_size=0, batch_moments={}, **none
+        )
+
+    def to_xarray(self) -> xarray.Dataset:
+        """`Result.to_xarray` of all lines along `wavelength` [nm]; the path of a bin differs with the group index.
+
+        Raises `FileError`: xarray is not installed.
+        """
+        sets = [one.to_xarray().drop_vars("path") for one in self.results.values()]
+        import xarray
+
+        axis = xarray.DataArray([*self.results], dims="wavelength", attrs={"units": "nm"}, name="wavelength")
+        return xarray.concat(sets, dim=axis, combine_attrs="drop_conflicts")
+
+
+def simulate_spectrum(scene: SceneLike, wavelengths: Iterable[float] | None = None, **options: Any) -> Spectrum:
+    """Runs of one scene at several wavelengths, each with the same photons (common random numbers), so that differences
+    between lines are known better than the lines.
+
+    Water by chlorophyll, temperature or salinity follows the wavelength, and so do colours of meshes; coefficients
+    given as numbers, or by a preset, hold for all.
+
+    Args:
+        scene: From `spadwarp.load_scene`, or the path of its file.
+        wavelengths: In vacuum, up to 64 [nm]; default: the lines of the laser's spectrum that the filter passes.
+        options: As in `simulate`; the seed is that of all runs.
+
+    Raises:
+        ArgumentError: No wavelengths, too many, one twice or out of range; ConfigError and others as `simulate`.
+    """
+    scene = as_scene(scene)
+    given = [line.wavelength_nm for line in spectral_lines(scene.laser, scene.detector)]
+    if wavelengths is not None:
+        given = [check_real("wavelengths", one, "[1e-9, 1e6] nm") for one in wavelengths]
+    if not 1 <= len(given) <= _MOST_LINES or len(set(given)) < len(given):
+        raise ArgumentError(f"wavelengths: {len(given)} given; 1 to {_MOST_LINES} different ones are needed")
+    changes: dict[str, Any] = {"laser.linewidth_nm": None, "laser.spectrum": None}
+    if scene.detector.filter_fwhm_nm is not None and scene.detector.filter_centre_nm is None:
+        changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
+    options = {"mesh_cache": {}, **options} if options.get("engine") is None else options
+    lines = {one: scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)}
+    return Spectrum(scene, MappingProxyType({one: simulate(line, **options) for one, line in lines.items()}))

@@ -22,9 +22,7 @@ import spadwarp_kernels as sk
 from spadwarp.arrays import caller_tallies
 from spadwarp.device import core_count, kernel_thread, pick_device, pick_devices, processor_name
 from spadwarp.mesh import TriangleMesh
-from spadwarp.parallel import Ray, Worker
-from spadwarp.parallel.ray import RayWorkers
-from spadwarp.parallel.worker import Event
+from spadwarp.parallel.workers import Event, Ray, RayWorkers, Worker
 from spadwarp.result import FluxTallies, SignedTallies, Tallies, Truth
 from spadwarp.result.tallies import (
     OVERFLOW,
@@ -101,16 +99,7 @@ class _Closed(NamedTuple):
     counters: dict[str, int]
     batch_moments: dict[str, int]
     batches: int
-    half_photons: int = 0
-
-    def plus(self, more: _Closed) -> _Closed:
-        return _Closed(
-            added(self.energy_balance, more.energy_balance),
-            added(self.counters, more.counters),
-            joined_moments(self.batch_moments, more.batch_moments),
-            self.batches + more.batches,
-            self.half_photons + more.half_photons,
-        )
+    half_photons: int
 
 
 class DeviceWorker:
@@ -151,7 +140,7 @@ class DeviceWorker:
             # Compiles, or loads from Warp's cache, before the time of the launches is taken.
             self._most = min(launch_size, batch_size or launch_size)
             sk.load_transport_kernel(spec, model.device, model=model, photon_count=self._most)
-        self._closed: _Closed | None = None
+        self._closed = list[_Closed]()
         self._unread = list[tuple[int, bool]]()  # batches closed on the device: photons, and whether in the half
         self._running = deque[tuple[int, wp.Event]]()  # launches on a GPU: photons, and their end
 
@@ -252,12 +241,9 @@ class DeviceWorker:
         unread, sums = self._unread, self._histograms[0].batches.take_sums()
         each = [moments_of(self._names, s, n, self._batch_size) for s, (n, _) in zip(sums, unread, strict=True)]
         half = sum(photons for photons, in_half in unread if in_half)
-        self._add_closed(_Closed(*sk.read_ledger(self.data), joined_moments(*each), len(unread), half))
+        self._closed.append(_Closed(*sk.read_ledger(self.data), joined_moments(*each), len(unread), half))
         self.data.ledger.zero_()
         self._unread = []
-
-    def _add_closed(self, more: _Closed) -> None:
-        self._closed = more if self._closed is None else self._closed.plus(more)
 
     def take_over(self, other: DeviceWorker) -> None:
         """Moves the tallies of another worker of the same run here; both must rest."""
@@ -265,26 +251,32 @@ class DeviceWorker:
             for mine, more in zip(self._histograms, other._histograms, strict=True):
                 mine.take_over(more)
             sk.add_tallies(self.data.ledger, other.data.ledger)
-            if other._closed is not None:
-                self._add_closed(other._closed)
+            self._closed += other._closed
             self._check_overflow()
             other.clear()
 
     def tallies(self) -> Tallies:
         """Those of all photons traced here, open batches aside; on the CPU in the memory of this worker."""
         with device_errors(self.model.device):
-            closed = self._closed or _Closed(*sk.read_ledger(self.data), {}, batches=0)
-            signed, histogram = self._signed_tallies(), self._histograms[0]
+            closed = self._closed or [_Closed(*sk.read_ledger(self.data), {}, batches=0, half_photons=0)]
+            balances, counters, moments, batches, halves = zip(*closed, strict=True)
+            balance = added(*balances)
+            signed, histogram, last = self._signed_tallies(), self._histograms[0], self._histograms[-1]
+            flux = None if self.data.flux is None else last.total
             if self._spec.inelastic:
-                closed = closed._replace(energy_balance=self._with_shifted(closed.energy_balance))
+                balance = self._with_shifted(balance)
             return Tallies(
                 tallies=_on_host(histogram.total).reshape(self._shape),
-                **closed._asdict(),
+                energy_balance=balance,
+                counters=added(*counters),
+                batch_moments=joined_moments(*moments),
+                batches=sum(batches),
+                half_photons=sum(halves),
                 half=None if histogram.half is None else _on_host(histogram.half).reshape(self._shape),
                 second_moment=histogram.second_moment(self._shape[1:]),
                 derivative_tallies=None if self._spec.channels else signed,
                 channel_tallies=signed if self._spec.channels else None,
-                flux_tallies=self._flux_tallies(),
+                flux_tallies=None if flux is None else FluxTallies(_on_host(flux), last.second_moment(flux.shape)),
             )
 
     def _signed_tallies(self) -> SignedTallies | None:
@@ -299,18 +291,12 @@ class DeviceWorker:
     def _with_shifted(self, energy_balance: dict[str, int]) -> dict[str, int]:
         """Of what the water has absorbed, the part that is scattered inelastically in entries of its own: at every
         collision it is the same."""
-        medium, source, balance = self.model.medium, self.model.inelastic.source, dict(energy_balance)
+        medium, source, balance = self.model.medium, self.model.inelastic.source, energy_balance
         absorption, lost = medium.extinction * (1.0 - medium.albedo), balance["absorbed_water"]
         for k, name in enumerate(self._signed):
             balance[name] = round(lost * min(float(source[k]) / absorption, 1.0))
             balance["absorbed_water"] -= balance[name]
         return balance
-
-    def _flux_tallies(self) -> FluxTallies | None:
-        if self.data.flux is None:
-            return None
-        histogram = self._histograms[-1]
-        return FluxTallies(_on_host(histogram.total), histogram.second_moment(histogram.total.shape))
 
     @property
     def signed_units(self) -> tuple[float, ...]:
@@ -324,7 +310,7 @@ class DeviceWorker:
 
     def clear(self) -> None:
         """Empties the tallies."""
-        self._closed = None
+        self._closed = []
         self.data.ledger.zero_()
         for histogram in self._histograms:
             histogram.clear()
@@ -389,25 +375,22 @@ def device_errors(device: wp.Device) -> Iterator[None]:
 # (https://github.com/NVIDIA/warp/issues/1491).
 
 
-def _beside(devices: Sequence[wp.Device]) -> bool:
+def _load_beside(spec: Any, devices: Sequence[wp.Device]) -> list[Any]:
     # Where memory is limited, two threads that compile may be too many.
-    return address_space() is None and not any(device.is_cuda for device in devices)
+    possible = address_space() is None and not any(device.is_cuda for device in devices)
+    return [kernel_thread().submit(sk.load_transport_kernel, spec, item) for item in devices if possible]
 
 
 def prepare_kernels(
     scene: Scene, mesh: TriangleMesh | None, device: str | None = None, *, derivatives: Sequence[str] = ()
 ) -> None:
     """Begins to load the transport kernel of a run on CPUs, which takes longest where it must be compiled; returns at
-    once.
+    once. What fails here fails again in the run.
 
     `mesh`: that of `spadwarp.mesh.build_mesh`; `device`, `derivatives` (full names): as for `simulate`. Raises
     `DeviceError` for a device that does not exist.
     """
-    devices = pick_devices(device)
-    if _beside(devices):
-        spec = transport_spec(scene, mesh, derivatives=derivatives)
-        for item in devices:  # what fails here fails again in the run
-            kernel_thread().submit(sk.load_transport_kernel, spec, item)
+    _load_beside(transport_spec(scene, mesh, derivatives=derivatives), pick_devices(device))
 
 
 # Devices of this host
@@ -449,7 +432,7 @@ class LocalWorkers:
         began = time.perf_counter()
         spec = transport_spec(plan.scene, plan.mesh, derivatives=plan.derivatives)
         # On GPUs `DeviceWorker` loads the kernel, which may be another one for a large histogram.
-        loading = [kernel_thread().submit(sk.load_transport_kernel, spec, item) for item in devices if _beside(devices)]
+        loading = _load_beside(spec, devices)
         models = []
         for device in devices:
             with device_errors(device):

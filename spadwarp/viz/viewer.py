@@ -89,10 +89,8 @@ def view(
     Raises `FileError`: plotly is not installed, or a file cannot be read or written; `ArgumentError`: no such frame,
     method or channel.
     """
-    try:
-        from plotly.offline import get_plotlyjs
-    except ModuleNotFoundError as error:
-        raise FileError("a page needs plotly: pip install 'spadwarp[view]'") from error
+    from plotly.offline import get_plotlyjs
+
     check_apart(path, source)
     held = source if isinstance(source, Held) else load(source)
     if isinstance(held, SequenceFile):

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.io import write_text
-from spadwarp.values import ArgumentError, FileError, check_integer, check_real
+from spadwarp.values import ArgumentError, check_integer, check_real
 from spadwarp.water.scattering_matrix import MATRIX_COLUMNS, rayleigh_matrix
 from spadwarp.water.seawater import (
     Coefficients,
@@ -148,10 +148,8 @@ def mie_particles(
 
     Raises `ArgumentError`: a value out of its range; `FileError`: miepython is not installed.
     """
-    try:
-        import miepython
-    except ModuleNotFoundError as error:
-        raise FileError("Mie scattering needs miepython: pip install 'spadwarp[mie]'") from error
+    import miepython
+
     check_ranges(wavelength_nm=wavelength_nm, temperature=temperature, salinity=salinity)
     concentration = check_real("concentration", concentration, "(0, 1e6] ppm")
     real, absorbing = check_real("index.real", complex(index).real, "[0.5, 5]"), complex(index).imag

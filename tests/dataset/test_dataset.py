@@ -26,7 +26,6 @@ from spadwarp.dataset import (
     Recipe,
     SpadDataset,
     TensorItem,
-    iterate_dataset,
     load_recipe,
     verify_dataset,
 )
@@ -88,7 +87,7 @@ def test_label_noisy_and_clean_depth_agree(folder, tmp_path, changes):
         folder = tmp_path / "data"
         make(recipe(**changes), folder)
     deviations, step = [], 1e-4
-    for item in iterate_dataset(folder, "all", fields=("noisy", "clean", "label", "bound")):
+    for item in FrameReader(folder, "all", fields=("noisy", "clean", "label", "bound")):
         noisy, clean, label, bound = (item[name][0] for name in ("noisy", "clean", "label", "bound"))
         outlier = label == 1
         assert np.isin(label, (0, 1)).all()
@@ -106,7 +105,7 @@ def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
     with h5py.File(folder / "scenes.h5") as file:
         profiles, edges = file["backscatter_profile"][...], file["profile_edges"][...]
     np.testing.assert_allclose((profiles * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
-    for item in iterate_dataset(folder, "train", fields=("noisy", "prior")):
+    for item in FrameReader(folder, "train", fields=("noisy", "prior")):
         noisy, prior = item["noisy"], item["prior"]
         assert (np.isnan(noisy) == np.isnan(prior)).all()
         bins = np.searchsorted(edges[item["scene"]], np.nan_to_num(noisy), side="right") - 1
@@ -119,7 +118,7 @@ def test_prior_is_the_density_of_background_at_the_measured_depth(folder):
 
 def test_realised_fraction_is_the_requested_one(folder):
     values = []
-    for item in iterate_dataset(folder, "all", fields=("label",)):
+    for item in FrameReader(folder, "all", fields=("label",)):
         label = item["label"]
         values.append(stats.binomtest(int(label.sum()), label.size, float(item["backscatter_fraction"])).pvalue)
         assert min(abs(item["backscatter_fraction"] - fraction) for fraction in FRACTIONS) < 1e-6
@@ -136,7 +135,7 @@ def test_a_sample_is_the_same_in_any_dataset_around_it(folder, other):
 
 
 def test_a_split_without_frames_is_named_at_once(other):
-    for reader in (FrameReader, SpadDataset, iterate_dataset):
+    for reader in (FrameReader, SpadDataset):
         with pytest.raises(ValueError, match=r"split = 'validation': .*other has no frames in it; it has train, test"):
             reader(other, "validation")
 
@@ -270,7 +269,7 @@ def test_traced_scenes_hold_their_histograms(tmp_path):
             assert (file["photons"][...] == 40_000).all() and (file["noise_ratio"][...] > 0).all()
         np.testing.assert_allclose((profile * np.diff(edges)).sum(axis=1), 1.0, rtol=1e-4)
         fields = ("noisy", "clean", "label", "intensity", "counts", "expected")
-        items = list(iterate_dataset(tmp_path / form, "test", fields=fields))
+        items = list(FrameReader(tmp_path / form, "test", fields=fields))
         totals[form] = [item["counts"] for item in items]
         for item in items:
             assert item["counts"].shape == item["expected"].shape == (64, 8, 12)
@@ -391,7 +390,7 @@ def test_depth_maps_of_an_engine_become_targets(tmp_path):
     tables = {**TABLES, "targets": {"exports": ["exports"]}}
     path = written(Recipe.from_dict(tables), tmp_path)
     make(path, tmp_path / "data")
-    for item in iterate_dataset(tmp_path / "data", fields=("clean", "noisy", "reflectance", "label")):
+    for item in FrameReader(tmp_path / "data", fields=("clean", "noisy", "reflectance", "label")):
         clean, valid = item["clean"][0], depth < 60000
         assert (np.isfinite(clean) == valid).all() and item["distance"] == 15.0
         assert np.abs(clean[valid] - 15.0).max() < 1e-4 and (item["reflectance"][0][valid] == 0.25).all()

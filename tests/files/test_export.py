@@ -294,7 +294,7 @@ def dataset(tmp_path_factory):
 
 
 def test_datasets_with_histograms(dataset, tmp_path):
-    items = list(spadwarp.dataset.iterate_dataset(dataset, "train", fields=("counts", "expected", "noisy", "clean")))
+    items = list(spadwarp.dataset.FrameReader(dataset, "train", fields=("counts", "expected", "noisy", "clean")))
     written = spadwarp.export(dataset, tmp_path / "a.mat", split="train")
     assert len(written) == len(items) == 4
     for path, item in zip(written, items, strict=True):
@@ -318,7 +318,7 @@ def test_datasets_with_histograms(dataset, tmp_path):
 
 def test_datasets_of_depth(dataset, tmp_path):
     """Images of a frame with those of its scene; a split of its own."""
-    items = list(spadwarp.dataset.iterate_dataset(dataset, "test", fields=("noisy", "clean", "label")))
+    items = list(spadwarp.dataset.FrameReader(dataset, "test", fields=("noisy", "clean", "label")))
     written = spadwarp.export(dataset, tmp_path / "a.exr", split="test")
     assert len(written) == len(items)
     for path, item in zip(written, items, strict=True):

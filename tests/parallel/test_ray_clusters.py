@@ -12,8 +12,7 @@ import pytest
 import spadwarp
 from helpers.cli import ENVIRONMENT, ROOT
 from helpers.scenes import scene
-from spadwarp.parallel import Ray
-from spadwarp.parallel.ray import RayWorkers
+from spadwarp.parallel.workers import Ray, RayWorkers
 
 STRANGER = """
 import sys

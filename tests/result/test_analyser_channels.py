@@ -11,7 +11,7 @@ from helpers.cli import DEVICE, run, tables
 from helpers.coarse_pictures import coarse_pictures
 from helpers.datasets import make, recipe
 from helpers.minimal_scene import CAMERA, scene
-from spadwarp.dataset import export_dataset, iterate_dataset
+from spadwarp.dataset import FrameReader, export_dataset
 from spadwarp.result import COMPONENTS, analyser_channel, degree_of_polarisation
 from spadwarp.values import ArgumentError, ConfigError
 
@@ -187,7 +187,7 @@ def test_data_sets_and_denoisers_take_a_channel(analysed, light, tmp_path):
     expected = {}
     for name in ("I", "cross"):
         make(recipe(**SMALL, **{"monte_carlo.channel": name}), tmp_path / name)
-        items = list(iterate_dataset(tmp_path / name, "test", fields=("expected", "polarisation")))
+        items = list(FrameReader(tmp_path / name, "test", fields=("expected", "polarisation")))
         expected[name] = np.array([item["expected"] for item in items], np.float64)
         part = np.array([item["polarisation"] for item in items])  # [frames, T, H, W]
     assert 0.3 < expected["cross"].sum() / expected["I"].sum() < 0.51

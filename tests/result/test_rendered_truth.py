@@ -8,7 +8,7 @@ import pytest
 
 from helpers.scenes import scene
 from spadwarp.io.arrays import write_exr
-from spadwarp.result.rendered_truth import load_truth_exr
+from spadwarp.result import load_truth_exr
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.values import FileError
 

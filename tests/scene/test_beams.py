@@ -14,7 +14,7 @@ from spadwarp.io.arrays import write_exr
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import laser as beam_profile
 from spadwarp.scene.pose import rotation_matrix
-from spadwarp.transport import photon_capacity, tally_scale
+from spadwarp.transport import tally_limits
 from spadwarp.values import FileError
 from spadwarp_kernels import profile_tables
 
@@ -129,14 +129,14 @@ def test_a_tally_holds_its_photons_wherever_the_laser_stands(name, tmp_path, mon
     gate = {"start_ns": 0.0, "bin_width_ps": 200.0, "bins": 400}
     one = scene(camera=NARROW, gate=gate, targets=WALL, **sections)
     mesh = build_mesh(one)
-    scale = tally_scale(one, mesh)
+    scale, capacity = tally_limits(one, mesh)
     assert math.frexp(scale)[0] == 0.5
     result = spadwarp.simulate(one, photons=100_000, seed=1, device="cpu")
     assert result.unit == 1.0 / scale
     found = result.tallies.sum(axis=0)
     if name == "a scan":
         found = found.mean(axis=(0, 1))  # few photons a pixel
-    assert 1e-8 < found.max() / result.photons * photon_capacity(one, mesh) / 2.0**62 < 0.5
+    assert 1e-8 < found.max() / result.photons * capacity / 2.0**62 < 0.5
     assert result.counters["clipped"] == 0
 
 

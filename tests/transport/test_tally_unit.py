@@ -16,7 +16,7 @@ from helpers.scenes import BEYOND, PENCIL, PLATE, scene
 from spadwarp import RunOptions, simulate
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.transport import PHOTON_CAPACITY, photon_capacity, tally_scale
+from spadwarp.transport import PHOTON_CAPACITY, TallyLimits, tally_limits
 from spadwarp.transport.model import build_model, transport_spec
 from spadwarp.values import ConfigError, SpadwarpError, path_from_time
 from spadwarp_kernels.photon.state import to_fixed_point
@@ -97,7 +97,8 @@ def test_the_unit_is_as_fine_as_the_furthest_target_needs():
     for distance, extinction, needs_more in [(5.0, 0.3, False), (8.0, 1.2, True)]:
         one = plate_at(distance, extinction)
         mesh = build_mesh(one)
-        units, capacity = one_return(one, distance) * tally_scale(one, mesh), photon_capacity(one, mesh)
+        scale, capacity = tally_limits(one, mesh)
+        units = one_return(one, distance) * scale
         assert (capacity < PHOTON_CAPACITY) == needs_more
         assert capacity >= PHOTON_CAPACITY / 16
         assert units > 1
@@ -120,20 +121,20 @@ def test_the_brightest_bin_follows_the_phase_function(water, device):
         targets=BEYOND,
     )
     result = simulate(one, photons=100_000, seed=2, device=device)
-    fill = result.tallies.sum(axis=0).max() / result.photons * photon_capacity(one, build_mesh(one)) / 2.0**62
+    fill = result.tallies.sum(axis=0).max() / result.photons * tally_limits(one, build_mesh(one)).photons / 2.0**62
     assert 1e-5 < fill < 0.5
 
 
 def test_more_photons_than_the_tally_holds_are_refused():
     one = plate_at(8.0, 1.2)
-    capacity = photon_capacity(one, build_mesh(one))
+    capacity = tally_limits(one, build_mesh(one)).photons
     with pytest.raises(ConfigError, match=rf"photons = {10**12} is outside \[1, {capacity}\]"):
         simulate(one, photons=10**12, device="cpu")
 
 
 def test_an_overflow_is_an_error_and_not_a_histogram(monkeypatch):
     one = scene(transport={"estimator": "analog"})
-    monkeypatch.setattr("spadwarp.transport.plan.scale_and_capacity", lambda *_: (2.0**57, PHOTON_CAPACITY))
+    monkeypatch.setattr("spadwarp.transport.plan.tally_limits", lambda *_: TallyLimits(2.0**57, PHOTON_CAPACITY))
     with pytest.raises(SpadwarpError, match="a histogram bin overflowed"):
         simulate(one, photons=200_000, device="cpu")
     for values, expected in [([0, 2**62 - 1], False), ([5, 2**62], True), ([-1, 0], True)]:

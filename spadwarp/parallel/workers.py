@@ -1,8 +1,8 @@
-"""Workers of Ray: each an actor that does one thing at a time; those that are lost are replaced."""
+"""Who runs the jobs: a device of this host, or workers of Ray, each an actor that does one thing at a time and is
+replaced when it is lost; and the signals that interrupt them."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import os
@@ -11,16 +11,55 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from spadwarp.device import core_count, physical_memory, pick_device, processor_name
-from spadwarp.parallel.worker import Event, Ray, Worker
-from spadwarp.values import ConfigError, DeviceError
+from spadwarp.values import ArgumentError, ConfigError, DeviceError, check_integer, shown
 
-__all__ = ["RayWorkers"]
+__all__ = ["Ray", "Worker", "interruptible"]
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Workers of Ray, each a process with one GPU or, on machines without GPUs, with a share of the cores."""
+
+    address: str | None = None
+    """Of a running cluster, "auto" or "host:port"; None takes the cluster that RAY_ADDRESS names or that this process
+    is connected to, else starts Ray on this machine alone."""
+    workers: int | None = None
+    """How many; by default one for each GPU of the cluster, else one for each of its machines."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.address, str | None):
+            raise ArgumentError(f"address = {shown(self.address)} is not text such as 'auto' or 'host:6379'")
+        if self.workers is not None:
+            object.__setattr__(self, "workers", check_integer("workers", self.workers, "[1, 100000]"))
+
+
+@dataclass(eq=False)
+class Worker:
+    """The process and device that run a job."""
+
+    device: str  # "cpu" or "cuda:0", ...; what `device=` takes
+    threads: int | None = None  # CPU threads that it may use; None: as many as there are cores
+    stopped: threading.Event = field(default_factory=threading.Event)
+    """Set when the run was interrupted. A job that has begun is waited for; a long one may end early."""
+    state: dict[str, Any] = field(default_factory=dict)  # kept from one job to the next on this worker
+
+
+class Event(NamedTuple):
+    """Something that a worker did; see `RayWorkers.wait`."""
+
+    kind: str
+    worker: Any
+    value: Any = None
+
+
+# Ray
 
 RETRIES = 3
 """How often a job whose worker was lost runs again; a job that loses more is likely what kills them."""
@@ -69,7 +108,7 @@ class RayWorkers:
         note: Called with remarks: which workers have joined, which were lost.
 
     Raises:
-        ConfigError, DeviceError: Ray is not installed, cannot be reached, or has no such devices.
+        ConfigError, DeviceError: Ray cannot be reached, or has no such devices.
     """
 
     def __init__(
@@ -92,10 +131,8 @@ class RayWorkers:
         self._patience = math.inf
 
     def __enter__(self) -> RayWorkers:
-        try:
-            import ray
-        except ModuleNotFoundError as error:
-            raise ConfigError("engine = Ray needs the package ray: pip install 'spadwarp[ray]'") from error
+        import ray
+
         self._ray = ray
         self._started = not ray.is_initialized()
         try:
@@ -112,7 +149,7 @@ class RayWorkers:
 
     def __exit__(self, *_: object) -> None:
         for worker in self.workers:
-            with contextlib.suppress(Exception):
+            with suppress(Exception):
                 self._ray.kill(worker.actor)
         if self._started:
             self._ray.shutdown()
@@ -183,7 +220,7 @@ class RayWorkers:
 
     def _replace(self, worker: RayWorker, error: Exception) -> None:
         self.workers.remove(worker)
-        with contextlib.suppress(Exception):
+        with suppress(Exception):
             self._ray.kill(worker.actor)
         self._losses += 1
         if self._losses > (RETRIES + 1) * (len(self.workers) + 1):
@@ -248,3 +285,40 @@ def _description(worker: RayWorker) -> str:
 
 def _first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+# Signals
+
+_handled = threading.Lock()
+
+
+@contextmanager
+def interruptible() -> Iterator[threading.Event]:
+    """An event that Ctrl-C, or SIGTERM as job schedulers send it, sets; a second signal raises KeyboardInterrupt.
+
+    Within another `interruptible`, and outside the main thread, which alone receives signals, nothing sets the event:
+    the outer block decides.
+    """
+    interrupted = threading.Event()
+    if threading.current_thread() is not threading.main_thread() or not _handled.acquire(blocking=False):
+        yield interrupted
+        return
+
+    first = 0.0
+
+    def handle(number: int, frame: object) -> None:
+        nonlocal first
+        # Some programs send one interrupt twice, to a process and to its group: a second one counts after 1 s.
+        if interrupted.is_set() and time.monotonic() > first + 1.0:
+            raise KeyboardInterrupt
+        if not interrupted.is_set():
+            first = time.monotonic()
+        interrupted.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        _handled.release()
