@@ -116,7 +116,9 @@ def test_errors_name_the_argument(call, text):
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
 def test_a_mesh_lives_as_long_as_its_shapes(kind):
     mesh = triangle()
-    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], meshes=[mesh], device="cpu")
+    image = sk.make_textures(np.zeros(1, int), np.zeros((1, 3, 2)), [np.ones((1, 1))], device="cpu")  # of the kernel
+    options = {"mesh": [mesh.id], "meshes": [mesh], "first_face": [0], "textures": image}  # that others have compiled
+    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], **options, device="cpu")
     del mesh
     gc.collect()
     assert np.nanmin(one_step(kind, shapes, poses(STILL), None).true_depth.numpy()) == pytest.approx(3.0)
