@@ -246,6 +246,7 @@ def test_every_picture_is_drawn_at_both_widths(kind, width, tmp_path, monkeypatc
     assert figure.axes and figure.get_figwidth() >= min(width, 3.9)  # wider where there are many panels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PICTURES_OF_THE_DOCS)
 def test_figures_of_the_docs_are_drawn(kind, tmp_path, monkeypatch):
     assert drawn(monkeypatch, lambda: PICTURES_OF_THE_DOCS[kind](tmp_path / "picture.png", style.PAGE), kind).axes
