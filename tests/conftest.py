@@ -19,7 +19,9 @@ from helpers.runs import RUN
 from helpers.scenes import scene
 from helpers.statistics_of_samples import DEVICES
 
-settings.register_profile("spadwarp", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "spadwarp", deadline=None, derandomize=True, max_examples=50, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("spadwarp")
 
 

@@ -1,7 +1,6 @@
 """The benchmark: that its cases are what they say, and that what it writes can be kept. Speed itself is not tested."""
 
 import json
-import math
 import runpy
 import sys
 from dataclasses import replace
@@ -12,11 +11,11 @@ import pytest
 from scipy import stats
 
 import spadwarp
-from helpers.cli import DEVICE, run
-from spadwarp.benchmark import CASES, GROUPS, compare, history, load_report, measure, newest_report, report
+from helpers.cli import run
+from spadwarp.benchmark import CASES, compare, history, load_report, newest_report, report
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene
-from spadwarp.values import ArgumentError, FileError
+from spadwarp.values import FileError
 
 PEERS = Path(__file__).parents[2] / "bench" / "peers"
 
@@ -37,26 +36,6 @@ def test_cases_have_the_faces_they_promise():
     assert faces["staircase_5m"].face_count == 120 and faces["staircase_5m_dense"].face_count >= 100_000
     # A million by the arithmetic of subdivision.
     assert sum(1280 * 4**one.subdivisions for one in scene("spheres").targets) == pytest.approx(1e6, rel=0.02)
-
-
-def test_plane_is_the_scene_that_comes_with_the_project():
-    shipped, ours = spadwarp.load_scene("plane_5m"), scene("plane_5m")
-    for section in ("medium", "laser", "targets"):
-        assert getattr(ours, section) == getattr(shipped, section)
-    assert ours.camera.aperture_area == pytest.approx(shipped.camera.aperture_area, rel=1e-12)
-    assert ours.gate.stop == pytest.approx(shipped.gate.stop, rel=1e-12)
-
-
-@pytest.mark.slow
-def test_rates_are_counts_over_the_fastest_run(staircase):
-    assert len(staircase.seconds) == 2
-    assert staircase.rates["photons"] == pytest.approx(4000 / min(staircase.seconds))
-    # At least one event a photon, bar those that leave; at most 64.
-    per_photon = staircase.rates["collisions"] / staircase.rates["photons"]
-    assert 1.0 < per_photon < 64.0
-    assert 0.0 < staircase.rates["queries"] < 2.0 * staircase.rates["collisions"]
-    assert staircase.tally_bytes == 3 * 8 * 64 * 64 * 1024 and staircase.memory is None
-    assert 0.0 < staircase.error_per_root_second < math.inf
 
 
 @pytest.mark.slow
@@ -119,17 +98,6 @@ def test_the_newest_report_of_such_a_device_is_taken(staircase, tmp_path):
         history(tmp_path / "none")
 
 
-@pytest.mark.slow
-def test_command_writes_and_compares(staircase, tmp_path):
-    kept, out = tmp_path / "kept.json", tmp_path / "new.json"
-    kept.write_text(json.dumps(report([staircase])))
-    options = ("--photons", "4e3", "--repeats", 1, "--json", out, "--compare", kept)
-    result = run("bench", "staircase_5m", *DEVICE, *options)
-    assert "120" in result.output and "unclear" in result.output  # a single run
-    again = load_report(out)
-    assert again["comparison"][0]["verdict"] == "unclear" and again["results"][0]["size"] == {"photons": 4000}
-
-
 def test_kept_files_are_compared_and_a_slower_case_fails_the_command(staircase, tmp_path):
     fast, slow, out = (tmp_path / f"{name}.json" for name in ("fast", "slow", "c"))
     fast.write_text(json.dumps(report([timed(staircase, 1.0, 1.001, 0.999)])))
@@ -187,18 +155,6 @@ def test_scaling_says_how_cost_grows(monkeypatch, staircase):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"cases": ["staircase"]}, r"'staircase' is not one of 'water', .*did you mean 'staircase_5m'"),
-        *(({"cases": ["water"], name: 0}, rf"{name} = 0 is outside \[1, ") for name in ("photons", "repeats")),
-    ],
-)
-def test_errors_name_the_argument(arguments, words):
-    with pytest.raises(ArgumentError, match=words):
-        spadwarp.benchmark.run(**arguments)
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
         (None, "cannot be read"),
@@ -215,25 +171,6 @@ def test_unsuitable_files_are_refused(tmp_path, text, message):
         load_report(tmp_path / "other.json")
 
 
-def test_scaling_spans_what_it_is_meant_to_show():
-    for cuda in (False, True):
-        cases = GROUPS["scaling"](cuda)
-        assert len({case.name for case in cases}) == len(cases)
-        assert [case.photons for case in cases if case.photons] == [10**power for power in range(5, 11 if cuda else 8)]
-        first, *_, last = [case for case in cases if case.name.startswith("faces_")]
-        assert build_mesh(Scene.from_dict(first.scene)).face_count == 12
-        assert 12 * 4 ** last.scene["targets"][0]["subdivisions"] == pytest.approx(1e6, rel=0.25)
-        for case in cases:
-            Scene.from_dict(case.scene)
-            assert not case.error  # nor batches in an image that barely fits
-
-
-def test_runs_are_repeated_until_enough():
-    case = replace(CASES["water"], error=False, time_limit=1e-9)
-    result = measure(case, spadwarp.device.pick_device("cpu"), 1000, 5)
-    assert len(result.seconds) == 1 and result.error_per_root_second is None
-
-
 @pytest.mark.parametrize("script", ["run_pmcx", "run_pmcxcl", "run_pmmc", "run_mitransient"])
 def test_a_missing_peer_is_reported_and_is_no_failure(script, monkeypatch, capsys):
     for module in ("pmcx", "pmcxcl", "pmmc", "mitsuba"):
@@ -246,17 +183,3 @@ def test_a_missing_peer_is_reported_and_is_no_failure(script, monkeypatch, capsy
         assert not end.code
     printed = capsys.readouterr().out
     assert printed.startswith("not run: ") and "pip install" in printed
-
-
-def test_kept_results_can_be_read():
-    for path in (PEERS.parent / "results").glob("*.json"):
-        assert load_report(path)["results"]
-
-
-@pytest.mark.slow
-def test_the_history_is_drawn(staircase, tmp_path, monkeypatch):
-    (tmp_path / "a.json").write_text(json.dumps(report([staircase, timed(staircase, 0.1, case="water")])))
-    (tmp_path / "b.json").write_text(json.dumps(report([timed(staircase, 0.1, 0.2)])))
-    monkeypatch.setattr(sys, "argv", ["history", str(tmp_path), "--out", str(tmp_path / "history.png")])
-    runpy.run_path(str(PEERS.parent / "history.py"), run_name="__main__")
-    assert (tmp_path / "history.png").stat().st_size > 10_000

@@ -123,6 +123,7 @@ def test_a_process_loads_nothing_heavy_and_keeps_stdout_for_the_answer():
     assert process.stderr == "" and "\n  cpu" in printed
 
 
+@pytest.mark.slow
 def test_scenes_of_built_ins_need_no_library_for_meshes():
     """What is imported is waited for by every command that reads a scene."""
     code = "import sys, spadwarp; spadwarp.check('configs/scenes/staircase_15m.toml'); print(*sys.modules)"

@@ -50,6 +50,7 @@ def test_options_lie_over_the_scene_and_output_follows_it(scene, tmp_path):
     assert {path.name for path in out.iterdir()} == {"result.h5", "scene.toml"}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default::RuntimeWarning")
 def test_warnings_of_a_run_are_shown_while_what_draws_is_loaded(scene, tmp_path, monkeypatch):
     """Matplotlib takes the warnings of all threads while it reads its styles."""

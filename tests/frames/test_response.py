@@ -1,7 +1,5 @@
 """The instrument response against quadrature."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy import integrate, stats
@@ -151,21 +149,13 @@ def matrix(**changes):
 
 REFUSED = [
     ("times of a measured response", measured([0.0, 5e-324, 1e-323])),  # of no usable length
-    ("times of a measured response", measured([-1.7e308, 0.0, 1.7e308])),
     ("pulse_fwhm = -1", response(pulse_fwhm=-1)),
-    ("tail = nan", response(tail=np.nan)),
-    ("sigma = inf", lambda: InstrumentResponse(sigma=np.inf)),
     ("no density", lambda: InstrumentResponse().density(0.0)),
     ("irf = 1e-10 is not an InstrumentResponse", matrix(irf=1e-10)),
     ("source_width = -1e-10 is outside", matrix(source_width=-1e-10)),
-    ("source_start = nan is outside", matrix(source_start=math.nan)),
-    ("source_bins = 0 is outside", matrix(source_bins=0)),
-    ("period = 0.0 is outside", matrix(period=0.0)),
     ("finite, ascending times", matrix(edges=[2.0, 1.0])),
-    ("finite, ascending times", matrix(edges=[])),
     # In the wrong unit; fills no memory.
     (r"of .* s on a side is longer than 1e\+07 bins of 1e-10 s", lambda: InstrumentResponse(sigma=1.0).per_bin(1e-10)),
-    ("bin_width = -1e-10 is outside", lambda: InstrumentResponse(sigma=1e-10).per_bin(-1e-10)),
 ]
 
 
@@ -180,9 +170,7 @@ def test_wrong_input_is_named(message, call):
     [
         ("time_ps,value\n0,1\n1,x\n", r"irf\.csv.*line 3"),
         ("0,1\n1,-1\n", r"irf\.csv.*line 2: value = -1 is outside \[0, 1e30\]"),
-        ("0,1\n0,2\n", r"irf\.csv.*ascending"),
         ("0,1\n", r"irf\.csv.*two or more"),
-        ("0,0\n1,0\n", r"irf\.csv.*not all 0"),
         ("0,1\n1e300,1\n", r"irf\.csv.*line 2: time_ps = 1e[+]300 is outside"),
     ],
 )

@@ -127,7 +127,8 @@ def test_no_error_of_the_depth_is_below_its_bound(depth, is_inside):
     assert any("lies in one or two bins" in text for text in found.warnings) == is_inside
 
 
-def test_start_is_that_of_a_lidar(light):
+def test_start_is_that_of_a_lidar():
+    light = spadwarp.simulate(plate(), photons=200_000, seed=1, device="cpu")
     frames = exposure(light, {"laser.pulse_energy": 1e-11}, pulses=200_000)
     scene = plate({"laser.pulse_energy": 1e-11})
     start = lidar_initial_guess(scene, read_exposure(frames, scene), device="cpu")

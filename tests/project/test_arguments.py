@@ -2,6 +2,7 @@
 that is not finite, out of range or of another kind."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import pytest
 import spadwarp
 from helpers.scenes import scene
 from helpers.synthetic_result import make_result, make_scene
+from spadwarp.scene import Medium, Scene
+from spadwarp.values import ArgumentError, ConfigError
 
 ROOM = {"targets": [{"builtin": "plane", "size": [4.0, 4.0], "translation": [0.0, 0.0, 3.0]}]}
 OF_SCENES = {
@@ -139,3 +142,39 @@ def test_a_device_that_does_not_exist_is_refused(name):
     ):
         with pytest.raises(spadwarp.DeviceError, match=r"device = .* is not one of cpu"):
             function()
+
+
+# Types
+
+
+CALLS = {
+    "path = 2147483648": lambda: spadwarp.load(2**31),
+    "path =": lambda: spadwarp.load_scene(3),
+    "recipe": lambda: spadwarp.dataset.make_dataset(3, "out"),
+    "tables": lambda: Scene.from_dict(3),
+    "result": lambda: spadwarp.files.write_run(None, 3),
+    "medium": lambda: Scene(medium=None),
+    "extinction": lambda: Medium(extinction=-1.0),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_arguments_of_the_wrong_type_are_named(name):
+    with pytest.raises((ArgumentError, ConfigError)) as caught:
+        CALLS[name]()
+    assert name in str(caught.value)
+
+
+def test_an_error_of_right_arguments_is_not_hidden(monkeypatch):
+    def broken(*_, **__):
+        raise ZeroDivisionError("a fault of ours")
+
+    monkeypatch.setattr("spadwarp.transport.simulation.make_plan", broken)
+    with pytest.raises(ZeroDivisionError):
+        spadwarp.simulate(scene(), photons=10, device="cpu")
+
+
+def test_public_functions_are_found_where_they_say():
+    """Pools of processes send them by their name."""
+    for function in (spadwarp.simulate, spadwarp.load_scene, spadwarp.frames.crlb, spadwarp.check):
+        assert pickle.loads(pickle.dumps(function)) is function

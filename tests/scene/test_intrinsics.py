@@ -88,12 +88,6 @@ def test_without_intrinsics_the_axis_is_in_the_middle():
 # Poses
 
 
-def test_a_cameras_axes_are_the_columns_of_its_rotation():
-    camera = Camera(**INTRINSICS, position=(1.0, 2.0, 3.0), rotation_deg=(0.0, 90.0, 0.0))
-    # Turned to the right about y, which points down: it looks along the world's +x.
-    np.testing.assert_allclose(to_world(camera, [[0, 0, 5.0], [2.0, 0, 0]]), [[6, 2, 3], [1, 2, 1]], atol=1e-12)
-
-
 @pytest.mark.parametrize("angles", [(10.0, 20.0, 30.0), (-170.0, 80.0, 5.0), (30.0, 90.0, 0.0), (-40.0, -90.0, 0.0)])
 def test_angles_are_read_back_from_the_matrix(angles):
     matrix = rotation_matrix(angles)
@@ -177,26 +171,15 @@ def test_a_calibration_file_becomes_fields(tmp_path, text):
         (_ROS_YAML.replace("plumb_bob", "equidistant"), "'equidistant' is not Brown's"),
         (_ROS_YAML.replace("61.0, 0, 29.2", "61.0, 0.3, 29.2"), "is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]"),
         (_PLAIN_JSON.replace("-0.01, 0, 0, 0", "-0.01, 0, 0.1, 0"), "no rational, prism or tilt terms"),
-        ('{"K": ', "not valid JSON"),
         ('{"K": ' + "[" * 100_000, "not valid JSON"),
         ("<opencv_storage><K>", "not valid XML: "),
         ("<!DOCTYPE a [<!ENTITY b 'c'>]><opencv_storage/>", "declares a document type"),
-        ("<opencv_storage><K>abc</K></opencv_storage>", "K = 'abc' is not a number"),
-        ("K: [61.0, 0,\n", "not valid YAML: while parsing a flow"),
         ("K: &a [61.0]\nD: *a\n", "not valid YAML: an alias stands in line 2"),
         (_ROS_YAML.replace("61.0", "abc"), "camera_matrix = 'abc' is not a number"),
-        (_ROS_YAML.replace("61.0", "inf"), "camera_matrix = inf is outside [-1e9, 1e9]"),
-        (_ROS_YAML.replace("61.0", "9" * 20_000), "is beyond the largest number"),
-        ('{"K": ' + "9" * 20_000 + "}", "not valid JSON: Exceeds the limit"),
-        ('{"K": {"rows": 3}}', "K = None is not a number"),
         (_ROS_YAML.replace("cols: 3", "cols: 2"), "camera_matrix has 9 numbers in 3 rows and 2 columns"),
-        (_ROS_YAML.replace("rows: 1", "rows: [1]"), "distortion_coefficients.rows = ['1'] is not a number"),
         (_OPENCV_JSON.replace('"cols": 1', '"cols": 8'), "5 numbers in 5 rows and 8 columns"),
-        (_OPENCV_XML.replace("<cols>3", "<cols>3 3"), "camera_matrix.cols = ['3', '3'] is not a number"),
-        (_OPENCV_XML.replace("<data>-0.28", "<data><a/>-0.28"), "0 numbers in 1 rows and 5 columns"),
         ("<a>" * 100_000, "not valid XML: "),
         ("<a>" * 50_000 + "</a>" * 50_000, "holds no camera_matrix"),
-        (_ROS_YAML.replace("width: 64", "width: [64, 48]"), "image_width = [64.0, 48.0] is not an integer"),
         (_ROS_YAML.replace("width: 64", "width: 64.5"), "image_width = 64.5 is not an integer in [1, 16384]"),
     ],
 )

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from helpers.pages import ROOT, text_of
-from spadwarp.scene import Camera, Medium, phase_function, presets
+from spadwarp.scene import Medium, phase_function, presets
 from spadwarp.scene.medium import natural_laws
 from spadwarp.water import pure_water_absorption
 
@@ -95,10 +95,3 @@ def test_water_gets_murkier_along_a_series(series):
     before, types, after = series.replace("}", "{").split("{")
     extinctions = [Medium(preset=f"{before}{one}{after}").extinction for one in types.split(",")]
     assert extinctions == sorted(extinctions)
-
-
-def test_the_papers_camera_has_pixels_of_9_2_um_and_20_degrees():
-    camera = Camera(preset="lu2024")
-    assert camera.focal_length * camera.pixel_tangent == pytest.approx(9.2e-6, rel=1e-3)
-    assert camera.horizontal_fov_deg == 20.0
-    assert camera.focal_length / (2 * camera.aperture_radius) == pytest.approx(2.0)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from helpers.minimal_scene import problems, scene
 from spadwarp.dataset.recipe import Recipe
 from spadwarp.denoise.recipe import TrainingRecipe
-from spadwarp.scene import Camera, Domain, Medium, Scene, parse_override, presets
+from spadwarp.scene import Camera, Medium, Scene, parse_override, presets
 from spadwarp.scene.medium import Constituent
 from spadwarp.scene.sections import interval_of, models_of, parts_of
 from spadwarp.values import SPEED_OF_LIGHT, ConfigError
@@ -55,11 +55,6 @@ def test_overriding_one_coefficient_keeps_its_partner_and_overriding_two_replace
     assert (both.extinction, both.albedo, both.anisotropy) == (0.9, 0.5, before.anisotropy)
     both = one.with_overrides(["medium.absorption=0.1", "medium.extinction=0.5"]).medium
     assert (both.absorption, both.extinction) == (0.1, 0.5)
-
-
-def test_index_names_stand_for_water_at_532_nm():
-    medium = Medium(extinction=1.0, albedo=0.5, group_index="fresh", phase_index="fresh")
-    assert (medium.group_index, medium.phase_index) == (1.3566, 1.3350)
 
 
 @pytest.mark.parametrize("name", sorted(name for name in presets() if not name.startswith("port.")))
@@ -176,13 +171,6 @@ def test_both_ways_to_give_a_camera_agree():
         assert camera.aperture_radius == pytest.approx(0.0025)
         assert math.tan(camera.horizontal_fov / 2) == pytest.approx(0.2)
         assert math.tan(camera.vertical_fov / 2) == pytest.approx(0.15)
-
-
-def test_a_domain_has_only_the_bounds_of_its_shape():
-    inf = math.inf
-    assert Domain(lower=1, upper=[2, 3, 4]).bounds == ((-inf,) * 3, (inf,) * 3)
-    assert Domain(shape="slab", lower=0, upper=2).bounds == ((-inf, -inf, 0.0), (inf, inf, 2.0))
-    assert Domain(shape="box", lower=-1, upper=[2, 3, 4]).bounds == ((-1.0,) * 3, (2.0, 3.0, 4.0))
 
 
 def number_fields(model, path=""):

@@ -195,27 +195,3 @@ def test_estimators_share_one_ledger(end, device):
         for name in ("next_event", "guided")
     ]
     assert equal_means_p(*means) > 1e-3
-
-
-@pytest.mark.slow
-def test_records_of_a_capped_walk_have_no_more_events_than_allowed(device):
-    """The analog photon's record is of the end of the flight after its last event, the others' of that event."""
-    one = scene(transport={"max_collisions": 3, "weight_cutoff": 0.0})
-    mesh = build_mesh(one)
-    model = build_model(one, pick_device(device), mesh)
-    found = {}
-    for estimator in ("none", "analog"):
-        spec = transport_spec(one, mesh, estimator=estimator, records=True)
-        data = sk.make_data(model, record_count=20_000)
-        sk.launch_transport(spec, model, data, seed=3, first_id=0, photon_count=20_000)
-        found[estimator] = data.records
-    capped = found["none"].reason.numpy() == sk.LEDGER_ENTRIES.index("max_collisions")
-    assert capped.any()
-    for name in ("reason", "collisions", "weight"):
-        np.testing.assert_array_equal(*(getattr(records, name).numpy() for records in found.values()))
-    assert (found["analog"].collisions.numpy()[capped] == 3).all()
-    start, end = (records.position.numpy() for records in found.values())
-    flown = np.linalg.norm(end - start, axis=1)
-    assert (flown[capped] > 0).all() and not flown[~capped].any()
-    more = found["analog"].path.numpy() - found["none"].path.numpy()
-    np.testing.assert_allclose(more, flown, atol=2e-5)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.transport.model import build_model, transport_spec
 from spadwarp_kernels.tally.tally import add_to_words, fold_accumulators
-from spadwarp_kernels.transport.launch import splits_accumulators
 
 PENCIL = {
     "laser": {"profile": "collimated", "position": [0.0, 0.0, 0.0]},
@@ -117,39 +115,6 @@ def test_carries_and_values_of_more_than_32_bits(device):
     assert not split_accumulators.numpy().any()
 
 
-def test_words_are_folded_once(device):
-    tally = wp.array([5, 2**40, 0], dtype=wp.int64, device=device)
-    split_accumulators = wp.array(np.array([0, 2**32 - 1, 7], np.uint32), dtype=wp.uint32, device=device)
-    for _ in range(2):
-        fold_accumulators(split_accumulators, tally)
-        assert tally.numpy().tolist() == [5, 2**40 + 2**32 - 1, 7]
-
-
-LARGE = 64 * 64 * 2048  # voxels of a component, 67 MB
-
-
-@pytest.mark.parametrize(
-    ("chosen", "spec", "changes", "photons"),
-    [
-        (True, {}, {}, 1 << 26),
-        (True, {"estimator": "guided", "mesh": True}, {}, 4 * LARGE),
-        (True, {"merged": True}, {}, 1 << 26),
-        (False, {}, {}, 4 * LARGE - 1),
-        (False, {}, {"tally_size": 3 * LARGE // 2}, 1 << 26),
-        (False, {}, {"split_accumulators": False}, 1 << 26),
-        (False, {}, {"device": SimpleNamespace(is_cuda=False)}, 1 << 26),
-        (False, {"estimator": "none"}, {}, 1 << 26),
-        (False, {"derivatives": ("absorption",)}, {}, 1 << 26),
-        (False, {"channels": 2, "polarised": True}, {}, 1 << 26),
-        (False, {"blocks": ("absorption",)}, {}, 1 << 26),
-    ],
-)
-def test_large_launches_into_large_tallies_on_a_gpu_keep_them(chosen, spec, changes, photons):
-    fields = {"split_accumulators": True, "device": SimpleNamespace(is_cuda=True), "tally_size": 3 * LARGE}
-    model = SimpleNamespace(**{**fields, **changes})
-    assert splits_accumulators(sk.TransportSpec(**{"estimator": "next_event", **spec}), model, photons) is chosen
-
-
 def test_only_where_their_memory_is_left(monkeypatch):
     """Half as much again as the histograms take, on the CPU 16 bytes a voxel with copy and total."""
     needed = 16 * 3 * 4 * 4 * 8
@@ -159,10 +124,3 @@ def test_only_where_their_memory_is_left(monkeypatch):
     monkeypatch.setattr("spadwarp.transport.model.physical_memory", lambda: 0.9 * needed)
     with pytest.raises(spadwarp.DeviceError, match="are available"):
         built({}, "cpu")
-
-
-def test_words_of_another_length_are_refused():
-    spec, model = built({}, "cpu")
-    data = dataclasses.replace(sk.make_data(model), split_accumulators=wp.zeros(3, dtype=wp.uint32, device="cpu"))
-    with pytest.raises(sk.ArgumentError, match=r"data\.split_accumulators"):
-        sk.launch_transport(spec, model, data, seed=1, first_id=0, photon_count=10)

@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 
 import spadwarp
-import spadwarp_kernels as sk
 from helpers.estimators import cells
 from helpers.runs import of_seeds
 from helpers.scenes import BEYOND, ELSEWHERE, scene
 from helpers.statistics_of_samples import DEVICES, equal_means_p
 from spadwarp import simulate
-from spadwarp.transport import trace
 from spadwarp.values import ConfigError
-from spadwarp_kernels.transport.launch import check_spec
 
 BARS = [
     {"builtin": "box", "size": [3.0, 3.0, 0.1], "translation": [0.0, 0.0, 2.3], "reflectance": 0.7},
@@ -83,11 +80,6 @@ def test_three_points_where_a_warp_has_a_short_queue(kind, device, tmp_path):
     assert abs(one.mean() - three.mean()) < 4 * np.sqrt((one.var(ddof=1) + three.var(ddof=1)) / 12)
 
 
-def test_records_of_photons_have_no_points(device):
-    one, more = (trace(with_points(scene(targets=[]), points), photons=500, device=device) for points in (1, 3))
-    assert np.array_equal(one.position, more.position) and np.array_equal(one.weight, more.weight)
-
-
 FACES = {"shape": "box", "lower": -2.0, "upper": 4.0, "outside_index": {"y_low": 1.0}}
 
 
@@ -106,11 +98,3 @@ def test_what_goes_with_one_point_alone_is_refused(changes, named, device):
             refuse()
     with pytest.raises(ConfigError, match="points_per_flight"):
         scene(transport={"points_per_flight": 4})
-
-
-def test_the_kernel_library_refuses_it_too():
-    for wrong in ({"estimator": "next_event"}, {"reflecting": True, "bounded": True}, {"grid": sk.DELTA_TRACKING}):
-        with pytest.raises(sk.ArgumentError, match=r"spec.points = 2: more than 1 needs"):
-            check_spec(sk.TransportSpec(**{"estimator": "guided", "points": 2, **wrong}))
-    with pytest.raises(sk.ArgumentError, match=r"spec.points = 4 .* \[1, 3\]"):
-        check_spec(sk.TransportSpec(estimator="guided", points=4))

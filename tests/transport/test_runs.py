@@ -432,14 +432,6 @@ def test_the_stopping_rule_does_not_see_how_many_devices_there_are():
     assert all(done <= total for _, done, total in seen) and seen[-1] == ("trace", one.photons, one.photons)
 
 
-def test_a_resumed_run_counts_all_batches_for_its_stopping_rule(whole):
-    photons, seen = 64 * whole.batch_size, []
-    options = {"photons": photons, "relative_error": 1e-6, "run": RunOptions(resume=whole)}
-    assert here(**options, progress=lambda *report: seen.append(report[0])).photons == photons
-    last = [remark for remark in seen if remark.startswith("error")][-1]
-    assert last.split(" after ")[1].startswith(("64 batches; ", "65 batches; "))  # the first run ended within one
-
-
 # Light that stays on its device
 
 
@@ -461,14 +453,3 @@ def test_light_and_derivatives_are_those_of_simulate():
         np.testing.assert_allclose(slopes[name].total.numpy(), parts.sum(axis=0), rtol=1e-6, atol=1e-9 * size)
         np.testing.assert_allclose(slopes[name].target.numpy(), parts[:2].sum(axis=0), rtol=1e-6, atol=1e-9 * size)
     assert tracer.truth.depth.shape == (8, 8)
-
-
-def test_rates_of_a_tally_need_arrays_that_fit():
-    tally = wp.array(np.arange(24), dtype=wp.int64, device="cpu")
-    scale = wp.array([1.0, 2.0], dtype=wp.float64, device="cpu")
-    rates = sk.tally_rates(tally, scale, bins=2, components=(1, 3), parameters=2, parameter=1).numpy()
-    cube = np.arange(24).reshape(3, 2, 2, 2)[1:, ..., 1].sum(axis=0)
-    np.testing.assert_array_equal(rates, cube * np.array([[1.0], [2.0]]))
-    for wrong in ({"bins": 3}, {"bins": 2, "parameters": 2, "parameter": 2}, {"bins": 4, "components": (2, 2)}):
-        with pytest.raises(sk.ArgumentError):
-            sk.tally_rates(tally, scale, **wrong)

@@ -31,6 +31,7 @@ def _one_pixel(one, row, column):
     return one.with_overrides(camera=camera, laser={"direction": direction}, scan={"mode": "none"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", [{}, {"distortion": [-0.1, 0.0, 0.01, 0.0, 0.0], "focus_distance": 1.5}])
 def test_a_scan_is_one_run_a_pixel_bit_for_bit(camera, device):
     """The photons of each position, walked one by one through a scene of that pixel alone, leave the same integers."""

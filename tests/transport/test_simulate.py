@@ -14,7 +14,7 @@ from spadwarp.scene.pose import rotation_matrix
 WIDE = {"shape": "box", "lower": -60.0, "upper": 60.0}  # that no light of the gate leaves
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(
     extinction=st.floats(0.01, 20),
     albedo=st.floats(0, 1),

@@ -299,6 +299,7 @@ def test_ballistic_return_of_a_shiny_plate_meets_the_closed_form(alpha, aside, h
     assert result.component("ballistic").sum() == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.slow
 def test_an_image_shows_in_the_picture(hidden, tmp_path):
     path, _ = chart(tmp_path, "glb", rows=4, columns=4)
     one = scene(

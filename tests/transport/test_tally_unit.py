@@ -107,7 +107,6 @@ def test_the_unit_is_as_fine_as_the_furthest_target_needs():
 @pytest.mark.parametrize(
     "water",
     [
-        {"anisotropy": -0.9},
         {"phase_function": "two_term_henyey_greenstein", "g1": 0.9, "g2": -0.6, "alpha": 0.8},
         {"phase_function": "fournier_forand"},
     ],

@@ -75,6 +75,7 @@ def test_stack_references(row):
     assert (row.reflected, row.transmitted) == pytest.approx(solved, abs=6e-9)
 
 
+@pytest.mark.slow
 def test_exit_cosine_and_time_resolved_references():
     for row, face, fractions in references.EXIT_COSINES:
         both = exit_cosine_fractions(**case_of(row), edges=references.EXIT_COSINE_EDGES)

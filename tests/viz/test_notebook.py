@@ -10,9 +10,15 @@ import pytest
 from matplotlib.figure import Figure
 
 import spadwarp
+from helpers.coarse_pictures import coarse_pictures
 from helpers.scenes import scene as make_scene
 
 SCENE = make_scene(gate={"start_ns": 0.0, "bin_width_ps": 400.0, "bins": 64})
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    coarse_pictures(monkeypatch.setattr)
 
 
 @pytest.fixture(scope="module")

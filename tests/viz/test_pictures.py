@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib.util
-import itertools
 import json
 import os
 import sys
@@ -247,23 +246,10 @@ def test_every_picture_is_drawn_at_both_widths(kind, width, tmp_path, monkeypatc
     assert figure.axes and figure.get_figwidth() >= min(width, 3.9)  # wider where there are many panels
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PICTURES_OF_THE_DOCS)
 def test_figures_of_the_docs_are_drawn(kind, tmp_path, monkeypatch):
     assert drawn(monkeypatch, lambda: PICTURES_OF_THE_DOCS[kind](tmp_path / "picture.png", style.PAGE), kind).axes
-
-
-@pytest.mark.slow
-def test_images_of_samples_fill_their_rows(tmp_path, monkeypatch):
-    truth = np.full((24, 32), 15.0, np.float32)
-    whole = [(truth, (13.5, 16.0), {"median": truth}, "staircase, backscatter fraction 0.183")] * 3
-    for images in (samples(), whole):
-        for enlarged in (False, True):
-            named = {"methods": METHODS[1:4], "note": "split test", "enlarged": enlarged}
-            figure = drawn(monkeypatch, lambda of=images, named=named: evaluation.draw_samples(of, tmp_path, **named))
-            boxes = [axis.get_position() for axis in figure.axes if axis.images]
-            height = figure.get_figheight()
-            lines = sorted({(round(box.y0 * height, 3), round(box.y1 * height, 3)) for box in boxes})[: len(images)]
-            assert all(upper[0] - lower[1] < 0.3 for lower, upper in itertools.pairwise(lines))
 
 
 def drawn(monkeypatch, draw, name="picture"):

@@ -10,7 +10,6 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.meshes import mesh_of
 from helpers.worlds import STILL, transforms
-from spadwarp_kernels.worlds.shapes import move_shapes
 
 SMALL = sk.SpadConfig(width=8, height=6, bins=32, gate_distance=(0.5, 6.0), pulses=100, pulse_energy=1e-12)
 
@@ -63,23 +62,15 @@ def test_poses_of_a_first_step(kind):
     ("arguments", "text"),
     [
         ({"kind": ["torus"] * 2}, "is not a list of plane, sphere"),
-        ({"kind": 3}, "kind is int; a list is needed"),
         ({"kind": ["mesh"] * 2}, r"mesh\[0\] = 0 is none"),
         ({"mesh": [-1, 0]}, r"mesh = -1 is outside"),
-        ({"mesh": 2}, "mesh is int; a list is needed"),
         ({"world": [3, 0]}, r"world\[0\] = 3 is not whole or outside \[-1, 0\]"),
-        ({"body": [1, 2, 3]}, "body does not fit 2 shapes"),
-        ({"reflectance": 1.5}, r"reflectance\[.*\] = .* is outside \[0, 1\]"),
         ({"visible": [True] * 3}, r"visible has shape \(3,\); \(2,\)"),
         ({"size": [(0, 0, 0), (-1, 1, 1)]}, r"size\[1\] = \[-1.0, 1.0, 1.0\] of a box is not finite and 0 or more"),
         ({"size": wp.full(2, wp.vec3(np.nan), device="cpu")}, r"size\[0\] = \[nan, .* of a plane is not finite"),
-        ({"body": [-1, 2.5]}, "body is not an integer of 32 bits for some of 2 shapes"),
         ({"body": [-1, 2**31]}, "body is not an integer of 32 bits"),
-        ({"body": [-1, -7]}, r"body\[1\] = -7 is outside \[-1, 2147483647\]"),
         ({"local": [STILL, (0,) * 7]}, r"local\[1\] has the quaternion .* of length 0"),
         ({"world": [[0], [0, 1]]}, "world is list and not an array of numbers"),
-        ({"worlds": 2**31 - 1}, r"worlds = 2147483647 is outside \[1, 16777216\]"),
-        ({"visible": "yes"}, "visible is .* not an array of numbers"),
         ({"kind": ["mesh"] * 2, "mesh": [12345] * 2}, r"mesh\[0\] is not the id of a wp.Mesh in meshes"),
         ({"kind": ["mesh"] * 2, "mesh": [triangle(9)] * 2}, r"mesh\[0\].indices\[2\] = 9 is outside \[0, 2\]"),
         ({"kind": ["mesh"] * 2, "mesh": [triangle()] * 2, "first_face": 99}, "reach beyond the 0 faces of textures"),
@@ -96,28 +87,19 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda: sk.SpadConfig(pde=1.5), r"config.pde = 1.5 is outside \[0, 1\]"),
         (lambda: sk.SpadConfig(gate_distance=(5.0, 2.0)), r"config.gate_distance\[1\] = 2.0 is outside \(5.0, inf\)"),
         (lambda: sk.SpadConfig(timing_sigma=1e3), "config.timing_sigma = 1000.0 s is .* bins"),
-        (lambda: sk.SpadConfig(seed=None), "config.seed = None is not an integer"),
         (lambda: sk.SpadCamera(frame="usd", device="cpu"), "frame = 'usd' is not one of 'optical', 'opengl'"),
-        (lambda: sk.SpadCamera(3, device="cpu"), "config is int; a SpadConfig is needed"),
         (lambda: sk.SpadCamera(cameras=2, world=[0], device="cpu"), r"world has shape \(1,\); \(2,\)"),
-        (lambda: sk.SpadCamera(world=3, device="cpu"), r"world has shape \(\); \(1,\)"),
-        (lambda: move_shapes(3, None), "shapes is int; a Shapes is needed"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, world=["a"], device="cpu"), "world is list and not an array of numbers"),
         (lambda: sk.SpadTracer(boxes(worlds=2), SMALL, 3), "world = 2 is none of the 2 worlds"),
-        (lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, photons=0), r"photons = 0 is outside \[1, 67108864\]"),
         (
             lambda: sk.SpadTracer(BOX_ON_BODY_2, SMALL, estimator="analog"),
             "estimator = 'analog' is not one of 'guided'",
         ),
-        (lambda: sk.write_poses(None, poses(STILL), poses(STILL)), "position is None"),
         # Kernels would read beyond the arrays.
         (lambda: camera().update(BOX_ON_BODY_2, poses(STILL), None), "body_q has 0 poses; the shapes are on 3 bodies"),
         (lambda: camera().update(BOX_ON_BODY_2, poses(STILL), poses(STILL, STILL)), "body_q has 2 poses; the shapes"),
         (lambda: camera(world=[1]).update(boxes(), *[poses(STILL)] * 2), "world = 1 is none of the 1 worlds"),
-        (lambda: camera().update_from_images(depths(1), reflectance="dark"), "reflectance = 'dark' is not a number"),
         (lambda: camera().update_from_images(depths(2)), r"depth is a wp.array of float32, shape \(2, 6, 8\)"),
         # Arrays that no device holds.
         (lambda: camera(cameras=10**9), r"cameras x config.height x config.width = 48000000000 is outside"),
@@ -134,7 +116,9 @@ def test_errors_name_the_argument(call, text):
 @pytest.mark.parametrize("kind", ["camera", "tracer"])
 def test_a_mesh_lives_as_long_as_its_shapes(kind):
     mesh = triangle()
-    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], mesh=[mesh.id], meshes=[mesh], device="cpu")
+    image = sk.make_textures(np.zeros(1, int), np.zeros((1, 3, 2)), [np.ones((1, 1))], device="cpu")  # of the kernel
+    options = {"mesh": [mesh.id], "meshes": [mesh], "first_face": [0], "textures": image}  # that others have compiled
+    shapes = sk.make_shapes(["mesh"], [(1, 1, 1)], **options, device="cpu")
     del mesh
     gc.collect()
     assert np.nanmin(one_step(kind, shapes, poses(STILL), None).true_depth.numpy()) == pytest.approx(3.0)
