@@ -10,11 +10,11 @@ import math
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file
@@ -81,24 +81,19 @@ class Laser(Section):
             yield self._that("linewidth_nm", reason)
         if self.spectrum is not None and self.linewidth_nm > 0.0:
             yield self._that("linewidth_nm", "cannot be combined with spectrum")
-
-    @model_validator(mode="after")
-    def _has_one_energy(self) -> Self:
-        # What was given stays in model_fields_set, from where to_dict() knows it.
         if len(self.given) > 1:
-            raise ValueError(f"needs one of {', '.join(ENERGIES)}; given: {', '.join(self.given)}")
-        (given,) = self.given
-        duration, rate = _GAUSSIAN_AREA * self.pulse_fwhm_ps * 1e-12, self.repetition_rate
+            yield f"needs one of {', '.join(ENERGIES)}; given: {', '.join(self.given)}"
+        # What was given stays in model_fields_set, from where to_dict() knows it.
+        given, duration, rate = self.given[0], _GAUSSIAN_AREA * self.pulse_fwhm_ps * 1e-12, self.repetition_rate
         if given == "peak_power" and duration == 0.0:
-            raise ValueError(self._that("peak_power", "needs pulse_fwhm_ps > 0, from which the energy follows"))
+            yield self._that("peak_power", "needs pulse_fwhm_ps > 0, from which the energy follows")
         energies = {"average_power": self.average_power / rate, "peak_power": self.peak_power * duration}
         energy = energies.get(given, self.pulse_energy)
         if energy not in (allowed := field_range(Laser, "pulse_energy")):
-            raise ValueError(self._that(given, f"makes pulses of {energy:.3g} J, outside {allowed}"))
+            yield self._that(given, f"makes pulses of {energy:.3g} J, outside {allowed}")
         derived = {"average_power": energy * rate, "peak_power": energy / duration if duration else math.inf}
         derived["pulse_energy"] = energy
         self.__dict__.update({name: value for name, value in derived.items() if name != given})
-        return self
 
     @property
     def given(self) -> tuple[str, ...]:

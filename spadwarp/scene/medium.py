@@ -10,11 +10,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BeforeValidator, Field, PrivateAttr, field_validator, model_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, field_validator
 
 from spadwarp.scene.grid import COEFFICIENTS, Grid, GridCells, cells_of
 from spadwarp.scene.laser import Laser
@@ -228,21 +228,20 @@ class Water(Section):
                 return kept
         return {name: value for name, value in kept.items() if name not in old} | keep if new else kept
 
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
+    def _problems(self) -> Iterator[str]:
+        yield from super()._problems()
         # What was given stays in model_fields_set, from where to_dict() knows it.
         if self.is_mixture:
             beside = [*self.given, *(["chlorophyll"] if self.chlorophyll is not None else [])]
             if beside:
-                raise ValueError(f"constituents determine the coefficients; {', '.join(beside)} cannot be given")
+                yield f"constituents determine the coefficients; {', '.join(beside)} cannot be given"
         elif self.chlorophyll is None:
             self.__dict__.update(complete_coefficients({name: getattr(self, name) for name in self.given}))
             if self.extinction not in (allowed := field_range(type(self), "extinction")):
-                raise ValueError(f"extinction = {self.extinction} is outside {allowed}")
+                yield f"extinction = {self.extinction} is outside {allowed}"
         elif self.given or self.preset is not None:
             others = ", ".join(self.given or ["preset"])
-            raise ValueError(self._that("chlorophyll", f"cannot be combined with {others}"))
-        return self
+            yield self._that("chlorophyll", f"cannot be combined with {others}")
 
     @property
     def is_mixture(self) -> bool:
@@ -345,6 +344,7 @@ class Medium(PhaseLaw, Water):
             yield "grid does not go with albedo = 'lu2024', which has no cells; give it a number"
         if self.grid is not None and self.grid.anisotropy is not None and law != "henyey_greenstein":
             yield f"grid.anisotropy = {self.grid.anisotropy} {own_law}; cells share any other"
+        self._follow(Laser.model_fields["wavelength_nm"].default)
 
     def _mixture_problems(self) -> Iterator[str]:
         """Why constituents exclude what is given beside them."""
@@ -389,11 +389,6 @@ class Medium(PhaseLaw, Water):
         numbers, b = self.concentrations_in(water), math.fsum(self.scattering_in(water))
         a = math.fsum(n * one.absorption for n, one in zip(numbers, self.constituents, strict=True))
         return a, b, a + b
-
-    @model_validator(mode="after")
-    def _at_default_wavelength(self) -> Self:
-        self._follow(Laser.model_fields["wavelength_nm"].default)
-        return self
 
     def _follow(self, wavelength_nm: float) -> None:
         """Sets what depends on the wavelength."""

@@ -300,7 +300,7 @@ class Section(_Model):
         return self
 
     def _problems(self) -> Iterator[str]:
-        """Why fields exclude each other."""
+        """Why fields exclude each other; where they do not, sets what follows from those that were given."""
         yield from ()
 
     def _that(self, name: str, reason: str) -> str:

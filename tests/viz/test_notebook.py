@@ -82,7 +82,7 @@ def test_a_bar_on_a_terminal_counts_to_the_end(capsys):
 
 def test_a_bar_in_a_notebook_is_one_that_changes(monkeypatch):
     display = pytest.importorskip("IPython.display")
-    from spadwarp.viz import notebook
+    from spadwarp.viz import result as notebook
 
     shown = []
     handle = SimpleNamespace(update=lambda html: shown.append(html.data))
