@@ -183,9 +183,10 @@ def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) 
 
 
 def _unused(held: Held) -> str:
-    """Why histograms that a file holds beside its depth are not used; "" where there are none."""
-    if isinstance(held, FrameReader) and held.histogram_bins:
-        return "; its histograms are not used, since a dataset does not keep their background"
+    """The order of a dataset's frames, and why histograms that a file holds beside its depth are not used."""
+    if isinstance(held, FrameReader):
+        unused = "; its histograms are not used, since a dataset does not keep their background"
+        return "; frames in the reader's order: train, validation, test" + (unused if held.histogram_bins else "")
     if isinstance(held, SequenceFile):
         return "; its histograms are not used, since each frame is of another scene"
     return ""
@@ -503,7 +504,8 @@ def read_scenes(folder: str | os.PathLike[str], split: str) -> CleanScenes:
             columns = [scenes.array(column) for column in ("depth", "bound", "backscatter_profile")]
             parts.append([*columns[:2], scenes.gate(), columns[2]])
     if not parts:
-        raise FileError(f"{folder}: the dataset has no scenes for {split}")
+        more = "" if split == "train" else f"; its recipe names none in targets.{split}, a target apart from the others"
+        raise FileError(f"{folder}: the dataset has no scenes for {split}{more}")
     depth, bound, gate, profile = (np.concatenate(arrays).astype(np.float32) for arrays in zip(*parts, strict=True))
     profile /= np.maximum(profile.mean(axis=1, keepdims=True), 1e-12)
     return CleanScenes(*map(torch.from_numpy, (depth, bound, gate, profile)))

@@ -128,9 +128,15 @@ def read_histograms(
     if gate_start is None and raw.gate_start is None:
         origin = f"{'tag' if raw.first else 'bin'} 0 is taken for the time of the pulse"
         warnings.warn(f"{path.name}: gate start is not given (gate_start): {origin}", SpadwarpWarning, stacklevel=2)
+    bin_width = raw.bin_width if bin_width is None else bin_width
+    if irf is not None and bin_width is not None and not irf.fwhm < (length := values.shape[-1] * bin_width):
+        raise ArgumentError(
+            f"{path}: irf = {irf.fwhm:.4g} s (its full width) is outside [0, {length:.4g} s), the length of "
+            "the histograms; a unit can be written, such as irf=300ps"
+        )
     return Histograms(
         values=np.ascontiguousarray(values),
-        bin_width=raw.bin_width if bin_width is None else bin_width,
+        bin_width=bin_width,
         gate_start=(gate_start if gate_start is not None else raw.gate_start or 0.0) + raw.first,
         irf=irf,
         response=irf,

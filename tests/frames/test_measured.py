@@ -11,7 +11,7 @@ import pytest
 
 import spadwarp
 from helpers.synthetic_result import make_result, make_scene
-from spadwarp.frames import read_histograms
+from spadwarp.frames import instrument_response, read_histograms
 from spadwarp.values import ArgumentError, FileError, SpadwarpWarning
 
 scipy_io = pytest.importorskip("scipy.io")
@@ -128,6 +128,11 @@ WIDER = r"are .* a wider bin than 4 ps \(bin_width\) would help"
         ("two.h5", {}, r"dataset is missing \(dataset\); the file holds a \(3, 5, 40\), b"),
         ("two.h5", {"dataset": "big"}, r"no array 'big'; it holds a \(3, 5, 40\)"),
         ("counts.npy", {"axes": "xxt"}, "are not the letters of"),
+        (
+            "counts.npy",
+            {"bin_width": 5e-11, "irf": instrument_response(pulse_fwhm=0.0, jitter_fwhm=300.0)},
+            "irf = 300 s",
+        ),
     ],
 )
 def test_facts_that_are_missing_or_wrong_are_asked_for(files, name, options, match):
