@@ -131,8 +131,13 @@ def numbers(
 
 def vector(name: str, value: Sequence[float], *, unit: bool = False, size: int = 3) -> None:
     """Finite components, of a unit vector if asked."""
-    length = float(np.linalg.norm(numbers(name, value, (size,), "(-inf, inf)")))
-    if unit and abs(length - 1.0) > 1e-3:
+    try:
+        length = math.hypot(*value) if len(value) == size else math.nan
+    except TypeError:
+        length = math.nan
+    if not math.isfinite(length):
+        numbers(name, value, (size,), "(-inf, inf)")  # says what is wrong, slowly
+    if unit and not abs(length - 1.0) <= 1e-3:
         raise ArgumentError(f"{name} = {tuple(value)} has the length {length:g}; a unit vector is needed")
 
 

@@ -187,8 +187,9 @@ def update_surfaces(surfaces: Surfaces, mesh: wp.Mesh, camera: "Camera | None" =
     check.kind("mesh", mesh, wp.Mesh)
     if surfaces.mesh != mesh.id:
         raise ArgumentError("surfaces are not those of mesh")
-    filled: dict[str, check.Need] = dict.fromkeys(("nodes", "faces", "order", "depth", "patches", "normals"), (None,))
-    check.fields("surfaces", surfaces, {"near_depth": (None, None), **filled})
+    for name in ("near_depth", "nodes", "faces", "order", "depth", "levels", "patches", "normals"):
+        if getattr(surfaces, name) is None:
+            raise ArgumentError(f"surfaces.{name} is None; make_surfaces fills it")
     if (surfaces.near_depth.size > 0) != (camera is not None):
         made = "with" if surfaces.near_depth.size else "without"
         raise ArgumentError(f"surfaces were made {made} a camera; update_surfaces needs the same")
