@@ -169,6 +169,7 @@ def _draw_frames(
     coding.depth_offset, coding.depth_step = plan.depth_offset, plan.depth_step
     coding.pulses = float(pulses)
     coding.intensity_step = intensity_step(float((pulses * -np.expm1(-maps["alpha"])).max()))
+    coding.counted = int(math.isnan(draw.fractions[0]))
     depth, intensity, labels = draw_frames(
         coding,
         put(view, wp.vec3),
@@ -193,8 +194,7 @@ def _background(scene: Scene, draw: SceneDraw, maps: dict[str, Floats]) -> tuple
     dark = (scene.detector.noise_rate + maps["daylight"]) * (scene.gate.stop - scene.gate.start)
     noise = backscatter + dark
     # Open water has nothing else to report; whether it reports at all is whether a photon was recorded.
-    alone = -np.expm1(-scene.pulses_per_depth_frame * noise)
-    probability = np.where(maps["fisher"] > 0, np.nan_to_num(maps["outlier_probability"]), alone)
+    probability = np.where(maps["fisher"] > 0, np.nan_to_num(maps["outlier_probability"]), 1.0)
     flat = np.divide(dark, noise, out=np.ones_like(noise), where=noise > 0)
     return probability, flat, np.ones(len(draw.fractions))
 

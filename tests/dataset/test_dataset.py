@@ -318,6 +318,15 @@ def test_the_centre_of_a_mesh_is_at_the_distance_of_the_recipe(tmp_path):
         np.testing.assert_allclose(size, (1.1, 0.7, 0.3), rtol=1e-5)
 
 
+def test_by_the_rates_a_pixel_reports_where_it_recorded_a_photon():
+    faint = {"exposure.signal_photons": [1.5], "frames.backscatter_fraction": "rates", "pose.size": [0.5]}
+    plan = Plan(recipe(**faint))
+    rendered = render_analytic(plan, plan.scene(0), device="cpu")
+    assert rendered.intensity_step == 1.0
+    assert np.array_equal(rendered.depth > 0, rendered.intensity > 0)
+    assert 0.1 < np.mean(rendered.depth > 0) < 0.9
+
+
 def test_a_thin_target_between_the_pixels_of_the_exposure_gets_one(tmp_path):
     plan = plan_of_mesh(trimesh.creation.box(extents=(0.3, 2.0, 0.1)), tmp_path)
     seen = np.isfinite(truth_maps(plan.scene(0).scene, device="cpu").depth).any(axis=0)

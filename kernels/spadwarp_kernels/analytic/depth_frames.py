@@ -235,6 +235,7 @@ class FrameCoding:
     depth_step: float  # [m]
     pulses: float  # pulses of a frame
     intensity_step: float  # recorded photons per unit of the intensity code
+    counted: int  # 1: only a pixel that recorded a photon reports
 
 
 @memoised
@@ -284,8 +285,11 @@ def _make_coding_kernel(optics: Optics) -> wp.Kernel:
                     # A fit does not leave the gate.
                     value = wp.clamp(value, low, high)
                     code = wp.clamp(int((value - coding.depth_offset) / coding.depth_step + 0.5), 1, 65535)
-                depth_codes[frame, pixel] = wp.uint16(code)
                 count = count_quantile(radius * wp.sin(angle), coding.pulses, alpha[pixel])
+                if coding.counted == 1 and count < 0.5:
+                    code = 0
+                    bits &= ~(128 >> k)
+                depth_codes[frame, pixel] = wp.uint16(code)
                 level = wp.min(int(count / coding.intensity_step + 0.5), 255)
                 intensity_codes[frame, pixel] = wp.uint8(level)
         label_bytes[frame, byte] = wp.uint8(bits)
