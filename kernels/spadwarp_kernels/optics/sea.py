@@ -19,7 +19,7 @@ from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_seq
 from spadwarp_kernels.base.rotations import cos_sin_turn
 from spadwarp_kernels.water.limits import fresnel_reflectance
 
-from .port import Connection, Port, connect_flat, refracted
+from .port import FLAT_PORT, Connection, Port, refracted
 from .waves import Facet, Waves, facet_at, facet_covariance, facet_normal, is_above_waves, make_waves, waves_distance
 
 __all__ = [
@@ -40,6 +40,9 @@ _INV_SQRT_PI = wp.constant(0.5641895835477563)
 # this factor, which keeps the weights of oblique ways small.
 _WIDE_PART = wp.constant(0.1)
 _WIDE = wp.constant(3.0)
+
+
+connect_flat = FLAT_PORT.connect
 
 
 @wp.struct

@@ -10,7 +10,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .camera import SCANNED, Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
 from .laser import Pose, Scan, make_pose
-from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay
+from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay, apparent_centre
 from .sea import WAVES, Sea, SeaKind
 
 __all__ = ["next_event_value"]
@@ -360,7 +360,7 @@ class Sight(NamedTuple):
 def _make_ways(port: PortKind | None) -> tuple[wp.Function, ...]:
     """What `Sight` has from `leave` to `toward_centre`."""
     has_port, kind = port is not None, port or FLAT_PORT
-    connect, apparent_of, apparent_centre, leave_port = kind.connect, kind.apparent, kind.apparent_centre, kind.leave
+    connect, apparent_of, leave_port = kind.connect, kind.apparent, kind.leave
 
     @wp.func
     def leave(camera: Camera, x: wp.vec3, u: wp.vec3) -> PortRay:
