@@ -436,9 +436,11 @@ def make_flat_port(
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
     if sea is not None:
         # Facets about waves hold no more than all slopes do; together with the steepest wave that is a bound.
-        deviation = math.sqrt(0.5) * max(*sea.slope, *sea.waves.spread)
+        deviation = math.sqrt(0.5) * max(*sea.spread)
         _widen(port, _STEEPEST * deviation + sea.waves.steepest, largest_angle)
-    if amplitude > 0.0:
+    if sea is not None and index[2] <= index[0]:
+        port.early = port.late = 0.0  # water behind it is seen straight on
+    elif amplitude > 0.0:
         between = 2.0 * amplitude / max(math.cos(largest_angle), 0.02)
         port.amplitude, port.straight = amplitude, between * math.sin(largest_angle)
         port.early, port.late = port.early + 2.0 * between, port.late + 2.0 * between
