@@ -7,7 +7,7 @@ from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
 from spadwarp_kernels.optics.camera import Camera, lens_point
-from spadwarp_kernels.optics.sea import FACETS
+from spadwarp_kernels.optics.sea import FACETS, passage_density
 from spadwarp_kernels.optics.visibility import Link, lens_in_air
 from spadwarp_kernels.photon.queue import Request
 from spadwarp_kernels.photon.spec import TransportSpec
@@ -357,7 +357,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(request, x, v, world) -> float``: density [1/sr] of what the water or the face of the
     request scatters at x into the direction v."""
     water, faces = spec.water, spec.faces
-    sea, passage_density = spec.sight.sea is not None, (spec.sight.sea or FACETS).density
+    sea, surface_at = spec.sight.sea is not None, (spec.sight.sea or FACETS).at
 
     @wp.func
     def scattering_density(request: Request, x: wp.vec3, v: wp.vec3, world: wp.ref[World]) -> float:
@@ -369,7 +369,7 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
             scattering = water.phase.pdf(one_minus_cosine(snapped, v), water.at(world.medium, world.layers, x))
         if wp.static(sea):
             if request.slot == SEA_SLOT:
-                scattering = passage_density(world.sea, x, request.u, v)
+                scattering = passage_density(surface_at(world.sea, x), request.u, v)
         return scattering
 
     return scattering_density

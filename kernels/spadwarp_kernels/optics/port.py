@@ -68,6 +68,7 @@ class PortRay:
     water: float  # length of its way in the water up to the port [m]; negative if the ray began behind that
     path: float  # length in water that takes as long as the way behind that [m]
     transmission: float  # fraction of unpolarised light that gets through; 0: none
+    cosines: wp.vec4  # index times cosine to the normal before and behind both faces, from inside to the water
     seen: wp.vec3  # of `Sight.leave`, a point that the lens sees it come from, in air alone [m]
 
 
@@ -98,161 +99,93 @@ def refracted(u: wp.vec3, normal: wp.vec3, ratio: float) -> wp.vec3:
     return ratio * across + (wp.sign(cosine) * wp.sqrt(rest)) * normal
 
 
-# ---- A flat port: a plane window, or a calm surface without one.
+# ---- Faces: where a ray meets one, and its normal outwards, as x, y, z and length [m]; without a normal it does not.
+# `outer`: that between window and water; `inward`: of a ray from the water.
 
 
-# Newton's method rises monotonically to the one root: 3 steps at 15 degrees in air, 5 at 63; beyond the critical angle,
-# where nearly all of the way is in a thin layer of air, up to about 12. After a step of this size, relative to t, the
-# error is its square.
-_FLAT_STEPS = wp.constant(16)
+@wp.func
+def _plane_face(port: Port, x: wp.vec3, u: wp.vec3, outer: bool, inward: bool) -> wp.vec4:
+    climb = wp.dot(u, port.normal)
+    if (climb < 0.0) != inward or climb == 0.0:
+        return wp.vec4()
+    level = port.distance + wp.where(outer, port.thickness, 0.0)
+    return wp.vec4(port.normal[0], port.normal[1], port.normal[2], (level - wp.dot(x, port.normal)) / climb)
+
+
+@wp.func
+def _sphere_face(port: Port, x: wp.vec3, u: wp.vec3, outer: bool, inward: bool) -> wp.vec4:
+    radius = port.radius + wp.where(outer, port.thickness, 0.0)
+    y = x - port.centre
+    b = wp.length(wp.cross(y, u))
+    near = -wp.dot(y, u) - _chord(radius, b)
+    # From outside a ray enters at the nearer point, also of a ray that began behind it; from inside it leaves farther.
+    if b >= radius or (not inward and near > 0.0):
+        return wp.vec4()
+    s = wp.where(inward, near, near + 2.0 * _chord(radius, b))
+    normal = wp.normalize(y + s * u)
+    return wp.vec4(normal[0], normal[1], normal[2], s)
+
+
+@wp.func
+def _chord(r: float, b: float) -> float:
+    """Half the chord of a circle at the distance b from its centre [m]."""
+    return wp.sqrt(wp.max((r - b) * (r + b), 0.0))
+
+
+# ---- The way between two points, by Newton's method: the direction inside.
+
+
+@wp.struct
+class _Aim:
+    u: wp.vec3  # unit direction at the point inside
+    density: float  # see `Connection`; 0: there is no way
+
+
+# It rises monotonically to the one root of a flat port: 3 steps at 15 degrees in air, 5 at 63; beyond the critical
+# angle, where nearly all of the way is in a thin layer of air, up to about 12. After a step of this size, relative to
+# the unknown, the error is its square.
+_STEPS = wp.constant(16)
 _LAST_STEP = wp.constant(1.0e-4)
 
 
 @wp.func
-def snell_tangent(h: wp.vec3, n: wp.vec3, aside: float) -> float:
-    """t of the ray that gets `aside` [m] on its way through layers of thicknesses h [m] >= 0 and indices n."""
-    m = wp.min(n[0], wp.min(n[1], n[2]))
-    n2 = wp.cw_mul(n, n)
-    e = wp.vec3((n[0] - m) * (n[0] + m), (n[1] - m) * (n[1] + m), (n[2] - m) * (n[2] + m))
-    t = aside / (m * (h[0] / n[0] + h[1] / n[1] + h[2] / n[2]))
-    for _ in range(_FLAT_STEPS):
-        t2 = t * t
-        value = float(0.0)
-        slope = float(0.0)
-        for i in range(3):
-            root = 1.0 / wp.sqrt(n2[i] + e[i] * t2)
-            value += h[i] * root
-            slope += h[i] * n2[i] * root * root * root
-        step = (aside / m - t * value) / slope
-        t += step
-        if wp.abs(step) <= _LAST_STEP * t:
-            break
-    return t
-
-
-@wp.func
-def connect_flat(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
-    """The way from x in the water to o inside."""
-    c = Connection()
+def _aim_flat(port: Port, x: wp.vec3, o: wp.vec3) -> _Aim:
+    """Unknown: t = k/sqrt(m^2 - k^2), k Snell's invariant and m the least index."""
+    aim = _Aim()
     y = x - o
     along = wp.dot(y, port.normal)
     inside = port.distance - wp.dot(o, port.normal)
     h = wp.vec3(inside, port.thickness, along - inside - port.thickness)
     if h[0] <= 0.0 or h[2] <= 0.0:
-        return c
+        return aim
     across = y - along * port.normal
     aside = wp.length(across)
-    across = across / wp.max(aside, 1.0e-30)
     n = port.index
     m = wp.min(n[0], wp.min(n[1], n[2]))
-    t = snell_tangent(h, n, aside)
+    t = aside / (m * (h[0] / n[0] + h[1] / n[1] + h[2] / n[2]))
+    for _ in range(_STEPS):
+        value = float(0.0)
+        slope = float(0.0)
+        for i in range(3):
+            root = 1.0 / wp.sqrt(n[i] * n[i] + (n[i] - m) * (n[i] + m) * t * t)
+            value += h[i] * root
+            slope += h[i] * n[i] * n[i] * root * root * root
+        step = (aside / m - t * value) / slope
+        t += step
+        if wp.abs(step) <= _LAST_STEP * t:
+            break
     cos_m = 1.0 / wp.sqrt(1.0 + t * t)
-    k = m * t * cos_m
+    # d(Omega)/dA = k/(n_w^2 cos(theta_w) rho rho'(k)) on the port's plane; rho/k and rho' are sums of positive terms.
+    ratio = float(0.0)
+    slope = float(0.0)
     q = wp.vec3()  # n cos(theta)
     for i in range(3):
         q[i] = cos_m * wp.sqrt(n[i] * n[i] + (n[i] - m) * (n[i] + m) * t * t)
-    c.to_port = -(k / n[2]) * across - (q[2] / n[2]) * port.normal
-    c.inside = -(k / n[0]) * across - (q[0] / n[0]) * port.normal
-    length = wp.vec3(h[0] * n[0] / q[0], h[1] * n[1] / q[1], h[2] * n[2] / q[2])
-    c.water = length[2]
-    c.exit = x + c.water * c.to_port
-    c.path = c.water + port.delay[0] * length[0] + port.delay[1] * length[1]
-    c.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), wp.vec4(q[0], q[1], q[1], q[2]))
-    # d(Omega)/dA = k/(n_w^2 cos(theta_w) rho rho'(k)) on the port's plane; rho/k and rho' are sums of positive terms.
-    ratio = length[0] / n[0] + length[1] / n[1] + length[2] / n[2]
-    slope = length[0] * n[0] / (q[0] * q[0]) + length[1] * n[1] / (q[1] * q[1]) + length[2] * n[2] / (q[2] * q[2])
-    c.density = n[0] / (n[2] * q[0] * q[2] * ratio * slope)
-    return c
-
-
-@wp.func
-def apparent_flat(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
-    """Where the ray of a connection from x to o meets the port's axis through o if it goes straight on."""
-    n = port.index
-    q_water = -n[2] * wp.dot(c.to_port, port.normal)
-    q_inside = -n[0] * wp.dot(c.inside, port.normal)
-    k2 = n[0] * n[0] - q_inside * q_inside
-    q_glass = wp.sqrt(n[1] * n[1] - k2)
-    inside = port.distance - wp.dot(o, port.normal)
-    behind = inside * q_water / q_inside + port.thickness * q_water / q_glass
-    return o + (inside + port.thickness - behind) * port.normal
-
-
-@wp.func
-def apparent_centre_flat(port: Port) -> wp.vec3:
-    """`apparent_flat` of the lens's centre, for rays along the normal."""
-    n = port.index
-    behind = port.distance * n[2] / n[0] + port.thickness * n[2] / n[1]
-    return (port.distance + port.thickness - behind) * port.normal
-
-
-@wp.func
-def leave_flat(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
-    """What comes of a ray from x in the water along u, up to the plane z = 0 inside; x may lie behind the port, on the
-    ray as it goes straight on."""
-    p = PortRay()
-    n = port.index
-    cosine = -wp.dot(u, port.normal)
-    behind = wp.dot(x, port.normal) - port.distance - port.thickness
-    across = n[2] * (u + cosine * port.normal)
-    k2 = wp.dot(across, across)
-    least = wp.min(n[0], n[1])
-    if cosine <= 0.0 or k2 >= least * least:
-        return p
-    q0 = wp.sqrt(n[0] * n[0] - k2)
-    q1 = wp.sqrt(n[1] * n[1] - k2)
-    p.water = behind / cosine
-    glass = port.thickness / q1
-    inner = x + p.water * u + glass * across - port.thickness * port.normal
-    p.u = (across - q0 * port.normal) / n[0]
-    if p.u[2] >= 0.0:
-        return p
-    length = -inner[2] / p.u[2]
-    p.x = inner + length * p.u
-    p.path = port.delay[0] * length + port.delay[1] * glass * n[1]
-    p.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), wp.vec4(q0, q1, q1, n[2] * cosine))
-    return p
-
-
-@wp.func
-def enter_flat(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
-    """What comes of a ray from x inside along u, up to where it enters the water."""
-    p = PortRay()
-    n = port.index
-    cosine = wp.dot(u, port.normal)
-    before = port.distance - wp.dot(x, port.normal)
-    across = n[0] * (u - cosine * port.normal)
-    k2 = wp.dot(across, across)
-    least = wp.min(n[1], n[2])
-    if cosine <= 0.0 or before <= 0.0 or k2 >= least * least:
-        return p
-    q1 = wp.sqrt(n[1] * n[1] - k2)
-    q2 = wp.sqrt(n[2] * n[2] - k2)
-    length = before / cosine
-    glass = port.thickness / q1
-    p.x = x + length * u + glass * across + port.thickness * port.normal
-    p.u = (across + q2 * port.normal) / n[2]
-    p.path = port.delay[0] * length + port.delay[1] * glass * n[1]
-    p.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), wp.vec4(n[0] * cosine, q1, q1, q2))
-    return p
-
-
-@wp.func
-def cosines_flat(port: Port, x: wp.vec3, u: wp.vec3) -> wp.vec4:
-    """Index times cosine at the interfaces of the ray through x in the water along u."""
-    n = port.index
-    across = n[2] * wp.cross(u, port.normal)
-    k2 = wp.dot(across, across)
-    q0 = wp.sqrt(wp.max(n[0] * n[0] - k2, 0.0))
-    q1 = wp.sqrt(wp.max(n[1] * n[1] - k2, 0.0))
-    return wp.vec4(q0, q1, q1, n[2] * wp.abs(wp.dot(u, port.normal)))
-
-
-# ---- A dome port: a spherical window.
-
-
-# After a step of this size, relative to the angle, the error of Newton's method is its square.
-_DOME_STEPS = wp.constant(12)
+        ratio += h[i] / q[i]
+        slope += h[i] * n[i] * n[i] / (q[i] * q[i] * q[i])
+    aim.density = n[0] / (n[2] * q[0] * q[2] * ratio * slope)
+    aim.u = (m * t * cos_m / (n[0] * wp.max(aside, 1.0e-30))) * across + (q[0] / n[0]) * port.normal
+    return aim
 
 
 @wp.func
@@ -263,43 +196,9 @@ def _turn(p: float, x: float) -> wp.vec2:
 
 
 @wp.func
-def _chord(r: float, b: float) -> float:
-    """Half the chord of a circle at the distance b from its centre [m]."""
-    return wp.sqrt(wp.max((r - b) * (r + b), 0.0))
-
-
-@wp.func
-def _cosines(port: Port, p: float) -> wp.vec4:
-    """Index times cosine at the interfaces, of a ray of index times distance p [m]."""
-    n = port.index
-    inner = port.radius
-    outer = port.radius + port.thickness
-    b = p / n[1]
-    return wp.vec4(
-        n[0] * _chord(inner, p / n[0]) / inner,
-        n[1] * _chord(inner, b) / inner,
-        n[1] * _chord(outer, b) / outer,
-        n[2] * _chord(outer, p / n[2]) / outer,
-    )
-
-
-@wp.func
-def cosines_dome(port: Port, x: wp.vec3, u: wp.vec3) -> wp.vec4:
-    """Index times cosine at the interfaces of the ray through x in the water along u."""
-    return _cosines(port, port.index[2] * wp.length(wp.cross(x - port.centre, u)))
-
-
-@wp.func
-def _transmission(port: Port, p: float) -> float:
-    """That of a ray of index times distance p [m]."""
-    n = port.index
-    return transmission(wp.vec4(n[0], n[1], n[1], n[2]), _cosines(port, p))
-
-
-@wp.func
-def connect_dome(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
-    """The way from x in the water to o inside."""
-    c = Connection()
+def _aim_dome(port: Port, x: wp.vec3, o: wp.vec3) -> _Aim:
+    """Unknown: the angle i inside to the axis through o and the centre."""
+    aim = _Aim()
     n = port.index
     inner = port.radius
     outer = port.radius + port.thickness
@@ -308,22 +207,21 @@ def connect_dome(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
     z = o - port.centre
     d = wp.length(z)
     if r <= outer or d >= inner:
-        return c
+        return aim
     to_x = y / r
     e = to_x
     if d > 1.0e-9:
         e = z / d
     cosine = wp.dot(e, to_x)
-    if cosine < 0.0:  # the axis through o and the centre, on the side of x, where no angle is near pi
+    if cosine < 0.0:  # the axis on the side of x, where no angle is near pi
         e = -e
         d = -d
         cosine = -cosine
-    aside = wp.cross(e, to_x)
-    sine = wp.length(aside)
+    sine = wp.length(wp.cross(e, to_x))
     beta = wp.atan2(sine, cosine)
     i = wp.atan2(r * sine, r * cosine - d)
     slope = float(1.0)
-    for _ in range(_DOME_STEPS):
+    for _ in range(_STEPS):
         p = n[0] * d * wp.sin(i)
         t0 = _turn(p, n[0] * inner)
         t1 = _turn(p, n[1] * inner)
@@ -337,96 +235,124 @@ def connect_dome(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
         if wp.abs(step) <= _LAST_STEP * i:
             break
     sin_i = wp.sin(i)
-    cos_i = wp.cos(i)
-    p = n[0] * d * sin_i
-    toward = (to_x - cosine * e) / wp.max(sine, 1.0e-20)
-    heading = beta + wp.asin(p / (n[2] * r))
-    c.to_port = -wp.cos(heading) * e - wp.sin(heading) * toward
-    c.inside = -cos_i * e - sin_i * toward
-    air = _chord(inner, p / n[0]) - d * cos_i
-    glass = _chord(outer, p / n[1]) - _chord(inner, p / n[1])
-    water_out = _chord(r, p / n[2])
-    c.water = water_out - _chord(outer, p / n[2])
-    c.exit = x + c.water * c.to_port
-    c.path = c.water + port.delay[0] * air + port.delay[1] * glass
-    c.transmission = _transmission(port, p)
+    aim.u = wp.cos(i) * e + sin_i / wp.max(sine, 1.0e-20) * (to_x - cosine * e)
     # sin(alpha) |d alpha/d beta|/(d^2 sin(beta) |cos i|) with alpha = asin(p/(n_w r)) put in.
     spread = 1.0 / slope
     if sine > 1.0e-12:
         spread = sin_i / sine
-    c.density = n[0] * n[0] * spread / (n[2] * n[2] * r * water_out * wp.abs(slope))
-    return c
+    water_out = _chord(r, n[0] * d * sin_i / n[2])
+    aim.density = n[0] * n[0] * spread / (n[2] * n[2] * r * water_out * wp.abs(slope))
+    return aim
+
+
+def _make_ways(face: wp.Function, aim_at: wp.Function) -> tuple[wp.Function, ...]:
+    """`connect`, `leave`, `enter` and `cosines` of a `PortKind`, by its faces."""
+
+    @wp.func
+    def cross(port: Port, x: wp.vec3, u: wp.vec3, inward: bool) -> PortRay:
+        """A ray through both faces: x and u behind the second, length up to the first as `water`, to the second as
+        `path`."""
+        p = PortRay()
+        p.u = u
+        n = port.index
+        q = wp.vec4()
+        before = wp.where(inward, n[2], n[0])
+        behind = wp.where(inward, n[0], n[2])
+        first = face(port, x, u, inward, inward)
+        m = wp.vec3(first[0], first[1], first[2])
+        glass = refracted(u, m, before / n[1])
+        if wp.length_sq(m) == 0.0 or wp.length_sq(glass) == 0.0:
+            return p
+        start = x + first[3] * u
+        second = face(port, start, glass, not inward, inward)
+        k = wp.vec3(second[0], second[1], second[2])
+        v = refracted(glass, k, n[1] / behind)
+        if wp.length_sq(k) == 0.0 or wp.length_sq(v) == 0.0:
+            return p
+        q[0] = before * wp.abs(wp.dot(u, m))
+        q[1] = n[1] * wp.abs(wp.dot(glass, m))
+        q[2] = n[1] * wp.abs(wp.dot(glass, k))
+        q[3] = behind * wp.abs(wp.dot(v, k))
+        p.cosines = wp.where(inward, wp.vec4(q[3], q[2], q[1], q[0]), q)
+        p.x = start + second[3] * glass
+        p.u = v
+        p.water = first[3]
+        p.path = second[3]
+        p.transmission = transmission(wp.vec4(n[0], n[1], n[1], n[2]), p.cosines)
+        return p
+
+    @wp.func
+    def leave(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
+        p = cross(port, x, u, True)
+        length = -p.x[2] / p.u[2]
+        wall = face(port, p.x, p.u, False, False)
+        walled = wp.length_sq(wall) > 0.0 and length >= wall[3]
+        if p.u[2] >= 0.0 or length <= 0.0 or walled:
+            p.transmission = 0.0
+        p.path = port.delay[0] * length + port.delay[1] * p.path
+        p.x += length * p.u
+        return p
+
+    @wp.func
+    def enter(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
+        p = cross(port, x, u, False)
+        if p.water <= 0.0:
+            p.transmission = 0.0
+        p.path = port.delay[0] * p.water + port.delay[1] * p.path
+        p.water = 0.0
+        return p
+
+    @wp.func
+    def connect(port: Port, x: wp.vec3, o: wp.vec3) -> Connection:
+        c = Connection()
+        aim = aim_at(port, x, o)
+        if aim.density <= 0.0:
+            return c
+        p = enter(port, o, aim.u)
+        c.inside = -aim.u
+        c.to_port = -p.u
+        c.water = face(port, x, c.to_port, True, True)[3]
+        c.exit = x + c.water * c.to_port
+        c.path = c.water + p.path
+        c.transmission = p.transmission
+        c.density = aim.density
+        return c
+
+    @wp.func
+    def cosines(port: Port, x: wp.vec3, u: wp.vec3) -> wp.vec4:
+        return cross(port, x, wp.where(wp.dot(u, port.normal) > 0.0, -u, u), True).cosines
+
+    return connect, leave, enter, cosines
+
+
+# ---- From where light seems to come, of a ray that goes straight on.
 
 
 @wp.func
-def apparent_dome(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
-    """The point of the ray of a connection from x to o, if it goes straight on, that is nearest to o."""
+def _apparent_flat(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
+    """Where the ray of a connection from x to o meets the port's axis through o."""
+    n = port.index
+    q_water = -n[2] * wp.dot(c.to_port, port.normal)
+    q_inside = -n[0] * wp.dot(c.inside, port.normal)
+    q_glass = wp.sqrt(n[1] * n[1] - n[0] * n[0] + q_inside * q_inside)
+    inside = port.distance - wp.dot(o, port.normal)
+    behind = inside * q_water / q_inside + port.thickness * q_water / q_glass
+    return o + (inside + port.thickness - behind) * port.normal
+
+
+@wp.func
+def apparent_centre(port: Port) -> wp.vec3:
+    """That of the lens's centre, of rays along the normal; of a dome, whose normal is 0, the centre itself: there rays
+    hardly bend."""
+    n = port.index
+    behind = port.distance * n[2] / n[0] + port.thickness * n[2] / n[1]
+    return (port.distance + port.thickness - behind) * port.normal
+
+
+@wp.func
+def _apparent_dome(port: Port, x: wp.vec3, o: wp.vec3, c: Connection) -> wp.vec3:
+    """The point of the ray of a connection from x to o that is nearest to o."""
     return x + wp.dot(o - x, c.to_port) * c.to_port
-
-
-@wp.func
-def apparent_centre_dome(port: Port) -> wp.vec3:
-    """The lens's centre: from near the centre of a dome, rays hardly bend."""
-    return wp.vec3(0.0)
-
-
-@wp.func
-def leave_dome(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
-    """As `leave_flat`."""
-    p = PortRay()
-    n = port.index
-    inner = port.radius
-    outer = port.radius + port.thickness
-    y = x - port.centre
-    to_middle = -wp.dot(y, u)
-    b = wp.length(wp.cross(y, u))
-    if b >= outer:
-        return p
-    water = to_middle - _chord(outer, b)
-    first = y + water * u
-    glass = refracted(u, wp.normalize(first), n[2] / n[1])
-    b1 = b * n[2] / n[1]
-    b0 = b * n[2] / n[0]
-    if b1 >= inner or b0 >= inner:
-        return p
-    through = _chord(outer, b1) - _chord(inner, b1)
-    second = first + through * glass
-    p.u = refracted(glass, wp.normalize(second), n[1] / n[0])
-    if p.u[2] >= 0.0:
-        return p
-    length = -(second[2] + port.centre[2]) / p.u[2]
-    if length <= 0.0 or length >= 2.0 * _chord(inner, b0):
-        return p
-    p.water = water
-    p.x = second + port.centre + length * p.u
-    p.path = port.delay[0] * length + port.delay[1] * through
-    p.transmission = _transmission(port, n[0] * b0)
-    return p
-
-
-@wp.func
-def enter_dome(port: Port, x: wp.vec3, u: wp.vec3) -> PortRay:
-    """What comes of a ray from x inside along u, up to where it enters the water."""
-    p = PortRay()
-    n = port.index
-    inner = port.radius
-    outer = port.radius + port.thickness
-    y = x - port.centre
-    b0 = wp.length(wp.cross(y, u))
-    b1 = b0 * n[0] / n[1]
-    b2 = b0 * n[0] / n[2]
-    if wp.dot(y, y) >= inner * inner or b1 >= inner or b2 >= outer:
-        return p
-    length = _chord(inner, b0) - wp.dot(y, u)
-    first = y + length * u
-    glass = refracted(u, wp.normalize(first), n[0] / n[1])
-    through = _chord(outer, b1) - _chord(inner, b1)
-    second = first + through * glass
-    p.x = second + port.centre
-    p.u = refracted(glass, wp.normalize(second), n[1] / n[2])
-    p.path = port.delay[0] * length + port.delay[1] * through
-    p.transmission = _transmission(port, n[0] * b0)
-    return p
 
 
 # ---- Kinds of ports, as the transport kernels take them, and their parameters from lengths and indices.
@@ -441,20 +367,21 @@ class PortKind(NamedTuple):
 
     name: str  # "flat" or "dome"
     connect: wp.Function  # Warp function (port, x, o) -> Connection from x in the water to o inside
+    leave: wp.Function
+    """Warp function (port, x, u) -> PortRay of a ray from x in the water along u, up to the plane z = 0 inside; x may
+    lie behind the port, on the ray as it goes straight on."""
+    enter: wp.Function  # Warp function (port, x, u) -> PortRay of a ray from inside up to where it enters the water
+    cosines: wp.Function
+    """Warp function (port, x, u) -> vec4, `PortRay.cosines` of the ray through x in the water along u, on its way in or
+    out."""
     apparent: wp.Function
     """Warp function (port, x, o, connection) -> the point from where the light of o seems to come at x [m]."""
-    apparent_centre: wp.Function  # Warp function (port) -> about that point for the lens's centre, at once [m]
-    leave: wp.Function  # Warp function (port, x, u) -> PortRay of a ray from the water to the plane z = 0 inside
-    enter: wp.Function  # Warp function (port, x, u) -> PortRay of a ray from inside into the water
-    cosines: wp.Function
-    """Warp function (port, x, u) -> vec4: index times cosine to the normal before and behind both interfaces, in the
-    order of `transmission`, of the ray through x in the water along u, on its way in or out."""
 
 
-FLAT_PORT = PortKind("flat", connect_flat, apparent_flat, apparent_centre_flat, leave_flat, enter_flat, cosines_flat)
+FLAT_PORT = PortKind("flat", *_make_ways(_plane_face, _aim_flat), _apparent_flat)
 """A plane window, or a calm surface without one."""
 
-DOME_PORT = PortKind("dome", connect_dome, apparent_dome, apparent_centre_dome, leave_dome, enter_dome, cosines_dome)
+DOME_PORT = PortKind("dome", *_make_ways(_sphere_face, _aim_dome), _apparent_dome)
 """A spherical window."""
 
 
@@ -509,9 +436,11 @@ def make_flat_port(
     _set_times(port, ((inside - tilt, (inside + tilt) * longest), (thickness, thickness * longest)))
     if sea is not None:
         # Facets about waves hold no more than all slopes do; together with the steepest wave that is a bound.
-        deviation = math.sqrt(0.5) * max(*sea.slope, *sea.waves.spread)
+        deviation = math.sqrt(0.5) * max(*sea.spread)
         _widen(port, _STEEPEST * deviation + sea.waves.steepest, largest_angle)
-    if amplitude > 0.0:
+    if sea is not None and index[2] <= index[0]:
+        port.early = port.late = 0.0  # water behind it is seen straight on
+    elif amplitude > 0.0:
         between = 2.0 * amplitude / max(math.cos(largest_angle), 0.02)
         port.amplitude, port.straight = amplitude, between * math.sin(largest_angle)
         port.early, port.late = port.early + 2.0 * between, port.late + 2.0 * between

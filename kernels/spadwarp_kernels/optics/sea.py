@@ -19,7 +19,7 @@ from spadwarp_kernels.base.philox import begin_sequence, sequence_word, step_seq
 from spadwarp_kernels.base.rotations import cos_sin_turn
 from spadwarp_kernels.water.limits import fresnel_reflectance
 
-from .port import Connection, Port, connect_flat, refracted
+from .port import FLAT_PORT, Connection, Port, refracted
 from .waves import Facet, Waves, facet_at, facet_covariance, facet_normal, is_above_waves, make_waves, waves_distance
 
 __all__ = [
@@ -42,6 +42,9 @@ _WIDE_PART = wp.constant(0.1)
 _WIDE = wp.constant(3.0)
 
 
+connect_flat = FLAT_PORT.connect
+
+
 @wp.struct
 class Sea:
     """The surface in the frame of the camera, made by `make_sea`; above it is air."""
@@ -55,6 +58,8 @@ class Sea:
     index: float  # phase index of the water over that of the air
     delay: float  # group index of the air over that of the water
     extinction: float  # of the air [1/m]; what it takes is absorbed
+    spread_along: wp.vec3  # of all slopes, with those of resolved waves: as `along`
+    spread: wp.vec2  # and as `slope`
     waves: Waves  # of a surface with resolved waves, see `WAVES`; its facets are then about those, else about the plane
 
 
@@ -229,21 +234,6 @@ def passage_density(sea: Sea, u: wp.vec3, v: wp.vec3) -> float:
 # ---- The way of light through the surface from a point to the lens.
 
 
-@wp.struct
-class SeaConnection:
-    """A way from a point on one side of the surface to one on the other, by a point S of it that was drawn; or by that
-    of the flat surface, the only one there is."""
-
-    to_surface: wp.vec3  # unit direction at the point
-    inside: wp.vec3  # unit direction from S to the other point
-    surface: wp.vec3  # S [m]
-    before: float  # length of the way up to S [m]
-    behind: float  # and from there on [m]
-    density: float
-    """What arrives of an intensity of 1 in that direction, per area across the ray and without extinction, over the
-    density of the draw [sr/m^2]; 0: nothing."""
-
-
 @wp.func
 def _draw_point(
     port: Port, flat: Connection, behind: float, up: wp.vec3, along: wp.vec3, width: wp.vec2, seed: wp.uint64
@@ -276,43 +266,6 @@ def _draw_point(
 
 
 @wp.func
-def _by_point(c: wp.ref[SeaConnection], s: wp.vec3, x: wp.vec3, o: wp.vec3):
-    """The way from x by s to o."""
-    c.surface = s
-    to_s = s - x
-    to_o = o - s
-    c.before = wp.length(to_s)
-    c.behind = wp.length(to_o)
-    c.to_surface = to_s / c.before
-    c.inside = to_o / c.behind
-
-
-@wp.func
-def _connect_by_plane(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -> SeaConnection:
-    c = SeaConnection()
-    flat = connect_flat(port, x, o)
-    if flat.density <= 0.0:
-        return c
-    c.to_surface = flat.to_port
-    c.inside = flat.inside
-    c.surface = flat.exit
-    c.before = flat.water
-    c.behind = wp.length(o - flat.exit)
-    c.density = flat.transmission * flat.density
-    if sea.slope[0] <= 0.0:
-        return c
-    drawn = _draw_point(port, flat, c.behind, sea.normal, sea.along, sea.slope, seed)
-    _by_point(c, wp.vec3(drawn[0], drawn[1], drawn[2]), x, o)
-    cosine = wp.abs(wp.dot(c.to_surface, port.normal))
-    area = c.before * c.before * c.behind * c.behind
-    c.density = passage_density(sea, c.to_surface, c.inside) * cosine / (area * wp.max(drawn[3], 1.0e-30))
-    return c
-
-
-# ---- Resolved waves: the surface is about the height field what it is else about the mean plane.
-
-
-@wp.func
 def _tilted(sea: Sea, facet: Facet) -> Sea:
     """The surface at a point of the waves, as that of their facet there."""
     normal = facet_normal(sea.waves, facet.slope)
@@ -322,42 +275,57 @@ def _tilted(sea: Sea, facet: Facet) -> Sea:
     return local
 
 
-@wp.func
-def _connect_by_waves(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -> SeaConnection:
-    """S is drawn about the flat surface at the height of the waves near it, and put on them."""
-    c = SeaConnection()
-    below = wp.dot(port.normal, sea.normal) < 0.0  # x is
-    side = wp.where(below, -1.0, 1.0)
-    # The flat surface above or below x, by which there is a way; of an x that is far from waves the mean plane.
-    depth = wp.dot(x, port.normal) - port.distance
-    near = depth < wp.max(sea.waves.high, -sea.waves.low)
-    plane = port
-    if near:
-        plane.distance += side * facet_at(sea.waves, x).height
-    flat = connect_flat(plane, x, o)
-    if flat.density <= 0.0:
+def _make_connect(waves: bool) -> wp.Function:
+    """`SeaKind.connect`. By waves S is drawn about the flat surface at their height near it, and put on them."""
+
+    @wp.func
+    def connect(sea: Sea, port: Port, x: wp.vec3, o: wp.vec3, seed: wp.uint64) -> Connection:
+        below = wp.dot(port.normal, sea.normal) < 0.0  # x is
+        side = wp.where(below, -1.0, 1.0)
+        plane = port
+        near = bool(False)
+        if wp.static(waves):
+            # The flat surface above or below x, by which there is a way; of an x that is far from waves the mean plane.
+            depth = wp.dot(x, port.normal) - port.distance
+            near = depth < wp.max(sea.waves.high, -sea.waves.low)
+            if near:
+                plane.distance += side * facet_at(sea.waves, x).height
+        c = connect_flat(plane, x, o)
+        if c.density <= 0.0 or sea.spread[0] <= 0.0:
+            return c
+        if wp.static(waves):
+            far = not near
+            if far:
+                # And from there on to the height of the waves: about, for a lens that is much farther than x.
+                across = c.to_port + wp.dot(-c.to_port, port.normal) * port.normal
+                lower = side * facet_at(sea.waves, c.exit).height / wp.max(-wp.dot(c.to_port, port.normal), 0.1)
+                c.exit -= lower * across
+                c.water -= wp.min(lower, 0.5 * c.water)
+        drawn = _draw_point(port, c, wp.length(o - c.exit), sea.normal, sea.spread_along, sea.spread, seed)
+        s = wp.vec3(drawn[0], drawn[1], drawn[2])
+        local = sea
+        if wp.static(waves):
+            facet = facet_at(sea.waves, s)
+            local = _tilted(sea, facet)
+            s += (facet.height - wp.dot(s - sea.waves.origin, sea.normal)) * sea.normal
+        to_s = s - x
+        to_o = o - s
+        behind = wp.length(to_o)
+        c.exit = s
+        c.water = wp.length(to_s)
+        c.to_port = to_s / c.water
+        c.inside = to_o / behind
+        c.transmission = 1.0
+        c.density = 0.0
+        cosine = wp.dot(c.to_port, local.normal)
+        # Facets that turn their backs on x or on o let nothing through.
+        if (cosine > 0.0) == below and (wp.dot(c.inside, local.normal) > 0.0) == below:
+            area = c.water * c.water * behind * behind * wp.dot(local.normal, sea.normal)
+            density = passage_density(local, c.to_port, c.inside)
+            c.density = density * wp.abs(cosine) / (area * wp.max(drawn[3], 1.0e-30))
         return c
-    if not near:
-        # And from there on to the height of the waves: about, for a lens that is much farther than x.
-        across = flat.to_port + wp.dot(-flat.to_port, port.normal) * port.normal
-        lower = side * facet_at(sea.waves, flat.exit).height / wp.max(-wp.dot(flat.to_port, port.normal), 0.1)
-        flat.exit -= lower * across
-        flat.water -= wp.min(lower, 0.5 * flat.water)
-    behind = wp.length(o - flat.exit)
-    drawn = _draw_point(port, flat, behind, sea.normal, sea.waves.spread_along, sea.waves.spread, seed)
-    s = wp.vec3(drawn[0], drawn[1], drawn[2])
-    facet = facet_at(sea.waves, s)
-    local = _tilted(sea, facet)
-    s += (facet.height - wp.dot(s - sea.waves.origin, sea.normal)) * sea.normal
-    _by_point(c, s, x, o)
-    cosine = wp.dot(c.to_surface, local.normal)
-    # Facets that turn their backs on x or on o let nothing through.
-    if (cosine > 0.0) == below and (wp.dot(c.inside, local.normal) > 0.0) == below:
-        level = wp.dot(local.normal, sea.normal)
-        area = c.before * c.before * c.behind * c.behind * level
-        density = passage_density(local, c.to_surface, c.inside)
-        c.density = density * wp.abs(cosine) / (area * wp.max(drawn[3], 1.0e-30))
-    return c
+
+    return connect
 
 
 class SeaKind(NamedTuple):
@@ -368,22 +336,16 @@ class SeaKind(NamedTuple):
     # ``(sea, x, u, above, limit) -> float``: length of the flight from x along u, on the side `above` the surface or
     # below it, to the surface [m]; 1e30 if it does not meet it, as a flight over waves may not beyond the limit [m]
     distance: wp.Function
-    passage: wp.Function  # ``(sea, x, u, above, random) -> SeaPassage`` of light at a point x of the surface
-    density: wp.Function  # ``(sea, x, u, v) -> float``, `passage_density` there
-    # ``(sea, port, x, o, seed) -> SeaConnection``: a way from x to o on the other side, which the port describes: the
-    # mean plane as o sees it; `seed`: 64 random bits
+    at: wp.Function  # ``(sea, x) -> Sea``, whose facets are those about a point x of the surface
+    # ``(sea, port, x, o, seed) -> Connection``: a way from x to o on the other side, by a point of the surface that is
+    # drawn, or that of a flat one; its density is over that of the draw. The port describes the other side: the mean
+    # plane as o sees it; `seed`: 64 random bits
     connect: wp.Function
-    clear: wp.Function | None  # ``(sea, x, u, length, above) -> bool``: whether no wave stands in the way; None: never
 
 
 @wp.func
-def _passage_at_plane(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, random: wp.vec4ui) -> SeaPassage:
-    return sample_passage(sea, u, above, random)
-
-
-@wp.func
-def _density_at_plane(sea: Sea, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
-    return passage_density(sea, u, v)
+def _plane_at(sea: Sea, x: wp.vec3) -> Sea:
+    return sea
 
 
 @wp.func
@@ -397,26 +359,14 @@ def _waves_distance(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, limit: float)
 
 
 @wp.func
-def _passage_at_waves(sea: Sea, x: wp.vec3, u: wp.vec3, above: bool, random: wp.vec4ui) -> SeaPassage:
-    return sample_passage(_tilted(sea, facet_at(sea.waves, x)), u, above, random)
+def _waves_at(sea: Sea, x: wp.vec3) -> Sea:
+    return _tilted(sea, facet_at(sea.waves, x))
 
 
-@wp.func
-def _density_at_waves(sea: Sea, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> float:
-    return passage_density(_tilted(sea, facet_at(sea.waves, x)), u, v)
-
-
-@wp.func
-def _clear_of_waves(sea: Sea, x: wp.vec3, u: wp.vec3, length: float, above: bool) -> bool:
-    return waves_distance(sea.waves, x, u, above, length) > length
-
-
-_AT_PLANE = (_is_above_plane, _plane_distance, _passage_at_plane, _density_at_plane, _connect_by_plane)
-FACETS = SeaKind("facets", *_AT_PLANE, None)
+FACETS = SeaKind("facets", _is_above_plane, _plane_distance, _plane_at, _make_connect(False))
 """Facets about the mean plane: waves by the statistics of their slopes alone."""
 
-_AT_WAVES = (_is_above_waves, _waves_distance, _passage_at_waves, _density_at_waves)
-WAVES = SeaKind("waves", *_AT_WAVES, _connect_by_waves, _clear_of_waves)
+WAVES = SeaKind("waves", _is_above_waves, _waves_distance, _waves_at, _make_connect(True))
 """A height field of waves, and about it facets for what it does not resolve."""
 
 
@@ -539,6 +489,7 @@ def make_sea(
     sea.normal, sea.height, sea.along = wp.vec3(*normal), height, wp.vec3(*wind)
     sea.slope = wp.vec2(*(math.sqrt(2.0 * variance) for variance in variances))
     sea.index, sea.delay, sea.extinction = index, delay, extinction
+    sea.spread_along, sea.spread = sea.along, sea.slope
     if heights is not None:
         check.vector("origin", origin)
         first = wind if columns is None else _level("columns", columns, up)
@@ -550,7 +501,6 @@ def make_sea(
         place += (height - place @ up) * up
         sea.waves.normal, sea.waves.origin = sea.normal, wp.vec3(*place)
         sea.waves.columns, sea.waves.rows = wp.vec3(*first), wp.vec3(*second)
-        sea.waves.spread_along, sea.waves.spread = sea.along, sea.slope
         sea.along = wp.vec3(*(vectors[0, 1] * first + vectors[1, 1] * second))
         sea.slope = wp.vec2(math.sqrt(2.0 * values[1]), math.sqrt(2.0 * values[0]))
     return sea

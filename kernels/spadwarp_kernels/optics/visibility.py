@@ -10,7 +10,7 @@ from spadwarp_kernels.base.rotations import cos_sin_turn
 
 from .camera import SCANNED, Camera, Gate, Lens, check_camera, clip_half_space, clip_to_view, field, lens_point
 from .laser import Pose, Scan, make_pose
-from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay
+from .port import DOME_PORT, FLAT_PORT, Port, PortKind, PortRay, apparent_centre
 from .sea import WAVES, Sea, SeaKind
 
 __all__ = ["next_event_value"]
@@ -151,64 +151,46 @@ def _nearer(port: Port, beyond: float, end: int) -> float:
     return port.thickness * (port.glass_slope[end] - 1.0) + beyond * (port.water_slope[end] - 1.0)
 
 
-@memoised
-def _make_flat_view(rough: bool, waves: bool = False) -> tuple[wp.Function, wp.Function]:
-    """`clip` and `shows` of a `Sight` behind a flat port; `rough`: it is the surface of a sea; `waves`: with waves,
-    whose highest crest is then the port, down to whose deepest trough light may go straight on."""
-
-    @wp.func
-    def clip_to_flat_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
-        """As `clip_to_view` behind a flat port: holds all that the lens point o sees."""
-        port = camera.port
-        beyond = wp.dot(x, port.normal) - port.distance - port.thickness
-        if wp.static(waves):
-            beyond += port.amplitude
-        climb = wp.dot(u, port.normal)
-        seen = _view_from(camera, view, o)
-        interval = clip_half_space(beyond, climb, wp.vec2(0.0, limit))
-        for k in range(4):
-            side = _side(seen, k)
-            outward = wp.dot(side, port.normal)
-            end = wp.where(outward < 0.0, 1, 0)  # that which widens the view
-            slope = port.water_slope[end] - 1.0
-            value = -outward * _nearer(port, beyond, end) - wp.dot(side, x - o)
-            rise = -wp.dot(side, u) - outward * climb * slope
-            if wp.static(rough):
-                aside = port.margin * wp.length(side)
-                value += aside * beyond
-                rise += aside * climb
-            if wp.static(waves):
-                value += port.straight * wp.length(side)
-            interval = clip_half_space(value, rise, interval)
-        return interval
-
-    @wp.func
-    def flat_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
-        """As `in_view` behind a flat port; False is certain."""
-        port = camera.port
-        beyond = wp.dot(x, port.normal) - port.distance - port.thickness
-        if wp.static(waves):
-            beyond += port.amplitude
-        shown = beyond > 0.0
-        for k in range(4):
-            side = _side(view, k)
-            outward = wp.dot(side, port.normal)
-            value = float(-1.0e30)
-            for end in range(2):
-                near = _nearer(port, beyond, end)
-                blur = camera.aperture_radius * wp.abs((x[2] + near * port.normal[2]) * camera.inverse_focus - 1.0)
-                value = wp.max(value, blur - outward * near)
-            if wp.static(rough):
-                value += port.margin * beyond * wp.length(side)
-            if wp.static(waves):
-                value += port.straight * wp.length(side)
-            shown = shown and value > wp.dot(side, x)
-        return shown
-
-    return clip_to_flat_view, flat_view_shows
+@wp.func
+def clip_to_flat_view(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
+    """As `clip_to_view` behind a flat port: holds all that the lens point o sees. Of a sea from its highest crest on,
+    down to whose deepest trough light may go straight on."""
+    port = camera.port
+    beyond = wp.dot(x, port.normal) - port.distance - port.thickness + port.amplitude
+    climb = wp.dot(u, port.normal)
+    seen = _view_from(camera, view, o)
+    interval = clip_half_space(beyond, climb, wp.vec2(0.0, limit))
+    for k in range(4):
+        side = _side(seen, k)
+        outward = wp.dot(side, port.normal)
+        end = wp.where(outward < 0.0, 1, 0)  # that which widens the view
+        slope = port.water_slope[end] - 1.0
+        aside = wp.length(side)
+        value = (
+            -outward * _nearer(port, beyond, end) - wp.dot(side, x - o) + aside * (port.margin * beyond + port.straight)
+        )
+        rise = -wp.dot(side, u) - outward * climb * slope + aside * port.margin * climb
+        interval = clip_half_space(value, rise, interval)
+    return interval
 
 
-clip_to_flat_view, flat_view_shows = _make_flat_view(False)
+@wp.func
+def flat_view_shows(camera: Camera, view: wp.vec4, x: wp.vec3) -> bool:
+    """As `in_view` behind a flat port; False is certain."""
+    port = camera.port
+    beyond = wp.dot(x, port.normal) - port.distance - port.thickness + port.amplitude
+    shown = beyond > 0.0
+    for k in range(4):
+        side = _side(view, k)
+        outward = wp.dot(side, port.normal)
+        value = float(-1.0e30)
+        for end in range(2):
+            near = _nearer(port, beyond, end)
+            blur = camera.aperture_radius * wp.abs((x[2] + near * port.normal[2]) * camera.inverse_focus - 1.0)
+            value = wp.max(value, blur - outward * near)
+        value += wp.length(side) * (port.margin * beyond + port.straight)
+        shown = shown and value > wp.dot(side, x)
+    return shown
 
 
 @wp.func
@@ -356,11 +338,28 @@ class Sight(NamedTuple):
     clear: wp.Function | None
 
 
+@wp.func
+def lens_in_air(camera: Camera) -> bool:
+    """Whether the lens of a camera by the sea is in the air: the other side of the surface is denser."""
+    return camera.port.index[2] > camera.port.index[0]
+
+
+@wp.func
+def _lies_across(camera: Camera, x: wp.vec3) -> bool:
+    """Whether the mean plane of a sea is between x and the lens: all else is seen straight on."""
+    return wp.dot(x, camera.port.normal) > camera.port.distance
+
+
+@wp.func
+def _lies_in_water(camera: Camera, x: wp.vec3) -> bool:
+    """As `_lies_across` with a port, which is between all that is scored and the lens."""
+    return True
+
+
 @memoised
-def _make_ways(port: PortKind | None) -> tuple[wp.Function, ...]:
-    """What `Sight` has from `leave` to `toward_centre`."""
-    has_port, kind = port is not None, port or FLAT_PORT
-    connect, apparent_of, apparent_centre, leave_port = kind.connect, kind.apparent, kind.apparent_centre, kind.leave
+def _make_link(port: PortKind | None) -> tuple[wp.Function, wp.Function]:
+    """`leave` and `link` of a `Sight` without a sea."""
+    has_port, connect, leave_port = port is not None, (port or FLAT_PORT).connect, (port or FLAT_PORT).leave
 
     @wp.func
     def leave(camera: Camera, x: wp.vec3, u: wp.vec3) -> PortRay:
@@ -398,110 +397,77 @@ def _make_ways(port: PortKind | None) -> tuple[wp.Function, ...]:
             link.path = r
         return link
 
+    return leave, link_to
+
+
+@memoised
+def _make_ways(port: PortKind | None, sea: SeaKind | None) -> tuple[wp.Function, ...]:
+    """What `Sight` has from `value` to `toward_centre`."""
+    bends, is_bent = port is not None or sea is not None, _lies_across if sea else _lies_in_water
+    connect, apparent_of = (port or FLAT_PORT).connect, (port or FLAT_PORT).apparent
+
     @wp.func
     def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
-        if wp.static(has_port):
+        if wp.static(bends):
             return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
         return next_event_value(camera, extinction, weight, scattering, link.to_lens, link.water)
 
     @wp.func
     def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         seen = wp.vec3(o)
-        if wp.static(has_port):
-            way = connect(camera.port, x, o)
-            if way.density > 0.0:
-                seen = apparent_of(camera.port, x, o, way)
+        if wp.static(bends):
+            bent = is_bent(camera, x)
+            if bent:
+                way = connect(camera.port, x, o)
+                if way.density > 0.0:
+                    seen = apparent_of(camera.port, x, o, way)
         return seen
 
     @wp.func
     def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
         straight = wp.normalize(o - x)
-        if wp.static(has_port):
-            way = connect(camera.port, x, o)
-            straight = wp.where(way.density > 0.0, way.to_port, straight)
+        if wp.static(bends):
+            bent = is_bent(camera, x)
+            if bent:
+                way = connect(camera.port, x, o)
+                straight = wp.where(way.density > 0.0, way.to_port, straight)
         return straight
 
     @wp.func
     def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
-        if wp.static(has_port):
-            return wp.normalize(apparent_centre(camera.port) - x)
+        if wp.static(bends):
+            bent = is_bent(camera, x)
+            if bent:
+                return wp.normalize(apparent_centre(camera.port) - x)
         return (-1.0 / wp.max(wp.length(x), 1.0e-30)) * x
 
-    return leave, link_to, value_of, apparent, toward, toward_centre
+    return value_of, apparent, toward, toward_centre
 
 
-# ---- The surface of a sea: what lies across it from the lens is seen through it, all else straight on.
-
-
-@wp.func
-def _lies_across(camera: Camera, x: wp.vec3) -> bool:
-    return wp.dot(x, camera.port.normal) > camera.port.distance
-
-
-@wp.func
-def lens_in_air(camera: Camera) -> bool:
-    """Whether the lens is in the air: the other side of the surface is denser."""
-    return camera.port.index[2] > camera.port.index[0]
+# ---- The surface of a sea.
 
 
 @memoised
-def _make_lies_across(sea: SeaKind) -> wp.Function:
-    """The Warp function ``(camera, sea, x) -> bool``: whether the surface is between x and the lens."""
-    waves, is_above = sea.name == WAVES.name, sea.is_above
-
-    @wp.func
-    def lies_across(camera: Camera, sea: Sea, x: wp.vec3) -> bool:
-        if wp.static(waves):
-            return is_above(sea, x) != lens_in_air(camera)
-        return _lies_across(camera, x)
-
-    return lies_across
-
-
-@memoised
-def _make_clear(sea: SeaKind) -> wp.Function | None:
-    """See `Sight.clear`. A way by the surface is followed from there to both ends: to the surface it would end there by
-    rounding, or not."""
-    clear_of = sea.clear
-    if clear_of is None:
-        return None
-
-    @wp.func
-    def clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
-        in_air = lens_in_air(camera)
-        rest = o - link.end
-        length = wp.length(rest)
-        if length > 0.0:
-            back = link.end - x
-            free = clear_of(sea, link.end, -link.to_lens, wp.length(back), not in_air)
-            return free and clear_of(sea, link.end, rest / length, length, in_air)
-        return clear_of(sea, x, link.to_lens, wp.length(o - x), in_air)
-
-    return clear
-
-
-@memoised
-def _make_sea_ways(sea: SeaKind) -> tuple[wp.Function, ...]:
-    """As `_make_ways`, with the surface of a sea."""
-    connect, lies_across = sea.connect, _make_lies_across(sea)
-    leave, _link, _value, _apparent, _toward, straight_to_centre = _make_ways(None)
-    _leave, _link, _value, apparent_behind, toward_behind, toward_centre_behind = _make_ways(FLAT_PORT)
+def _make_sea_link(sea: SeaKind) -> wp.Function:
+    """`Sight.link` with the surface of a sea."""
+    connect, is_above = sea.connect, sea.is_above
 
     @wp.func
     def link_to(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, at_sea: bool, seed: wp.uint64) -> Link:
         link = Link()
         in_air = lens_in_air(camera)
-        if not at_sea and lies_across(camera, sea, x):
+        air = float(0.0)
+        if not at_sea and is_above(sea, x) != in_air:
             way = connect(sea, camera.port, x, o, seed)
-            link.to_lens = way.to_surface
+            rest = wp.length(o - way.exit)
+            link.to_lens = way.to_port
             link.image = o - way.inside
-            link.end = way.surface
-            link.begin = wp.where(in_air, x, way.surface)
-            link.along = wp.where(in_air, way.to_surface, way.inside)
-            link.water = wp.where(in_air, way.before, way.behind)
-            air = wp.where(in_air, way.behind, way.before)
-            link.path = link.water + sea.delay * air
-            link.gather = way.density * wp.max(-way.inside[2], 0.0) * wp.exp(-sea.extinction * air)
+            link.end = way.exit
+            link.begin = wp.where(in_air, x, way.exit)
+            link.along = wp.where(in_air, way.to_port, way.inside)
+            link.water = wp.where(in_air, way.water, rest)
+            air = wp.where(in_air, rest, way.water)
+            link.gather = way.transmission * way.density * wp.max(-way.inside[2], 0.0)
         else:
             to_lens = o - x
             r = wp.length(to_lens)
@@ -512,49 +478,48 @@ def _make_sea_ways(sea: SeaKind) -> tuple[wp.Function, ...]:
             link.along = link.to_lens
             link.water = wp.where(in_air, 0.0, r)
             air = r - link.water
-            link.path = link.water + sea.delay * air
-            link.gather = wp.max(-link.to_lens[2], 0.0) / (r * r) * wp.exp(-sea.extinction * air)
+            link.gather = wp.max(-link.to_lens[2], 0.0) / (r * r)
+        link.path = link.water + sea.delay * air
+        link.gather *= wp.exp(-sea.extinction * air)
         return link
 
-    @wp.func
-    def value_of(camera: Camera, extinction: float, weight: float, scattering: float, link: Link) -> float:
-        return weight * scattering * wp.exp(-extinction * link.water) * camera.aperture_area * link.gather
-
-    @wp.func
-    def apparent(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        seen = wp.vec3(o)
-        if lens_in_air(camera):
-            seen = apparent_behind(camera, x, o)
-        return seen
-
-    @wp.func
-    def toward(camera: Camera, x: wp.vec3, o: wp.vec3) -> wp.vec3:
-        straight = wp.normalize(o - x)
-        if _lies_across(camera, x):
-            straight = toward_behind(camera, x, o)
-        return straight
-
-    @wp.func
-    def toward_centre(camera: Camera, x: wp.vec3) -> wp.vec3:
-        straight = straight_to_centre(camera, x)
-        if _lies_across(camera, x):
-            straight = toward_centre_behind(camera, x)
-        return straight
-
-    return leave, link_to, value_of, apparent, toward, toward_centre
+    return link_to
 
 
 @memoised
-def _make_sea_view(shows: wp.Function, waves: bool) -> tuple[wp.Function, ...]:
+def _make_clear(sea: SeaKind) -> wp.Function | None:
+    """See `Sight.clear`. A way by the surface is followed from there to both ends: to the surface it would end there by
+    rounding, or not."""
+    if sea.name != WAVES.name:
+        return None
+    distance = sea.distance
+
+    @wp.func
+    def clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
+        in_air = lens_in_air(camera)
+        rest = o - link.end
+        length = wp.length(rest)
+        if length > 0.0:
+            back = link.end - x
+            way = wp.length(back)
+            free = distance(sea, link.end, -link.to_lens, not in_air, way) > way
+            return free and distance(sea, link.end, rest / length, in_air, length) > length
+        way = wp.length(o - x)
+        return distance(sea, x, link.to_lens, in_air, way) > way
+
+    return clear
+
+
+@memoised
+def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
     """`clip`, `shows` and `gate` of a `Sight` with the surface of a sea, for flights in the water; `shows` of the
-    lens; `waves`: some of the water is above the mean plane."""
-    clip_across, shows_across = _make_flat_view(True, waves)
+    lens."""
 
     @wp.func
     def clip(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
         interval = wp.vec2()
         if lens_in_air(camera):
-            interval = clip_across(camera, view, x, u, o, limit)
+            interval = clip_to_flat_view(camera, view, x, u, o, limit)
         else:
             interval = clip_to_view(camera, view, x, u, o, limit)
         return interval
@@ -565,20 +530,11 @@ def _make_sea_view(shows: wp.Function, waves: bool) -> tuple[wp.Function, ...]:
         if not _lies_across(camera, x):
             shown = shows(camera, view, x)
         elif lens_in_air(camera):
-            shown = shows_across(camera, view, x)
-        if wp.static(waves):
-            near = wp.abs(wp.dot(x, camera.port.normal) - camera.port.distance)
-            shown = shown or near < camera.port.amplitude
-        return shown
+            shown = flat_view_shows(camera, view, x)
+        # Some of the water is above the mean plane.
+        return shown or wp.abs(wp.dot(x, camera.port.normal) - camera.port.distance) < camera.port.amplitude
 
-    @wp.func
-    def gate_of(camera: Camera, gate: Gate) -> Gate:
-        wide = gate
-        if lens_in_air(camera):
-            wide = _gate_behind_port(camera, gate)
-        return wide
-
-    return clip, shows_point, gate_of
+    return clip, shows_point, _gate_behind_port
 
 
 # Of what lies behind a kind of port: `clip`, `shows` and `gate`.
@@ -596,33 +552,22 @@ def _make_placed(pose: Pose, moves: bool, waves: bool) -> tuple[wp.Function, wp.
     @wp.func
     def camera_at(camera: Camera, scan: Scan, target: int) -> Camera:
         if wp.static(moves):
-            position = wp.transform_get_translation(scan.pose[target])
-            distance = camera.port.distance - wp.dot(position, camera.port.normal)
-            normal = turn_in(scan, target, camera.port.normal)
-            camera.port.distance = distance
-            camera.port.normal = normal
+            camera.port.distance -= wp.dot(wp.transform_get_translation(scan.pose[target]), camera.port.normal)
+            camera.port.normal = turn_in(scan, target, camera.port.normal)
         return camera
 
     @wp.func
     def sea_at(sea: Sea, scan: Scan, target: int) -> Sea:
         if wp.static(moves):
-            position = wp.transform_get_translation(scan.pose[target])
-            height = sea.height - wp.dot(position, sea.normal)
-            normal = turn_in(scan, target, sea.normal)
-            along = turn_in(scan, target, sea.along)
-            sea.height = height
-            sea.normal = normal
-            sea.along = along
+            sea.height -= wp.dot(wp.transform_get_translation(scan.pose[target]), sea.normal)
+            sea.normal = turn_in(scan, target, sea.normal)
+            sea.along = turn_in(scan, target, sea.along)
+            sea.spread_along = turn_in(scan, target, sea.spread_along)
             if wp.static(waves):
-                origin = point_in(scan, target, sea.waves.origin)
-                columns = turn_in(scan, target, sea.waves.columns)
-                rows = turn_in(scan, target, sea.waves.rows)
-                spread_along = turn_in(scan, target, sea.waves.spread_along)
-                sea.waves.normal = normal
-                sea.waves.origin = origin
-                sea.waves.columns = columns
-                sea.waves.rows = rows
-                sea.waves.spread_along = spread_along
+                sea.waves.normal = sea.normal
+                sea.waves.origin = point_in(scan, target, sea.waves.origin)
+                sea.waves.columns = turn_in(scan, target, sea.waves.columns)
+                sea.waves.rows = turn_in(scan, target, sea.waves.rows)
         return sea
 
     return camera_at, sea_at
@@ -644,9 +589,10 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind |
     cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows, _same_gate)
     if port is not None:
         cosines, may_hide, view = port.cosines, _may_hide_anywhere, _VIEWS[port.name]
-    ways = _make_sea_ways(sea) if sea else _make_ways(port)
+    leave, link = _make_link(port)
+    ways = (leave, _make_sea_link(sea) if sea else link, *_make_ways(port, sea))
     if sea:
-        view = _make_sea_view(lens.shows, waves)
+        view = _make_sea_view(lens.shows)
     if moves or sea:
         may_hide = _may_hide_anywhere
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)

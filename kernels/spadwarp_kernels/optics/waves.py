@@ -34,8 +34,6 @@ class Waves:
     origin: wp.vec3  # the point of the mean plane at the first node [m]
     columns: wp.vec3  # unit vector in the plane along a row
     rows: wp.vec3  # and from row to row
-    spread_along: wp.vec3  # of the slopes of the sea as a whole: unit vector in the plane
-    spread: wp.vec2  # along it and across, the width of exp(-s^2/width^2)
 
 
 @wp.struct
@@ -204,23 +202,23 @@ def facet_covariance(heights: ArrayLike, size: Sequence[float]) -> NDArray[np.fl
     Raises:
         ArgumentError: Heights that are no such array, or no numbers.
     """
-    h = _checked(heights, size)
-    cell = [size[0] / h.shape[1], size[1] / h.shape[0]]
-    right, down = np.roll(h, -1, axis=1) - h, np.roll(h, -1, axis=0) - h
-    right_below, down_right = np.roll(right, -1, axis=0), np.roll(down, -1, axis=1)
-    squares = [(p * p + p * q + q * q).mean() / 3.0 for p, q in ((right, right_below), (down, down_right))]
-    product = (0.25 * (right + right_below) * (down + down_right)).mean() / (cell[0] * cell[1])
-    return np.array([[squares[0] / cell[0] ** 2, product], [product, squares[1] / cell[1] ** 2]])
+    (a, a_next), (b, b_next) = _edges(_checked(heights, size), size)
+    squares = [(p * p + p * q + q * q).mean() / 3.0 for p, q in ((a, a_next), (b, b_next))]
+    product = (0.25 * (a + a_next) * (b + b_next)).mean()
+    return np.array([[squares[0], product], [product, squares[1]]])
 
 
 def steepest_facet(heights: ArrayLike, size: Sequence[float]) -> float:
     """The largest slope of a periodic height field, of any direction; arguments: see `facet_covariance`."""
-    h = _checked(heights, size)
-    right, down = np.roll(h, -1, axis=1) - h, np.roll(h, -1, axis=0) - h
     # Slopes are bilinear in a cell's corners: the largest are at its corners.
-    along = np.maximum(np.abs(right), np.abs(np.roll(right, -1, axis=0))) * (h.shape[1] / size[0])
-    across = np.maximum(np.abs(down), np.abs(np.roll(down, -1, axis=1))) * (h.shape[0] / size[1])
+    along, across = (np.maximum(np.abs(p), np.abs(q)) for p, q in _edges(_checked(heights, size), size))
     return float(np.hypot(along, across).max())
+
+
+def _edges(h: NDArray[np.float64], size: Sequence[float]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Slopes of both edges of each cell along the rows, and of both from row to row."""
+    slopes = [(np.roll(h, -1, axis=k) - h) * (h.shape[k] / length) for k, length in ((1, size[0]), (0, size[1]))]
+    return [(slope, np.roll(slope, -1, axis=k)) for k, slope in enumerate(slopes)]
 
 
 def make_waves(heights: ArrayLike, size: Sequence[float], *, device: wp.DeviceLike = None) -> Waves:

@@ -237,11 +237,11 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
             f"spec.sea = {spec.sea and spec.sea.name} does not go with model.sea.index = {float(model.sea.index):g}"
         )
     if spec.sea:
-        yield "sea", {"normal": "unit", "along": "unit", "index": "(1, 4]", "delay": "(0, 4]"}
-        yield "sea", {"height": "(-inf, inf)", "slope": "[0, 1]", "extinction": "[0, inf)"}
+        yield "sea", {"normal": "unit", "along": "unit", "spread_along": "unit", "index": "(1, 4]", "delay": "(0, 4]"}
+        yield "sea", {"height": "(-inf, inf)", "slope": "[0, 1]", "spread": "[0, 1]", "extinction": "[0, inf)"}
         if spec.waves:
-            yield "sea.waves", {"heights": (None, None), "cell": "(0, inf)", "spread": "(0, inf)", "low": "(-inf, inf)"}
-            yield "sea.waves", dict.fromkeys(("normal", "columns", "rows", "spread_along"), "unit")
+            yield "sea.waves", {"heights": (None, None), "cell": "(0, inf)", "low": "(-inf, inf)"}
+            yield "sea.waves", dict.fromkeys(("normal", "columns", "rows"), "unit")
             yield "sea", {"slope": "(0, 1]"}
         if model.medium.axis_threshold < 1.0:
             raise ArgumentError(f"model.medium.axis_threshold = {model.medium.axis_threshold}; spec.sea needs 1")

@@ -18,7 +18,7 @@ from spadwarp_kernels.base.philox import (
 )
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
-from spadwarp_kernels.optics.sea import FACETS
+from spadwarp_kernels.optics.sea import FACETS, sample_passage
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import (
     END,
@@ -513,7 +513,7 @@ def make_meet_sea(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Fun
     @wp.func
     def meet_sea(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
-        passage = surface.passage(world.sea, s.x, s.u, s.above, draw)
+        passage = sample_passage(surface.at(world.sea, s.x), s.u, s.above, draw)
         new = Outcome()
         new.reason = s.reason
         new.weight = s.weight

@@ -60,8 +60,8 @@ def connection_kernel(
 ):
     k = wp.tid()
     c = connect_sea(sea, port, x, o, wp.uint64(number[k]) * wp.uint64(0x9E3779B97F4A7C15))
-    surface[k] = c.surface
-    density[k] = c.density
+    surface[k] = c.exit
+    density[k] = c.transmission * c.density
 
 
 def words(values):

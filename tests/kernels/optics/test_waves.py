@@ -58,7 +58,7 @@ def connect_kernel(
 ):
     k = wp.tid()
     c = connect(sea, port, x, o, wp.uint64(number[k]) * wp.uint64(0x9E3779B97F4A7C15))
-    point[k] = c.surface
+    point[k] = c.exit
     e[k] = c.density
 
 
