@@ -131,7 +131,7 @@ LINES = {
     "viz": (2200, 2426),
     "water": (800, 853),
     "kernels/spadwarp_kernels": (50, 45),
-    "kernels/analytic": (1650, 1617),
+    "kernels/analytic": (1650, 1621),
     "kernels/base": (950, 1219),
     "kernels/detection": (1000, 1349),
     "kernels/estimators": (1300, 1101),
