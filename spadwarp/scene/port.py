@@ -261,7 +261,12 @@ class PortGeometry:
             t, goal, m = np.zeros_like(aside), aside, min(layers)
         else:
             t, goal = np.arctan2(aside, along - d), np.arctan2(aside, along)
-            faces = ((n[0] * self.radius, -1.0), (n[1] * self.radius, 1.0), (n[1] * outer, -1.0), (n[2] * outer, 1.0))
+            faces: Any = (
+                (n[0] * self.radius, -1.0),
+                (n[1] * self.radius, 1.0),
+                (n[1] * outer, -1.0),
+                (n[2] * outer, 1.0),
+            )
             faces += ((n[2] * np.where(r > outer, r, np.nan), -1.0),)
         for _ in range(_STEPS):
             if flat:

@@ -371,8 +371,8 @@ def _within_waves(scene: Scene, surface: Surface) -> tuple[str, str] | None:
     """As `within_port`, for a lens or a laser as near to the mean plane as the waves of the sea are high."""
     waves = None if scene.scan.mode == "trajectory" else surface.wave_field
     ends = {"camera": scene.camera.position, "laser": vector_of(to_world(scene.camera, scene.beam.position))}
-    for section, place in ends.items() if waves is not None else ():
-        if abs(height := surface.height_of(place)) <= waves.amplitude:
+    for section, place in ends.items():
+        if waves is not None and abs(height := surface.height_of(place)) <= waves.amplitude:
             text = f"{list(place)} is {height:.4g} m from the mean plane of the surface"
             return f"{section}.position", f"{text}, whose waves are up to {waves.amplitude:.3g} m high"
     return None
