@@ -135,7 +135,7 @@ LINES = {
     "kernels/base": (950, 1219),
     "kernels/detection": (1000, 1349),
     "kernels/estimators": (1300, 1101),
-    "kernels/optics": (1350, 2703),
+    "kernels/optics": (1350, 2702),
     "kernels/photon": (850, 1245),
     "kernels/riders": (750, 677),
     "kernels/surface": (1700, 1887),

@@ -508,8 +508,7 @@ def make_sea(
 
 def _level(name: str, vector: ArrayLike, up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The unit vector of the mean plane that a vector lies above."""
-    direction = np.array(vector, np.float64)
-    check.vector(name, direction.tolist())
+    direction = check.numbers(name, vector, (3,), "(-inf, inf)")
     level = direction - (direction @ up) * up
     check.number(f"length of {name} in the plane", float(np.linalg.norm(level)), "(0, inf)")
     unit: NDArray[np.float64] = level / np.linalg.norm(level)
