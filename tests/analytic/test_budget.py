@@ -48,7 +48,14 @@ def test_rows_run_over_waters_and_ranges_and_the_gate_follows():
     assert (named.medium, named.extinction) == ("tank", 1.0)
 
 
-@pytest.mark.parametrize("count_law", ["per_pulse", "per_frame", "per_frame_lu2024"])
+@pytest.mark.parametrize(
+    "count_law",
+    [
+        pytest.param("per_pulse", marks=pytest.mark.slow),
+        "per_frame",
+        pytest.param("per_frame_lu2024", marks=pytest.mark.slow),
+    ],
+)
 def test_the_pulses_needed_are_enough_and_not_too_many(count_law):
     """With them the bound is within 1 cm and outliers are within 1 %; with a tenth less one of the two is not."""
     one = SCENE.with_overrides({"laser.pulse_energy": 1e-11, "detector.dark_count_rate": 2e4})
