@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,7 @@ from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import Channel, Result, analyser_channel, merge
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.scene.sight import depth_from_time, depth_per_time
-from spadwarp.transport import RunOptions, simulate, truth_maps
+from spadwarp.transport import Progress, RunOptions, simulate, truth_maps
 from spadwarp.transport.reconstruction import known_light
 from spadwarp.values import ConfigError, SpadwarpWarning
 
@@ -33,7 +33,6 @@ __all__ = ["Pilot"]
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Progress = Callable[[str, int, int], None]
 
 _SIDE = 16  # largest width and height of the window [pixels]
 _MOST_NOISE = 0.95  # part of the information that may be noise; a bound from what is left of more would be noise itself

@@ -218,10 +218,9 @@ def depth(
     metres = [float(of(found)) for of in (np.min, np.max, np.median)] if found.size else None
     summary = {"pixels_with_return": int(found.size), "metres": metres, "quantity": reduced.quantity}
     if 2 * found.size < pixels and min_significance != 0:
-        least = "the default" if min_significance is None else f"{min_significance:g}"
         complain(
-            f"{pixels - found.size} of {pixels} pixels have no return of the least significance, {least}; "
-            "--min-significance 0 gives each pixel a depth, `spadwarp denoise` uses the pixels around it",
+            f"{pixels - found.size} of {pixels} pixels have no significant return and so no depth; "
+            "--min-significance 0 gives every pixel one, `spadwarp denoise` uses the pixels around it",
             "note",
         )
     answer({**summary, "frames": reduced.frames, "files": files})

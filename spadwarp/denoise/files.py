@@ -115,7 +115,7 @@ def read_depth(
         of_result = {"channel": channel or "I"} if isinstance(held, Result) else {}
         if own is not None:
             frames = own.values.astype(np.float32)
-            source = f"depth as it is{_unused(held)}"
+            source = f"depth as it is{_remark(held)}"
             return DepthReading(depth=frames, frames=True, gate=gate_of(held), profile=None, source=source, truth=truth)
     found = _stored_depth(place, channel, measured.get("dataset"), as_depth)
     if found is not None:
@@ -182,7 +182,7 @@ def _with_background(held: Histograms, given: ArrayLike | BackgroundLaw | None) 
     )
 
 
-def _unused(held: Held) -> str:
+def _remark(held: Held) -> str:
     """The order of a dataset's frames, and why histograms that a file holds beside its depth are not used."""
     if isinstance(held, FrameReader):
         unused = "; its histograms are not used, since a dataset does not keep their background"
@@ -504,7 +504,7 @@ def read_scenes(folder: str | os.PathLike[str], split: str) -> CleanScenes:
             columns = [scenes.array(column) for column in ("depth", "bound", "backscatter_profile")]
             parts.append([*columns[:2], scenes.gate(), columns[2]])
     if not parts:
-        more = "" if split == "train" else f"; its recipe names none in targets.{split}, a target apart from the others"
+        more = "" if split == "train" else f"; name a target in targets.{split} of its recipe"
         raise FileError(f"{folder}: the dataset has no scenes for {split}{more}")
     depth, bound, gate, profile = (np.concatenate(arrays).astype(np.float32) for arrays in zip(*parts, strict=True))
     profile /= np.maximum(profile.mean(axis=1, keepdims=True), 1e-12)

@@ -163,12 +163,13 @@ def _of_stored(file: FramesFile | SequenceFile) -> FrameSequence:
                 "background": file.background(number) * file.bins * file.pulses,
                 "content": ", ".join([*content, f"{file.trajectory.times[number]:g} s"]),
             }
-        still = {"scene": file.scene, "depth": file.truth_depth, "content": "".join(content)}
-        if file.expected is not None:
-            still["expected"] = file.expected * pulses
-        if file.expected is not None and file.background is not None:
-            still["background"] = _mean_background(file.background, file.expected.shape) * file.pulses
-        return still
+        return {
+            "scene": file.scene,
+            "depth": file.truth_depth,
+            "expected": file.expected * pulses,
+            "background": _mean_background(file.background, file.expected.shape) * file.pulses,
+            "content": "".join(content),
+        }
 
     def frame(number: int) -> SequenceFrame:
         depths = {f"{method}.Z": file.depth(method, number) for method in file.methods}

@@ -131,8 +131,8 @@ def read_histograms(
     bin_width = raw.bin_width if bin_width is None else bin_width
     if irf is not None and bin_width is not None and not irf.fwhm < (length := values.shape[-1] * bin_width):
         raise ArgumentError(
-            f"{path}: irf = {irf.fwhm:.4g} s (its full width) is outside [0, {length:.4g} s), the length of "
-            "the histograms; a unit can be written, such as irf=300ps"
+            f"{path}: irf = {irf.fwhm:.4g} s (full width at half maximum) is outside [0, {length:.4g}) s: the "
+            f"histograms are {length:.4g} s long; with a unit, write irf=300ps"
         )
     return Histograms(
         values=np.ascontiguousarray(values),

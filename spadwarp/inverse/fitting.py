@@ -31,14 +31,13 @@ from spadwarp.inverse.goodness import Goodness, Lost, goodness_of, significance
 from spadwarp.inverse.rendering import Half, Renderer
 from spadwarp.inverse.unknowns import BACKGROUND, DEPTH, Unknown, read_unknowns, scene_value, with_values
 from spadwarp.scene import Detector, Scene, SceneLike, as_scene
-from spadwarp.transport import truth_maps
+from spadwarp.transport import Progress, truth_maps
 from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, check_real, percent
 
 __all__ = ["Estimate", "EstimateMap", "Fit", "Fitter", "Iteration", "fit"]
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
-Progress = Callable[[str, int, int], None]
 Prior = Mapping[str, tuple[float, float]]
 
 BATCHES = 4  # of photons in each half, and of a difference of depths

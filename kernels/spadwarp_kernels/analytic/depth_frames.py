@@ -197,10 +197,8 @@ def sample_frames(
     optics, drawn = _pixel_maps(optics, ports, laser, gate_paths, view, **maps)
     pixels, device = view.shape[0], view.device
     frames = check.integer("frames", frames, 0)
-    first_frame, seed = (
-        check.integer("first_frame", first_frame, 0, 2**31 - 1 - frames),
-        check.integer("seed", seed, 0, 2**64 - 1),
-    )
+    first_frame = check.integer("first_frame", first_frame, 0, 2**31 - 1 - frames)
+    seed = check.integer("seed", seed, 0, 2**64 - 1)
     kinds = (wp.float32, wp.bool)
     made: Any = tuple(wp.empty((frames, pixels), dtype=kind, device=device) for kind in kinds) if out is None else out
     if not (isinstance(made, tuple) and len(made) == 2):
@@ -334,6 +332,7 @@ def draw_frames(
     width = check.integer("coding.width", coding.width, 1)
     if check.integer("coding.pixels", coding.pixels, 1) % width:
         raise ArgumentError(f"coding.width = {width} does not divide coding.pixels = {coding.pixels}")
+    check.integer("coding.counted", coding.counted, 0, 1)
     check.fields("coding", coding, {"depth_offset": "(-inf, inf)", "depth_step": "(0, inf)"})
     check.fields("coding", coding, {"intensity_step": "(0, inf)", "pulses": "[0, inf)"})
     check.array("view", view, wp.vec3, (coding.pixels,))
