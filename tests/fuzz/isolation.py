@@ -45,13 +45,16 @@ def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: i
             os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
         log.seek(0)
-        stderr = log.read().split(b"\nExtension modules")[0][-4000:].decode(errors="replace")
+        stderr = log.read().split(b"\nExtension modules")[0]
+        # Of a crash the innermost frames come first; of all else the last words tell most.
+        fault = stderr.find(b"Fatal Python error")
+        text = (stderr[fault:][:4000] if fault >= 0 else stderr[-4000:]).decode(errors="replace")
     if answer is None:
-        return Outcome("hang", None, stderr, taken)
+        return Outcome("hang", None, text, taken)
     if os.WIFSIGNALED(status):
-        return Outcome("crash", signal.Signals(os.WTERMSIG(status)).name, stderr, taken)
+        return Outcome("crash", signal.Signals(os.WTERMSIG(status)).name, text, taken)
     if not answer:
-        return Outcome("crash", f"exit {os.WEXITSTATUS(status)}", stderr, taken)
+        return Outcome("crash", f"exit {os.WEXITSTATUS(status)}", text, taken)
     return Outcome(*pickle.loads(answer), taken)
 
 
