@@ -50,9 +50,9 @@ class FluxValues:
 
 def flux_arrays(scene: Scene) -> dict[str, FluxArray]:
     """Of all sections of a scene, such as "around/fluence", in the order of the tally."""
-    found, first = dict[str, FluxArray](), 0
+    found, first, absorption = dict[str, FluxArray](), 0, scene.medium.range.absorption
     for section in scene.flux:
-        found |= {f"{section.name}/{name}": array for name, array in section.arrays(scene, first).items()}
+        found |= {f"{section.name}/{name}": array for name, array in section.arrays(absorption, first).items()}
         first += section.size
     return found
 

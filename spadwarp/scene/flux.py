@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,6 @@ from pydantic import BeforeValidator, Field
 from spadwarp.io.hdf5 import Coordinate
 from spadwarp.scene.pose import sideways, unit_vector
 from spadwarp.scene.sections import Corner, Direction, Section, Vector, Whole, field, listed
-
-if TYPE_CHECKING:
-    from spadwarp.scene.scene import Scene
 
 __all__ = ["Flux", "Sun"]
 
@@ -116,9 +113,9 @@ class Flux(Section):
         longest = min(longest, 4.0 / absorption if absorption > 0.0 else longest)
         return 2.0 ** math.floor(22.0 - math.log2(min(longest, 1e6)))
 
-    def arrays(self, scene: Scene, first: int = 0) -> dict[str, FluxArray]:
-        """Those of its part of the tally, which begins at an entry, by name."""
-        unit = 1.0 / self.scale(scene.medium.range.absorption)
+    def arrays(self, absorption: float, first: int = 0) -> dict[str, FluxArray]:
+        """Those of its part of the tally, which begins at an entry, by name; `absorption`: the least [1/m]."""
+        unit = 1.0 / self.scale(absorption)
         if self.voxels is not None:
             width = self.gate_width_ps
             gates = 0.0 if width is None else self.gate_start_ns * 1e-9 + width * 1e-12 * (np.arange(self.gates) + 0.5)
