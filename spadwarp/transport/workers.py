@@ -655,6 +655,9 @@ class LightTracer:
     ) -> None:
         if scene.surface is not None:
             raise ConfigError("a fit knows no surface of the sea", source=scene.source)
+        if channels := scene.tallied_channels:
+            text = f"a fit models all light, and knows no channels such as {channels[0]!r}"
+            raise ConfigError(text, source=scene.source)
         names = derivatives or None
         plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=names, batches=False)
         workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)

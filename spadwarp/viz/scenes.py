@@ -14,6 +14,7 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from numpy.typing import NDArray
 
 from spadwarp.dataset import FrameReader
+from spadwarp.dataset.recipe import SPLITS
 from spadwarp.mesh import SIZED_BUILTINS, MeshSummary, TriangleMesh, build_mesh, builtin_names, make_builtin
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_camera, to_world
@@ -232,7 +233,7 @@ def draw_dataset(
         raise ArgumentError(f"split = {split!r} holds no frames")
     number = min(frames, len(reader))
     items = [reader[int((k + 0.5) * len(reader) / number)] for k in range(number)]
-    splits = {name: split for split, value in reader.manifest["splits"].items() for name in value["targets"]}
+    splits = {name: split for split in SPLITS for name in reader.manifest["splits"][split]["targets"]}
     height, across = reader.shape
     figure, axes = _sheet(number, width, least=2.3, ratio=height / across / 3, title=0.3)
     beyond = np.concatenate([(item["clean"] - item["distance"]).ravel() for item in items])

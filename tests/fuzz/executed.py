@@ -43,7 +43,7 @@ def run_case(case: Case, corpus: Path) -> tuple[str, str]:
 
 def _judge(case: Case, outcome: Outcome, before: dict[str, str], after: dict[str, str]) -> tuple[str, str]:
     if outcome.kind != "done":
-        return outcome.kind, f"{outcome.value} after {outcome.seconds:.1f} s\n{outcome.text[-1500:]}"
+        return outcome.kind, f"{outcome.value} after {outcome.seconds:.1f} s\n{outcome.text}"
     code, errors, unbounded = outcome.value
     if code == BUG or "Traceback (most recent call last)" in errors:
         return "traceback", errors[-1500:]

@@ -143,6 +143,7 @@ def test_start_is_that_of_a_lidar():
     [
         ({"detector.afterpulsing_probability": 0.1}, {}, "afterpulsing_probability"),
         ({"detector.max_count": 7}, {}, "max_count"),
+        ({"laser.polarisation": "linear", "camera.polarisation": "stokes"}, {}, "knows no channels such as"),
         ({}, {"initial_guess": {"medium.absorption": 1.0}}, "is not an unknown"),
         ({}, {"prior": {"depth": 1.0}}, "standard deviation"),
         ({}, {"photons": 10}, "photons = 10"),
@@ -150,7 +151,7 @@ def test_start_is_that_of_a_lidar():
 )
 def test_what_a_fit_leaves_out_is_refused(overrides, options, words):
     with pytest.raises((spadwarp.ConfigError, spadwarp.ArgumentError), match=words):
-        fit(np.zeros((8, 8, 160), int), plate(overrides), "depth", **options)
+        fit(np.ones((8, 8, 160), int), plate(overrides), "depth", **options)
 
 
 @pytest.mark.slow

@@ -97,7 +97,7 @@ def fields(name: str, struct: Any, needs: Mapping[str, Need], device: Any = None
         elif need == "unit":
             for row in np.reshape(value, (-1, 3)):
                 vector(path, row, unit=True)
-        elif hasattr(value, "__len__"):
+        elif hasattr(value, "__len__") and np.ndim(value):
             for k, one in enumerate(value):
                 number(f"{path}[{k}]", one, need)
         else:

@@ -365,8 +365,8 @@ def _check_data(spec: TransportSpec, model: Model, data: Data, photon_count: int
     signed = spec.signed + len(spec.blocks) * model.derivatives.blocks.count if scores else 0
     if signed or data.gradients is not None:
         fits("gradients", wp.int64, check.integer("bins of data.gradients", bins * signed, 1) if signed else None)
-    if spec.flux:
-        fits("flux", wp.int64, check.integer("model.flux.size", model.flux.size, 1))
+    if spec.flux or data.flux is not None:
+        fits("flux", wp.int64, check.integer("model.flux.size", model.flux.size, 1) if spec.flux else None)
     if data.split_accumulators is not None:
         fits("split_accumulators", wp.uint32, data.tally.size)
     fits("ledger", wp.int64, ledger.LEDGER_SLOTS * ledger.LEDGER_WIDTH)

@@ -103,6 +103,7 @@ BOX_ON_BODY_2 = sk.make_shapes(["box"], [(1, 1, 1)], body=[2], device="cpu")
         (lambda: camera().update_from_images(depths(2)), r"depth is a wp.array of float32, shape \(2, 6, 8\)"),
         # Arrays that no device holds.
         (lambda: camera(cameras=10**9), r"cameras x config.height x config.width = 48000000000 is outside"),
+        (lambda: dataclasses.replace(SMALL, pulses=np.array(3.0)), r"config.pulses = array\(3.\) is not an integer"),
         (lambda: sk.SpadCamera(dataclasses.replace(SMALL, bins=8192), 4 * 10**7, device="cpu"), "need 1.26e.05 GB"),
         (lambda: sk.SpadTracer(boxes(), LARGE, oversampling=1024), "oversampling = 2415919104 is outside"),
         (lambda: sk.SpadTracer(boxes(visible=False), SMALL), "world 0 of camera 0 has no shapes"),
