@@ -150,7 +150,6 @@ def _bound_noise(recording: Recording, photons: int) -> list[str]:
 
 _SEEN = {"group_index": opt.real_number, "horizontal_fov_deg": opt.from_unit("°")}
 _DepthInputs = Annotated[dict[str, Any], opt.items(opt.MEASURED | _SEEN)]
-_Background = Annotated[float | Literal["median"], opt.number_or("median")]
 
 
 @command()
@@ -161,7 +160,7 @@ def depth(
     method: opt.Method = "centroid",
     channel: opt.Channel = "I",
     inputs: _DepthInputs | None = None,
-    background: _Background | None = None,
+    background: str | None = None,
     min_significance: float | None = None,
     ply: Path | None = None,
     ply_frame: Literal["camera", "world"] = "camera",
@@ -177,8 +176,6 @@ def depth(
         path (FILE): A result or frames (.h5, or their directory), or measured: .npy, .mat, .h5, .ptu. Of an analytic
             file, a dataset or a shard its depth frames are written as they are.
         method: Estimator of the arrival time.
-        background (COUNTS): Background per bin, or "median": each pixel's median bin. By default that of the file; for
-            measured histograms none, with likelihood the median.
         min_significance (S): Of counts, pixels whose significance is below S have no depth: background alone gives more
             with a probability of 10^-S. 0: every pixel has one. By default detector.min_significance of a simulation, 4
             of measured histograms.
@@ -208,10 +205,13 @@ def depth(
     pixels = histograms.values[..., 0].size if reduced is None else reduced.values.size
     names = [f"{quantity}.{ending}" for quantity in ("depth", "range") for ending in ("npy", "exr", "png")]
     names.append("significance.npy")
-    check_outputs(out, names, files={"--ply": ply}, inputs=(path, *files), needed=32 * pixels)
+    level, known = _background(background)
+    check_outputs(out, names, files={"--ply": ply}, inputs=(path, level, *files), needed=32 * pixels)
     if reduced is None:
-        seen |= {"background": background, "min_significance": min_significance}
+        seen |= {"background": known, "min_significance": min_significance}
         reduced = depth_of(histograms, method=method, device=device, **seen)
+        for text in reduced.notes:
+            complain(text, "note")
     comment = f"{path.name}, {reduced.method}"
     files = spadwarp.files.write_depth(reduced, out, ply=ply, ply_frame=ply_frame, comment=comment)
     found = reduced.first[np.isfinite(reduced.first)]
@@ -224,6 +224,21 @@ def depth(
             "note",
         )
     answer({**summary, "frames": reduced.frames, "files": files})
+
+
+def _background(text: str | None) -> tuple[Path | None, Any]:
+    """The file of --background, and its value: a law, a number or an array."""
+    from spadwarp.frames import BackgroundLaw
+
+    laws = get_args(BackgroundLaw)
+    if text is None or text in laws:
+        return None, text
+    try:
+        return None, opt.real_number(text)
+    except typer.BadParameter:
+        if not text.endswith(".npy"):
+            wrong(f"{text!r} is no .npy file, no number of counts and none of {', '.join(laws)}", "--background")
+    return Path(text), spadwarp.io.read_npy(text, largest=1 << 29)
 
 
 _Start = Annotated[dict[str, float], opt.numbers("NAME=VALUE")]
@@ -399,9 +414,6 @@ def denoise(
         gate (FROM:TO): Gate in depth, such as 13.5:16 [m]; also in time, such as 90ns:110ns, with --input group_index.
             By default that of the file, or the range of its depths.
         profile: .npy with the water's backscatter over the gate in equal bins.
-        background (FILE|flat|decay|none): Of measured counts: .npy with the expected background of a pixel in each bin,
-            [bins] or [height, width, bins]; or the law by which it is estimated from the counts. By default that of the
-            file, else decay (decays and a constant).
         weights: Weights of spadwarp train. By default the package's.
         mask (P): Leave out pixels that see a target with less than this probability: 0.08 for PyramidNet of depth, 0.5
             for histograms.
@@ -416,7 +428,7 @@ def denoise(
     """
     import numpy as np
 
-    from spadwarp.denoise import BackgroundLaw, denoise_file, depth_files
+    from spadwarp.denoise import denoise_file, depth_files
 
     facts, files = opt.read_measured(inputs)
     depths = None if gate is None else _gate(gate, facts.get("group_index"))
@@ -426,12 +438,11 @@ def denoise(
         raise FileError(f"{path}: several files are called {twice[0]!r} and would overwrite each other's results")
     needed = sum(one.stat().st_size for one in paths if one.is_file())
     names = [stem + ending for stem in stems for ending in _ENDINGS]
-    is_law = background is None or background in get_args(BackgroundLaw)
-    level = None if background is None or is_law else Path(background)
+    level, known = _background(background)
     check_outputs(out, names, inputs=(*paths, profile, level, weights, *files), needed=needed)
     settings: dict[str, Any] = {"model": model, "gate": depths, "weights": weights, "device": device, "mask": mask}
     settings["min_significance"] = min_significance
-    settings["background"] = spadwarp.io.read_npy(level, largest=1 << 29) if level else background
+    settings["background"] = known
     settings["profile"] = None if profile is None else spadwarp.io.read_npy(profile, largest=1 << 20)
     lines: dict[str, str] = {}
     summary: list[dict[str, Any]] = []

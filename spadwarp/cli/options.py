@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from spadwarp import Ray, Result, Scene
 
 __all__ = ["MEASURED", "Channel", "Length", "Measured", "Method", "Part", "Seconds", "command", "from_to", "from_unit"]
-__all__ += ["given", "items", "load_run", "number_or", "numbers", "read_engine", "read_measured"]
+__all__ += ["given", "items", "load_run", "number_or_text", "numbers", "read_engine", "read_measured"]
 __all__ += ["read_scene", "real_number", "refuse", "whole_number"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
@@ -242,18 +242,12 @@ def _size(text: str) -> tuple[int, int]:
     return int(found[2]), int(found[1])
 
 
-def number_or(word: str | None = None) -> Callable[[str], float | str]:
-    """A number, or the word; any text where none is named."""
-
-    def parse(text: str) -> float | str:
-        try:
-            return text if text == word else parse_number(text)
-        except ValueError:
-            if word is None:
-                return text
-        raise typer.BadParameter(f"{text!r} is neither a number nor {word!r}")
-
-    return parse
+def number_or_text(text: str) -> float | str:
+    """A number, or any other text."""
+    try:
+        return parse_number(text)
+    except ValueError:
+        return text
 
 
 Length = Annotated[float, from_unit("m")]

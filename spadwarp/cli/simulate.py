@@ -353,7 +353,7 @@ def reconstruct(run: Path, *, out: Path | None = None, device: str | None = None
 
 # Of --rendered: arguments of `spadwarp.result.load_truth_exr`.
 _IMAGES = {"depth": Path, "depth_channel": str, "depth_scale": opt.real_number, "radial": bool, "normal": Path}
-_IMAGES |= {"albedo": opt.number_or(), "albedo_channel": str, "preset": str}
+_IMAGES |= {"albedo": opt.number_or_text, "albedo_channel": str, "preset": str}
 _Images = Annotated[dict[str, Any], opt.items(_IMAGES)]
 
 

@@ -3,7 +3,6 @@
 torch and the other packages of the extra are loaded when a function needs them: `pip install "spadwarp[denoise]"`.
 """
 
-from spadwarp.denoise.backgrounds import *
 from spadwarp.denoise.files import *
 from spadwarp.denoise.histograms import *
 from spadwarp.denoise.inference import *

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spadwarp.denoise.backgrounds import return_width
+from spadwarp.frames.backgrounds import return_width
 
 FALSE_ALARMS = 1e-3
 """Probability that a frame without defects has one, of each kind of test."""

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.dataset import FrameReader, read_manifest
 from spadwarp.dataset.shards import SceneFile
-from spadwarp.denoise.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.denoise.baselines import CLASSICAL
 from spadwarp.denoise.frames import MARGIN, checked_gate, depth_frames
 from spadwarp.denoise.histograms import dim_pixels, second_return, target_bins, without_defects
@@ -25,6 +24,7 @@ from spadwarp.denoise.inference import Estimate, detected, estimate_frames, esti
 from spadwarp.denoise.network_files import Precision, require_torch, weights_metadata
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
+from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import Method, depth_of
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import on_host, real_array
-from spadwarp.denoise.backgrounds import Background, BackgroundLaw, bins_of_target, estimate_background
 from spadwarp.denoise.defects import Defects, find_defects, repaired
 from spadwarp.denoise.frames import POOLED, SIDES
 from spadwarp.denoise.network_files import require_torch, torch_device
+from spadwarp.frames.backgrounds import Background, BackgroundLaw, bins_of_target, estimate_background
 from spadwarp.frames.measured import Histograms
 from spadwarp.values import ArgumentError, percent
 
@@ -80,8 +80,9 @@ def checked_histograms(
     if taps.ndim != 1 or taps.size % 2 == 0 or not (np.isfinite(taps).all() and taps.sum() > 0):
         raise ArgumentError(f"response has shape {taps.shape}; an odd number of values centred on time zero is needed")
     levels, one, each = real_array("background", background), cubes.shape[-1:], cubes.shape[-3:]
+    levels = levels if levels.ndim else np.broadcast_to(levels, one)
     if levels.shape not in (one, each) or not (np.isfinite(levels).all() and (levels >= 0).all()):
-        raise ArgumentError(f"background has shape {levels.shape}; {one} or {each} is needed, of numbers >= 0")
+        raise ArgumentError(f"background has shape {levels.shape}; (), {one} or {each} is needed, of numbers >= 0")
     return cubes, levels, taps
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.denoise.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.denoise.baselines import BASELINES, CLASSICAL, MEDIAN_WINDOWS, classical_depth, median_filter
 from spadwarp.denoise.frames import (
     MARGIN,
@@ -24,6 +23,7 @@ from spadwarp.denoise.frames import (
 )
 from spadwarp.denoise.histograms import features_of_histograms, target_bins, without_defects
 from spadwarp.denoise.network_files import MODELS, Precision, fast_precision, load_network, require_torch, torch_device
+from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
 from spadwarp.frames.depth import arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA, InstrumentResponse
 from spadwarp.values import ArgumentError, SpadwarpWarning, check_choice, check_real
@@ -120,8 +120,8 @@ def estimate(
         counts: Histograms that `depth` was estimated from, over the gate in equal bins, `[H, W, T]` or `[N, H, W, T]`.
             PyramidNet uses them, with `response`: where photons are few, neighbouring pixels together show more than
             each alone.
-        background: Expected background counts, the same for all pixels `[T]`, or of each pixel `[H, W, T]`; or the law
-            by which `spadwarp.denoise.estimate_background` estimates them from the counts: "decay", "flat" or "none".
+        background: Expected background counts, a number, the same for all pixels `[T]`, or of each pixel `[H, W, T]`;
+            or the law by which `spadwarp.frames.estimate_background` estimates them: "decay", "flat" or "none".
         response: Instrument response per bin centred on its time zero, `[2 r + 1]`, as
             `spadwarp.frames.InstrumentResponse.per_bin` gives it.
         min_significance: Of counts, pixels below this significance have no depth; 0: every pixel has one.

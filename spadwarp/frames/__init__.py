@@ -1,5 +1,6 @@
 """Frames of a SPAD camera: counts, arrival times, depth, the Cramér–Rao bound, files."""
 
+from spadwarp.frames.backgrounds import *
 from spadwarp.frames.cramer_rao import *
 from spadwarp.frames.depth import *
 from spadwarp.frames.file import *

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.arrays import histogram_rows, in_torch_order, is_torch, real_array, tensor_of
+from spadwarp.frames.backgrounds import BackgroundLaw, estimate_background
 from spadwarp.frames.response import InstrumentResponse
 from spadwarp.result import Result
 from spadwarp.scene import Camera, Medium, Scene
@@ -90,8 +91,8 @@ def arrival_time(
         background: Expected background per bin in the unit of `histogram` (dark counts, ambient, backscatter): a
             number, `[T]`, or `[H, W, T]`, which all frames share. Peak and centroid subtract it; the matched filter
             does not use it.
-        level_known: False: detections do not rely on `background`. As where there is none, the level of a pixel is then
-            that of its counts, and the shape over time that of all pixels, less peaks narrower than about 16 FWHM.
+        level_known: False: detections use the shape of `background` over time alone, and the level of the pixel's own
+            counts. Without a background, the shape is that of `estimate_background`.
         pulses: Of each histogram, where each counts one photon at most; 0: any number. For detections.
         gate: (start, stop) [s]: only bins whose centres lie in it are used.
         min_significance: Pixels below this significance have no arrival time, see `spadwarp_kernels.DetectionTest`; the
@@ -136,7 +137,8 @@ def arrival_time(
             options |= {"width": fwhm, "pulses": check_integer("pulses", pulses, "[0, 4611686018427387904]")}
             options["pixels"] = math.prod(frame[-2:])
             if known is None or not level_known:
-                options["profile"] = _background_profile(rows, first, stop, fwhm)
+                given = known is not None and known.numpy().any()
+                options["profile"] = known if given else _background_shape(rows, frame, first, stop, fwhm)
         elif min_significance:
             raise ArgumentError(f"min_significance = {min_significance} needs counts, integers; these are rates")
         found = kernels.arrival_bins(rows, method=method, background=known, response=response, **options)
@@ -175,23 +177,17 @@ def _background_rows(background: Any, rows: Any, frame: tuple[int, ...]) -> Any:
     return histogram_rows(flat.reshape((-1, shape[-1] if shape else 1)), name="background", device=rows.device)[0]
 
 
-def _background_profile(rows: Any, first: int, stop: int, fwhm: float) -> Any:
-    """Shape of the background over time, float32 `[1, T]` on the device of the counts.
+def _background_shape(rows: Any, frame: tuple[int, ...], first: int, stop: int, fwhm: float) -> Any:
+    """Shape of the background over time, float32 `[1, T]` on the device of the counts: that of all pixels together.
 
-    Of all pixels, over so many bins that their counts are 20 or more on average; the median over much longer times
-    takes peaks away, and leaves what only rises or falls. One count more keeps it from 0.
+    One count more keeps it from 0.
     """
     import warp as wp
-    from scipy.ndimage import median_filter, uniform_filter1d
 
-    bins, profile = stop - first, np.ones(rows.shape[1])
-    total = rows.numpy()[:, first:stop].sum(axis=0, dtype=np.float64)
-    half = math.ceil(fwhm)
-    side = 2 * max(half, math.ceil(10.0 * bins / max(float(total.sum()), 1.0))) + 1
-    if side < bins:
-        counts = side * uniform_filter1d(total, side, mode="nearest")
-        profile[first:stop] += median_filter(counts, min(8 * (side + 2 * half) + 1, 2 * bins + 1), mode="nearest")
-    return wp.array(profile[None], dtype=wp.float32, device=rows.device)
+    shape = np.ones((1, rows.shape[1]), np.float32)
+    counts = rows.numpy()[:, first:stop].reshape(-1, *(1, *frame)[-2:], stop - first)
+    shape[0, first:stop] = estimate_background(counts, fwhm).per_bin + 1.0 / len(rows)
+    return wp.array(shape, dtype=wp.float32, device=rows.device)
 
 
 def _response_table(irf: InstrumentResponse, bin_width: float, phases: int) -> tuple[NDArray[np.float64], int]:
@@ -235,6 +231,7 @@ class Reduction:
     method: str  # estimator of the arrival time, or "stored" for depth that was read
     camera: Camera | None = None  # that of a simulation, with its pose in the world; else None
     significance: NDArray[np.float32] | None = None  # of counts, float32 `[frames, H, W]`, see `spadwarp.arrival_time`
+    notes: tuple[str, ...] = ()  # how the background was estimated, in words
 
     @property
     def frames(self) -> int:
@@ -259,7 +256,7 @@ def depth_of(
     method: Method = "centroid",
     group_index: float | None = None,
     horizontal_fov_deg: float | None = None,
-    background: float | Literal["median"] | None = None,
+    background: ArrayLike | BackgroundLaw | None = None,
     min_significance: float | None = None,
     device: Any = None,
 ) -> Reduction:
@@ -270,8 +267,9 @@ def depth_of(
         method: See `spadwarp.arrival_time`; `"matched"` and `"likelihood"` need a response.
         group_index: Vacuum speed of light over that of the pulse, ≥ 1; a simulation has its own.
         horizontal_fov_deg: Full horizontal field of view of a measuring camera with square pixels, in (0, 180).
-        background: Expected background per bin in the unit of the values, ≥ 0; `"median"`: the median bin of each
-            pixel. Default: that of the file; else none, with `"likelihood"` the median.
+        background: Expected background in the unit of the values, ≥ 0, as `arrival_time` takes it; or the law by which
+            `estimate_background` estimates it: "decay", "flat" or "none". Default: that of the file; else "decay" of
+            counts, and of rates for `"likelihood"`. The log-matched filter does not use it.
         min_significance: See `spadwarp.arrival_time`; default: of counts of a scene its `detector.min_significance`.
         device: Warp device.
 
@@ -289,13 +287,18 @@ def depth_of(
     if any(value is None for value in missing.values()):
         raise ArgumentError("; ".join(text for text, value in missing.items() if value is None))
     index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
+    counted, notes = values.dtype.kind in "iu", ()
     known: Any = histograms.background if background is None else background
-    level_known = known is not None and (histograms.level_known if background is None else background != "median")
-    if background == "median" or (known is None and method == "likelihood"):
-        # Of all frames together: that of sparse counts would be 0.
-        frames = values.reshape(-1, height, width, values.shape[-1])
-        known = (np.median(frames.sum(axis=0), axis=-1, keepdims=True) / len(frames)).astype(np.float32)
-    significance = np.empty(values.shape[:-1], np.float32) if values.dtype.kind in "iu" else None
+    level_known = histograms.level_known or background is not None
+    if known is None and (counted or method == "likelihood"):
+        known = "decay"
+    if isinstance(known, str):
+        # Of the log-matched filter, which does not use it, `arrival_time` needs its shape alone.
+        taps = 2.0 if response is None else response.per_bin(float(histograms.bin_width or 0.0))
+        found = None if method == "matched" or known == "none" else estimate_background(values, taps, law=known)
+        known, level_known = (None, False) if found is None else (found.counts, False)
+        notes = () if found is None else (found.summary,)
+    significance = np.empty(values.shape[:-1], np.float32) if counted else None
     if min_significance is None and histograms.scene is not None and significance is not None:
         min_significance = histograms.scene.detector.min_significance
     options: dict[str, Any] = {"gate_start": histograms.gate_start, "bin_width": histograms.bin_width, "method": method}
@@ -312,6 +315,7 @@ def depth_of(
         method=method,
         camera=None if histograms.scene is None else histograms.scene.camera,
         significance=None if significance is None else significance.reshape(-1, height, width),
+        notes=notes,
     )
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from spadwarp.denoise import estimate, estimate_background
+from spadwarp.denoise import estimate
 from spadwarp.denoise.defects import FALSE_ALARMS, find_defects, repaired
+from spadwarp.frames import estimate_background
 from spadwarp.values import ArgumentError, SpadwarpWarning
 
 SIDE, BINS = 32, 96

@@ -10,11 +10,11 @@ import torch
 from helpers.stepped_frames import GATE, denoised, noisy_frame, scene, scores
 from spadwarp import ArgumentError, DeviceError, FileError
 from spadwarp.denoise import baselines, estimate, inference, weights_metadata
-from spadwarp.denoise.backgrounds import bins_of_target, profile_of_depth
 from spadwarp.denoise.frames import depth_frames, gates_of_target
 from spadwarp.denoise.inference import corrected_target
 from spadwarp.denoise.network_files import MODELS, WEIGHTS
 from spadwarp.evaluation.drawn_scenes import evaluation_scene, noisy_depth, water_profile
+from spadwarp.frames.backgrounds import bins_of_target, profile_of_depth
 from spadwarp.io.arrays import read_exr
 
 OF_DEPTH = [name for name in MODELS if name != "histograms"]

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.values import ArgumentError, check_choice, percent
 
 __all__ = ["Background", "BackgroundLaw", "estimate_background"]
@@ -55,15 +56,12 @@ class Background(NamedTuple):
         law = "decays and a constant" if self.decays else "a constant"
         text = f"background estimated from the frame: {law}, {self.per_bin.sum():.3g} counts in a pixel"
         text += f" ± {percent(self.relative_error)} %"
-        text += (
-            ""
-            if self.scale is None
-            else f", {self.scale.min():.2g} to {self.scale.max():.2g} times that in blocks of 4 x 4"
-        )
+        if self.scale is not None:
+            text += f", {self.scale.min():.2g} to {self.scale.max():.2g} times that in blocks of 4 x 4"
         return text + (f", {percent(self.interpolated)} % of the bins interpolated" if self.interpolated else "")
 
 
-def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "decay") -> Background:
+def estimate_background(counts: ArrayLike, response: ArrayLike | float, *, law: str = "decay") -> Background:
     """Background of counts `[H, W, T]` or `[N, H, W, T]`: one course over time for all pixels and frames.
 
     Of one frame, blocks of 4 × 4 pixels have scales of their own where these differ by more than chance: ambient light
@@ -71,21 +69,21 @@ def estimate_background(counts: ArrayLike, response: ArrayLike, *, law: str = "d
 
     Args:
         counts: Whole numbers or rates >= 0.
-        response: Instrument response per bin, centred on its time zero, `[2 r + 1]`.
+        response: Instrument response per bin, centred on its time zero, `[2 r + 1]`; or the FWHM of a return [bins].
         law: One of `BackgroundLaw`. "decay": decays and a constant, or the constant alone where decays do not make the
             counts clearly more likely; "flat": a constant; "none": nothing.
 
     Raises `ArgumentError`.
     """
     check_choice("background", law, get_args(BackgroundLaw))
-    cube, taps = np.asarray(counts), np.asarray(response, np.float64)
+    cube = np.asarray(counts)
     if cube.ndim not in (3, 4) or cube.size == 0:
         raise ArgumentError(f"counts have shape {cube.shape}; [H, W, T] or [N, H, W, T] is needed")
     bins = cube.shape[-1]
     if law == "none":
         return Background(np.zeros(bins, np.float32), None, 0.0, 0.0, False)
     blocks, pixels = _blocks(cube.reshape(-1, *cube.shape[-3:]))
-    return _estimated(blocks, pixels, return_width(taps), _RATES[:1] if law == "flat" else _RATES, cube.shape)
+    return _estimated(blocks, pixels, return_width(response), _RATES[:1] if law == "flat" else _RATES, cube.shape)
 
 
 def _estimated(
@@ -96,8 +94,17 @@ def _estimated(
     shape: tuple[int, ...] | None,
 ) -> Background:
     """The background of blocks of counts of this shape; `width`: of a return [bins]."""
-    level, weight = _first_fit(blocks.sum(axis=0), pixels.sum(), rates)
-    free, opening = np.ones(blocks.shape, bool), np.ones(blocks.shape[1])
+    from scipy.ndimage import uniform_filter1d
+
+    total, begin = blocks.sum(axis=0), 0
+    if len(rates) > 1:
+        begin = int(uniform_filter1d(total, width).argmax())  # a gate that opens has its most counts when it is open
+        begin = begin if begin < total.size // 2 else 0
+    exposure = np.where(np.arange(total.size) < begin, 0.0, pixels.sum())
+    level, weight = _first_fit(total * (exposure > 0), exposure, rates)
+    level[:begin] = level[begin]
+    free = np.ones(blocks.shape, bool)
+    opening = _opening(total, pixels.sum() * level) if begin else np.ones(total.size)
     for tolerance in _TOLERANCES:
         scale = _scales(blocks, pixels, level * opening, free)
         scaled = pixels * scale
@@ -156,8 +163,11 @@ def _blocks(frames: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float
     return sums.reshape(-1, frames.shape[-1]), np.tile(sizes, len(frames)).astype(np.float64)
 
 
-def return_width(taps: NDArray[np.float64]) -> int:
-    """Bins that hold nearly all of a return: ± 2 deviations of the response."""
+def return_width(response: ArrayLike | float) -> int:
+    """Bins that hold nearly all of a return: ± 2 deviations of the response, per bin or by its FWHM [bins]."""
+    taps = np.asarray(response, np.float64)
+    if not taps.ndim:
+        return 2 * int(np.ceil(2.0 * float(taps) / FWHM_PER_SIGMA)) + 1
     place = np.arange(taps.size) - taps.size // 2
     total = taps.sum()
     mean = (taps * place).sum() / total
@@ -165,10 +175,10 @@ def return_width(taps: NDArray[np.float64]) -> int:
 
 
 def _first_fit(
-    total: NDArray[np.float64], pixels: float, rates: NDArray[np.float64]
+    total: NDArray[np.float64], exposure: NDArray[np.float64], rates: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A fit to the counts of all pixels, in which what rises above it counts no more, `[T]`, and its weights."""
-    exposure, seen, weight = np.full(total.size, pixels), total, None
+    seen, weight = total, None
     for _ in range(12):
         level, weight, _ = _fit(seen, exposure, rates, weight)
         most = level * exposure + _CLIPPED * np.sqrt(level * exposure)
