@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
-from spadwarp.result import Reconstruction, Result
+from spadwarp.result import COMPONENTS, Reconstruction, Result
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import image_tangents
 from spadwarp.scene.sight import lines_of_sight
@@ -47,7 +47,8 @@ _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
 # Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
 _AROUND = (4, 1)
-_FLOOR = 1e-3  # of the mean: prediction where none is expected
+_FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
+_ROUNDING = 1e-9  # of the most: what sums of rises and falls leave where no ray sees light
 
 
 def reconstruct(result: Result, *, device: str | None = None) -> Result:
@@ -88,14 +89,17 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
     found = np.zeros_like(mean)
 
     def smooth(k: int) -> Cube:
-        expected = predictions[k].sum(dtype=np.float64)
-        if not (result.tallies[k].any() and expected > 0.0):
+        if not (result.tallies[k].any() and predictions[k].any()):
             found[k] = mean[k]
             return np.zeros_like(mean[k])
-        predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / expected)
-        light, square = _smoothed(halves[0, k], halves[1, k], predicted, aligned if k == 1 else 0 * aligned, device)
-        raw = (result.tallies[k].sum(axis=-1, dtype=np.float64) * result.tally_value).sum()
-        found[k] = light * (raw / light.sum(dtype=np.float64))
+        predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / predictions[k].sum(dtype=np.float64))
+        predicted += np.float32(k == 1) * _FLOOR * predicted.mean()
+        start = aligned if k == 1 else 0 * aligned
+        light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, device)
+        # Windows are chosen by the same noise, which loses rare light: each aligned bin gets its own light back.
+        rows = np.arange(gate.bins) + (start.max() - start)[..., None]
+        traced, kept = (np.bincount(rows.ravel(), cube.ravel()) for cube in (result.component(COMPONENTS[k]), light))
+        found[k] = light * np.divide(traced, kept, out=np.zeros_like(kept), where=kept > 0.0)[rows]
         return square
 
     with ThreadPoolExecutor(1 if device.is_cuda else 2) as threads:
@@ -110,7 +114,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
     model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
     row = count + 2  # what comes after the gate
     first = np.arange(shape[0] * shape[1]).reshape(shape) * row
-    found: list[tuple[Any, ...]] = [(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))]
+    found: list[Any] = [(np.zeros(0, np.int64), *np.zeros((2, 0)))]
     hits = np.zeros(first.size * row)
     for place, lens in _places(scene, focus) if model.mesh is not None else ():
         corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
@@ -146,13 +150,12 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
                 for step, share in ((0, 1.0 - edge + whole), (1, edge - whole)):
                     parts = (0.5 * sign / width) * share
                     found.append((first[inside] + whole + step, (even * lit)[inside] * parts, even[inside] * parts))
-    index = np.concatenate([rays[0] for rays in found])
-    light = [np.concatenate([rays[k] for rays in found]) for k in (1, 2)]
-    rises = [np.bincount(index, part, hits.size).reshape(*shape, row) for part in light]
-    direct, plain = (np.cumsum(part, axis=-1) for part in rises)
+    index, *light = (np.concatenate(rays) for rays in zip(*found, strict=True))
     covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / _RAYS
-    known = [np.maximum(cube, 0.0).astype(np.float32) for cube in (direct[..., :count], plain[..., :count], covered)]
-    return known[0], known[1], known[2]
+    rises = (np.bincount(index, part, hits.size).reshape(*shape, row) for part in light)
+    sums = (np.cumsum(part, axis=-1)[..., :count] for part in rises)
+    cubes = *(np.where(part > _ROUNDING * part.max(), part, 0.0) for part in sums), covered
+    return tuple(cube.astype(np.float32) for cube in cubes)  # type: ignore[return-value]
 
 
 def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
@@ -227,7 +230,7 @@ def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp
     """Light of a component and its squared error `[H, W, T]`. `start`: bin from which those of a pixel are counted."""
     bins, shift = first.shape[-1], int(start.max()) - start
     rows = np.arange(bins) + shift[..., None]
-    cubes = [first, second, 0.25 * (first - second) ** 2, predicted + _FLOOR * predicted.mean()]
+    cubes = [first, second, 0.25 * (first - second) ** 2, predicted]
     shape = (*first.shape[:2], bins + int(shift.max()))
     aligned = np.zeros((*shape, 4), np.float32)
     for k, cube in enumerate(cubes):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum_filter, uniform_filter
 
 import spadwarp
 import spadwarp_kernels as sk
@@ -26,6 +26,13 @@ def test_energy_of_each_component_is_that_of_the_tallies(runs: tuple[Result, Res
     result, _ = runs
     for name in COMPONENTS:
         assert result.expected(name).sum() == pytest.approx(result.component(name).sum(), rel=1e-6)
+
+
+def test_ballistic_light_has_no_floor_at_depths_of_other_pixels(runs: tuple[Result, Result]) -> None:
+    few, other = (run.component("ballistic") > 0.0 for run in runs)
+    dark = ~maximum_filter(few | other, (3, 3, 7))
+    assert dark.mean() > 0.5
+    assert (runs[0].expected("ballistic")[dark] > 0.0).mean() < 0.03  # sides of steps that a pixel's rays graze
 
 
 def test_no_light_is_negative_so_that_counts_can_be_drawn(runs: tuple[Result, Result]) -> None:

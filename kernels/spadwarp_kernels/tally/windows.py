@@ -6,7 +6,7 @@ import warp as wp
 
 __all__ = ["blend_kernel", "combine_kernel", "delay_kernel", "estimate_kernel", "window_sums"]
 
-
+_Cube = wp.array3d[wp.vec4]
 _BLOCK = 64  # neighbours that a thread of a processor takes, so that it reads whole lines of its cache
 
 
@@ -86,7 +86,9 @@ def delay_kernel(fine: wp.array2d[float], first: int, last: int, per_bin: int, d
 
 @wp.func
 def _estimates(own: wp.vec4, sums: wp.vec4) -> wp.vec3:
-    """Of both halves, and the variance of their mean."""
+    """Of both halves, and the variance of their mean; as traced where nothing is predicted."""
+    if own[3] == 0.0:
+        return wp.vec3(own[0], own[1], own[2])
     ratio = own[3] / wp.max(wp.max(sums[3], own[3]), 1.0e-30)
     return wp.vec3(sums[0] * ratio, sums[1] * ratio, wp.max(sums[2], 0.0) * ratio * ratio)
 
@@ -98,7 +100,7 @@ def _product(own: wp.vec4, first: float, second: float) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def estimate_kernel(values: wp.array3d[wp.vec4], sums: wp.array3d[wp.vec4], risk: wp.array3d[wp.vec4]):
+def estimate_kernel(values: _Cube, sums: _Cube, risk: _Cube):
     """Squared bias, variance and squared prediction of the estimates from a window. Launch: the cube's shape.
 
     `values`: first half, second half, variance of their mean, prediction; `sums`: these over the window.
@@ -110,12 +112,7 @@ def estimate_kernel(values: wp.array3d[wp.vec4], sums: wp.array3d[wp.vec4], risk
 
 
 @wp.kernel(enable_backward=False)
-def blend_kernel(
-    values: wp.array3d[wp.vec4],
-    sums: wp.array3d[wp.vec4],
-    risk: wp.array3d[wp.vec4],
-    blended: wp.array3d[wp.vec4],
-):
+def blend_kernel(values: _Cube, sums: _Cube, risk: _Cube, blended: _Cube):
     """Adds a window's estimates by their squared error, `risk` around the voxel. Launch: the cube's shape.
 
     `blended`: first half, second half, standard deviation of their mean, weights.
@@ -129,7 +126,7 @@ def blend_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def combine_kernel(values: wp.array3d[wp.vec4], blended: wp.array3d[wp.vec4], risk: wp.array3d[wp.vec4]):
+def combine_kernel(values: _Cube, blended: _Cube, risk: _Cube):
     """Divides by the weights; squared bias, variance and squared prediction of the blend. Launch: the cube's shape."""
     i, j, k = wp.tid()
     own, found = values[i, j, k], blended[i, j, k] / wp.max(blended[i, j, k][3], 1.0e-30)
