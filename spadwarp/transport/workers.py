@@ -653,8 +653,6 @@ class LightTracer:
         mesh_cache: dict[str, Any] | None = None,
         tally: Any = None,
     ) -> None:
-        if scene.surface is not None:
-            raise ConfigError("a fit knows no surface of the sea", source=scene.source)
         names = derivatives or None
         plan = make_plan(scene, RunOptions(), photons=photons, seed=seed, derivatives=names, batches=False)
         workers = LocalWorkers(plan, pick_devices(device)[:1], tallies=tally, mesh_cache=mesh_cache)

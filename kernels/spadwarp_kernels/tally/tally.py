@@ -385,7 +385,7 @@ def tally_rates(
     scale: wp.array,
     *,
     bins: int,
-    components: tuple[int, int] = (0, 3),
+    components: tuple[int, int] | None = None,
     parameters: int = 1,
     parameter: int = 0,
 ) -> wp.array:
@@ -395,7 +395,7 @@ def tally_rates(
         tally: int64, `Data.tally`, or `Data.gradients` with so many `parameters`.
         scale: float64 `[pixel]`: value of a tally unit.
         bins: Of the gate.
-        components: First, and the one after the last, in the order of `COMPONENTS`.
+        components: First, and the one after the last, in the order of `tally_components`; by default all.
         parameters: Derivatives side by side in a voxel.
         parameter: Which of them.
 
@@ -404,13 +404,16 @@ def tally_rates(
     """
     check.array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
     bins, parameters = check.integer("bins", bins, 1), check.integer("parameters", parameters, 1)
+    parameter = check.integer("parameter", parameter, 0, parameters - 1)
+    voxels = check.integer("values of tally", scale.shape[0] * bins * parameters, 0)
+    sea = isinstance(tally, wp.array) and tally.size == len(tally_components(True)) * voxels
+    shape = (len(tally_components(sea)), scale.shape[0], bins, parameters)
+    check.array("tally", tally, wp.int64, (math.prod(shape),), contiguous=True)
+    components = (0, shape[0]) if components is None else components
     if not (isinstance(components, tuple | list) and len(components) == 2):
         raise ArgumentError("components is not a pair such as (0, 3)")
-    stop = check.integer("components[1]", components[1], 1, len(COMPONENTS))
+    stop = check.integer("components[1]", components[1], 1, shape[0])
     first = check.integer("components[0]", components[0], 0, stop - 1)
-    parameter = check.integer("parameter", parameter, 0, parameters - 1)
-    shape = (len(COMPONENTS), scale.shape[0], bins, parameters)
-    check.array("tally", tally, wp.int64, (check.integer("values of tally", math.prod(shape), 0),), contiguous=True)
     rates: Any = wp.empty(shape[1:3], dtype=float, device=tally.device)
     inputs = [tally.reshape(shape), scale, first, stop, parameter, rates]
     launch_pixels(_rates_kernel, shape[1], inputs, device=tally.device)
