@@ -682,5 +682,5 @@ class LightTracer:
     def _light(self, tally: Any, value: Any, parameters: int, parameter: int) -> ExpectedLight:
         scale: Any = wp.array(np.asarray(value, np.float64), dtype=wp.float64, device=tally.device)
         which: Any = {"bins": self._scene.gate.bins, "parameters": parameters, "parameter": parameter}
-        target = sk.tally_rates(tally, scale, components=(0, 2), **which) if self._separate_targets else None
+        target = sk.tally_rates(tally, scale, components=2, **which) if self._separate_targets else None
         return ExpectedLight(sk.tally_rates(tally, scale, **which), target)

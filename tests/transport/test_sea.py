@@ -217,13 +217,13 @@ def test_waves_and_shots_stay_on_their_side():
     for sections, text in (
         (
             {"surface": low, "laser": {"position": [0.0] * 3}},
-            r"camera\.position: .* is 0\.1 m .* waves are up to 0\.\d+ m high",
+            r"camera\.position: 0\.1 m .* waves of up to 0\.\d+ m",
         ),
         (
             {"surface": {"waves": {**WAVES, "shortest": 0.0625}}},
             r"surface\.waves: heights: the waves hold .* outside \[0, 0\.9\]",
         ),
-        (rising, r"scan: shot 3 is -0\.2 m from the surface"),
+        (rising, r"camera\.position: -0\.2 m from the surface in shot 3"),
     ):
         one = sea_scene("both in air", **sections)
         with pytest.raises(spadwarp.ConfigError, match=text):
