@@ -214,8 +214,6 @@ class Scene(Shown, Document):
         }.items():
             if found:
                 yield f"{field}: cannot be combined with surface"
-        if self.polarised:
-            yield "surface: cannot be combined with polarised light, since its facets have no matrices"
         if (threshold := self.transport.axis_threshold) < 1.0:
             yield f"transport.axis_threshold = {threshold} does not go with surface: set it to 1"
         camera, beam = self.camera, self.beam

@@ -368,13 +368,25 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
 
 
 def _within_waves(scene: Scene, surface: Surface) -> tuple[str, str] | None:
-    """As `within_port`, for a lens or a laser as near to the mean plane as the waves of the sea are high."""
-    waves = None if scene.scan.mode == "trajectory" else surface.wave_field
-    ends = {"camera": scene.camera.position, "laser": vector_of(to_world(scene.camera, scene.beam.position))}
-    for section, place in ends.items():
-        if waves is not None and abs(height := surface.height_of(place)) <= waves.amplitude:
-            text = f"{list(place)} is {height:.4g} m from the mean plane of the surface"
-            return f"{section}.position", f"{text}, whose waves are up to {waves.amplitude:.3g} m high"
+    """As `within_port`, for a lens or a laser that reaches the waves of the sea; or in a shot of a scan their mean
+    plane, or stands across it from where the scene's does."""
+    camera, beam, normal = scene.camera, scene.beam, np.array(surface.normal)
+    position, axes = np.array([camera.position]), rotation_matrix(camera.rotation_deg)[None]
+    if scene.scan.mode == "trajectory":
+        shots = shots_of(scene)
+        position, axes = shots.position, shots.rotation
+    tilt = np.sqrt(np.maximum(1.0 - (axes[:, :, 2] @ normal) ** 2, 0.0))
+    waves = 0.0 if (field := surface.wave_field) is None else field.amplitude
+    ends = {"camera": ((0.0, 0.0, 0.0), camera.aperture_radius)}
+    ends["laser"] = beam.position, beam.beam_radius if beam.profile == "collimated" else 0.0
+    for section, (place, radius) in ends.items():
+        own = surface.height_of(vector_of(to_world(camera, place)))
+        height = (position + axes @ np.asarray(place) - surface.point) @ normal * math.copysign(1.0, own)
+        low = int((height - radius * tilt).argmin())
+        if height[low] <= radius * tilt[low] + waves:
+            shot = f" in shot {low}" if len(height) > 1 else ""
+            text = f"{height[low]:.4g} m from the surface{shot}, on its side; it must not reach that"
+            return f"{section}.position", text + (f", nor waves of up to {waves:.3g} m" if waves else "")
     return None
 
 

@@ -46,8 +46,6 @@ def _parameters(scene: Scene) -> dict[str, Parameter]:
         everywhere = "light is polarised, whose matrices have no derivatives; simulate the scene without polarisation"
     if medium.inelastic:
         everywhere = "light of other wavelengths has no derivatives; leave out medium.inelastic"
-    if scene.surface is not None:
-        everywhere = "derivatives cannot be combined with surface; take differences of two runs with one seed"
     in_water = everywhere
     if medium.is_mixture and not everywhere:
         in_water = "the water is a sum of constituents; their concentrations have derivatives"

@@ -25,7 +25,6 @@ from spadwarp.scene.port import PortGeometry
 from spadwarp.scene.pose import rotation_matrix, sideways, vector_of
 from spadwarp.scene.scan import Shots, shots_of
 from spadwarp.scene.scene import camera_port, laser_port, mean_plane
-from spadwarp.scene.sea import Surface
 from spadwarp.scene.sight import lines_of_sight, scan_axes, view_directions, within_port
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_limits
@@ -586,7 +585,6 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
     ends = [("laser", laser_port(scene), beam.position, beam.axis, "beam_radius", radius)][scene.sun is not None :]
     if scene.surface is not None and scene.scan.mode == "trajectory":
         ends, camera = [], False  # the places are those of the shots
-        _check_shots(scene, scene.surface)
     if camera:
         radius, origin = 0.0 if lens.pinhole else lens.aperture_radius, (0.0, 0.0, 0.0)
         ends.append(("camera", camera_port(scene), origin, (0.0, 0.0, 1.0), "aperture_diameter", radius))
@@ -611,26 +609,6 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
             if beyond > 0.0:
                 text = f"reaches {beyond:.4g} m through {face} of the domain, which has an outside_index"
                 raise ConfigError(f"{section}.{field}: {text}", source=scene.source)
-
-
-def _check_shots(scene: Scene, surface: Surface) -> None:
-    """Refuses shots whose lens or laser reaches the surface of the sea, or stands across it from where the scene's
-    does."""
-    shots, beam, normal = shots_of(scene), scene.beam, np.array(surface.normal)
-    tilt = np.sqrt(np.maximum(1.0 - (shots.rotation[:, :, 2] @ normal) ** 2, 0.0))
-    waves = 0.0 if (field := surface.wave_field) is None else field.amplitude
-    ends = {"camera": ((0.0, 0.0, 0.0), scene.camera.aperture_radius)}
-    ends["laser"] = beam.position, beam.beam_radius if beam.profile == "collimated" else 0.0
-    for section, (place, radius) in ends.items():
-        at = shots.position + shots.rotation @ np.asarray(place)
-        own = surface.height_of(vector_of(to_world(scene.camera, place)))
-        height = (at - surface.point) @ normal * math.copysign(1.0, own)
-        low = int((height - radius * tilt).argmin())
-        if height[low] <= radius * tilt[low] + waves:
-            text = f"shot {low} is {height[low]:.4g} m from the surface, on the side where {section}.position is"
-            if waves:
-                text += f", and the waves are up to {waves:.3g} m high"
-            raise ConfigError(f"scan: {text}; it must not reach it", source=scene.source)
 
 
 def _check_gate(scene: Scene) -> None:

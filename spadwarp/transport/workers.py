@@ -653,8 +653,6 @@ class LightTracer:
         mesh_cache: dict[str, Any] | None = None,
         tally: Any = None,
     ) -> None:
-        if scene.surface is not None:
-            raise ConfigError("a fit knows no surface of the sea", source=scene.source)
         if channels := scene.tallied_channels:
             text = f"a fit models all light, and knows no channels such as {channels[0]!r}"
             raise ConfigError(text, source=scene.source)
@@ -687,5 +685,5 @@ class LightTracer:
     def _light(self, tally: Any, value: Any, parameters: int, parameter: int) -> ExpectedLight:
         scale: Any = wp.array(np.asarray(value, np.float64), dtype=wp.float64, device=tally.device)
         which: Any = {"bins": self._scene.gate.bins, "parameters": parameters, "parameter": parameter}
-        target = sk.tally_rates(tally, scale, components=(0, 2), **which) if self._separate_targets else None
+        target = sk.tally_rates(tally, scale, components=2, **which) if self._separate_targets else None
         return ExpectedLight(sk.tally_rates(tally, scale, **which), target)

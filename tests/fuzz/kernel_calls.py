@@ -92,7 +92,7 @@ def _valid_calls():
     taps = wp.ones(3, dtype=wp.float64)
     calls = {
         "tally rates": (sk.tally_rates, dict(
-            tally=tallies(), scale=wp.ones(2, dtype=wp.float64, device="cpu"), bins=2, components=(0, 3), parameters=1,
+            tally=tallies(), scale=wp.ones(2, dtype=wp.float64, device="cpu"), bins=2, components=3, parameters=1,
             parameter=0)),
         "launch": (sk.launch_transport, dict(
             spec=sk.TransportSpec("next_event"), model=model, data=sk.make_data(model), seed=1, first_id=0,

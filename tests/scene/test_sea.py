@@ -28,7 +28,6 @@ BOTTOM = {"builtin": "plane", "size": [40.0, 40.0], "translation": [0.0, 0.0, 8.
         ({**BAY, "transport": {"axis_threshold": 0.99}}, "axis_threshold = 0.99 does not go with surface"),
         ({**BAY, "camera": {"port": {"distance": 0.1}}}, "camera.port, a table: cannot be combined with surface"),
         ({**BAY, "scan": {"mode": "confocal"}}, "scan.mode = 'confocal': cannot be combined with surface"),
-        ({**BAY, "medium": {"scattering_matrix": "rayleigh"}}, "cannot be combined with polarised light"),
         ({**BAY, "medium": {"grid": {"shape": "plume", "extinction": 1.0, "size": 1.0}}}, "medium.grid, a table"),
         ({"surface": {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, 1.0], "preset": "calm"}}, "outside_index"),
         ({"surface": {**BAY["surface"], "direction": [0.0, 0.0, 1.0]}}, "a wind blows along the sea"),
@@ -94,8 +93,6 @@ def test_models_that_know_no_waves_refuse():
         spadwarp.simulate_analytic(one, device="cpu")
     with pytest.raises(ConfigError, match=r"plan knows neither \[surface\]"):
         spadwarp.plan(one, device="cpu")
-    with pytest.raises(ConfigError, match="cannot be combined with surface"):
-        spadwarp.simulate(one, photons=1000, derivatives=["medium.absorption"], device="cpu")
 
 
 def test_check_counts_the_way_in_the_water_alone():

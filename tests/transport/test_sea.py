@@ -100,6 +100,69 @@ def test_nearly_flat_and_flat_seas_are_a_calm_surface():
         assert a.mean() == pytest.approx(b.mean(), rel=3e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.physics
+def test_derivatives_are_differences_of_runs_with_the_same_random_numbers():
+    """By absorption, scattering and anisotropy, of each component: of legs in the water alone."""
+    names, values, steps = ("absorption", "scattering", "anisotropy"), np.array([0.1, 0.4, 0.8]), (0.01, 0.04, 0.02)
+
+    def light(shift, seed, **choices):
+        a, b, g = values + shift
+        medium = {"extinction": a + b, "albedo": b / (a + b), "anisotropy": g}
+        one = sea_scene("both in air", medium=medium)
+        return spadwarp.simulate(one, photons=40_000, seed=seed, device="cpu", **choices)
+
+    def total(result):
+        return np.array([result.component(name).sum() for name in result.scene.components[:3]])
+
+    slopes, changes = [], []
+    for seed in range(8):
+        found = light(np.zeros(3), seed, derivatives=names)
+        slopes.append([found.derivatives[f"medium.{name}"].sum(axis=(1, 2, 3)) for name in names])
+        shifts = np.diag(steps)
+        pairs = [(total(light(one, seed)), total(light(-one, seed))) for one in shifts]
+        changes.append([(up - down) / (2.0 * step) for (up, down), step in zip(pairs, steps, strict=True)])
+    slopes, off = np.array(slopes), np.array(slopes)[..., :3] - np.array(changes)
+    assert not slopes[..., 3].any()  # light that met the surface alone
+    error, mean = off.std(axis=0, ddof=1) / math.sqrt(8), np.abs(slopes.mean(axis=0)[:, :3])
+    assert (np.abs(off.mean(axis=0)) < 4.0 * error + 1e-3 * mean).all()
+    assert (error < 0.03 * mean)[mean > 0.0].all()
+
+
+@pytest.mark.slow
+@pytest.mark.physics
+def test_a_polarised_flat_sea_is_a_port_and_the_estimators_agree_over_facets():
+    """In each channel: for light off the target as it arrives, and for light of all histories."""
+    surface, laser, target = PLACES["both in air"]
+    stokes = {"aperture_diameter": 0.5, "polarisation": "stokes"}
+    sections = {
+        "medium": {"scattering_matrix": "voss_fry"},
+        "laser": {**laser, "polarisation": "linear", "polarisation_angle_deg": 30.0},
+        "camera": stokes,
+        "targets": [target],
+        "gate": {"bins": 12},
+    }
+
+    def channels(estimator, photons, seeds=10, **others):
+        one = scene(**sections | {"transport": {"estimator": estimator}} | others)
+        runs = [spadwarp.simulate(one, photons=photons, seed=seed, device="cpu").channels for seed in range(seeds)]
+        return np.array([[part.sum(axis=(1, 2))[:3] for part in run.values()] for run in runs])
+
+    calm = {"distance": 1.0, "inside_index": 1.00028}
+    port = {"camera": {**stokes, "port": calm}, "laser": {**sections["laser"], "port": "camera"}}
+    flat = channels("guided", 20_000, surface={**surface, "mean_square_slope": 0.0, "air_index": 1.00028})
+    behind = channels("guided", 20_000, **port)
+    for part in (0, 2):  # what the water scatters forward is reflected from below the surface, too
+        assert equal_means_p(*(one[:, :, part].reshape(10, -1) for one in (flat, behind))) > 1e-3
+    q, i = (flat[:, k, 0].sum(axis=1).mean() for k in (1, 0))
+    assert q / i == pytest.approx(behind[:, 1, 0].sum(axis=1).mean() / behind[:, 0, 0].sum(axis=1).mean(), rel=0.02)
+    rough = {"surface": {"wind": 5.0, **surface}}
+    guided, analog = (
+        channels(name, n, **rough).reshape(10, -1) for name, n in (("guided", 15_000), ("analog", 50_000))
+    )
+    assert equal_means_p(analog, guided) > 1e-3
+
+
 def test_masking_is_an_entry_of_the_energy_balance():
     """At most 1.4 % of light from the air up to 60°, and 3 % of light from the water up to 48°, up to 12 m/s."""
     for angle, place, most in ((0.0, "both in air", 0.014), (60.0, "both in air", 0.014), (45.0, "below", 0.03)):
@@ -154,13 +217,13 @@ def test_waves_and_shots_stay_on_their_side():
     for sections, text in (
         (
             {"surface": low, "laser": {"position": [0.0] * 3}},
-            r"camera\.position: .* is 0\.1 m .* waves are up to 0\.\d+ m high",
+            r"camera\.position: 0\.1 m .* waves of up to 0\.\d+ m",
         ),
         (
             {"surface": {"waves": {**WAVES, "shortest": 0.0625}}},
             r"surface\.waves: heights: the waves hold .* outside \[0, 0\.9\]",
         ),
-        (rising, r"scan: shot 3 is -0\.2 m from the surface"),
+        (rising, r"camera\.position: -0\.2 m from the surface in shot 3"),
     ):
         one = sea_scene("both in air", **sections)
         with pytest.raises(spadwarp.ConfigError, match=text):

@@ -254,6 +254,8 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
         if wp.static(sea):
             if s.bounces.face == SEA_FACE:
                 q = ask_at_sea(s, world)
+                if wp.static(rides):
+                    q.carried = s.carried
             q.second = s.flight.block[1]  # of the direction to come
             if on_surface and s.collisions == s.bounces.count:
                 q.component = BALLISTIC
@@ -392,15 +394,10 @@ def _make_hidden_by_waves(spec: TransportSpec) -> wp.Function:
 
 
 @memoised
-def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
-    """The Warp function ``(request, world) -> Scored`` of next events, with what rides along.
-
-    `flights`: whether requests may ask for a point of a flight.
-    """
-    reflects, collides, water = spec.domain.reflects, flights and spec.scores_collisions, spec.water
-    flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
-    sight, pose, sea, rider = spec.sight, spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
-    is_hidden = _make_hidden_by_waves(spec)
+def _make_carry(spec: TransportSpec) -> wp.Function:
+    """The Warp function ``(found, request, link, world, inside)``: what rides along with light of a request goes by the
+    link to the lens, where it arrives along `inside`, of any length."""
+    pose, sea, rider = spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
 
     @wp.func
     def carry(found: wp.ref[Scored], request: Request, link: Link, world: wp.ref[World], inside: wp.vec3):
@@ -409,8 +406,30 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
         to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
         rider.fly(carried, world, request.x, request.u, wp.length(found.origin - request.x))
         rider.event(carried, world, request.slot, found.origin, request.u, to_lens)
-        rider.fly(carried, world, found.origin, to_lens, link.water)
-        rider.deliver(found.contribution, carried, world, link.end, link.to_lens, wp.normalize(inside))
+        arrives = wp.normalize(inside)
+        if wp.static(sea):
+            if wp.length_sq(found.behind - found.lens) > 0.0:
+                behind = pose.turn_out(world.scan, request.target, arrives)
+                rider.event(carried, world, SEA_SLOT, found.lens, to_lens, behind)
+            begin = pose.point_out(world.scan, request.target, link.begin)
+            rider.fly(carried, world, begin, pose.turn_out(world.scan, request.target, link.along), link.water)
+        else:
+            rider.fly(carried, world, found.origin, to_lens, link.water)
+        rider.deliver(found.contribution, carried, world, link.end, link.to_lens, arrives)
+
+    return carry
+
+
+@memoised
+def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
+    """The Warp function ``(request, world) -> Scored`` of next events, with what rides along.
+
+    `flights`: whether requests may ask for a point of a flight.
+    """
+    reflects, collides, water = spec.domain.reflects, flights and spec.scores_collisions, spec.water
+    flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
+    sight, pose, sea, rider = spec.sight, spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
+    is_hidden, carry = _make_hidden_by_waves(spec), _make_carry(spec)
 
     @wp.func
     def score(request: Request, world: wp.ref[World]) -> Scored:

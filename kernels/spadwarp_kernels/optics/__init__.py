@@ -8,8 +8,6 @@ from .polarisation import *
 from .port import *
 from .sea import *
 from .visibility import *
-from .waves import *
 
 if not TYPE_CHECKING:  # type checkers follow the stars
     __all__ = camera.__all__ + laser.__all__ + polarisation.__all__ + port.__all__ + sea.__all__ + visibility.__all__
-    __all__ += waves.__all__

@@ -35,7 +35,7 @@ _WORDS = {
 
 # Fields that cannot be combined, and those that need another.
 _EXCLUDED = {
-    "sea": ("port", "laser_port", "reflecting", "grid", "merged", "signed", "blocks", "polarised", "flux"),
+    "sea": ("port", "laser_port", "reflecting", "grid", "merged", "flux"),
     "inelastic": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
     "grid": ("layered", "random_albedo"),
     "merged": ("reflecting", "derivatives", "channels"),

@@ -12,8 +12,9 @@ import warp as wp
 from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis, set_apart
 from spadwarp_kernels.optics.laser import beam_frame
 from spadwarp_kernels.optics.port import Port
+from spadwarp_kernels.optics.sea import FACETS, Sea
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
+from spadwarp_kernels.photon.state import SEA_SLOT, Carried, CarriedRef, Contribution, WorldRef
 from spadwarp_kernels.surface.triangle import face_in
 
 from .rider import NOTHING, Rider
@@ -162,6 +163,18 @@ def window_elements(n: wp.vec4, q: wp.vec4) -> Elements:
     return m
 
 
+@wp.func
+def passage_elements(sea: Sea, u: wp.vec3, v: wp.vec3) -> Elements:
+    """Of the facet of the surface of a sea that reflects u to v or, on the other side of it, refracts it."""
+    climb = wp.dot(u, sea.normal)
+    ratio = wp.where(climb < 0.0, sea.index, 1.0 / sea.index)  # behind over before
+    if climb * wp.dot(v, sea.normal) < 0.0:
+        return facet_elements(u, v, ratio)
+    m = wp.normalize(u - ratio * v)
+    before = wp.abs(wp.dot(u, m))
+    return window_elements(wp.vec4(1.0, 1.0, 1.0, ratio), wp.vec4(before, before, before, ratio * wp.abs(wp.dot(v, m))))
+
+
 def make_port_elements(cosines: wp.Function | None) -> wp.Function | None:
     """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u, for those of a
     `PortKind`; None without."""
@@ -206,7 +219,9 @@ def _make_begin(spec: TransportSpec) -> wp.Function:
 
 def _make_event(spec: TransportSpec) -> wp.Function:
     """Water multiplies by L M L/m11. A Lambertian surface depolarises; a specular lobe has Fresnel's matrix of the
-    facet between u and v, over its m11; both in proportion to what they send to v."""
+    facet between u and v, over its m11; both in proportion to what they send to v. So has a facet of a sea's surface.
+    """
+    sea, surface = spec.sight.sea is not None, spec.sight.sea or FACETS
 
     @wp.func
     def on_a_face(stokes: wp.vec4, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3) -> wp.vec4:
@@ -222,6 +237,8 @@ def _make_event(spec: TransportSpec) -> wp.Function:
         before, after = set_apart(u), set_apart(v)
         if slot >= 0:
             c.stokes = on_a_face(c.stokes, world, slot, set_apart(x), before, after)
+        elif wp.static(sea) and slot == SEA_SLOT:
+            c.stokes = turn_stokes(c.stokes, before, after, passage_elements(surface.at(world.sea, x), before, after))
         else:
             m = table_elements(world.polarisation.first, world.polarisation.last, one_minus_cosine(before, after))
             c.stokes = turn_stokes(c.stokes, before, after, m)

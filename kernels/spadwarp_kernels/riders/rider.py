@@ -51,7 +51,7 @@ class Rider(NamedTuple):
     fly: wp.Function = _fly  # ``(carried, world, x, u, length)``, a way in the water
     event: wp.Function = _event
     """``(carried, world, slot, x, u, v)``, an event at x that turns light from u to v, on the face of a slot of the
-    mesh's tree or (-1) in the water."""
+    mesh's tree, (-1) in the water, or (SEA_SLOT) at the surface of a sea, which reflects or refracts it."""
     mirror: wp.Function = _mirror
     """``(carried, u, v, index)``, a smooth boundary that mirrors light from u to v, for the index behind it over that
     of the water."""

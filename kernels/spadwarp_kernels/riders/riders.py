@@ -20,7 +20,7 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.photon.derivatives import NOT_MET, Blocks, LogDerivatives, met_count, met_entry, score_entry
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import Carried, CarriedRef, Contribution, WorldRef
+from spadwarp_kernels.photon.state import SEA_SLOT, Carried, CarriedRef, Contribution, WorldRef
 from spadwarp_kernels.surface.triangle import face_in
 from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
 from spadwarp_kernels.water.medium import boundary_ahead, layer_index
@@ -183,7 +183,8 @@ def _make_event(spec: TransportSpec) -> wp.Function:
             if wp.static(by_reflectance > 0):
                 c.log_derivatives = on_a_face(c.log_derivatives, world, slot, x, u, v)
         elif wp.static(in_water > 0):
-            c.log_derivatives = in_the_water(c.log_derivatives, world, x, u, v)
+            if wp.static(spec.sight.sea is None) or slot != SEA_SLOT:
+                c.log_derivatives = in_the_water(c.log_derivatives, world, x, u, v)
 
     return event
 

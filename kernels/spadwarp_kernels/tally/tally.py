@@ -366,8 +366,7 @@ def _rates_kernel(
     first_pixel: int,
     tally: wp.array4d[wp.int64],
     scale: wp.array[wp.float64],
-    component: int,
-    stop_component: int,
+    components: int,
     parameter: int,
     # Out:
     rates: wp.array2d[float],
@@ -375,7 +374,7 @@ def _rates_kernel(
     pixel = first_pixel + wp.tid()
     for k in range(rates.shape[1]):
         total = wp.int64(0)
-        for c in range(component, stop_component):
+        for c in range(components):
             total += tally[c, pixel, k, parameter]
         rates[pixel, k] = float(wp.float64(total) * scale[pixel])
 
@@ -385,7 +384,7 @@ def tally_rates(
     scale: wp.array,
     *,
     bins: int,
-    components: tuple[int, int] = (0, 3),
+    components: int | None = None,
     parameters: int = 1,
     parameter: int = 0,
 ) -> wp.array:
@@ -395,7 +394,7 @@ def tally_rates(
         tally: int64, `Data.tally`, or `Data.gradients` with so many `parameters`.
         scale: float64 `[pixel]`: value of a tally unit.
         bins: Of the gate.
-        components: First, and the one after the last, in the order of `COMPONENTS`.
+        components: How many of `tally_components`, from the first on; by default all.
         parameters: Derivatives side by side in a voxel.
         parameter: Which of them.
 
@@ -404,14 +403,13 @@ def tally_rates(
     """
     check.array("scale", scale, wp.float64, (None,), tally.device if isinstance(tally, wp.array) else None)
     bins, parameters = check.integer("bins", bins, 1), check.integer("parameters", parameters, 1)
-    if not (isinstance(components, tuple | list) and len(components) == 2):
-        raise ArgumentError("components is not a pair such as (0, 3)")
-    stop = check.integer("components[1]", components[1], 1, len(COMPONENTS))
-    first = check.integer("components[0]", components[0], 0, stop - 1)
     parameter = check.integer("parameter", parameter, 0, parameters - 1)
-    shape = (len(COMPONENTS), scale.shape[0], bins, parameters)
-    check.array("tally", tally, wp.int64, (check.integer("values of tally", math.prod(shape), 0),), contiguous=True)
+    voxels = check.integer("values of tally", scale.shape[0] * bins * parameters, 0)
+    sea = isinstance(tally, wp.array) and tally.size == len(tally_components(True)) * voxels
+    shape = (len(tally_components(sea)), scale.shape[0], bins, parameters)
+    check.array("tally", tally, wp.int64, (math.prod(shape),), contiguous=True)
+    components = check.integer("components", shape[0] if components is None else components, 1, shape[0])
     rates: Any = wp.empty(shape[1:3], dtype=float, device=tally.device)
-    inputs = [tally.reshape(shape), scale, first, stop, parameter, rates]
+    inputs = [tally.reshape(shape), scale, components, parameter, rates]
     launch_pixels(_rates_kernel, shape[1], inputs, device=tally.device)
     return rates

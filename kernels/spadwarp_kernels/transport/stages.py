@@ -27,6 +27,7 @@ from spadwarp_kernels.photon.state import (
     RAY,
     SCATTER,
     SEA_FACE,
+    SEA_SLOT,
     TOO_LONG,
     Draws,
     Launch,
@@ -337,7 +338,10 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
         if wp.static(chosen):
             reweigh(s.weight, s.flight.factor)
             s.directed += s.weight.taken
-        rider.fly(s.carried, world, s.x, s.u, c.distance)
+        in_water = float(c.distance)
+        if wp.static(sea):
+            in_water = wp.where(s.above, 0.0, in_water)
+        rider.fly(s.carried, world, s.x, s.u, in_water)
         if wp.static(tallies_flux):
             score_flux(s, world, sink, c.distance, c.reason < 0 and c.mirror == 0 and s.hit.face < 0)
         s.x = s.x + c.distance * s.u
@@ -370,6 +374,7 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
     """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
     estimator says so, with what rides along."""
     crosses, sight, pose, rider = cross is not None, spec.sight, spec.sight.pose, make_rider(spec)
+    sea = sight.sea is not None
 
     @wp.func
     def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
@@ -382,7 +387,10 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
                     x, u = pose.point_in(world.scan, s.target, s.x), pose.turn_in(world.scan, s.target, s.u)
                     passage = sight.leave(world.camera, x, u)
                     rider.fork(carried, world)
-                    rider.fly(carried, world, s.x, s.u, passage.water)
+                    in_water = float(passage.water)
+                    if wp.static(sea):
+                        in_water = wp.where(s.above, 0.0, in_water)
+                    rider.fly(carried, world, s.x, s.u, in_water)
                     rider.deliver(c, carried, world, s.x, s.u, passage.u)
             if not c.value <= 0.0:
                 s.contributions += 1
@@ -508,12 +516,13 @@ def make_meet_sea(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Fun
     `directed`, `flies_on`: see `make_bounce`.
     """
     terminate, continues = make_terminate(spec), make_continues(flies_on)
-    surface = spec.sight.sea or FACETS
+    surface, rider = spec.sight.sea or FACETS, make_rider(spec)
 
     @wp.func
     def meet_sea(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
         draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
         passage = sample_passage(surface.at(world.sea, s.x), s.u, s.above, draw)
+        rider.event(s.carried, world, SEA_SLOT, s.x, s.u, passage.u)
         new = Outcome()
         new.reason = s.reason
         new.weight = s.weight

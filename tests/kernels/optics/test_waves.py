@@ -9,7 +9,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.launch import launched, unit
 from spadwarp_kernels.optics.port import Port
-from spadwarp_kernels.optics.waves import height_above_waves, waves_distance
+from spadwarp_kernels.optics.sea import facet_at, waves_distance
 
 SIZE, INDEX = 4.0, 1.34
 COLUMNS, ROWS = unit(np.array([1.0, 0.3, 0.0])), unit(np.array([-0.3, 1.0, 0.0]))
@@ -48,8 +48,8 @@ def rays_kernel(
     sea: sk.Sea, x: wp.array[wp.vec3], u: wp.array[wp.vec3], above: bool, height: wp.array[float], met: wp.array[float]
 ):
     k = wp.tid()
-    height[k] = height_above_waves(sea.waves, x[k])
-    met[k] = waves_distance(sea.waves, x[k], u[k], above, 20.0)
+    height[k] = wp.dot(x[k] - sea.waves.origin, sea.waves.normal) - facet_at(sea.waves, x[k]).height
+    met[k] = waves_distance(sea, x[k], u[k], above, 20.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -93,8 +93,8 @@ def test_facets_hold_what_the_waves_leave():
     slopes = field_at(heights, x)[1]
     covariance = sk.facet_covariance(heights, (SIZE, SIZE))
     np.testing.assert_allclose(slopes.T @ slopes / len(x), covariance, atol=4e-4)
-    assert np.hypot(*slopes.T).max() == pytest.approx(sk.steepest_facet(heights, (SIZE, SIZE)), rel=0.03)
     sea = sea_of(heights)
+    assert np.hypot(*slopes.T).max() == pytest.approx(sea.waves.steepest, rel=0.03)
     along, across = np.array(sea.along), np.cross([0.0, 0.0, 1.0], np.array(sea.along))
     frame = np.array([[v @ COLUMNS, v @ ROWS] for v in (along, across)])
     rest = frame.T @ np.diag(np.square(sea.slope) / 2.0) @ frame

@@ -13,6 +13,7 @@ from spadwarp_kernels.base.rotations import orthonormal_basis
 from spadwarp_kernels.riders.polarisation import (
     Elements,
     fresnel_elements,
+    passage_elements,
     table_elements,
     transport_stokes,
     turn_stokes,
@@ -148,3 +149,37 @@ def test_a_window_has_the_transmissions_of_both_polarisations(device):
         p = p * 4.0 * one * two / (one + two) ** 2
     np.testing.assert_allclose(out["m12"], (p - s) / (p + s), atol=1e-5)
     np.testing.assert_allclose(out["m33"], 2.0 * np.sqrt(p * s) / (p + s), atol=1e-5)
+
+
+@wp.func
+def pass_sea(stokes: wp.vec4, u: wp.vec3, v: wp.vec3, sea: sk.Sea) -> wp.vec4:
+    return turn_stokes(stokes, u, v, passage_elements(sea, u, v))
+
+
+def test_facets_of_the_sea_reflect_and_refract_the_field(device):
+    """From both sides, by the field's components along and across the plane of incidence."""
+    rng, index = np.random.default_rng(5), 1.34
+    sea = sk.make_sea((0.01, 0.01), index=index, normal=(0.0, 0.0, 1.0), height=0.0, device=device)
+    u = unit(np.float64(directions(20_000, rng)))
+    m = unit(np.column_stack([0.2 * rng.normal(size=(20_000, 2)), np.ones(20_000)]))
+    m *= np.where(u[:, 2:] < 0.0, 1.0, -1.0)  # to the side of the light
+    ratio, cosine = np.where(u[:, 2] < 0.0, index, 1.0 / index), -(u * m).sum(axis=1)
+    rest = 1.0 - (1.0 - cosine**2) / ratio**2
+    for reflects in (True, False):
+        v = u + 2.0 * cosine[:, None] * m
+        if not reflects:
+            v = (u + cosine[:, None] * m) / ratio[:, None] - np.sqrt(np.maximum(rest, 0.0))[:, None] * m
+        kept = (cosine > 0.05) & (u[:, 2] * v[:, 2] * (-1.0 if reflects else 1.0) > 0.0) & (reflects | (rest > 1e-4))
+        s, p = np.array([amplitudes(c, n) for c, n in zip(cosine[kept], ratio[kept], strict=True)]).T
+        if not reflects:
+            s, p = 1.0 + s, (1.0 + p) / ratio[kept]
+        whole, cross = 0.5 * (abs(s) ** 2 + abs(p) ** 2), p * s.conj()
+        elements = [0.5 * (abs(p) ** 2 - abs(s) ** 2), whole, cross.real, cross.imag, cross.real]
+        stokes = rng.normal(size=(kept.sum(), 4)).astype(np.float32)
+        rays = [one[kept].astype(np.float32) for one in (u, v)]
+        found = each(pass_sea, [on_device(stokes, device, wp.vec4), *rays, sea], [wp.vec4], device)
+        before, after = (each(orthonormal_basis, [one], (wp.vec3, wp.vec3), device)[0] for one in rays)
+        expected = scattered(stokes, before, u[kept], v[kept], after, lambda c: block_matrix(*elements / whole))  # noqa: B023
+        assert kept.sum() > 5000
+        np.testing.assert_allclose(found, expected, atol=2e-3)
+        assert np.median(np.abs(found - expected)) < 1e-5
