@@ -55,7 +55,8 @@ def simulate(
 
     Writes result.h5 (for `spadwarp info` and `spadwarp.load`), the complete scene.toml, depth.exr, truth.exr and
     pictures. Ctrl-C or SIGTERM ends the run and writes the photons traced so far; after a crash, --resume continues
-    from the last checkpoint. With --trajectory: sequence.h5 (counts, depth, truth; with --tags detections) and
+    from the last checkpoint. With laser.wavelengths_nm: these files for each line, spectrum.h5 and spectrum.png.
+    With --trajectory: sequence.h5 (counts, depth, truth; with --tags detections) and
     sequence.gif.
 
     Args:
@@ -125,11 +126,15 @@ def simulate(
         return
     else:
         read = opt.read_scene(scene, overrides, mesh=mesh, photons=asked, seed=seed)
+    engine = opt.read_engine(ray, workers)
+    if read.laser.wavelengths_nm:
+        limits: dict[str, Any] = {"time": time, "relative_error": relative_error}
+        own = spadwarp.RunOptions(threads=threads)
+        return _simulate_lines(read, out, scene, **limits, device=devices, engine=engine, run=own)
     if reconstruct and not read.has_straight_sight:
         wrong("knows neither [surface] nor scan.mode = 'trajectory'", "--reconstruct")
     if records:
         _check_records(read, whole=not (first_photon or shard))
-    engine = opt.read_engine(ray, workers)
     names = _parameters(read, derivatives, earlier)
     _prepare(read, devices, engine, names)
     _prepare_directory(out, read, earlier, scene, derivatives=len(names), records=records, checkpoint=checkpoint > 0)
@@ -169,13 +174,36 @@ def simulate(
         done = f"{count(result.photons)}{wanted} photons"
         without = "; no records were written" if records else ""
         fail(f"interrupted after {done}, which are written and marked partial{without}", INTERRUPTED)
+    _say_error(result, relative_error, out)
+
+
+def _say_error(result: Result, wanted: float | None, out: Path) -> None:
+    """Warns of a run that has not reached the error wanted of it."""
     error = result.relative_error if result.batches > 1 else None
-    if relative_error is not None and (error is None or error > relative_error):
+    if wanted is not None and (error is None or error > wanted):
         reached = "is not known" if error is None else f"is {100 * error:.3g} %"
-        number = read.transport.photons
+        number = result.scene.transport.photons
         late = number != "auto" and result.photons < number
         why = "since rare heavy photons arrived late" if late else f"after {count(result.photons)} photons"
-        complain(f"warning: the error {reached} {why}, not {100 * relative_error:.3g} %; --resume {out} adds photons")
+        complain(f"warning: the error {reached} {why}, not {100 * wanted:.3g} %; --resume {out} adds photons")
+
+
+def _simulate_lines(scene: Scene, out: Path, source: Path | None, **options: Any) -> None:
+    """Traces and writes the lines of `laser.wavelengths_nm`."""
+    text = "cannot be combined with laser.wavelengths_nm"
+    opt.refuse(text, "--resume", "--shard", "--first-photon", "--records", "--reconstruct", "--derivatives")
+    names = [*spadwarp.files.RUN_FILES, "spectrum.h5", "spectrum.png"]
+    lines = scene.laser.wavelengths_nm
+    folders = [] if isinstance(lines, str) else [spadwarp.files.line_folder("", line) for line in lines]
+    needed = max(len(lines), 1) * spadwarp.files.bytes_needed(scene)
+    check_outputs(out, [*names, *map(str, folders)], inputs=(source, *scene.files), needed=needed)
+    _prepare(scene, options["device"], options["engine"], ())
+    with redirect_stdout(sys.stderr), _while_pictures_load(progress(), scene) as report:
+        spectrum = spadwarp.transport.simulate_spectrum(scene, progress=report, **options)
+    files = spadwarp.files.write_spectrum(spectrum, out, device=None if options["engine"] else options["device"])
+    rows = {f"{line:.9g} nm": one.summary() for line, one in spectrum.results.items()}
+    shown = {name: f"{row['detections_per_pulse']:.3g} detections per pulse" for name, row in rows.items()}
+    answer({"kind": "spectrum", "lines": rows, "files": files}, shown=shown)
 
 
 def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tuple[str, ...]:

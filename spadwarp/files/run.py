@@ -26,13 +26,14 @@ from spadwarp.result.result import difference
 from spadwarp.scene import Scene
 from spadwarp.scene.camera import to_world
 from spadwarp.scene.pose import rotation_matrix
+from spadwarp.transport import Spectrum
 from spadwarp.values import ArgumentError, FileError, check_choice
 
 if TYPE_CHECKING:
     from spadwarp.inverse import Fit, Unknown
 
 __all__ = ["CHECKPOINT", "RUN_FILES", "RunFiles", "bytes_needed", "fit_files", "load_resumable", "remove_checkpoint"]
-__all__ += ["write_depth", "write_fit", "write_run"]
+__all__ += ["line_folder", "write_depth", "write_fit", "write_run", "write_spectrum"]
 
 CHECKPOINT = "checkpoint.h5"
 """Name of the partial result of an unfinished run."""
@@ -119,6 +120,33 @@ def _pictures(result: Result, folder: Path, depth: NDArray[np.float64]) -> list[
     kinds: tuple[str, ...] = _KINDS[:-1] if result.scene.transport.estimator != "none" else ()
     kinds += _KINDS[-1:] if result.scene.flux else ()
     return [partial(draw, kinds=(kind,)) for kind in kinds] if formats else []
+
+
+def line_folder(out: str | Path, wavelength: float) -> Path:
+    """The directory of the run of one wavelength [nm] in that of several."""
+    return Path(out) / f"{wavelength:.9g}nm"
+
+
+def write_spectrum(spectrum: Spectrum, out: str | Path, *, device: str | None = None) -> list[Path]:
+    """Writes runs at several wavelengths to a directory: spectrum.h5, all histograms and depths with an axis of
+    wavelength, and spectrum.png; returns the paths.
+
+    Of the lines of the laser's spectrum also the files of `write_run` of their sum, in the same directory; of
+    wavelengths of one's own those of each, in directories such as `532nm`. Raises `FileError`.
+    """
+    written, folder = list[Path](), Path(out)
+    if spectrum.scene.laser.wavelengths_nm == "spectrum":
+        written += write_run(spectrum.combined(), folder, device=device).written
+        depth = {line: one.depth(device=device) for line, one in spectrum.results.items()}
+    else:
+        depth = {}
+        for line, one in spectrum.results.items():
+            files = write_run(one, line_folder(folder, line), device=device)
+            written, depth[line] = written + files.written, files.depth
+    written.append(spectrum.save(folder / "spectrum.h5", depth=depth))
+    if spectrum.scene.output.png:
+        written.append(spectrum.plot(folder / "spectrum.png", depth=depth))
+    return written
 
 
 def _save(result: Result, path: Path) -> Path:

@@ -10,17 +10,27 @@ import math
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import unit_vector
-from spadwarp.scene.sections import AnyFile, CsvFile, Direction, Section, Vector, field, field_range, read_table
+from spadwarp.scene.sections import (
+    AnyFile,
+    CsvFile,
+    Direction,
+    Section,
+    Vector,
+    field,
+    field_range,
+    listed,
+    read_table,
+)
 from spadwarp.scene.settings import Detector
 from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval, SpadwarpError
 from spadwarp.water.seawater import RANGES
@@ -59,6 +69,12 @@ class Laser(Section):
     wavelength_nm: float = field(532.0, "in vacuum [nm]; with a spectrum that of photons and water", "[1e-9, 1e6]")
     linewidth_nm: float = field(0.0, "of a Gaussian spectrum, width at half maximum [nm]; 0: one line", "[0, 100000]")
     spectrum: CsvFile = field(None, "a measured spectrum: .csv file of wavelength [nm] and power per nm of any scale")
+    wavelengths_nm: (
+        Literal["spectrum"]
+        | Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], BeforeValidator(listed), Field(max_length=64)]
+    ) = ()
+    """lines that `spadwarp simulate` traces with the same photons, each in its own water [nm]; "spectrum": those of the
+    laser's spectrum that the filter passes; everything else takes wavelength_nm"""
     polarisation: Literal["none", "linear", "right_circular", "left_circular"] = "none"
     """of the light; right is clockwise for who looks towards the laser"""
     polarisation_angle_deg: float = Field(0.0, ge=-180, le=180)
@@ -81,6 +97,8 @@ class Laser(Section):
             yield self._that("linewidth_nm", reason)
         if self.spectrum is not None and self.linewidth_nm > 0.0:
             yield self._that("linewidth_nm", "cannot be combined with spectrum")
+        if len(set(self.wavelengths_nm)) < len(self.wavelengths_nm) and self.wavelengths_nm != "spectrum":
+            yield self._that("wavelengths_nm", "names one twice")
         if len(self.given) > 1:
             yield f"needs one of {', '.join(ENERGIES)}; given: {', '.join(self.given)}"
         # What was given stays in model_fields_set, from where to_dict() knows it.

@@ -6,6 +6,7 @@ from spadwarp.transport.plan import *
 from spadwarp.transport.reconstruction import *
 from spadwarp.transport.records import *
 from spadwarp.transport.simulation import *
+from spadwarp.transport.spectrum import *
 from spadwarp.transport.workers import *
 from spadwarp.values import guarded
 

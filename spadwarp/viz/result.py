@@ -6,7 +6,8 @@ import base64
 import html as markup
 import io
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,12 +37,12 @@ from spadwarp.result import (
 from spadwarp.result.result import pixel_channel, pixel_standard_error
 from spadwarp.scene import Medium, Scene
 from spadwarp.scene.sight import lines_of_sight
-from spadwarp.transport import truth_maps
+from spadwarp.transport import Spectrum, truth_maps
 from spadwarp.values import ArgumentError, ConfigError, SpadwarpError, check_integer, count, percent, rounded
 from spadwarp.viz import style
 from spadwarp.viz.style import BLUE, INTENSITY_MAP, PAGE, TEXT, Panels, log_axis, paper, save, shown_limits
 
-__all__ = ["draw", "draw_denoised", "draw_depth", "draw_result", "html", "plot", "progress_bar"]
+__all__ = ["draw", "draw_denoised", "draw_depth", "draw_result", "draw_spectrum", "html", "plot", "progress_bar"]
 
 KINDS = ("depth", "intensity", "histogram", "truth", "flux")
 """Figures of a result."""
@@ -131,6 +132,48 @@ def draw_result(
         figure = _result_figure(result, kind, depth, method, width)
         written += [save(figure, Path(directory) / f"{kind}.{ending}") for ending in formats]
     return written
+
+
+_MOST_DEPTHS = 6  # panels of lines
+
+
+@paper()
+def draw_spectrum(
+    spectrum: Spectrum, path: str | Path, *, depth: Mapping[float, NDArray[np.float64]], width: float = PAGE
+) -> Path:
+    """Writes a picture of runs at several wavelengths: the colour of their light, depth and histograms of all pixels by
+    line; returns its path.
+
+    `depth`: frames by wavelength `[H, W]` [m], of which up to six are shown. `width`: [inch]. Raises `FileError`.
+    """
+    lines = spectrum.wavelengths
+    shown = [lines[k] for k in np.unique(np.linspace(0, len(lines) - 1, min(len(lines), _MOST_DEPTHS)).astype(int))]
+    first = spectrum.results[lines[0]]
+    panels = Panels(first.truth.depth.shape, 1 + len(shown), width=width, below=(2.0,))
+    panels.figure.caption(_caption(replace(first, scene=spectrum.scene)))
+    axis, bar = panels.place("Colour of the light")
+    # A photon of the line has the energy of the laser's less what the wavelength makes of it.
+    energy = [spectrum.shares[nm] / nm * one.intensity for nm, one in spectrum.results.items()]
+    axis.imshow(style.srgb(np.stack(energy, axis=-1), lines))
+    bar.axis("off")
+    style.middle_text(bar, "CIE 1931, as a screen shows it")
+    limits = style.target_limits(first.truth.depth, np.stack([depth[nm] for nm in shown]))
+    for nm in shown:
+        panels.show_depth(depth[nm], f"Depth at {nm:.6g} nm", limits)
+    (curves,) = panels.below()
+    tops = []
+    for nm, shade in zip(lines, style.colour_map("turbo")(np.linspace(0.05, 0.95, len(lines))), strict=True):
+        one = spectrum.results[nm]
+        light = one.histogram.sum(axis=(0, 1)) * one.scene.laser.photons_per_pulse * one.scene.detector.pde
+        tops.append(float((light := light * spectrum.shares[nm]).max()))
+        label = f"{nm:.6g} nm" if nm in shown else None
+        curves.stairs(light, 1e9 * one.bin_edges, baseline=None, color=shade, label=label)
+    top = max(tops) or 1.0
+    curves.set(xlabel="time of flight [ns]", ylabel="detections per\npulse and bin, all pixels", yscale="log")
+    curves.set(xlim=1e9 * first.bin_edges[[0, -1]], ylim=(1e-5 * top, 3.0 * top))
+    log_axis(curves, "y")
+    panels.figure.key([curves], 0.8)
+    return save(panels.figure, path)
 
 
 # A result

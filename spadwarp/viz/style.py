@@ -24,7 +24,7 @@ from matplotlib.axis import Axis
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.io.paths import atomic_path
 from spadwarp.result import Channel
@@ -264,6 +264,33 @@ def arrival_line(axis: Axes, arrival: float, edges: NDArray[np.float64]) -> None
 def coloured_depth(depth: NDArray[Any], scale: Normalize) -> NDArray[np.float64]:
     """RGB `[H, W, 3]` of a depth image; the background's colour where it is NaN."""
     return colour_map(DEPTH_MAP, missing=BACKGROUND)(scale(np.ma.masked_invalid(depth)))[..., :3]
+
+
+# The colour matching functions of CIE 1931: height, wavelength, width below and above it [nm] of the lobes of each
+# (Wyman, Sloan & Shirley, JCGT 2(2), 2013, table 1); and XYZ to linear sRGB (IEC 61966-2-1).
+_LOBES: tuple[tuple[tuple[float, ...], ...], ...] = (
+    ((1.056, 599.8, 37.9, 31.0), (0.362, 442.0, 16.0, 26.7), (-0.065, 501.1, 20.4, 26.2)),
+    ((0.821, 568.8, 46.9, 40.5), (0.286, 530.9, 16.3, 31.1)),
+    ((1.217, 437.0, 11.8, 36.0), (0.681, 459.0, 26.0, 13.8)),
+)
+_SRGB_OF_XYZ = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
+
+
+def srgb(energy: NDArray[Any], wavelengths: ArrayLike) -> NDArray[np.float64]:
+    """The colour of light of some wavelengths [nm], from its energy `[..., wavelength]`, as sRGB in [0, 1] `[..., 3]`.
+
+    The brightest is as bright as the screen shows it; what no screen shows, such as light of one wavelength, is the
+    colour beside it without what would be negative. Light that no eye sees is black.
+    """
+    nm = np.asarray(wavelengths, np.float64)
+    xyz = np.zeros((nm.size, 3))
+    for k, lobes in enumerate(_LOBES):
+        for height, peak, below, above in lobes:
+            xyz[:, k] += height * np.exp(-0.5 * ((nm - peak) / np.where(nm < peak, below, above)) ** 2)
+    seen = energy * ((nm >= 380.0) & (nm <= 780.0))
+    linear = np.maximum(seen @ xyz @ np.transpose(_SRGB_OF_XYZ), 0.0)
+    linear = np.minimum(linear / max(float(np.percentile(linear.max(axis=-1), 99.5)), 1e-300), 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
 
 
 def mark_pixels(axis: Axes, missed: NDArray[np.bool_], invented: NDArray[np.bool_]) -> None:

@@ -81,6 +81,21 @@ def test_directory_in_use_is_refused_unless_overwritten(scene, tmp_path):
     assert {path.name for path in out.iterdir()} == FILES | {"mine.txt"}
 
 
+def test_lines_are_runs_of_their_own_beside_what_has_all_of_them(scene, tmp_path):
+    out, changes = tmp_path / "out", ["--set=laser.wavelengths_nm=[532, 450]", "--set=medium.chlorophyll=0.5"]
+    run("simulate", scene, "--out", out, *DEVICE, *changes, "--set=output.png=true")
+    assert {path.name for path in out.iterdir()} == {"450nm", "532nm", "spectrum.h5", "spectrum.png"}
+    for line in (450.0, 532.0):
+        alone = spadwarp.load_scene(scene, {"laser.wavelength_nm": line, "medium.chlorophyll": 0.5})
+        own = spadwarp.simulate(alone, device="cpu")
+        assert np.array_equal(spadwarp.load(out / f"{line:g}nm").tallies, own.tallies)
+    refused = run("simulate", scene, "--out", out, *changes, "--records", code=2)
+    assert "--records" in refused.output and "cannot be combined" in refused.output
+    broad = ["--set=laser.linewidth_nm=1", "--set=laser.wavelengths_nm=spectrum", "--photons=500"]
+    run("simulate", scene, "--out", tmp_path / "broad", *DEVICE, *broad)
+    assert {path.name for path in (tmp_path / "broad").iterdir()} == FILES | {"spectrum.h5"}
+
+
 def test_records_are_those_of_trace(scene, tmp_path):
     out = tmp_path / "out"
     run("simulate", scene, "--out", out, "--records", "--quiet", *DEVICE, "--photons", 1000)

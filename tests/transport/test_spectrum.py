@@ -1,5 +1,6 @@
 """Runs at several wavelengths with the same photons, and their sum over a spectrum."""
 
+import h5py
 import numpy as np
 import pytest
 
@@ -48,6 +49,33 @@ def test_lines_have_an_axis():
     data = simulate_spectrum(broad(), [480.0, 500.0], photons=500, device="cpu").to_xarray()
     assert data["histogram"].dims[0] == "wavelength" and data["wavelength"].values.tolist() == [480.0, 500.0]
     assert (data["histogram"].sel(wavelength=480.0) != data["histogram"].sel(wavelength=500.0)).any()
+
+
+@pytest.mark.physics
+def test_monte_carlo_over_the_spectrum_is_the_analytic_sum():
+    """Eq 7: unscattered light of the target through a filter, of a laser over whose width the water changes much."""
+    one = broad(wavelength_nm=600.0, linewidth_nm=30.0).with_overrides(
+        {"detector.filter_fwhm_nm": 60.0, "camera.aperture_diameter": 0.02, "transport.estimator": "guided"}
+    )
+    found = simulate_spectrum(one, photons=20_000, device="cpu").combined()
+    scale = one.laser.photons_per_pulse * one.detections_per_photon
+    light = found.component("ballistic").sum(axis=-1) * scale
+    expected = spadwarp.simulate_analytic(one, frames=0, device="cpu").signal
+    narrow = spadwarp.simulate_analytic(one.with_overrides({"laser.linewidth_nm": 0.0}), frames=0, device="cpu").signal
+    assert light.sum() == pytest.approx(expected.sum(), rel=0.01)
+    assert abs(narrow.sum() * one.detections_per_photon / one.detector.pde / expected.sum() - 1.0) > 0.05
+
+
+def test_the_file_has_an_axis_of_wavelength(tmp_path):
+    found = simulate_spectrum(broad(wavelengths_nm=[500.0, 480.0]), photons=500, device="cpu")
+    with h5py.File(found.save(tmp_path / "spectrum.h5")) as file:
+        assert [scale[0].name for scale in file["histogram"].dims] == [
+            f"/{name}" for name in ("wavelength", "component", "y", "x", "time")
+        ]
+        assert file["wavelength"][:].tolist() == [480.0, 500.0]
+        for number, one in enumerate(found.results.values()):
+            np.testing.assert_allclose(file["histogram"][number].sum(axis=0), one.histogram, rtol=1e-5, atol=1e-12)
+            np.testing.assert_array_equal(file["depth"][number], one.depth().astype(np.float32))
 
 
 def test_wavelengths_that_cannot_be_are_named():

@@ -293,3 +293,13 @@ def test_colours_of_depth_end_where_truth_and_measurement_do():
     truth = np.tile(np.linspace(5.0, 6.0, 50), (40, 1))
     low, high = target_limits(truth, truth - np.linspace(0.0, 2.0, 40)[:, None])
     assert 2.8 < low < 4.0 and high == pytest.approx(6.0, abs=0.2)
+
+
+def test_colours_of_light_are_those_of_the_cie():
+    """Light of equal energy at all wavelengths is the illuminant E, whose sRGB is known; a line has a hue."""
+    nm = np.arange(380.0, 781.0)
+    linear = np.array([1.2048, 0.9483, 0.9089]) / 1.2048
+    expected = 1.055 * linear ** (1 / 2.4) - 0.055
+    np.testing.assert_allclose(style.srgb(np.ones((1, nm.size)), nm)[0], expected, atol=0.01)
+    assert [style.srgb(np.eye(1), [one])[0].argmax() for one in (650.0, 532.0, 450.0)] == [0, 1, 2]
+    assert not style.srgb(np.eye(1), [1500.0]).any()

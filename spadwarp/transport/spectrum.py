@@ -1,0 +1,163 @@
+"""Runs at several wavelengths with the same photons: an axis of wavelength, and the light of a broad laser."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spadwarp.io.hdf5 import Coordinate, name_dimensions, write_hdf5
+from spadwarp.result import Result
+from spadwarp.result.result import coordinates_of
+from spadwarp.scene import Scene, SceneLike, as_scene, spectral_lines
+from spadwarp.transport.simulation import simulate
+from spadwarp.values import ArgumentError, ConfigError, check_choice, check_real
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["Spectrum", "simulate_spectrum"]
+
+_MOST_LINES = 64
+_CUBE = ("wavelength", "component", "y", "x", "time")
+_ARRAYS = {
+    "share": (("wavelength",), "1", "photons of the laser that are of this line and pass the filter"),
+    "histogram": (_CUBE, "1", "fraction of the emitted photons per pixel and bin"),
+    "depth": (("wavelength", "y", "x"), "m", "depth z of the return"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Results by wavelength, of `simulate_spectrum`."""
+
+    scene: Scene
+    """The scene with its laser and filter; those of the results have lasers of one line."""
+    results: Mapping[float, Result]
+    """Wavelength in vacuum [nm], ascending → the run at it, with the photons of all the others."""
+
+    @property
+    def wavelengths(self) -> tuple[float, ...]:
+        """In vacuum [nm], ascending."""
+        return tuple(self.results)
+
+    @property
+    def shares(self) -> dict[float, float]:
+        """Part of the laser's photons that is of each line and passes the filter; where the lines are not those of the
+        laser's spectrum, what the filter passes of a laser of this line alone."""
+        shares = {line.wavelength_nm: line.share for line in spectral_lines(self.scene.laser, self.scene.detector)}
+        if set(shares) == set(self.results):
+            return shares
+        scenes = {wavelength: one.scene for wavelength, one in self.results.items()}
+        return {wavelength: spectral_lines(one.laser, one.detector)[0].share for wavelength, one in scenes.items()}
+
+    def combined(self) -> Result:
+        """The result of the scene's laser: the sum of the lines by what the spectrum and the filter leave of each, for
+        all that takes a result (eq 7 of the paper by Monte Carlo).
+
+        It has no standard errors: those of runs with the same photons are not independent. Raises `ConfigError` where
+        the wavelengths are others than those of the spectrum.
+        """
+        lines = spectral_lines(self.scene.laser, self.scene.detector)
+        if {line.wavelength_nm for line in lines} != set(self.results):
+            text = f"{len(self.results)} wavelengths are not the {len(lines)} lines of the spectrum"
+            raise ConfigError(f"laser.spectrum: {text}; wavelengths = 'spectrum' takes those")
+        shares = self.shares
+        whole, first = math.fsum(shares.values()), next(iter(self.results.values()))
+        light = np.zeros(first.tallies.shape)
+        for wavelength, one in self.results.items():
+            # A bin is as long at all wavelengths; what a tally unit stands for may differ from line to line.
+            light += shares[wavelength] / max(whole, 1e-300) * (one.unit * one.photons) * one.tallies
+        unit = min(one.unit for one in self.results.values())
+        tallies: NDArray[np.int64] = np.rint(light / (unit * first.photons)).astype(np.int64)
+        none: dict[str, Any] = dict.fromkeys(("half", "second_moment", "reconstruction", "derivative_tallies"))
+        return replace(
+            first, scene=self.scene, tallies=tallies, unit=unit, batches=0, batch_size=0, batch_moments={}, **none
+        )
+
+    def to_xarray(self) -> xarray.Dataset:
+        """`Result.to_xarray` of all lines along `wavelength` [nm]; the path of a bin differs with the group index.
+
+        Raises `FileError`: xarray is not installed.
+        """
+        sets = [one.to_xarray().drop_vars("path") for one in self.results.values()]
+        import xarray
+
+        axis = xarray.DataArray([*self.results], dims="wavelength", attrs={"units": "nm"}, name="wavelength")
+        return xarray.concat(sets, dim=axis, combine_attrs="drop_conflicts")
+
+    def save(self, path: str | Path, *, depth: Mapping[float, NDArray[np.float64]] | None = None) -> Path:
+        """Writes histograms and depth by line to one HDF5 file with an axis of wavelength, for
+        `xarray.open_dataset(path, engine="h5netcdf")`; returns its path.
+
+        `depth`: frames by wavelength [m]; by default `Result.depth`. Raises `FileError`.
+        """
+        first = next(iter(self.results.values()))
+        frames = {line: one.depth() for line, one in self.results.items()} if depth is None else depth
+        # As large as the histograms, so that only one line is held at a time.
+        with write_hdf5(path) as file:
+            file.attrs.update({"photons": first.photons, "seed": str(first.seed), "scene": self.scene.to_toml()})
+            file["share"] = [*self.shares.values()]
+            file["depth"] = np.stack([frames[line] for line in self.results]).astype(np.float32)
+            cubes = (np.stack([one.component(name) for name in one.scene.components]) for one in self.results.values())
+            shape = (len(self.results), *first.tallies.shape)
+            chunks = (1, 1, *shape[2:]) if first.tallies[0].size < 1 << 17 else (1, 1, 1, *shape[3:])
+            light = file.create_dataset("histogram", shape, np.float32, chunks=chunks, compression="gzip", shuffle=True)
+            for number, cube in enumerate(cubes):
+                light[number] = cube
+            axis: dict[str, Coordinate | int | None] = {"wavelength": ([*self.results], "nm", "in vacuum")}
+            name_dimensions(file, {**coordinates_of(first), **axis}, _ARRAYS)
+        return Path(path)
+
+    def plot(self, path: str | Path, *, depth: Mapping[float, NDArray[np.float64]]) -> Path:
+        """Writes a picture: see `spadwarp.viz.draw_spectrum`."""
+        import spadwarp
+
+        return spadwarp.viz.draw_spectrum(self, path, depth=depth)
+
+
+def simulate_spectrum(
+    scene: SceneLike, wavelengths: Iterable[float] | Literal["spectrum"] | None = None, **options: Any
+) -> Spectrum:
+    """Runs of one scene at several wavelengths, each with the same photons (common random numbers), so that differences
+    between lines are known better than the lines.
+
+    Water by chlorophyll, temperature or salinity follows the wavelength, and so do colours of meshes; coefficients
+    given as numbers, or by a preset, hold for all.
+
+    Args:
+        scene: From `spadwarp.load_scene`, or the path of its file.
+        wavelengths: In vacuum, up to 64 [nm], or "spectrum": the lines of the laser's spectrum that the filter passes;
+            by default `scene.laser.wavelengths_nm`, or else "spectrum".
+        options: As in `simulate`; the seed is that of all runs.
+
+    Raises:
+        ArgumentError: No wavelengths, too many, one twice or out of range; ConfigError and others as `simulate`.
+        KeyboardInterrupt: After Ctrl-C, which ends all lines and keeps none.
+    """
+    scene = as_scene(scene)
+    wavelengths = scene.laser.wavelengths_nm or "spectrum" if wavelengths is None else wavelengths
+    if isinstance(wavelengths, str):
+        check_choice("wavelengths", wavelengths, ("spectrum",))
+        given = [line.wavelength_nm for line in spectral_lines(scene.laser, scene.detector)]
+    else:
+        given = [check_real("wavelengths", one, "[1e-9, 1e6] nm") for one in wavelengths]
+    if not 1 <= len(given) <= _MOST_LINES or len(set(given)) < len(given):
+        raise ArgumentError(f"wavelengths: {len(given)} given; 1 to {_MOST_LINES} different ones are needed")
+    changes: dict[str, Any] = {f"laser.{name}": None for name in ("linewidth_nm", "spectrum", "wavelengths_nm")}
+    if scene.detector.filter_fwhm_nm is not None and scene.detector.filter_centre_nm is None:
+        changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
+    options = {"mesh_cache": {}, **options} if options.get("engine") is None else options
+    lines = {one: scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)}
+    results = dict[float, Result]()
+    for wavelength, line in lines.items():
+        results[wavelength] = simulate(line, **options)
+        if results[wavelength].partial:
+            raise KeyboardInterrupt
+    return Spectrum(scene, MappingProxyType(results))
