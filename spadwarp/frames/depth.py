@@ -287,7 +287,8 @@ def depth_of(
     if any(value is None for value in missing.values()):
         raise ArgumentError("; ".join(text for text, value in missing.items() if value is None))
     index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
-    counted, notes = values.dtype.kind in "iu", ()
+    counted = values.dtype.kind in "iu"
+    notes: tuple[str, ...] = ()
     known: Any = histograms.background if background is None else background
     level_known = histograms.level_known or background is not None
     if known is None and (counted or method == "likelihood"):
