@@ -321,7 +321,7 @@ def _check_truth(truth: Truth, scene: Scene) -> None:
     hit = ~np.isnan(truth.depth)
     if not hit.any():
         raise ArgumentError("truth.depth is NaN in every pixel: nothing is in view")
-    for name, interval in (("depth", "(0, inf)"), ("range", "(0, inf)"), ("reflectance", "[0, 1]")):
+    for name, interval in (("depth", "(0, inf) m"), ("range", "(0, inf) m"), ("reflectance", "[0, 1]")):
         values = getattr(truth, name)[hit]
         if not (possible := Interval.read(interval).holds(values)).all():
             wrong = int(np.argmin(possible))

@@ -25,7 +25,7 @@ from spadwarp.denoise.network_files import Precision, require_torch, weights_met
 from spadwarp.denoise.recipe import TrainingRecipe, load_training_recipe
 from spadwarp.files import Held, gate_of, holds_own_file, is_own_file, load, locate, sequence, stored_depth
 from spadwarp.frames.backgrounds import BackgroundLaw, profile_of_depth
-from spadwarp.frames.depth import Method, depth_of
+from spadwarp.frames.depth import Method, Quantity, depth_of
 from spadwarp.frames.file import SequenceFile
 from spadwarp.frames.measured import Histograms, read_histograms, stored_images
 from spadwarp.io.arrays import read_exr, write_exr
@@ -53,6 +53,7 @@ class DepthReading:
     """Depth from a file; None for what the file does not give."""
 
     depth: NDArray[np.float32]  # [N, H, W] [m]; NaN where there is none
+    quantity: Quantity = "depth"
     frames: bool  # whether the file held several
     gate: tuple[float, float] | None  # start and stop [m]
     profile: NDArray[np.float64] | None  # backscatter over the gate, [bins]
@@ -106,7 +107,7 @@ def read_depth(
     if place.suffix.lower() not in ENDINGS and not place.is_dir():
         raise FileError(f"{existing_file(place)}: ending {place.suffix!r} is not one of {', '.join(ENDINGS)}")
     if not (np.isfinite(scale) and scale > 0):
-        raise ArgumentError(f"scale = {scale} is outside (0, inf)")
+        raise ArgumentError(f"scale = {scale} is outside (0, inf), metres per unit")
     truth: NDArray[np.float32] | None = None
     of_result: dict[str, Any] = {}
     if is_own_file(place):
@@ -232,6 +233,7 @@ def _estimate_depth(
     dim = [] if counted else dim_pixels(histograms)
     return DepthReading(
         depth=depth,
+        quantity=reduced.quantity,
         frames=reduced.frames > 1,
         gate=(range_from_time(histograms.gate_start, index), range_from_time(gate_stop, index)),
         profile=backscatter_profile(histograms),
@@ -386,12 +388,28 @@ def denoise_file(
     threshold = target_threshold(model) if mask is None else mask
     shown = found.masked(threshold)[0]
     files = _write(folder, name, read, Estimate(depth, *found[1:]), second, model)
-    title = f"{Path(path).name}: {model}"
-    files.append(draw_denoised(read.depth[0], shown, folder / f"{name}.png", gate=gate, title=title, truth=read.truth))
+    notes += _worse(read.depth, depth, model)
+    if model == "usdn" and weights is None:
+        notes.append("usdn, for comparison: its depths are off by 1 to 3 cm even without noise; pyramid is better")
+    style: dict[str, Any] = {"quantity": read.quantity, "title": f"{Path(path).name}: {model}"}
+    files.append(draw_denoised(read.depth[0], shown, folder / f"{name}.png", gate=gate, truth=read.truth, **style))
     return Denoised(
         depth=depth, target_probability=found.target_probability, threshold=threshold, confidence=found.confidence,
         gate=gate, files=tuple(files), notes=tuple(notes),
     )  # fmt: skip
+
+
+def _worse(depth: NDArray[np.float32], found: NDArray[np.float32], model: str) -> list[str]:
+    """A note where pixels move by more than the noise of the input, which second differences of neighbours show."""
+    bends = (np.abs(np.diff(depth, 2, axis=axis)) for axis in (1, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # all NaN
+        noise = min(float(np.nanmedian(bend)) / (0.6745 * 6**0.5) if bend.size else np.nan for bend in bends)
+        moved = float(np.nanmedian(np.abs(found - depth)))
+    if not moved > max(1.2 * noise, 1e-4):
+        return []
+    text = f"worse: the input's noise is {1e3 * noise:.2g} mm, but half of the pixels moved by {1e3 * moved:.2g} mm"
+    return [text if model == "pyramid" else f"{text}; model pyramid is more accurate"]
 
 
 def _write(
@@ -407,7 +425,8 @@ def _write(
         with atomic_path(folder / f"{name}{ending}.npy") as temporary, temporary.open("wb") as file:
             np.save(file, values if read.frames else values[0])
     metadata = {"content": "denoised depth", "method": method, "frame": "+x right, +y down, +z forward"}
-    channels = {"Z": found.depth, "target_probability": found.target_probability, "confidence": found.confidence}
+    channels = {"Z" if read.quantity == "depth" else "range": found.depth, "confidence": found.confidence}
+    channels["target_probability"] = found.target_probability
     first = {channel: np.ascontiguousarray(values[0]) for channel, values in channels.items()}
     return [*(folder / f"{name}{ending}.npy" for ending in arrays), write_exr(folder / f"{name}.exr", first, metadata)]
 

@@ -135,7 +135,7 @@ def depth_frames(
         )
     start, stop = checked_gate(gate)
     if (values[np.isfinite(values)] < 0).any():
-        raise ArgumentError(f"depth {np.nanmin(values)} m is outside [0, inf)")
+        raise ArgumentError(f"depth {np.nanmin(values)} m is outside [0, inf) m")
     present = np.isfinite(values) & (values > 0)
     slack = MARGIN * (stop - start)
     outside = present & ~((values >= start - slack) & (values <= stop + slack))

@@ -220,6 +220,9 @@ def detected(
     return found._replace(depth=depth, target_probability=probability, significance=significance)
 
 
+_COARSE = 0.76  # part of the light in one bin, from which on the FWHM of a Gaussian response is less than a bin
+
+
 def estimate_histograms(
     depth: NDArray[Any],
     counts: NDArray[Any],
@@ -241,15 +244,23 @@ def estimate_histograms(
         raise ArgumentError(f"counts are of {height} x {width} pixels; by {model!r} {least}")
     some = counts[..., bins]
     given: dict[str, Any] = {"background": background[..., bins], "response": response, "device": device}
+
+    def within_bins(found: Estimate) -> Estimate:
+        """In a bin wider than the response the histograms tell no place: that of the pixel's own light counts."""
+        if np.max(response) < _COARSE * np.sum(response):
+            return found
+        near = np.abs(depth - found.depth) < (gate[1] - gate[0]) / some.shape[-1]
+        return found._replace(depth=np.where(near, depth, found.depth).astype(np.float32))
+
     if model in CLASSICAL:
-        found = to_depth(classical_depth(some, method=model, **given)).astype(np.float32)  # type: ignore[arg-type]
-        return Estimate(found.reshape(depth.shape), np.ones_like(depth), np.full_like(depth, np.nan))
+        place = to_depth(classical_depth(some, method=model, **given)).astype(np.float32)  # type: ignore[arg-type]
+        return within_bins(Estimate(place.reshape(depth.shape), np.ones_like(depth), np.full_like(depth, np.nan)))
     features = features_of_histograms(some, **given, total=counts.sum(axis=-1), to_depth=to_depth)
     with warnings.catch_warnings():
         if some.shape[-1] < counts.shape[-1]:
             warnings.simplefilter("ignore")  # depths outside this part are false peaks
         frames = depth_frames(depth, gate=gate, profile=profile, features=features)
-    return estimate_frames(frames, model=model, weights=weights, device=device)
+    return within_bins(estimate_frames(frames, model=model, weights=weights, device=device))
 
 
 def _leaves_frames_empty(depth: NDArray[Any], gate: tuple[float, float], part: tuple[float, float]) -> bool:

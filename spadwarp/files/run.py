@@ -232,12 +232,11 @@ def write_depth(
     channels = {"range": reduction.range[0], "intensity": reduction.intensity[0].astype(np.float32)}
     if name == "depth":
         channels["Z"] = reduction.first
-    label = "depth z [m]" if name == "depth" else "range [m]"
     metadata = {"content": "measured depth", "method": reduction.method, "frame": "+x right, +y down, +z forward"}
     written = [
         write_array(folder / f"{name}.npy", array if reduction.frames > 1 else array[0]),
         write_exr(folder / f"{name}.exr", channels, metadata),
-        reduction.plot(folder / f"{name}.png", label=label, title=f"{name.capitalize()} ({reduction.method})"),
+        reduction.plot(folder / f"{name}.png", quantity=name, title=f"{name.capitalize()} ({reduction.method})"),
     ]
     if (found := reduction.significance) is not None:
         written.append(write_array(folder / "significance.npy", found if reduction.frames > 1 else found[0]))

@@ -31,6 +31,7 @@ from spadwarp.values import (
 __all__ = ["METHODS", "Histograms", "Method", "Reduction", "arrival_time", "depth_frame", "depth_of"]
 
 Method = Literal["peak", "centroid", "matched", "likelihood"]
+Quantity = Literal["depth", "range"]
 METHODS: tuple[Method, ...] = ("peak", "centroid", "matched", "likelihood")
 
 
@@ -155,7 +156,7 @@ def _bins_of_gate(gate: tuple[float, float], gate_start: float, bin_width: float
     if not (isinstance(gate, tuple | list) and len(gate) == 2):
         raise ArgumentError(f"gate = {shown(gate)} is not (start [s], stop [s])")
     # Centres at (k + 0.5): k from ceil(x - 0.5) to, not including, ceil(y - 0.5).
-    edges = [(check_real("gate", time, "[-inf, inf]") - gate_start) / bin_width - 0.5 for time in gate]
+    edges = [(check_real("gate", time, "[-inf, inf] s") - gate_start) / bin_width - 0.5 for time in gate]
     first, stop = (int(np.clip(np.ceil(np.nan_to_num(edge)), 0, bins)) for edge in edges)
     if first >= stop:
         end = gate_start + bins * bin_width
@@ -203,7 +204,7 @@ def _response_table(irf: InstrumentResponse, bin_width: float, phases: int) -> t
 
 
 def depth_frame(
-    result: Result, *, method: Method = "centroid", quantity: Literal["depth", "range"] = "depth", **options: Any
+    result: Result, *, method: Method = "centroid", quantity: Quantity = "depth", **options: Any
 ) -> NDArray[np.float64]:
     """Depth frame of a simulation's histograms [m], float64 `[H, W]`; NaN where nothing returned.
 
@@ -222,7 +223,7 @@ def depth_frame(
 class Reduction:
     """Depth of histograms."""
 
-    quantity: Literal["depth", "range"]
+    quantity: Quantity
     """`"depth"`: planar, z; `"range"`: along the line of sight, where the view is not known."""
     values: NDArray[np.float64]  # float64 `[frames, H, W]` [m]; NaN where nothing returned
     range: NDArray[np.float64]  # the same along the line of sight

@@ -98,9 +98,9 @@ def read_histograms(
     path = existing_file(path)
     for name, value in {"tag_unit": tag_unit, "bin_width": bin_width}.items():
         if value is not None:
-            check_real(f"{name} [s]", value, "(0, 0.001)")
+            check_real(name, value, "(0, 1e-3) s")
     if gate_start is not None:
-        check_real("gate_start [s]", gate_start, "[-1, 1]")
+        check_real("gate_start", gate_start, "[-1, 1] s")
     if _is_own(path):
         arguments = {"dataset": dataset, "axes": axes, "image size": image_size, "tag unit": tag_unit, "irf": irf}
         arguments |= {"bin width": bin_width, "sum frames": sum_frames, "gate start": gate_start}
@@ -454,7 +454,7 @@ def _check_ptu(file: Any, path: Path) -> None:
     if (readable := len(file.read_records())) < file.number_records:
         raise FileError(f"{path}: cut: of {file.number_records} records {readable} are there")
     if not 1e-15 < (width := float(file.tcspc_resolution)) < 1e-3:
-        raise FileError(f"{path}: MeasDesc_Resolution = {width} s is outside (1e-15, 1e-3)")
+        raise FileError(f"{path}: MeasDesc_Resolution = {width} s is outside (1e-15, 1e-3) s")
 
 
 def _ptu_scan(file: Any, image_size: tuple[int, int] | None) -> tuple[NDArray[np.int32], str]:

@@ -84,7 +84,7 @@ class Window(NamedTuple):
         if widths.shape != (bins,):
             raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
         if not (np.isfinite(widths).all() and (widths > 0).all()):
-            raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf)")
+            raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf) s")
         edges = np.append(0.0, np.cumsum(widths / widths.mean())) * bin_width
         period = period if wrap else max(period, edges[-1])
         rest = period - edges[-1]

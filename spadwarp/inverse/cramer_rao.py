@@ -148,6 +148,7 @@ def bounds(
     warnings = render.warnings() + found.not_identifiable(in_logarithm)
     if share > SIMULATION:
         warnings.append(
-            f"the noise of the simulation is {percent(share)} % of that of the counts, above 10 %: more photons"
+            f"the noise of the simulation is {percent(share)} % of that of the counts in the variances, above 10 %; "
+            f"{render.photons * share / SIMULATION:.1e} photons would do"
         )
     return replace(found, warnings=tuple(warnings))

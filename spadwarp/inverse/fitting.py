@@ -635,7 +635,8 @@ class Fitter:
         if solution.simulation_share > SIMULATION:
             sentences.append(
                 f"the noise of the simulation is {percent(solution.simulation_share)} % of that of the counts in the "
-                "variances, above 10 %: give more photons; the standard errors contain it"
+                f"variances, above 10 %, which the standard errors contain; "
+                f"{self.render.photons * solution.simulation_share / SIMULATION:.1e} photons would do"
             )
         if any(name not in self.prior for name in found.names):
             sentences += found.not_identifiable([unknown.is_positive for unknown in self.shared])

@@ -98,6 +98,8 @@ def _read(scene: Scene, word: Any) -> Unknown:
         )
     if name == "ambient_rate":
         name = BACKGROUND
+    if name.rpartition(".")[2] in ("extinction", "albedo"):
+        raise ArgumentError(f"unknown: {shown(name)} follows from absorption and scattering: name these two")
     field = _FIELD.fullmatch(name)
     if field is None and name not in (DEPTH, BACKGROUND):
         known = [*_SHORT, *_SHORT.values(), *parts, *parts.values(), *own, DEPTH]

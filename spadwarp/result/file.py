@@ -446,7 +446,7 @@ def load_truth_exr(
     if not hit.any():
         raise FileError(f"{depth}: no pixel has a depth: everything is sky, 0 or NaN")
     if (raw[hit] < 0).any():
-        raise FileError(f"{depth}: depth {raw[hit].min():g} is outside (0, inf)")
+        raise FileError(f"{depth}: depth {raw[hit].min():g} m is outside (0, inf) m")
     distance = raw * scale if radial else raw * scale / view[..., 2]
 
     if isinstance(albedo, (str, Path)):

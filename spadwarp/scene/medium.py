@@ -75,7 +75,7 @@ def complete_coefficients(pair: Mapping[str, Any]) -> dict[str, Any]:
     else:
         part, value = ("scattering", b) if a is None else ("absorption", a)
         if value > c:
-            raise ValueError(f"{part} = {value} is outside [0, {c}], {c} being the extinction")
+            raise ValueError(f"{part} = {value} is outside [0, {c}] 1/m, {c} being the extinction")
         a = c - b if a is None else a
         b = c - a if b is None else b
     share = (b / c if c else 0.0) if albedo is None else albedo
@@ -326,7 +326,7 @@ class Medium(PhaseLaw, Water):
         yield from self._only_with("scattering_matrix = 'tabulated'", has_table, "matrix_table")
         for i, layer in enumerate(self.layers):
             if i and layer.start <= (before := self.layers[i - 1].start):
-                yield f"layers[{i}].start = {layer.start} is outside ({before}, inf), the layer before it"
+                yield f"layers[{i}].start = {layer.start} is outside ({before}, inf) m, the layer before it"
             if (layer.albedo == "lu2024") != (self.albedo == "lu2024"):
                 yield f"layers[{i}].albedo = {layer.albedo!r} does not go with {self.albedo!r}, the medium's"
             # A preset may bring one with it, which is no more than what the medium's own preset may.

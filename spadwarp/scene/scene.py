@@ -484,7 +484,7 @@ class Trajectory:
 
         Values in between are linear; the three angles of a `rotation_deg` together are those of the shortest turn.
         """
-        check_real("frame_rate", frame_rate, "[1e-6, 1e12]")
+        check_real("frame_rate", frame_rate, "[1e-6, 1e12] Hz")
         span = float(self.times[-1] - self.times[0])
         count = int(span * frame_rate * (1 + 1e-12)) + 1
         check_integer("frames of the trajectory", count, f"[1, {_MOST_ROWS}]")

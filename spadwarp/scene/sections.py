@@ -52,6 +52,7 @@ Overrides = Mapping[str, Any] | Sequence[str]
 FileName = str | os.PathLike[str]
 
 _NUMBER = re.compile(r"\s*[+-]?\.?\d")
+_WITHOUT_UNIT = re.compile(r"^(\w+) = .*? is outside [\[(][^\])]*[\])](?=,|;|$)")
 
 
 class FilePath(NamedTuple):
@@ -296,8 +297,13 @@ class Section(_Model):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for problem in self._problems():
-            raise ValueError(problem)
+            raise ValueError(_WITHOUT_UNIT.sub(self._with_unit, problem))
         return self
+
+    def _with_unit(self, found: re.Match[str]) -> str:
+        info = type(self).model_fields.get(found[1])
+        unit = None if info is None else field_unit(info)
+        return found[0] if unit in (None, "1") else f"{found[0]} {unit}"
 
     def _problems(self) -> Iterator[str]:
         """Why fields exclude each other; where they do not, sets what follows from those that were given."""

@@ -600,7 +600,7 @@ def _check_places(scene: Scene, mesh: TriangleMesh | None, camera: bool = True) 
         centre = to_world(lens, point).tolist()
         for letter, value, low, high in zip("xyz", centre, *domain.bounds, strict=True):
             if not low - slack <= value <= high + slack:
-                text = f"{name}: {letter} = {value} is outside [{low}, {high}], the domain"
+                text = f"{name}: {letter} = {value} is outside [{low}, {high}] m, the domain"
                 raise ConfigError(text, source=scene.source)
         across = rotation_matrix(lens.rotation_deg) @ np.asarray(axis, np.float64)
         for face in domain.reflecting:
@@ -615,7 +615,7 @@ def _check_gate(scene: Scene) -> None:
     """Refuses a gate that begins after the longest path."""
     begin, max_path = scene.gate.start * scene.medium.pulse_speed, scene.transport.max_path
     if max_path is not None and max_path <= begin:
-        text = f"transport.max_path = {max_path} m is outside ({begin:g}, inf), the path at which the gate begins"
+        text = f"transport.max_path = {max_path} m is outside ({begin:g}, inf) m, the path at which the gate begins"
         raise ConfigError(text, source=scene.source)
 
 

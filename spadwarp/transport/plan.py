@@ -85,7 +85,7 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         checked: dict[str, Any] = {
-            "checkpoint_every": check_real("checkpoint_every", self.checkpoint_every, "[0, inf]")
+            "checkpoint_every": check_real("checkpoint_every", self.checkpoint_every, "[0, inf] s")
         }
         for name, within in _RANGES.items():
             value = getattr(self, name)

@@ -151,7 +151,7 @@ def simulate(
     )
     if time is not None and not plan.is_auto:
         raise ConfigError(f"time = {shown(time)} goes with photons = 'auto'")
-    seconds = _SECONDS if time is None else check_real("time", time, "(0, 1e9]")
+    seconds = _SECONDS if time is None else check_real("time", time, "(0, 1e9] s")
     with ExitStack() as stack:
         stopped = stack.enter_context(interruptible())
         if progress is not None:

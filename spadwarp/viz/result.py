@@ -615,13 +615,13 @@ def draw_depth(
     intensity: NDArray[Any],
     path: str | Path,
     *,
-    label: str,
+    quantity: str,
     title: str,
     width: float = PAGE,
 ) -> Path:
-    """A depth or range image `[H, W]` [m] beside the intensity; returns the path. `width`: of the picture [inch]."""
+    """An image `[H, W]` [m] of "depth" or "range" beside the intensity; returns the path. `width`: [inch]."""
     panels = Panels(image.shape, 2, width=width)
-    panels.show_depth(image, title, shown_limits(image, beyond=1.0, weights=intensity), label)
+    panels.show_depth(image, title, shown_limits(image, beyond=1.0, weights=intensity), style.LABELS[quantity])
     panels.show_intensity(intensity, "Intensity", "sum over bins")
     return save(panels.figure, path)
 
@@ -634,10 +634,11 @@ def draw_denoised(
     *,
     gate: tuple[float, float],
     title: str,
+    quantity: str = "depth",
     truth: NDArray[np.float32] | None = None,
     width: float = PAGE,
 ) -> Path:
-    """A frame before and after, depth `[H, W]` [m] each; returns the path.
+    """A frame before and after, depth or, as the `quantity` says, range `[H, W]` [m] each; returns the path.
 
     With the truth also that, the error, and in colours of their own the pixels in which a target was missed or
     invented, and their parts of the target and of the water: NaN stands for no target. `width`: of the picture [inch].
@@ -648,15 +649,16 @@ def draw_denoised(
         low, high = shown_limits(denoised if np.isfinite(denoised).any() else noisy, beyond=1.0)
     limits = max(low, gate[0] - 1.0), min(high, gate[1] + 1.0)
     panels = Panels(noisy.shape, 2 if truth is None else 4, width=width)
-    panels.show_depth(noisy, "Input", limits)
+    label = style.LABELS[quantity]
+    panels.show_depth(noisy, "Input", limits, label)
     if truth is None:
-        panels.show_depth(denoised, "Denoised", limits)
+        panels.show_depth(denoised, "Denoised", limits, label)
     else:
         target, found = np.isfinite(truth), np.isfinite(denoised)
         missed, invented = target & ~found, found & ~target
         parts = (some.sum() / max(1, of.sum()) for some, of in ((missed, target), (invented, ~target)))
         of_target, of_water = map(percent, parts)
-        label = f"depth z [m]\nblack: missed, {of_target} %\nred: invented, {of_water} %"
+        label += f"\nblack: missed, {of_target} %\nred: invented, {of_water} %"
         style.mark_pixels(panels.show_depth(denoised, "Denoised", limits, label), missed, invented)
         panels.show_depth(truth, "Truth", limits)
         panels.show_error(denoised - truth, "Denoised − truth")

@@ -54,6 +54,7 @@ CHANNEL_NAMES: dict[Channel, str] = {"co": "co-polarised", "cross": "cross-polar
 CHANNEL_NAMES |= {"fluorescence": "fluorescent"}
 """Words for light of a channel."""
 
+LABELS = {"depth": "depth z [m]", "range": "range along the line of sight [m]"}
 DEPTH_MAP, INTENSITY_MAP = "viridis_r", "cividis"
 BOUND_MAP, PROBABILITY_MAP, LIGHT_MAP = "magma_r", "inferno_r", "inferno"
 # Orange to violet without the dark ends, which are the colours of what is beyond them.
@@ -137,7 +138,7 @@ class PaperFigure(Figure):
 
 def new_figure(width: float, height: float) -> PaperFigure:
     """An empty figure [inch]. Raises `ArgumentError` where the width cannot hold text or is no width."""
-    return PaperFigure(figsize=(check_real("width", width, "[2.5, 50]"), height), layout="constrained")
+    return PaperFigure(figsize=(check_real("width", width, "[2.5, 50] inch"), height), layout="constrained")
 
 
 def arranged(count: int, width: float, least: float) -> tuple[int, int]:
@@ -384,7 +385,7 @@ class Panels:
         return axis
 
     def show_depth(
-        self, image: NDArray[Any], title: str, limits: tuple[float, float], label: str = "depth z [m]"
+        self, image: NDArray[Any], title: str, limits: tuple[float, float], label: str = LABELS["depth"]
     ) -> Axes:
         """Depth [m]."""
         return self.show(image, title, label, DEPTH_MAP, limits)

@@ -354,7 +354,7 @@ def video(
     path = Path(path)
     if path.suffix.lower() not in (".gif", ".mp4"):
         raise ArgumentError(f"path = {str(path)!r} ends neither in .gif nor in .mp4")
-    pictures, fps = check_integer("pictures", pictures, "[1, 1000000]"), check_real("fps", fps, "[0.01, 50]")
+    pictures, fps = check_integer("pictures", pictures, "[1, 1000000]"), check_real("fps", fps, "[0.01, 50] 1/s")
     check_choice("scale", scale, ("log", "linear"))
     check_apart(path, source)
     held = source if isinstance(source, Held) else load(source)

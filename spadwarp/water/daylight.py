@@ -112,7 +112,7 @@ def _air_mass(elevation_deg: float) -> float:
 
 def refracted_cosine(sun_elevation_deg: float, index: float) -> float:
     """Cosine of the sun's zenith angle below a calm surface of water of a refractive index in [1, 4]."""
-    check_real("sun_elevation_deg", sun_elevation_deg, "[-90, 90]")
+    check_real("sun_elevation_deg", sun_elevation_deg, "[-90, 90] °")
     check_real("index", index, "[1, 4]")
     return math.sqrt(1.0 - (math.cos(math.radians(sun_elevation_deg)) / index) ** 2)
 

@@ -162,7 +162,7 @@ BRIGHT = {"pulse_energy": 1e-3, "half_angle_deg": 35.0}
 GAUSSIAN = {"profile": "gaussian", "half_angle_deg": 20.0}
 REFUSED = {
     "truth.depth is NaN in every pixel": wrong("depth", np.nan),
-    r"truth.depth = -1.0 at pixel \(2, 3\) is outside \(0, inf\)": wrong("depth", -1.0, at=(2, 3)),
+    r"truth.depth = -1.0 at pixel \(2, 3\) is outside \(0, inf\) m": wrong("depth", -1.0, at=(2, 3)),
     r"truth.depth = inf at pixel \(2, 3\)": wrong("depth", np.inf, at=(2, 3)),
     r"truth.reflectance = 1.5 at pixel \(1, 1\) is outside \[0, 1\]": wrong("reflectance", 1.5, at=(1, 1)),
     r"truth.range = nan at pixel \(0, 4\)": wrong("range", np.nan, at=(0, 4)),

@@ -93,7 +93,7 @@ def test_own_channels_scale_and_rotated_cameras(tmp_path):
         ("depth", "nothing.exr", None, "no such file"),
         ("depth", "text.exr", None, "not an EXR image"),
         ("depth", "sky.exr", filled(A=65504.0), "no pixel has a depth"),
-        ("depth", "negative.exr", filled(A=-1.0), r"depth -1 is outside \(0, inf\)"),
+        ("depth", "negative.exr", filled(A=-1.0), r"depth -1 m is outside \(0, inf\) m"),
         ("depth", "two.exr", filled(**{"a.A": 1.0, "b.A": 1.0}), "could be a.A or b.A"),
         ("albedo", "bright.exr", filled(G=1.5), r"albedo 1.5 is outside \[0, 1\]"),
         ("normal", "flat.exr", filled(R=0, G=0, B=0), r"no normal at pixel \(1, 0\)"),

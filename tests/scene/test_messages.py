@@ -75,7 +75,10 @@ def port(*names, **fields):
         # Water
         ({"medium": {}}, TWO_OF),
         (medium(scattering=0.1), TWO_OF),
-        ({"medium": {"absorption": 0.4, "extinction": 0.3}}, "absorption = 0.4 is outside [0, 0.3], 0.3 being the ext"),
+        (
+            {"medium": {"absorption": 0.4, "extinction": 0.3}},
+            "absorption = 0.4 is outside [0, 0.3] 1/m, 0.3 being",
+        ),
         ({"medium": {"absorption": 0.1, "albedo": 1.0}}, "medium.albedo = 1.0 leaves the extinction undetermined"),
         ({"medium": {"chlorophyll": 0.5, "preset": "uwoc-clear"}}, "chlorophyll = 0.5 cannot be combined with preset"),
         ({"medium": {"chlorophyll": 0.5}, **laser(wavelength_nm=850.0)}, "wavelength_nm = 850.0 is outside [400, 700]"),
@@ -98,12 +101,15 @@ def port(*names, **fields):
         ("daylight={sun_elevation_deg=45}", "daylight.depth is missing (of the lens below the surface [m])"),
         ({**medium(layers=[LAYER]), "daylight": {"sun_elevation_deg": 60.0, "depth": 5.0}}, "daylight takes one water"),
         # Walls
-        ({"domain": {"shape": "slab", "lower": 3, "upper": 1}}, "lower = 3.0 is outside (-inf, 1.0), 1.0 being upper"),
+        (
+            {"domain": {"shape": "slab", "lower": 3, "upper": 1}},
+            "lower = 3.0 is outside (-inf, 1.0) m, 1.0 being",
+        ),
         ('domain={shape="box", upper=[1, 1]}', "domain.upper = [1, 1] has the wrong number of values; 3 are needed"),
         ("domain={outside_index={y_low=1.0}}", "no such face with shape = 'unbounded'; a slab has z_low and z_high"),
         (BOX + ", outside_index={y_lw=1.0}}", "did you mean 'y_low'?"),
         # Lasers and their spectrum
-        (laser(profile="gaussian", half_angle_deg=90.0), "half_angle_deg = 90.0 is outside (0, 90), the range of a"),
+        (laser(profile="gaussian", half_angle_deg=90.0), "half_angle_deg = 90.0 is outside (0, 90) °, the range of a"),
         ("laser.profile=measured", "needs profile_image with profile = 'measured': the path of an image"),
         (laser(pulse_energy=1.0, average_power=2.0), "laser needs one of pulse_energy, average_power, peak_power"),
         (laser(peak_power=1.0, pulse_fwhm_ps=0.0), "laser.peak_power = 1.0 needs pulse_fwhm_ps > 0"),
@@ -115,7 +121,7 @@ def port(*names, **fields):
         (camera(horizontal_fov_deg=120.0, distortion=[-0.4, 0, 0, 0]), "[-0.4, 0.0, 0.0, 0.0, 0.0] is not one-to-one"),
         (
             {"camera": {**LENS, "focus_distance": 0.04}},
-            "focus_distance = 0.04 is outside (0.05, inf], beyond the focal",
+            "focus_distance = 0.04 is outside (0.05, inf] m, beyond the focal",
         ),
         (
             {**camera(pinhole=True), "transport": {"estimator": "analog"}},

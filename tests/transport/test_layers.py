@@ -129,7 +129,7 @@ def test_layers_survive_the_way_through_toml(tmp_path):
 @pytest.mark.parametrize(
     ("medium", "text"),
     [
-        ({"layers": [MURKY, MURKY]}, "medium.layers[1].start = 1.2 is outside (1.2, inf), the layer before it"),
+        ({"layers": [MURKY, MURKY]}, "medium.layers[1].start = 1.2 is outside (1.2, inf) m, the layer before it"),
         ({"layers": [{"start": 1.0}]}, "medium.layers[0] needs exactly two of"),
         ({"layers": [{**MURKY, "albedo": "lu2024"}]}, "medium.layers[0].albedo = 'lu2024' does not go with 0.8"),
         ({"layers": [{**MURKY, "group_index": 1.3}]}, "medium.layers[0].group_index is not a known field"),

@@ -130,8 +130,8 @@ def test_a_camera_outside_the_water_is_refused():
     camera = {"domain": {"shape": "slab", "lower": 0.5, "upper": 9.0}, "laser": {"position": [0, 0, 1.0]}}
     laser = {"domain": {"shape": "box", "lower": 1.0, "upper": 9.0}}
     for sections, text in (
-        (camera, r"camera\.position: z = 0\.0 is outside \[0\.5, 9\.0\], the domain"),
-        (laser, r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\], the domain"),
+        (camera, r"camera\.position: z = 0\.0 is outside \[0\.5, 9\.0\] m, the domain"),
+        (laser, r"laser\.position: x = -0\.1 is outside \[1\.0, 9\.0\] m, the domain"),
     ):
         one = scene(**sections)
         with pytest.raises(ConfigError, match=text):

@@ -135,7 +135,7 @@ def draw_scene(path, width, **_):
 
 def draw_depth_alone(path, width, request):
     result = request.getfixturevalue("result")
-    labels = {"label": "depth z [m]", "title": "Depth (peak)"}
+    labels = {"quantity": "depth", "title": "Depth (peak)"}
     draw_depth(result.truth.depth, result.intensity, path, width=width, **labels)
 
 
