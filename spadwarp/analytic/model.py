@@ -164,10 +164,9 @@ def scene_optics(scene: Scene) -> tuple[Any, Any]:
         ports.camera = port_parameters(scene, camera, (0.0, 0.0, 0.0), radius, 0.0)
     if laser is not None:
         ports.laser = port_parameters(scene, laser, scene.beam.position, 0.0, 0.0)
-    rough = scene.surface is not None and not scene.surface.is_flat
-    if scene.surface is not None:
-        ports.slope = math.sqrt(0.5 * sum(scene.surface.slope_variances))
-    return kernels.make_optics(port_kind(camera), port_kind(laser), rough), ports
+    slope = 0.0 if scene.surface is None else math.sqrt(0.5 * sum(scene.surface.slope_variances))
+    ports.slope = slope
+    return kernels.make_optics(port_kind(camera), port_kind(laser), rough=slope > 0.0), ports
 
 
 def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Map:

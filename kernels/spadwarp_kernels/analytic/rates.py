@@ -253,9 +253,10 @@ def phase_at(phase: wp.array[wp.float64], cos_theta: wp.float64) -> wp.float64:
 
 
 @memoised
-def make_single_scatter(optics: Optics) -> tuple[wp.Function, wp.Function, wp.Function]:
+def make_single_scatter(optics: Optics) -> tuple[wp.Function, wp.Function, wp.Function, wp.Function]:
     """Warp functions for single scattering seen through some optics: detections per pulse and metre of range [1/m],
-    C_back(t) without a target [1/s], and C_dark + C_back of a pixel i inside the gate [1/s]."""
+    C_back(t) without a target [1/s], and C_dark + C_back of a pixel i inside the gate [1/s]; and detections per pulse
+    of the light that the surface of a sea reflects."""
     light_at, range_of_path = optics.light, optics.range_of_path
 
     @wp.func
@@ -310,21 +311,9 @@ def make_single_scatter(optics: Optics) -> tuple[wp.Function, wp.Function, wp.Fu
         value = (ONE - w) * wp.float64(water.profile[row, k]) + w * wp.float64(water.profile[row, wp.min(k + 1, last)])
         return lidar.dark + value / lidar.bin_width
 
-    return single_scatter_per_metre, single_scatter_rate, background_rate
-
-
-single_scatter_rate = make_single_scatter(IN_WATER)[1]
-"""That of a camera and a laser in the water."""
-
-
-@memoised
-def _make_glint(optics: Optics) -> wp.Function:
-    """The Warp function ``(lidar, sight)`` -> detections per pulse of the light that facets of a sea's surface reflect:
-    those across the line of sight, along which the laser shines."""
-    light_at = optics.light
-
     @wp.func
     def glint(lidar: Lidar, sight: SightRay) -> wp.float64:
+        """By facets across the line of sight, along which the laser is taken to shine."""
         s = least_range(sight)
         light = light_at(lidar, point_at(sight, s))
         path = light.path + s + sight.delay
@@ -342,13 +331,17 @@ def _make_glint(optics: Optics) -> wp.Function:
         radiance = above * reflected * facets / (wp.float64(4.0) * cosine)
         return lidar.photons * lidar.pde * radiance * collection(lidar, sight.view[2])
 
-    return glint
+    return single_scatter_per_metre, single_scatter_rate, background_rate, glint
+
+
+single_scatter_rate = make_single_scatter(IN_WATER)[1]
+"""That of a camera and a laser in the water."""
 
 
 @memoised
 def _make_table_kernel(optics: Optics) -> wp.Kernel:
     see, light_at, range_of_path, illuminated = optics.see, optics.light, optics.range_of_path, optics.illuminated
-    per_metre, glint, rough = make_single_scatter(optics)[0], _make_glint(optics), optics.rough
+    (per_metre, *_, glint), rough = make_single_scatter(optics), optics.rough
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
     def table_kernel(
