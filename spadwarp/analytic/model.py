@@ -4,6 +4,9 @@ From the truth of the scene: signal detections per pulse (eq 3–7), arrival tim
 information (eq 9) and Cramér–Rao bound. Equation numbers are those of *A Simulation Method for Underwater SPAD Depth
 Imaging Datasets*, Sensors 24, 3886 (2024).
 
+Over the surface of a sea the beam and what a pixel sees are spread by slopes, on the way down and on the way up, as
+normal distributions; slopes of resolved waves count with the others, and no light is masked.
+
 What the model leaves out: multiple scattering, shadows of a laser beside the lens, range aliasing, pile-up (the
 information is that of α ≪ 1 per acquisition) and instrument responses that are not Gaussian.
 """
@@ -161,7 +164,9 @@ def scene_optics(scene: Scene) -> tuple[Any, Any]:
         ports.camera = port_parameters(scene, camera, (0.0, 0.0, 0.0), radius, 0.0)
     if laser is not None:
         ports.laser = port_parameters(scene, laser, scene.beam.position, 0.0, 0.0)
-    return kernels.make_optics(port_kind(camera), port_kind(laser)), ports
+    slope = 0.0 if scene.surface is None else math.sqrt(0.5 * sum(scene.surface.slope_variances))
+    ports.slope = slope
+    return kernels.make_optics(port_kind(camera), port_kind(laser), rough=slope > 0.0), ports
 
 
 def false_peaks(signal: ArrayLike, level: ArrayLike, lengths: ArrayLike, device: Any = None) -> Map:
@@ -188,8 +193,11 @@ class _Model:
         angles = np.maximum(np.linspace(0.0, np.pi, 4097), 2e-5)
         self.phase = self.on_device(phase_function(scene.medium).density(angles))
         in_water = distances
-        if scene.camera.port is not None:
-            in_water = np.maximum(np.nan_to_num(distances - lines_of_sight(scene, views).lead, nan=0.0), 0.0)
+        if camera_port(scene) is not None:
+            beyond = np.nan_to_num(distances - lines_of_sight(scene, views).lead, nan=0.0)
+            if scene.surface is not None and ((distances > 0.0) & (beyond < 0.0)).any():
+                raise ConfigError("analytic: a target is seen before the [surface], in the air", source=scene.source)
+            in_water = np.maximum(beyond, 0.0)
         self.sights = [self.on_device(views), self.on_device(in_water)]
 
     def on_device(self, values: ArrayLike, kind: Any = np.float64, *, nan: float = 0.0) -> Any:
@@ -257,18 +265,19 @@ class _Model:
 def _not_covered(scene: Scene) -> dict[str, bool]:
     """Sentences on what the model cannot do, and whether the scene asks for it."""
     laser, chosen, medium = scene.beam, scene.analytic, scene.medium
-    ported = scene.camera.port is not None or scene.laser.port is not None
+    ported = camera_port(scene) is not None or laser_port(scene) is not None
     port, parallel, lu2024 = laser_port(scene), laser.profile == "collimated", chosen.form == "lu2024"
     return {
-        "analytic: the model knows no surface of the sea; simulate follows light through it, and for a flat one "
-        "camera.port with a distance and no window stands for it": scene.surface is not None,
+        "analytic: over [surface] the model needs camera and laser in the air, and a diverging laser.profile": (
+            scene.surface is not None and (parallel or camera_port(scene) is None or port is None)
+        ),
         "analytic: laser.profile = 'measured' has no closed form; simulate takes any": laser.profile == "measured",
         f"analytic: scan.mode = {scene.scan.mode!r} is not one beam for all pixels; simulate takes it": (
             scene.scan.mode != "none"
         ),
         f"analytic.form = 'lu2024' needs a uniform_cone laser of half_angle_deg < 90, not {laser.profile!r} "
         f"of {laser.half_angle_deg}": lu2024 and (laser.profile != "uniform_cone" or laser.half_angle_deg >= 90),
-        "analytic.form = 'lu2024' knows no camera.port or laser.port; 'radiometric' does": lu2024 and ported,
+        "analytic.form = 'lu2024' knows no port and no surface; 'radiometric' does": lu2024 and ported,
         "analytic: laser.profile = 'collimated' does not stay parallel behind a dome, and has no closed form; "
         "simulate takes it": parallel and port is not None and port.shape == "dome",
         f"medium.layers: {len(medium.layers)} given; the analytic simulator takes one water": bool(medium.layers),
@@ -331,7 +340,7 @@ def passed_by_grid(scene: Scene, views: Map, distances: Map) -> Map:
     sights = lines_of_sight(scene, views)
     points = sights.points(distances)
     depth = np.zeros(len(points))
-    for begin in (sights.start, _begin_of_light(scene, points)):
+    for begin in (sights.start, _begin_of_light(scene, sights, points)):
         way = np.isfinite(begin + points).all(axis=-1, keepdims=True)
         ends = (np.where(way, end, 0.0) for end in (begin, points))
         first, last = (to_world(scene.camera, end) for end in ends)
@@ -339,15 +348,14 @@ def passed_by_grid(scene: Scene, views: Map, distances: Map) -> Map:
     return np.exp(-depth)
 
 
-def _begin_of_light(scene: Scene, points: Map) -> Map:
+def _begin_of_light(scene: Scene, sights: LinesOfSight, points: Map) -> Map:
     """Where the laser's light to points `[P, 3]` enters the water, or is emitted in it [m]; NaN where there is no
     way."""
     beam, port = scene.beam, laser_port(scene)
     laser, axis = np.array(beam.position), np.array(beam.axis)
     if beam.profile != "collimated":
-        if port is None:
-            return np.broadcast_to(laser, points.shape)
-        return port.enter(laser, port.connect(points, laser)[0])[0]
+        light, water, _ = sights.light_at(points)
+        return points - water[:, None] * light
     if port is None:
         return points - ((points - laser) @ axis)[:, None] * axis
     # Behind a flat port, see `_not_covered`, a parallel beam stays one.

@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.budgets import central_pixel
+from spadwarp.analytic.model import pixel_maps
 from spadwarp.device import pick_device
 from spadwarp.frames import Frames, detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, arrival_time
 from spadwarp.frames.response import FWHM_PER_SIGMA
 from spadwarp.result import Channel, Result, analyser_channel, merge
 from spadwarp.scene import Scene, noise_rate
+from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import depth_from_time, depth_per_time
 from spadwarp.transport import Progress, RunOptions, simulate, truth_maps
 from spadwarp.transport.reconstruction import known_light
@@ -52,7 +54,7 @@ class Pilot:
     pixels: int  # with a target
     unscattered: float  # detections of the target per pulse in the gate, without scattered light
     target: float  # the same with it
-    backscatter: float  # of backscatter
+    backscatter: float  # of backscatter, and of light that met the surface of a sea alone
     noise: float  # of dark counts and ambient light
     brightest: float  # of light in the brightest twentieth of the pixels, which noise does not choose
     bound: float  # Cramér–Rao bound of depth for one pulse [m]; for N pulses it is bound/√N
@@ -95,8 +97,15 @@ def window(scene: Scene, device: str | None = None) -> Scene:
 def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
     """The third of the pixels with a target whose unscattered light is nearest to the median: what is known of it
     without a photon does not choose pixels by their noise. bool `[H, W]`."""
-    light = known_light(scene, None, pick_device(device))[0].sum(axis=-1, dtype=np.float64)
-    light[np.isnan(truth_maps(scene, device=device).depth)] = np.nan
+    truth = truth_maps(scene, device=device)
+    if scene.surface is None:
+        light = known_light(scene, None, pick_device(device))[0].sum(axis=-1, dtype=np.float64)
+    else:
+        hit = {"distance": truth.range.ravel(), "normal": truth.normal.reshape(-1, 3)}
+        view, reflectance = pixel_directions(scene.camera).reshape(-1, 3), truth.reflectance.ravel()
+        maps, _ = pixel_maps(scene, view=view, **hit, reflectance=reflectance, device=device, outliers=False)
+        light = maps["signal"].reshape(truth.depth.shape)
+    light[np.isnan(truth.depth)] = np.nan
     off = np.abs(light - np.nanmedian(light))
     chosen = np.argsort(off, axis=None, kind="stable")[: max(1, np.isfinite(light).sum() // 3)]
     return np.isin(np.arange(light.size), chosen).reshape(light.shape)
@@ -149,7 +158,8 @@ def measure(
     halves = (merge(runs[0::2]), merge(runs[1::2])) if len(runs) > 2 else runs
     first, second = (analyser_channel(dataclasses.replace(run, scene=seen_by), channel) for run in halves)
     both = merge([first, second])
-    clear = dataclasses.replace(both, tallies=both.tallies * np.array([1, 0, 0])[:, None, None, None])
+    unscattered = np.arange(len(both.tallies)) == 0
+    clear = dataclasses.replace(both, tallies=both.tallies * unscattered[:, None, None, None])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SpadwarpWarning)  # the noise of the runs is judged here
         frames, clear_frames = (detect(run, pulses=1, seed=0, device=device) for run in (both, clear))
@@ -189,7 +199,7 @@ def measure(
         pixels=int(seen.sum()),
         unscattered=float(both.component("ballistic")[typical].sum(axis=-1).mean() * scale),
         target=float(returned.sum()),
-        backscatter=float(both.component("backscatter")[typical].sum(axis=-1).mean() * scale),
+        backscatter=float(_background(both)[typical].sum(axis=-1).mean() * scale),
         noise=float(np.median(noise_rate(both.scene, both.truth))) * (scene.gate.stop - scene.gate.start),
         brightest=_brightest(*(run.detections.sum(axis=-1, dtype=np.float64) for run in (first, second))),
         bound=bound,
@@ -247,6 +257,11 @@ def _return(signal: Floats, background: Floats, scene: Scene) -> tuple[Floats, F
     return peak, np.take_along_axis(background, near, axis=-1).mean(axis=-1) * bins_per_sigma
 
 
+def _background(result: Result) -> Floats:
+    """Light that met no target, `[H, W, T]`."""
+    return np.sum([result.component(name) for name in result.scene.components[2:]], axis=0, dtype=np.float64)
+
+
 class _Pool:
     """The mean over typical pixels of light `[H, W, T]`, whose bins are counted from each pixel's own true path; `[T]`.
     By whole bins: within a bin the run does not know where the light is."""
@@ -274,7 +289,7 @@ def _bounds(result: Result, runs: tuple[Result, Result], pool: _Pool, device: st
     signal, first, second = (
         pool(run.component("ballistic") + run.component("forward_scattered")) * scale for run in (result, *runs)
     )
-    light = result.component("backscatter") * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
+    light = _background(result) * scale + noise_rate(scene, result.truth) * scene.gate.bin_width
     options: dict[str, Any] = {
         "bin_width": scene.gate.bin_width,
         "irf": detector_response(scene.detector, scene.laser),

@@ -213,8 +213,8 @@ def plan(
     problem = ""
     if channel != "I" and not (scene.camera.channels if channel in POLARISED else channel in scene.tallied_channels):
         problem = f"channel = {channel!r} needs camera.polarisation = 'analyser' or 'stokes', or medium.inelastic"
-    elif not scene.has_straight_sight:
-        problem = "plan knows neither [surface] nor scan.mode = 'trajectory'; simulate and detect do"
+    elif scene.scan.mode == "trajectory":
+        problem = "plan knows no scan.mode = 'trajectory'; simulate and detect do"
     elif ranges is None:
         distance = truth_maps(scene, device=device).range
         if np.isnan(distance).all():

@@ -200,19 +200,12 @@ class PortGeometry:
     def spread(self, x: ArrayLike, u: ArrayLike, distance: float) -> float:
         """Irradiance across a ray from x inside along the unit vector u, for an intensity of 1 in clear water, where it
         has gone a distance beyond the port [1/m²]; by differences. 1/distance² without a port."""
-        x, u = np.asarray(x, np.float64), np.asarray(u, np.float64)
         start, direction, lead, _ = self.enter(x, u)
-        middle = start + (distance - lead) * direction
-        aside = np.linalg.svd(u[None])[2][1:]
-        step, sides = 1e-4, []
-        for axis in aside:
-            ends = []
-            for sign in (1.0, -1.0):
-                y, v, _, _ = self.enter(x, math.cos(step) * u + sign * math.sin(step) * axis)
-                ends.append(y + ((middle - y) @ direction / (v @ direction)) * v)
-            sides.append((ends[0] - ends[1]) / (2.0 * step))
-        area = float(np.linalg.norm(np.cross(sides[0], sides[1])))
-        return float(self.transmission(x, u)) / area
+        middle, step = start + (distance - lead) * direction, 1e-4 * distance
+        sides = step * np.linalg.svd(direction[None])[2][1:]
+        seen = self.connect(middle + np.concatenate([sides, -sides]), x)[0]
+        solid_angle = float(np.linalg.norm(np.cross(seen[0] - seen[2], seen[1] - seen[3])))
+        return float(self.transmission(x, u)) * solid_angle / (2.0 * step) ** 2
 
     def _to_face(self, x: Floats, u: Floats, outward: float) -> Floats:
         if self.shape == "flat":

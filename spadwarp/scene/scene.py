@@ -216,17 +216,7 @@ class Scene(Shown, Document):
                 yield f"{field}: cannot be combined with surface"
         if (threshold := self.transport.axis_threshold) < 1.0:
             yield f"transport.axis_threshold = {threshold} does not go with surface: set it to 1"
-        camera, beam = self.camera, self.beam
-        places = {"camera.position": camera.position, "laser.position": vector_of(to_world(camera, beam.position))}
-        normal = np.array(surface.normal) @ rotation_matrix(camera.rotation_deg)
-        wide = {"camera.position": (0.0 if camera.pinhole else camera.aperture_radius, np.array([0.0, 0.0, 1.0]))}
-        wide["laser.position"] = beam.beam_radius if beam.profile == "collimated" else 0.0, np.array(beam.axis)
-        for field, place in places.items():
-            radius, axis = wide[field]
-            height, reach = surface.height_of(place), radius * math.sqrt(max(1.0 - float(axis @ normal) ** 2, 0.0))
-            if abs(height) <= max(reach, 1e-6):
-                yield f"{field}: {height:.4g} m above the surface, which the lens or the beam, {reach:.4g} m, reaches"
-        if surface.is_flat and surface.height_of(camera.position) < 0.0:
+        if surface.is_flat and surface.height_of(self.camera.position) < 0.0:
             yield (
                 "surface.mean_square_slope = 0 does not go with a camera in the water: a flat surface seen from below "
                 "is a face of the domain with an outside_index"
@@ -296,7 +286,7 @@ class Scene(Shown, Document):
 
     @property
     def has_straight_sight(self) -> bool:
-        """Whether unscattered light has one known way, to a lens at rest: `spadwarp.reconstruct` and `plan` need it."""
+        """Whether unscattered light has one known way, to a lens at rest: `spadwarp.reconstruct` needs it."""
         return self.surface is None and self.scan.mode != "trajectory"
 
     @property

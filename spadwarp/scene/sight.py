@@ -191,27 +191,23 @@ class LinesOfSight:
 
 
 def lines_of_sight(scene: Scene, view: Floats | None = None) -> LinesOfSight:
-    """Lines of sight of a scene's pixels `[H, W]`, or those that leave the lens centre along unit vectors."""
-    port, laser = camera_port(scene), np.array(scene.beam.position, np.float64)
+    """Lines of sight of a scene's pixels `[H, W]`, of a scan by the sea each in the frame of its shot; or those that
+    leave the lens centre along unit vectors."""
+    port, beyond, laser = camera_port(scene), laser_port(scene), np.array(scene.beam.position, np.float64)
+    pose = None
     if view is None and scene.surface is not None and scene.scan.mode == "trajectory":
-        return _lines_of_shots(scene, port, laser)
+        shots = shots_of(scene)
+        axes = (rotation_matrix(scene.camera.rotation_deg).T @ shots.rotation)[shots.number]
+        pose = axes, to_camera(scene.camera, shots.position)[shots.number]
     view = view_directions(scene) if view is None else view
-    lines = _in_water(view) if port is None else port.enter(np.zeros(3), view)
-    beyond = laser_port(scene)
-    return LinesOfSight(*lines, laser, beyond, open=scene.surface is not None and None not in (port, beyond))
-
-
-def _lines_of_shots(scene: Scene, port: PortGeometry | None, laser: Floats) -> LinesOfSight:
-    """Lines of sight of a scan by the sea, each in the frame of its shot."""
-    shots, view = shots_of(scene), view_directions(scene)
-    turn = rotation_matrix(scene.camera.rotation_deg).T
-    axes, position = (turn @ shots.rotation)[shots.number], to_camera(scene.camera, shots.position)[shots.number]
-    lines = _in_water(view)
-    if port is not None:
-        start, along, *lengths = port.enter(position, np.einsum("hwij,hwj->hwi", axes, view))
-        lines = _turned_in(axes, start - position), _turned_in(axes, along), lengths[0], lengths[1]
-    beyond = laser_port(scene)
-    return LinesOfSight(*lines, laser, beyond, (axes, position), None not in (port, beyond))
+    if port is None:
+        lines = _in_water(view)
+    elif pose is None:
+        lines = port.enter(np.zeros(3), view)
+    else:
+        start, along, *lengths = port.enter(pose[1], np.einsum("hwij,hwj->hwi", pose[0], view))
+        lines = _turned_in(pose[0], start - pose[1]), _turned_in(pose[0], along), lengths[0], lengths[1]
+    return LinesOfSight(*lines, laser, beyond, pose, open=scene.surface is not None and None not in (port, beyond))
 
 
 def _turned_in(axes: Floats, vectors: Floats) -> Floats:

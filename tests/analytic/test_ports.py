@@ -213,7 +213,7 @@ def test_daylight_through_a_port_is_that_in_the_water_times_its_own_factor():
 
 
 def test_what_has_no_model_behind_a_port_is_refused_by_name():
-    with pytest.raises(ConfigError, match=r"analytic.form = 'lu2024' knows no camera.port or laser.port"):
+    with pytest.raises(ConfigError, match=r"analytic.form = 'lu2024' knows no port and no surface"):
         maps_of(ported(WINDOW, analytic={"form": "lu2024"}))
     beam = {"profile": "collimated", "beam_radius": 0.005}
     with pytest.raises(ConfigError, match="'collimated' does not stay parallel behind a dome"):
@@ -252,3 +252,22 @@ def test_depths_and_their_errors_follow_the_bent_rays_also_from_disk(tmp_path):
     stored = stored_depth(file)
     np.testing.assert_array_equal(stored.range, lines.range_from_depth(stored.values))
     assert gate_of(file) == pytest.approx(summary(one)["gate_range"], abs=0.02)
+
+
+@pytest.mark.slow
+def test_an_airborne_lidar_is_that_of_monte_carlo_without_scattering_or_with_one():
+    """The bottom's return and the water's of a bay in a breeze, spread by slopes on both ways, and the glint."""
+    bay = spadwarp.load_scene("bay_200m").with_overrides({"transport.max_collisions": 2})
+    result = maps_of(bay)
+    traced = spadwarp.simulate(bay, photons=1_000_000, seed=1, device="cpu")
+    scale = bay.laser.photons_per_pulse * bay.detections_per_photon
+    off_surface = result._table.cumulative[:, 1].reshape(result.signal.shape)  # a step before all else
+    modelled = {
+        "ballistic": result.signal,
+        "backscatter": result.backscatter * (1.0 - off_surface),
+        "surface": result.backscatter * off_surface,
+    }
+    for name, light in modelled.items():
+        found = traced.component(name).sum(axis=-1) * scale
+        for block in (np.s_[:, :], np.s_[3:5, 3:5]):  # all of the spread light, and its middle
+            assert light[block].sum() == pytest.approx(found[block].sum(), rel=0.03), name

@@ -7,7 +7,6 @@ import pytest
 from scipy.optimize import brentq
 
 import spadwarp
-import spadwarp_kernels as sk
 from helpers.scenes import scene
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.scene import mean_plane
@@ -15,6 +14,7 @@ from spadwarp.scene.sea import jonswap, peak_length
 from spadwarp.scene.sight import depth_from_time, lines_of_sight
 from spadwarp.transport import wave_errors
 from spadwarp.values import ConfigError, FileError
+from spadwarp_kernels.optics.sea import facet_covariance, unresolved_covariance
 
 BAY = {"surface": {"point": [0.0, 0.0, 3.0], "up": [0.0, 0.0, -1.0], "wind": 5.0}}
 BOTTOM = {"builtin": "plane", "size": [40.0, 40.0], "translation": [0.0, 0.0, 8.0], "reflectance": 0.4}
@@ -24,7 +24,6 @@ BOTTOM = {"builtin": "plane", "size": [40.0, 40.0], "translation": [0.0, 0.0, 8.
     ("sections", "text"),
     [
         ({"surface": {"wind": 5.0, "mean_square_slope": 0.01}}, "needs either wind or mean_square_slope"),
-        ({"surface": {"point": [0.0, 0.0, 0.0], "wind": 5.0}}, "camera.position: 0 m above the surface"),
         ({**BAY, "transport": {"axis_threshold": 0.99}}, "axis_threshold = 0.99 does not go with surface"),
         ({**BAY, "camera": {"port": {"distance": 0.1}}}, "camera.port, a table: cannot be combined with surface"),
         ({**BAY, "scan": {"mode": "confocal"}}, "scan.mode = 'confocal': cannot be combined with surface"),
@@ -87,12 +86,14 @@ def test_truth_has_targets_on_both_sides():
     np.testing.assert_allclose(depth[1, 1], 2.0, rtol=1e-5)
 
 
-def test_models_that_know_no_waves_refuse():
-    one = scene(**BAY, targets=[BOTTOM])
-    with pytest.raises(ConfigError, match="knows no surface of the sea"):
-        spadwarp.simulate_analytic(one, device="cpu")
-    with pytest.raises(ConfigError, match=r"plan knows neither \[surface\]"):
-        spadwarp.plan(one, device="cpu")
+def test_the_analytic_model_is_of_an_airborne_lidar():
+    for changes, text in (
+        ({"surface": {**BAY["surface"], "up": [0.0, 0.0, 1.0]}}, "camera and laser in the air"),
+        ({"laser": {"profile": "collimated", "beam_radius": 0.1}}, "and a diverging laser.profile"),
+        ({"targets": [{**BOTTOM, "translation": [0.0, 0.0, 2.0]}]}, "a target is seen before the"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            spadwarp.simulate_analytic(scene(**{**BAY, "targets": [BOTTOM], **changes}), device="cpu")
 
 
 def test_check_counts_the_way_in_the_water_alone():
@@ -159,14 +160,14 @@ def test_waves_go_with_the_wind():
     # A wave cos(k x - ω t) has the phase -ω t where fft's frequency is k.
     phase = np.angle(transform[1][k] / transform[0][k])
     np.testing.assert_allclose(phase, -0.05 * np.sqrt(9.81 * 2.0 * math.pi * k / 40.0), rtol=1e-6)
-    along = sk.facet_covariance(heights[0], (40.0, 40.0))
+    along = facet_covariance(heights[0], (40.0, 40.0))
     assert along[0, 0] > 20.0 * along[1, 1]
 
 
 def test_facets_keep_a_quarter_of_the_slopes():
     surface = waves_of(cells=256)
     field = surface.wave_field
-    rest = sk.unresolved_covariance(surface.slope_variances, (1.0, 0.0), field.heights, field.size)
+    rest = unresolved_covariance(surface.slope_variances, (1.0, 0.0), field.heights, field.size)
     assert 0.2 < rest[0, 0] / surface.slope_variances[0] < 0.3
 
 

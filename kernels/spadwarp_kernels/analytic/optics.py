@@ -13,7 +13,7 @@ from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
-from spadwarp_kernels.optics.port import DOME_PORT, FLAT_PORT, Port, PortKind, check_port
+from spadwarp_kernels.optics.port import DOME_PORT, FLAT_PORT, Connection, Port, PortKind, check_port
 
 __all__ = ["BACKSCATTER_SOURCES", "Lidar", "Ports", "make_optics"]
 
@@ -36,6 +36,7 @@ class Ports:
 
     camera: Port  # what the camera looks through
     laser: Port  # what the laser shines through
+    slope: wp.float64  # of a rough surface that both are, standard deviation of its slopes along an axis
 
 
 @wp.struct
@@ -94,6 +95,7 @@ class Optics(NamedTuple):
     """Warp functions for a camera and a laser, each in the water or behind a port."""
 
     kinds: tuple[PortKind | None, PortKind | None]  # of the ports of camera and laser; None: in the water
+    rough: bool  # whether these are the surface of a sea with slopes; `light` is then the mean over a pixel
     see: wp.Function  # (ports, view) -> SightRay of a pixel, from the unit vector in which the lens sees it
     beside: wp.Function  # (lidar, sight, x, a, b) -> point at the depth of x that is seen a and b pixels beside it
     footprint: wp.Function  # (lidar, distance) -> about the side of a pixel [m]
@@ -220,7 +222,15 @@ def _light_in_water(lidar: Lidar, x: wp.vec3d) -> LaserConnection:
     return light
 
 
-def _make_beam(kind: PortKind | None) -> tuple[wp.Function, ...]:
+@wp.func
+def facet_spread(port: Port, slope: wp.float64, c: Connection) -> wp.float64:
+    """Variance across a way through the surface of a sea, along an axis, of where its facets send it [m^2]."""
+    bend = port.index[0] / port.index[2] * wp.dot(c.inside, port.normal) - wp.dot(c.to_port, port.normal)
+    aside = slope * wp.float64(c.water * bend)
+    return aside * aside
+
+
+def _make_beam(kind: PortKind | None, rough: bool) -> tuple[wp.Function, ...]:
     """`Optics.spot` to `light` of a laser behind a kind of port, or in the water."""
     has_port, is_flat = kind is not None, kind == FLAT_PORT
     enter, leave, connect = (kind or FLAT_PORT).enter, (kind or FLAT_PORT).leave, (kind or FLAT_PORT).connect
@@ -278,7 +288,29 @@ def _make_beam(kind: PortKind | None) -> tuple[wp.Function, ...]:
         out.fluence = beam_fluence(lidar, -wp.normalize(wp.vec3d(c.inside)), ONE) * spread
         return out
 
-    return spot, emit, light_behind_port if has_port else _light_in_water
+    @wp.func
+    def light_by_facets(lidar: Lidar, x: wp.vec3d) -> LaserConnection:
+        """The mean over what the pixel that sees x gets its light from: the beam and the ways down and up are normal
+        distributions, the pixel a square."""
+        out = light_behind_port(lidar, x)
+        down = connect(lidar.ports.laser, wp.vec3(x), wp.vec3(lidar.laser))
+        up = connect(lidar.ports.camera, wp.vec3(x), wp.vec3(0.0))
+        if down.density > 0.0 and up.density > 0.0:
+            ratio = wp.float64(lidar.ports.laser.index[2] / lidar.ports.laser.index[0])
+            solid = ratio * ratio * wp.float64(down.density)  # angle at the laser over area at x
+            aside2 = facet_spread(lidar.ports.laser, lidar.ports.slope, down)
+            aside2 += facet_spread(lidar.ports.camera, lidar.ports.slope, up)
+            width = wp.sqrt(TWO * (wp.float64(0.25) * lidar.tan2 + solid * aside2))
+            side = lidar.pixel_tangent * wp.sqrt(wp.float64(down.density / up.density))
+            seen = -wp.vec3d(down.inside)
+            off = seen / wp.dot(seen, lidar.axis) - lidar.axis
+            out.fluence = solid * wp.float64(down.transmission)
+            for k in range(2):
+                share = wp.erf((off[k] + HALF * side) / width) - wp.erf((off[k] - HALF * side) / width)
+                out.fluence *= HALF * share / side
+        return out
+
+    return spot, emit, light_by_facets if rough else light_behind_port if has_port else _light_in_water
 
 
 # ---- Both.
@@ -411,22 +443,25 @@ def _make_illuminated(kinds: tuple[PortKind | None, PortKind | None], light: wp.
     return illuminated
 
 
-def make_optics(port: PortKind | None = None, laser_port: PortKind | None = None) -> Optics:
+def make_optics(port: PortKind | None = None, laser_port: PortKind | None = None, rough: bool = False) -> Optics:
     """The optics of a camera and a laser behind kinds of ports; None: in the water.
 
-    A collimated beam needs a flat port, behind which it stays one.
+    A collimated beam needs a flat port, behind which it stays one. `rough`: both ports are FLAT_PORT and the surface of
+    a sea, whose facets have `Ports.slope`; of a diverging laser along about the camera's axis.
     """
     for name, kind in {"port": port, "laser_port": laser_port}.items():
         if not isinstance(kind, PortKind | None):
             raise ArgumentError(f"{name} = {kind!r} is not a PortKind or None")
-    return _make_optics((port, laser_port))
+    if rough and (port, laser_port) != (FLAT_PORT, FLAT_PORT):
+        raise ArgumentError("rough = True needs FLAT_PORT as port and laser_port")
+    return _make_optics((port, laser_port), rough)
 
 
 @memoised
-def _make_optics(kinds: tuple[PortKind | None, PortKind | None]) -> Optics:
-    beam = _make_beam(kinds[1])
+def _make_optics(kinds: tuple[PortKind | None, PortKind | None], rough: bool) -> Optics:
+    beam = _make_beam(kinds[1], rough)
     ranges = _make_range_of_path(kinds[1]), _make_illuminated(kinds, beam[-1])
-    return Optics(kinds, *_make_camera(kinds[0]), *beam, *ranges)
+    return Optics(kinds, rough, *_make_camera(kinds[0]), *beam, *ranges)
 
 
 IN_WATER = make_optics()
@@ -476,8 +511,10 @@ def check_lidar(lidar: Any, optics: Any, view: Any, **columns: Any) -> tuple[Opt
     optics, _ = check_ports("lidar.ports", lidar.ports, optics)
     if optics is not IN_WATER and lidar.lu2024:
         raise ArgumentError("lidar.lu2024 = 1 is for a camera and a laser in the water, not for optics of ports")
-    if lidar.profile == 2 and optics.kinds[1] == DOME_PORT:
-        raise ArgumentError("lidar.profile = 2: a collimated beam does not stay one behind a dome")
+    if lidar.profile == 2 and (optics.kinds[1] == DOME_PORT or optics.rough):
+        raise ArgumentError("lidar.profile = 2: a collimated beam does not stay one behind a dome or a rough surface")
+    if optics.rough:
+        check.number("lidar.ports.slope", lidar.ports.slope, "(0, 1]")
     check.array("view", view, wp.vec3d, (None,))
     check.arrays(wp.float64, (view.shape[0],), view.device, **columns)
     return optics, view.shape[0], view.device

@@ -12,7 +12,7 @@ from spadwarp_kernels.base import check
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
 from spadwarp_kernels.base.native import HALF, ONE, PI, TWO, ZERO
 
-from .optics import IN_WATER, Lidar, Optics, SightRay, check_lidar, point_at
+from .optics import IN_WATER, Lidar, Optics, SightRay, check_lidar, least_range, point_at
 
 __all__ = ["signal_map", "single_scatter_table"]
 
@@ -73,7 +73,7 @@ def _beam_ray(lidar: Lidar, radial: wp.float64, azimuth: wp.float64):
 def make_radiometric_signal(optics: Optics) -> wp.Function:
     """The Warp function ``(lidar, sight, range, normal, reflectance)`` -> signal detections per pulse."""
     emit, receive, light_at, beside = optics.emit, optics.receive, optics.light, optics.beside
-    spot, footprint = optics.spot, optics.footprint
+    spot, footprint, rough = optics.spot, optics.footprint, optics.rough
 
     @wp.func
     def small_spot_signal(
@@ -112,10 +112,10 @@ def make_radiometric_signal(optics: Optics) -> wp.Function:
         light = light_at(lidar, x)
         if light.path <= ZERO:
             return ZERO
-        if spot(lidar, light.path) < TWO * footprint(lidar, sight.distance + distance):
+        if wp.static(not rough) and spot(lidar, light.path) < TWO * footprint(lidar, sight.distance + distance):
             return small_spot_signal(lidar, x, sight.view, normal, reflectance)
         fluence = light.fluence
-        if lidar.profile != 1:
+        if wp.static(not rough) and lidar.profile != 1:
             # A pixel on the rim of the beam is partly illuminated.
             corners_inside = wp.int32(0)
             for corner in range(4):
@@ -253,9 +253,10 @@ def phase_at(phase: wp.array[wp.float64], cos_theta: wp.float64) -> wp.float64:
 
 
 @memoised
-def make_single_scatter(optics: Optics) -> tuple[wp.Function, wp.Function, wp.Function]:
+def make_single_scatter(optics: Optics) -> tuple[wp.Function, wp.Function, wp.Function, wp.Function]:
     """Warp functions for single scattering seen through some optics: detections per pulse and metre of range [1/m],
-    C_back(t) without a target [1/s], and C_dark + C_back of a pixel i inside the gate [1/s]."""
+    C_back(t) without a target [1/s], and C_dark + C_back of a pixel i inside the gate [1/s]; and detections per pulse
+    of the light that the surface of a sea reflects."""
     light_at, range_of_path = optics.light, optics.range_of_path
 
     @wp.func
@@ -310,7 +311,27 @@ def make_single_scatter(optics: Optics) -> tuple[wp.Function, wp.Function, wp.Fu
         value = (ONE - w) * wp.float64(water.profile[row, k]) + w * wp.float64(water.profile[row, wp.min(k + 1, last)])
         return lidar.dark + value / lidar.bin_width
 
-    return single_scatter_per_metre, single_scatter_rate, background_rate
+    @wp.func
+    def glint(lidar: Lidar, sight: SightRay) -> wp.float64:
+        """By facets across the line of sight, along which the laser is taken to shine."""
+        s = least_range(sight)
+        light = light_at(lidar, point_at(sight, s))
+        path = light.path + s + sight.delay
+        if path < lidar.start * lidar.speed or path > lidar.stop * lidar.speed:
+            return ZERO
+        port = lidar.ports.camera
+        cosine = wp.dot(sight.view, wp.vec3d(port.normal))
+        cos2 = cosine * cosine
+        mss = TWO * lidar.ports.slope * lidar.ports.slope
+        facets = wp.exp((ONE - ONE / cos2) / mss) / (PI * mss * cos2 * cos2)
+        amplitude = wp.float64((port.index[2] - port.index[0]) / (port.index[2] + port.index[0]))
+        # Over what the surface transmits, and spreads, as the fluence below it is.
+        reflected = amplitude * amplitude / (ONE - amplitude * amplitude)
+        above = light.fluence * wp.dot(sight.u, wp.vec3d(port.normal)) / cosine
+        radiance = above * reflected * facets / (wp.float64(4.0) * cosine)
+        return lidar.photons * lidar.pde * radiance * collection(lidar, sight.view[2])
+
+    return single_scatter_per_metre, single_scatter_rate, background_rate, glint
 
 
 single_scatter_rate = make_single_scatter(IN_WATER)[1]
@@ -320,7 +341,7 @@ single_scatter_rate = make_single_scatter(IN_WATER)[1]
 @memoised
 def _make_table_kernel(optics: Optics) -> wp.Kernel:
     see, light_at, range_of_path, illuminated = optics.see, optics.light, optics.range_of_path, optics.illuminated
-    per_metre, *_ = make_single_scatter(optics)
+    (per_metre, *_, glint), rough = make_single_scatter(optics), optics.rough
 
     @wp.kernel(module="unique", module_options={"max_unroll": 1}, enable_backward=False)
     def table_kernel(
@@ -347,7 +368,7 @@ def _make_table_kernel(optics: Optics) -> wp.Kernel:
         far = wp.max(sight.distance + lit[1], near)
         # Gauss-Legendre of three nodes on panels of equal ln(distance from the lens): the rate falls as a power times
         # an exponential.
-        step = wp.log(far / near) / wp.float64(_PANELS)
+        step = wp.log(far / near) / wp.float64(wp.static(TABLE_EDGES - 1 - int(rough)))
         offset = wp.float64(0.7745966692414834)
         half = HALF * step
         sum = wp.float64(0.0)
@@ -356,7 +377,10 @@ def _make_table_kernel(optics: Optics) -> wp.Kernel:
         for k in range(paths.shape[1]):
             s = r - sight.distance
             paths[i, k] = float(light_at(lidar, point_at(sight, s)).path + s + sight.delay)
-            if k < _PANELS:
+            if wp.static(rough) and k == 0:
+                sum = glint(lidar, sight)  # a panel of its own, without width
+                cumulative[i, 1] = float(sum)
+            elif k < _PANELS:
                 mid = r * wp.exp(half)
                 low = mid * wp.exp(-offset * half)
                 high = mid * wp.exp(offset * half)

@@ -6,7 +6,7 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.native import from_bits
 from spadwarp_kernels.base.philox import join_words, u01, u01_fine, u01_high, u01_low
 from spadwarp_kernels.base.rotations import cotangent, one_minus_cosine, snap_from
-from spadwarp_kernels.optics.camera import Camera, lens_point
+from spadwarp_kernels.optics.camera import lens_point
 from spadwarp_kernels.optics.sea import FACETS, passage_density
 from spadwarp_kernels.optics.visibility import Link, lens_in_air
 from spadwarp_kernels.photon.queue import Request
@@ -177,32 +177,6 @@ class ScoredPoint:
     ahead: float  # of `scores_collisions`, length of the flight up to there that the weight does not account for [m]
 
 
-@memoised
-def make_ask_at_sea(waves: bool) -> wp.Function:
-    """The Warp function ``(s, world) -> Request`` of a photon at the surface of a sea, for all that the surface sends
-    to the lens, but for what `Sight.link` finds from the event before: transmitted light of events that scatter.
-    `waves`: the event before may have been at the surface, too."""
-
-    @wp.func
-    def ask_at_sea(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
-        q = Request()
-        q.wanted = lens_in_air(world.camera) == s.above or s.collisions == 0
-        if wp.static(waves):
-            q.wanted = q.wanted or s.bounces.leg > 1
-        q.x = s.x
-        q.u = s.u
-        q.weight = s.weight.value
-        q.path = s.path
-        q.first = s.flight.block[3]
-        q.rounding_sample = s.flight.block[2]
-        q.slot = SEA_SLOT
-        q.target = s.target
-        q.component = sea_component(s, s.collisions - s.bounces.count + 1)
-        return q
-
-    return ask_at_sea
-
-
 @wp.func
 def sea_component(s: wp.ref[PhotonState], scatterings: int) -> int:
     """The component of light after so many collisions and targets, which the surface of a sea is none of."""
@@ -211,11 +185,29 @@ def sea_component(s: wp.ref[PhotonState], scatterings: int) -> int:
     return wp.where(scatterings == 0, SURFACE, component)
 
 
+@wp.func
+def ask_at_sea(s: wp.ref[PhotonState], world: wp.ref[World], waves: bool) -> Request:
+    """Of a photon at the surface of a sea, for all that the surface sends to the lens, but for what `Sight.link` finds
+    from the event before: transmitted light of events that scatter. `waves`: that may have been at the surface, too."""
+    q = Request()
+    q.wanted = lens_in_air(world.camera) == s.above or s.collisions == 0 or (waves and s.bounces.leg > 1)
+    q.x = s.x
+    q.u = s.u
+    q.weight = s.weight.value
+    q.path = s.path
+    q.first = s.flight.block[3]
+    q.rounding_sample = s.flight.block[2]
+    q.slot = SEA_SLOT
+    q.target = s.target
+    q.component = sea_component(s, s.collisions - s.bounces.count + 1)
+    return q
+
+
 @memoised
 def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Function:
     """The Warp function ``(s, world) -> Request`` of the event that the photon has come to."""
     sight, reflects, sea = spec.sight, spec.domain.reflects, spec.sight.sea is not None
-    ask_at_sea, tracks, rides = make_ask_at_sea(spec.waves), spec.water.profile is not None, make_rider(spec).rides
+    tracks, rides = spec.water.profile is not None, make_rider(spec).rides
 
     @wp.func
     def event_request(s: wp.ref[PhotonState], world: wp.ref[World]) -> Request:
@@ -253,7 +245,7 @@ def make_event_request(spec: TransportSpec, flights: bool = False) -> wp.Functio
                         q.component = BACKSCATTER
         if wp.static(sea):
             if s.bounces.face == SEA_FACE:
-                q = ask_at_sea(s, world)
+                q = ask_at_sea(s, world, wp.static(spec.waves))
                 if wp.static(rides):
                     q.carried = s.carried
             q.second = s.flight.block[1]  # of the direction to come
@@ -378,22 +370,6 @@ def make_scattering(spec: TransportSpec) -> wp.Function:
 
 
 @memoised
-def _make_hidden_by_waves(spec: TransportSpec) -> wp.Function:
-    """The Warp function ``(camera, x, o, link, target, world) -> bool``: whether waves stand in the way of a link from
-    x to o, in the frame of the camera."""
-    waves, sea_at = spec.waves, spec.sight.sea_at
-    is_clear = spec.sight.clear or sea_at  # any function: it is not called
-
-    @wp.func
-    def hidden_by_waves(camera: Camera, x: wp.vec3, o: wp.vec3, link: Link, target: int, world: wp.ref[World]) -> bool:
-        if wp.static(waves):
-            return link.gather > 0.0 and not is_clear(camera, sea_at(world.sea, world.scan, target), x, o, link)
-        return False
-
-    return hidden_by_waves
-
-
-@memoised
 def _make_carry(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(found, request, link, world, inside)``: what rides along with light of a request goes by the
     link to the lens, where it arrives along `inside`, of any length."""
@@ -429,7 +405,7 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
     reflects, collides, water = spec.domain.reflects, flights and spec.scores_collisions, spec.water
     flight_point, scattering_density = make_flight_point(spec), make_scattering(spec)
     sight, pose, sea, rider = spec.sight, spec.sight.pose, spec.sight.sea is not None, make_rider(spec)
-    is_hidden, carry = _make_hidden_by_waves(spec), _make_carry(spec)
+    carry = _make_carry(spec)
 
     @wp.func
     def score(request: Request, world: wp.ref[World]) -> Scored:
@@ -459,13 +435,14 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
             bits = join_words(request.second, request.first)
         origin = pose.point_in(world.scan, request.target, found.origin)
         camera = sight.camera_at(world.camera, world.scan, request.target)
-        link = sight.link(camera, sight.sea_at(world.sea, world.scan, request.target), origin, lens, at_sea, bits)
+        surface = sight.sea_at(world.sea, world.scan, request.target)
+        link = sight.link(camera, surface, origin, lens, at_sea, bits)
         to_lens = pose.turn_out(world.scan, request.target, link.to_lens)
         found.lens = pose.point_out(world.scan, request.target, link.end)
         found.behind = pose.point_out(world.scan, request.target, lens)
         pixel = sight.project(world.camera, view, request.target, link.image, lens)
         scattering = scattering_density(request, found.origin, to_lens, world)
-        if pixel >= 0 and not scattering <= 0.0 and not is_hidden(camera, origin, lens, link, request.target, world):
+        if pixel >= 0 and not scattering <= 0.0 and sight.clear(camera, surface, origin, lens, link):
             seed = join_words(request.second, request.first)
             if wp.static(collides):
                 # The flight up to the point and the way to the lens by one loop: the code is long.

@@ -28,11 +28,9 @@ __all__ = [
     "Sea",
     "SeaKind",
     "Waves",
-    "facet_covariance",
     "make_sea",
     "see_through_waves_kernel",
     "slope_variances",
-    "unresolved_covariance",
 ]
 
 _INV_PI = wp.constant(0.3183098861837907)
@@ -576,15 +574,8 @@ def slope_variances(wind: float, *, by_direction: bool = False) -> tuple[float, 
 
 
 def facet_covariance(heights: ArrayLike, size: Sequence[float]) -> NDArray[np.float64]:
-    """Mean squares and product of the slopes of a periodic height field along its rows and from row to row, `[2, 2]`.
-
-    Args:
-        heights: Of the nodes [m], `[rows, columns]`, at least 2 of each.
-        size: Length of a row and of a column, the periods [m].
-
-    Raises:
-        ArgumentError: Heights that are no such array, or no numbers.
-    """
+    """Mean squares and product of the slopes of a periodic height field along its rows and from row to row, `[2, 2]`;
+    arguments: see `make_sea`."""
     (a, a_next), (b, b_next) = _edges(_checked(heights, size), size)
     squares = [(p * p + p * q + q * q).mean() / 3.0 for p, q in ((a, a_next), (b, b_next))]
     product = (0.25 * (a + a_next) * (b + b_next)).mean()
@@ -600,16 +591,10 @@ def _edges(h: NDArray[np.float64], size: Sequence[float]) -> list[tuple[NDArray[
 def unresolved_covariance(
     variances: Sequence[float], along: Sequence[float], heights: ArrayLike, size: Sequence[float]
 ) -> NDArray[np.float64]:
-    """Covariance of the slopes of a sea that a height field leaves to facets, along its rows and from row to row,
-    `[2, 2]`.
+    """Covariance of the slopes that a height field leaves to facets, along its rows and from row to row, `[2, 2]`.
 
-    Args:
-        variances: Of all slopes, along and across the wind, see `slope_variances`.
-        along: Components of the wind's direction along the rows and from row to row; any length but 0.
-        heights, size: See `facet_covariance`.
-
-    Raises:
-        ArgumentError: Less than a tenth of the variance on an axis is left, or a number is out of its range.
+    `along`: the wind's direction along both, of any length; else as in `make_sea`. Raises `ArgumentError` where less
+    than a tenth of the variance on an axis is left.
     """
     resolved = facet_covariance(heights, size)
     wind = np.array(along, np.float64) / math.hypot(*along)
@@ -650,9 +635,9 @@ def make_sea(
         along: Direction in which the wind blows, of any length, not along the normal.
         delay: Group index of the air over that of the water.
         extinction: Of the air [1/m].
-        heights: Of resolved waves above the plane, see `facet_covariance`, for `TransportSpec.sea` = WAVES. Facets
-            about them then hold the rest of the variances, see `unresolved_covariance`.
-        size: Length of a row of the heights and of a column [m].
+        heights: Of resolved waves above the plane [m], `[rows, columns]`, at least 2 of each, for `TransportSpec.sea` =
+            WAVES. The field is periodic; facets about it hold the rest of the variances, see `unresolved_covariance`.
+        size: Length of a row of the heights and of a column, the periods [m].
         columns: Direction along a row, of any length, not along the normal; default: that of the wind.
         origin: A point above or below the first node [m].
         device: Where the heights are stored.

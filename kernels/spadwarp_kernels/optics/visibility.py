@@ -335,7 +335,7 @@ class Sight(NamedTuple):
     sea_at: wp.Function
     sea: SeaKind | None  # what surface of a sea there is
     # ``(camera, sea, x, o, link) -> bool``, whether no wave of it stands in the way of a link from x to o
-    clear: wp.Function | None
+    clear: wp.Function
 
 
 @wp.func
@@ -486,16 +486,21 @@ def _make_sea_link(sea: SeaKind) -> wp.Function:
     return link_to
 
 
+@wp.func
+def _always_clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
+    return True
+
+
 @memoised
-def _make_clear(sea: SeaKind) -> wp.Function | None:
+def _make_clear(sea: SeaKind) -> wp.Function:
     """See `Sight.clear`. A way by the surface is followed from there to both ends: to the surface it would end there by
     rounding, or not."""
-    if sea.name != WAVES.name:
-        return None
     distance = sea.distance
 
     @wp.func
     def clear(camera: Camera, sea: Sea, x: wp.vec3, o: wp.vec3, link: Link) -> bool:
+        if link.gather <= 0.0:
+            return False
         in_air = lens_in_air(camera)
         rest = o - link.end
         length = wp.length(rest)
@@ -598,5 +603,5 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind |
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
     pose = make_pose(moves)
     placed = _make_placed(pose, moves and sea is not None, waves)
-    clear = _make_clear(sea) if sea else None
+    clear = _make_clear(sea) if sea and waves else _always_clear
     return Sight(cosines, *imaging, *view, may_hide, *ways, make_sample_lens(port), pose, *placed, sea, clear)

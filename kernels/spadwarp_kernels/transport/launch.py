@@ -258,10 +258,8 @@ def _light_needs(spec: TransportSpec, model: Model) -> Needs:
         check_camera("model.camera", camera, calibrated=spec.lens.name != PLAIN.name)
         yield "gate", {"bins": "[1, inf)", "start": "(-inf, inf)", "bins_per_metre": "(0, inf)"}
         yield "gate", {"stop": f"({float(model.gate.start)}, inf)"}
-        if spec.sea:
-            check_port("model.camera.port", camera.port, FLAT_PORT)
-        if spec.port is not None:
-            check_port("model.camera.port", camera.port, spec.port)
+        if (port := FLAT_PORT if spec.sea else spec.port) is not None:
+            check_port("model.camera.port", camera.port, port)
     if estimator.cross is not None:
         yield "camera", {"aperture_radius": "(0, inf)"}
     if estimator.direct is not None:

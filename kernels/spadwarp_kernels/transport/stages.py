@@ -216,16 +216,12 @@ def make_fly(
         seed = join_words(s.flight.block[0], s.flight.block[2])
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
         s.flight.distance = spec.water.free_path(world.medium, world.layers, s.x, s.u, xi, seed)
+        limit = world.limits.max_path - s.path
         if wp.static(sea):
-            limit = world.limits.max_path - s.path
-            if s.above:
-                limit /= world.sea.delay
+            limit = wp.where(s.above, limit / world.sea.delay, limit)
             s.flight.sea = surface.distance(world.sea, s.x, s.u, s.above, limit)
             s.flight.distance = wp.min(wp.where(s.above, 1.0e30, s.flight.distance), s.flight.sea)
-        s.flight.reach = wp.min(s.flight.distance, world.limits.max_path - s.path)
-        if wp.static(sea):
-            if s.above:
-                s.flight.reach = wp.min(s.flight.distance, (world.limits.max_path - s.path) / world.sea.delay)
+        s.flight.reach = wp.min(s.flight.distance, limit)
         if wp.static(plans):
             if wp.static(cuda):
                 s.flight.sample_block = random_block_keyed(draws.keys, id, event, STREAM_FLIGHT_SAMPLE)
@@ -338,10 +334,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
         if wp.static(chosen):
             reweigh(s.weight, s.flight.factor)
             s.directed += s.weight.taken
-        in_water = float(c.distance)
-        if wp.static(sea):
-            in_water = wp.where(s.above, 0.0, in_water)
-        rider.fly(s.carried, world, s.x, s.u, in_water)
+        rider.fly(s.carried, world, s.x, s.u, wp.where(s.above, 0.0, c.distance))
         if wp.static(tallies_flux):
             score_flux(s, world, sink, c.distance, c.reason < 0 and c.mirror == 0 and s.hit.face < 0)
         s.x = s.x + c.distance * s.u
@@ -374,7 +367,6 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
     """The Warp function ``(s, world, sink)``: what a photon brings that flies through the aperture itself, if an
     estimator says so, with what rides along."""
     crosses, sight, pose, rider = cross is not None, spec.sight, spec.sight.pose, make_rider(spec)
-    sea = sight.sea is not None
 
     @wp.func
     def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
@@ -387,10 +379,7 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
                     x, u = pose.point_in(world.scan, s.target, s.x), pose.turn_in(world.scan, s.target, s.u)
                     passage = sight.leave(world.camera, x, u)
                     rider.fork(carried, world)
-                    in_water = float(passage.water)
-                    if wp.static(sea):
-                        in_water = wp.where(s.above, 0.0, in_water)
-                    rider.fly(carried, world, s.x, s.u, in_water)
+                    rider.fly(carried, world, s.x, s.u, wp.where(s.above, 0.0, passage.water))
                     rider.deliver(c, carried, world, s.x, s.u, passage.u)
             if not c.value <= 0.0:
                 s.contributions += 1

@@ -9,7 +9,7 @@ import warp as wp
 import spadwarp_kernels as sk
 from helpers.launch import launched, unit
 from spadwarp_kernels.optics.port import Port
-from spadwarp_kernels.optics.sea import facet_at, waves_distance
+from spadwarp_kernels.optics.sea import facet_at, facet_covariance, waves_distance
 
 SIZE, INDEX = 4.0, 1.34
 COLUMNS, ROWS = unit(np.array([1.0, 0.3, 0.0])), unit(np.array([-0.3, 1.0, 0.0]))
@@ -91,7 +91,7 @@ def test_facets_hold_what_the_waves_leave():
     heights, rng = ripples(), np.random.default_rng(3)
     x = ORIGIN + rng.uniform(0.0, SIZE, (200_000, 1)) * COLUMNS + rng.uniform(0.0, SIZE, (200_000, 1)) * ROWS
     slopes = field_at(heights, x)[1]
-    covariance = sk.facet_covariance(heights, (SIZE, SIZE))
+    covariance = facet_covariance(heights, (SIZE, SIZE))
     np.testing.assert_allclose(slopes.T @ slopes / len(x), covariance, atol=4e-4)
     sea = sea_of(heights)
     assert np.hypot(*slopes.T).max() == pytest.approx(sea.waves.steepest, rel=0.03)
@@ -116,7 +116,7 @@ def test_ways_through_waves_to_the_lens(aside, depth):
     """In the mean the integral over the field by its own grid; from the crest of a wave, above the mean plane, too."""
     heights = ripples(0.005)
     sea, count = sea_of(heights, mss=0.03), 400
-    covariance = np.diag([0.015, 0.015]) - sk.facet_covariance(heights, (SIZE, SIZE))
+    covariance = np.diag([0.015, 0.015]) - facet_covariance(heights, (SIZE, SIZE))
     values, vectors = np.linalg.eigh(covariance)
     o, crest = np.array([0.0, 0.0, 2.3]), ORIGIN + np.argmax(heights.max(axis=0)) * SIZE / 32 * COLUMNS
     crest = crest + np.argmax(heights[:, np.argmax(heights.max(axis=0))]) * SIZE / 32 * ROWS
