@@ -603,7 +603,7 @@ def same_targets(a: Truth, b: Truth) -> bool:
 _BLOCK = re.compile(r"\[(\d+),(\d+),(\d+)\]")
 
 
-class _Cube(NamedTuple):
+class Cube(NamedTuple):
     """Tallies of light or of a derivative by component, their unit, and their second moment, if there is one."""
 
     tallies: NDArray[np.int64]
@@ -611,22 +611,22 @@ class _Cube(NamedTuple):
     second_moment: Any
 
 
-def _cubes_of(result: Result, group: str) -> dict[str, _Cube]:
+def cubes_of(result: Result, group: str) -> dict[str, Cube]:
     """Of derivatives or of the camera's channels, by name; the channel "I" is the histogram."""
-    found, cubes = signed_of(result).get(group), dict[str, _Cube]()
+    found, cubes = signed_of(result).get(group), dict[str, Cube]()
     if group == "channels" and "I" in result.scene.camera.channels:
-        cubes["I"] = _Cube(result.tallies, result.unit, result.second_moment)
+        cubes["I"] = Cube(result.tallies, result.unit, result.second_moment)
     if found is not None:
         moments = [None] * len(found.names) if found.second_moment is None else found.second_moment.swapaxes(0, 1)
         parts = zip(found.names, found.tallies, found.units, moments, strict=True)
-        cubes |= {name: _Cube(*cube) for name, *cube in parts}
+        cubes |= {name: Cube(*cube) for name, *cube in parts}
     for one in result.scene.medium.inelastic if group == "channels" else ():
         if one.decay_time_ns > 0.0 and one.process in cubes:
             cubes[one.process] = _decayed(cubes[one.process], one.decay_time_ns * 1e-9 / result.scene.gate.bin_width)
     return cubes
 
 
-def _decayed(cube: _Cube, bins: float) -> _Cube:
+def _decayed(cube: Cube, bins: float) -> Cube:
     """Light given off after an exponential time, `bins` on average, if all bins are lit evenly."""
     from scipy.signal import lfilter
 
@@ -634,7 +634,7 @@ def _decayed(cube: _Cube, bins: float) -> _Cube:
     first = 1.0 - bins * (1.0 - rest)  # what is left in its own bin; of each later one `rest` of that before
     later = bins * (1.0 - rest) ** 2
     light = lfilter([first, later - first * rest], [1.0, -rest], cube.tallies.astype(np.float64), axis=-1)
-    return _Cube(np.rint(light).astype(np.int64), cube.unit, None)
+    return Cube(np.rint(light).astype(np.int64), cube.unit, None)
 
 
 class _SignedValues(Mapping[str, Floats]):
@@ -643,7 +643,7 @@ class _SignedValues(Mapping[str, Floats]):
 
     def __init__(self, result: Result, group: str, *, errors: bool = False) -> None:
         self._result, self._group, self._errors = result, group, errors
-        cubes = _cubes_of(result, group)
+        cubes = cubes_of(result, group)
         self._cubes = {name: one for name, one in cubes.items() if not errors or one.second_moment is not None}
 
     def __iter__(self) -> Iterator[str]:
@@ -797,7 +797,7 @@ def analyser_channel(result: Result, channel: Channel) -> Result:
         raise ConfigError(f"channel = {channel!r}: {problem}", source=result.scene.source)
     tallies, unit = _channel_tallies(result, channel)
     lines_left_out = result.scene.with_overrides({"medium.inelastic": []})  # light of another wavelength alone comes
-    cube = _cubes_of(result, "channels").get(channel)
+    cube = cubes_of(result, "channels").get(channel)
     moments = None if cube is None or cube.second_moment is None else cube.second_moment.copy()
     return replace(
         result,
@@ -824,7 +824,7 @@ def pixel_channel(result: Result, channel: Channel, row: int, column: int) -> Fl
 
 def _channel_tallies(result: Result, channel: Channel, at: tuple[Any, ...] = ()) -> tuple[NDArray[np.int64], float]:
     """Tallies of co- or cross-polarised light, or a part of them, and their unit."""
-    cubes, camera = _cubes_of(result, "channels"), result.scene.camera
+    cubes, camera = cubes_of(result, "channels"), result.scene.camera
     if channel in cubes:
         return np.maximum(cubes[channel].tallies[at], 0), cubes[channel].unit
     leak, angle = 1.0 / camera.analyser_extinction_ratio, 2.0 * math.radians(camera.analyser_angle_deg)
@@ -867,7 +867,7 @@ def _polarisation_summary(result: Result) -> dict[str, Any]:
 
 def _sums(result: Result, axes: tuple[int, ...]) -> dict[str, Floats]:
     """Channel → its light, times the photons."""
-    cubes = _cubes_of(result, "channels").items()
+    cubes = cubes_of(result, "channels").items()
     return {name: cube.tallies.sum(axis=axes, dtype=np.float64) * cube.unit for name, cube in cubes}
 
 

@@ -308,6 +308,7 @@ class Medium(PhaseLaw, Water):
     layer_axis: Direction = field((0.0, 0.0, 1.0), "direction across the layers, in the world; not 0")
     grid: Grid | None = field(None, "water that varies within a box, cell by cell; not with layers")
     _molecular_share: float = PrivateAttr(0.0)
+    _beside: tuple[Medium, ...] = PrivateAttr(())
 
     @field_validator("phase_index", "group_index", mode="before")
     @classmethod
@@ -432,6 +433,23 @@ class Medium(PhaseLaw, Water):
         Known with chlorophyll, 0 without it; 0 with layers too, which share one phase function.
         """
         return self._molecular_share
+
+    @property
+    def particle_scattering(self) -> float:
+        """The scattering less that of molecules beside `phase_function` [1/m]."""
+        return self.scattering * (1.0 - self.molecular_share)
+
+    @property
+    def beside(self) -> tuple[Medium, ...]:
+        """The medium at wavelengths whose light rides on the same photons, see `Medium.with_beside`; at most 4."""
+        return self._beside
+
+    def with_beside(self, media: Sequence[Medium]) -> Medium:
+        """The medium whose photons carry light of other wavelengths, with these media, as well: a run has a channel for
+        each, "line 1" and so on."""
+        medium = self.model_copy()
+        medium._beside = tuple(media)
+        return medium
 
     @property
     def phase_functions(self) -> list[PhaseFunction]:

@@ -292,7 +292,8 @@ class Scene(Shown, Document):
     @property
     def tallied_channels(self) -> tuple[str, ...]:
         """Channels with tallies of their own: of polarised light, or of light at other wavelengths."""
-        return (*self.camera.tallied_channels, *(one.process for one in self.medium.inelastic))
+        others = (one.process for one in self.medium.inelastic)
+        return (*self.camera.tallied_channels, *others, *(f"line {k + 1}" for k in range(len(self.medium.beside))))
 
     @property
     def polarised(self) -> bool:

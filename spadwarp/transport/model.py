@@ -29,6 +29,7 @@ from spadwarp.scene.sight import lines_of_sight, scan_axes, view_directions, wit
 from spadwarp.transport.derivatives import derivative_kinds, make_derivatives
 from spadwarp.transport.plan import tally_limits
 from spadwarp.values import ArgumentError, ConfigError, DeviceError
+from spadwarp.water.seawater import WATER_DEPOLARISATION
 
 __all__ = ["points_per_flight", "target_map", "truth_maps", "wave_errors"]
 
@@ -88,8 +89,8 @@ def build_model(
         parts["sea"] = sea
     if scene.polarised:
         parts |= _polarised(scene, mesh, scale, device)
-    if scene.medium.inelastic:
-        parts |= _inelastic(scene, scale, device)
+    if scene.medium.inelastic or scene.medium.beside:
+        parts |= _lines(scene, scale, device)
     if camera and scene.flux:
         parts["flux"] = _flux(scene, device)
     model = sk.Model(
@@ -295,7 +296,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         derivatives=kinds,
         blocks=by_block,
         polarised=scene.polarised,
-        inelastic=bool(scene.medium.inelastic),
+        lines=bool(scene.medium.inelastic or scene.medium.beside),
         # Those of a scene go with its own estimator.
         points=1 if "estimator" in choices else points_per_flight(scene, kinds, by_block),
         channels=len(scene.tallied_channels),
@@ -528,13 +529,29 @@ def _polarised(scene: Scene, mesh: TriangleMesh | None, scale: float, device: wp
     return {"polarisation": light, "derivatives": tallies}
 
 
-def _inelastic(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
-    """Lines of inelastic scattering, and a tally of each, finer than the histogram by as much as it holds less: at most
-    as much as inelastic scattering is of elastic by any one angle."""
+def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
+    """Light of other wavelengths, and a tally of each. That of inelastic scattering is finer than the histogram by as
+    much as it holds less: at most as much as inelastic scattering is of elastic by any one angle."""
     water, wavelength = scene.medium, scene.laser.wavelength_nm
+    if count := len(water.beside):
+        # Of their molecules what their scattering by the medium's law has not; the law of both is that of the medium.
+        again = [one.particle_scattering / water.particle_scattering for one in water.beside]
+        molecules = [one.scattering - one.particle_scattering for one in (water, *water.beside)]
+        found = sk.make_lines(
+            [own - part * molecules[0] for own, part in zip(molecules[1:], again, strict=True)],
+            [(1.0 - WATER_DEPOLARISATION) / (1.0 + WATER_DEPOLARISATION)] * count,
+            [one.extinction for one in water.beside],
+            [part * water.scattering for part in again],
+            [1.0] * count,
+            medium=_medium(scene, device),
+            elastic=True,
+            delay=[one.group_index / water.group_index for one in water.beside],
+        )
+        tallies = sk.make_derivatives([], [], [scale] * count, channels=count, device=device)
+        return {"lines": found, "derivatives": tallies}
     lines, least = water.inelastic, float(phase_function(water).density(np.linspace(0.01, math.pi, 500)).min())
     scattering = [water.scattering if one.scattering is None else one.scattering for one in lines]
-    found = sk.make_inelastic(
+    found = sk.make_lines(
         [one.source(wavelength) for one in lines],
         [one.anisotropy for one in lines],
         [one.absorption + b for one, b in zip(lines, scattering, strict=True)],
@@ -544,7 +561,7 @@ def _inelastic(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
     )
     parts = [one.passed * one.source(wavelength) / (4.0 * math.pi * water.scattering * least) for one in lines]
     scales = [scale / 2.0 ** math.floor(math.log2(max(part, 1e-12))) for part in parts]
-    return {"inelastic": found, "derivatives": sk.make_derivatives([], [], scales, channels=len(lines), device=device)}
+    return {"lines": found, "derivatives": sk.make_derivatives([], [], scales, channels=len(lines), device=device)}
 
 
 def _emitted_stokes(laser: Laser) -> tuple[float, float, float, float]:

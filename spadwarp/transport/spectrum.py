@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from spadwarp.io.hdf5 import Coordinate, name_dimensions, write_hdf5
 from spadwarp.result import Result
-from spadwarp.result.result import coordinates_of
+from spadwarp.result.result import Cube, coordinates_of, cubes_of
 from spadwarp.scene import Scene, SceneLike, as_scene, spectral_lines
 from spadwarp.transport.simulation import simulate
 from spadwarp.values import ArgumentError, ConfigError, check_choice, check_real
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["Spectrum", "simulate_spectrum"]
 
 _MOST_LINES = 64
+_MOST_TOGETHER = 5  # the kernels take four lines beside that of the photons
+_MOST_APART = 1.0  # optical depths of path between lines that share photons
 _CUBE = ("wavelength", "component", "y", "x", "time")
 _ARRAYS = {
     "share": (("wavelength",), "1", "photons of the laser that are of this line and pass the filter"),
@@ -154,10 +156,66 @@ def simulate_spectrum(
     if scene.detector.filter_fwhm_nm is not None and scene.detector.filter_centre_nm is None:
         changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
     options = {"mesh_cache": {}, **options} if options.get("engine") is None else options
-    lines = {one: scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)}
+    left = [scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)]
     results = dict[float, Result]()
-    for wavelength, line in lines.items():
-        results[wavelength] = simulate(line, **options)
-        if results[wavelength].partial:
+    while left:
+        # As many neighbours as ride on the photons of the one in their middle.
+        sizes = range(min(len(left), _MOST_TOGETHER), 0, -1) if _options_allow(options) else (1,)
+        size = next(size for size in sizes if size == 1 or _ride_together(left[:size]))
+        group, left = left[:size], left[size:]
+        found = _simulate_together(group, **options) if size > 1 else [simulate(group[0], **options)]
+        if any(one.partial for one in found):
             raise KeyboardInterrupt
+        results |= {line.laser.wavelength_nm: one for line, one in zip(group, found, strict=True)}
     return Spectrum(scene, MappingProxyType(results))
+
+
+def _options_allow(options: Mapping[str, Any]) -> bool:
+    return all(options.get(name) is None for name in ("derivatives", "blocks", "tallies"))
+
+
+def _ride_together(lines: Sequence[Scene]) -> bool:
+    """Whether photons of the line in the middle carry the light of all: they differ in coefficients of one water alone,
+    and by less than one optical depth over the longest path, beyond which weights become so uneven that a run of its
+    own is worth its time."""
+    one = lines[len(lines) // 2]
+    medium = one.medium
+    if medium.varies or medium.inelastic or medium.albedo == "lu2024" or one.polarised or one.surface or one.flux:
+        return False
+    if one.camera.port or one.laser.port or one.domain.reflecting or one.transport.max_path is not None:
+        return False
+    coloured = any(target.reflectance == "from_file" for target in one.targets)
+    if coloured or one.transport.estimator == "none" or medium.particle_scattering <= 0.0:
+        return False
+    apart = max(abs(line.medium.extinction - medium.extinction) for line in lines)
+    return apart * one.path_limit <= _MOST_APART
+
+
+def _simulate_together(lines: Sequence[Scene], **options: Any) -> list[Result]:
+    """Runs of lines on the photons of the one in the middle, whose energy balance and counters all have."""
+    middle = len(lines) // 2
+    one, gate = lines[middle], lines[middle].gate
+    others = [line.medium for k, line in enumerate(lines) if k != middle]
+    # What is outside the gate at one wavelength may be in it at another.
+    apart = max(abs(medium.group_index / one.medium.group_index - 1.0) for medium in others)
+    more = math.ceil(apart * gate.stop / gate.bin_width)
+    before = min(more, int(gate.start / gate.bin_width))
+    start_ns = gate.start_ns - before * 1e-3 * gate.bin_width_ps
+    wide = one.with_overrides({"gate.start_ns": start_ns, "gate.bins": gate.bins + before + more})
+    run = simulate(wide.model_copy(update={"medium": wide.medium.with_beside(others)}), **options)
+    cubes, kept = cubes_of(run, "channels"), slice(before, before + gate.bins)
+    found = [*cubes.values()]
+    found.insert(middle, Cube(run.tallies, run.unit, run.second_moment))
+    none: dict[str, Any] = dict.fromkeys(("half", "channel_tallies"))
+    return [
+        replace(
+            run,
+            scene=line,
+            tallies=np.ascontiguousarray(cube.tallies[..., kept]),
+            unit=cube.unit,
+            second_moment=None if cube.second_moment is None else np.ascontiguousarray(cube.second_moment[..., kept]),
+            batch_moments={},
+            **none,
+        )
+        for line, cube in zip(lines, found, strict=True)
+    ]

@@ -111,7 +111,7 @@ def _valid_calls():
         "make_layers": (sk.make_layers, dict(
             start=[0.0, 1.0], extinction=[1.0, 1.0], albedo=[0.5, 0.5], anisotropy=[0.1, 0.1], axis=(0, 0, 1.0),
             shares=[[0.25, 0.75], [0.5, 0.5]], device="cpu")),
-        "make_inelastic": (sk.make_inelastic, dict(
+        "make_lines": (sk.make_lines, dict(
             source=[1e-3, 1e-3], anisotropy=[0.55, 0.0], extinction=[0.4, 0.5], scattering=[0.1, 0.1],
             passed=[1.0, 0.5], medium=sk.make_medium(0.1, 0.1))),
         "make_flux_volume": (sk.make_flux_volume, dict(

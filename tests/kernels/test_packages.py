@@ -50,7 +50,7 @@ OWNED = {
     "optics": "lens measured_beam confocal port laser_port sun sea",
     "surface": "mesh brute_force pattern specular use_warp_bvh",
     "photon": "stepped merged",
-    "riders": "derivatives blocks polarised inelastic channels flux",
+    "riders": "derivatives blocks polarised lines channels flux",
     "estimators": "estimator points",
     "transport": "records roulette",
 }

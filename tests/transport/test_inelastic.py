@@ -161,7 +161,7 @@ def test_raman_coefficient_is_that_of_bartlett():
     line = Inelastic(process="raman", absorption=0.3)
     assert line.source(488.0) == 2.7e-4 and line.source(532.0) == pytest.approx(1.71e-4, rel=2e-3)
     # p = 0.0673 (1 + 0.550 cos²θ), of unit integral.
-    found = sk.make_inelastic([1e-4], [A], [0.3], [0.1], [1.0], medium=sk.make_medium(0.1, 0.1))
+    found = sk.make_lines([1e-4], [A], [0.3], [0.1], [1.0], medium=sk.make_medium(0.1, 0.1))
     assert found.even[0] == pytest.approx(0.0673, abs=5e-5)
     assert pytest.approx(0.550, abs=5e-4) == A
 

@@ -1,11 +1,14 @@
 """Runs at several wavelengths with the same photons, and their sum over a spectrum."""
 
+import math
+
 import h5py
 import numpy as np
 import pytest
 
 import spadwarp
 from helpers.scenes import scene
+from helpers.statistics_of_samples import equal_means_p
 from spadwarp.scene import spectral_lines
 from spadwarp.transport import simulate_spectrum
 from spadwarp.values import ArgumentError, ConfigError
@@ -19,14 +22,36 @@ def broad(**laser):
     return scene(medium=SEA, laser=laser, detector={"filter_fwhm_nm": 40.0})
 
 
-def test_each_line_is_its_own_run_to_the_bit(device):
-    found = simulate_spectrum(broad(), [600.0, 480.0], photons=5_000, device=device)
-    assert found.wavelengths == (480.0, 600.0)
+def test_a_line_far_from_the_others_is_its_own_run_to_the_bit(device):
+    found = simulate_spectrum(broad(), [650.0, 480.0], photons=5_000, device=device)
+    assert found.wavelengths == (480.0, 650.0)
     for wavelength, one in found.results.items():
         own = scene(medium=SEA, laser={"wavelength_nm": wavelength}, detector={"filter_fwhm_nm": 40.0})
         assert (spadwarp.simulate(own, photons=5_000, device=device).tallies == one.tallies).all()
         filtered = one.scene.detections_per_photon / one.scene.detector.pde
         assert filtered == pytest.approx(0.5 ** ((wavelength - 540.0) / 20.0) ** 2)
+
+
+@pytest.mark.slow
+def test_near_lines_share_photons_and_are_as_their_own_runs(device):
+    """Of water whose absorption, scattering, molecules and group index differ, within a gate that moves with it."""
+    gate = {"start_ns": 3.3, "bin_width_ps": 1111.0, "bins": 20}
+    one = scene(medium=SEA, gate=gate, transport={"estimator": "guided"})
+    lines, photons, seeds = [500.0, 515.0, 532.0, 545.0, 552.0], 20_000, range(16)
+    own, shared = [], []
+    for seed in seeds:
+        runs = simulate_spectrum(one, lines, photons=photons, seed=seed, device=device).results
+        shared.append([run.histogram.sum(axis=(0, 1)) for run in runs.values()])
+        assert len({tuple(run.energy_balance.values()) for run in runs.values()}) == 1
+        apart = (one.with_overrides({"laser.wavelength_nm": line}) for line in lines)
+        apart = [spadwarp.simulate(each, photons=photons, seed=100 + seed, device=device) for each in apart]
+        own.append([run.histogram.sum(axis=(0, 1)) for run in apart])
+    own, shared = np.array(own), np.array(shared)
+    for k in range(len(lines)):
+        assert equal_means_p(shared[:, k], own[:, k], 0.5) > 1e-3
+    # The delay of a line over that of the photons', in bins, is known better than the light of a bin.
+    late = shared @ np.arange(20) / shared.sum(axis=-1) - own @ np.arange(20) / own.sum(axis=-1)
+    assert (abs(late.mean(axis=0)) < 4.0 * late.std(axis=0, ddof=1) / math.sqrt(len(seeds))).all()
 
 
 def test_the_sum_over_the_spectrum_is_that_of_its_lines(device):

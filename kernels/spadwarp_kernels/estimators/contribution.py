@@ -462,8 +462,9 @@ def make_score(spec: TransportSpec, flights: bool = False) -> wp.Function:
             else:
                 extinction = water.extinction(world.medium, world.layers, found.origin, to_lens, link.water, seed)
             found.contribution.value = sight.value(world.camera, extinction, weight, scattering, link)
+            found.contribution.path = path + link.path
             found.contribution.index = spec.tally_index(
-                world.camera, world.gate, pixel, path + link.path, request.component
+                world.camera, world.gate, pixel, found.contribution.path, request.component
             )
             if wp.static(rider.rides):
                 if found.contribution.value > 0.0:

@@ -55,6 +55,7 @@ def make_analog(spec: TransportSpec) -> Estimator:
                     if s.above:
                         path = s.path + world.sea.delay * ray.water
                         found.value *= wp.exp(-world.sea.extinction * ray.water)
+                found.path = path
                 found.index = tally_index(world.camera, world.gate, pixel, path, component)
                 found.rounding_sample = u01(s.flight.block[2])
         if wp.static(reflects):

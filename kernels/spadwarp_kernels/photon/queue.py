@@ -221,7 +221,7 @@ def _has_more(spec: TransportSpec, flights: bool) -> bool:
 def _size(spec: TransportSpec, flights: bool, long: bool) -> tuple[int, int]:
     """Entries of a warp, and vectors of each: requests that wait, and those that come, of flights by their points, with
     `long` an event as well."""
-    vectors = 3 + _has_more(spec, flights) + (1 if spec.polarised or spec.inelastic else -(-len(spec.derivatives) // 4))
+    vectors = 3 + _has_more(spec, flights) + (1 if spec.polarised or spec.lines else -(-len(spec.derivatives) // 4))
     return MOST_LEFT + 32 * (spec.points + 1 if long else spec.points), vectors
 
 
@@ -241,7 +241,7 @@ def _make_words(spec: TransportSpec, more: bool, begin: int) -> tuple[wp.Functio
     what a request has beside x, u, weight and path: a vector from `begin` on, or a pair where requests are of
     scatterings in water alone, which need one random word beside that of the tally. `more`: see `_has_more`."""
     confocal = spec.confocal
-    short = not (spec.mesh or more or spec.derivatives or spec.polarised or spec.inelastic or spec.grid or spec.sea)
+    short = not (spec.mesh or more or spec.derivatives or spec.polarised or spec.lines or spec.grid or spec.sea)
 
     @wp.func
     def write_pair(memory: int, entry: int, request: Request):
@@ -304,7 +304,7 @@ def make_queue(
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
     """
     confocal, polarised, has_slot, more = spec.confocal, spec.polarised, spec.mesh or spec.sea, _has_more(spec, flights)
-    rank_of, inelastic = _among_takers if traces else _lane, spec.inelastic
+    rank_of, lines = _among_takers if traces else _lane, spec.lines
     derivative_vectors = -(-len(spec.derivatives) // 4)
     carried = 3 + more
     entries, vectors = _size(spec, flights, long)
@@ -334,9 +334,8 @@ def make_queue(
             put(memory, entry, wp.static(carried) + i, wp.vec4(a[4 * i], a[4 * i + 1], a[4 * i + 2], a[4 * i + 3]))
         if wp.static(polarised):
             put(memory, entry, wp.static(carried), request.carried.stokes)  # which cannot be combined with derivatives
-        if wp.static(inelastic):
-            shifted = request.carried.shifted  # nor can these, nor both
-            put(memory, entry, wp.static(carried), wp.vec4(shifted[0], shifted[1], 0.0, 0.0))
+        if wp.static(lines):
+            put(memory, entry, wp.static(carried), request.carried.shifted)  # nor can these, nor both
 
     @wp.func
     def push(s: PhotonRef, request: Request, world: WorldRef, sink: SinkRef, memory: int):
@@ -371,9 +370,8 @@ def make_queue(
                 request.carried.log_derivatives[4 * i + k] = part[k]
         if wp.static(polarised):
             request.carried.stokes = get(memory, entry, wp.static(carried))
-        if wp.static(inelastic):
-            shifted = get(memory, entry, wp.static(carried))
-            request.carried.shifted = wp.vec2(shifted[0], shifted[1])
+        if wp.static(lines):
+            request.carried.shifted = get(memory, entry, wp.static(carried))
         return request
 
     return warp_memory, push, pop

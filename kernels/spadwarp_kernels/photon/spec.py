@@ -36,7 +36,7 @@ _WORDS = {
 # Fields that cannot be combined, and those that need another.
 _EXCLUDED = {
     "sea": ("port", "laser_port", "reflecting", "grid", "merged", "flux"),
-    "inelastic": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
+    "lines": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
     "grid": ("layered", "random_albedo"),
     "merged": ("reflecting", "derivatives", "channels"),
     "blocks": ("reflecting", "merged"),
@@ -95,9 +95,9 @@ class TransportSpec(NamedTuple):
     BLOCK_DERIVATIVES; the blocks are those of `Derivatives.blocks`."""
     polarised: bool = False
     """Photons carry a Stokes vector, and scores are of the light that it stands for, see `Model.polarisation`."""
-    inelastic: bool = False
-    """Photons carry what has become light of other wavelengths, see `Model.inelastic`, of which each of `channels` is
-    one; in homogeneous water."""
+    lines: bool = False
+    """Photons carry light of other wavelengths, see `Model.lines`, of which each of `channels` is one; in homogeneous
+    water."""
     points: int = 1
     """At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`, `blocks`
     and DELTA_TRACKING, three with up to 4 derivatives."""
@@ -107,8 +107,8 @@ class TransportSpec(NamedTuple):
     sun: bool = False
     """The light is that of sun and sky, see `make_sun`, through a calm surface, FLAT_PORT as `laser_port`."""
     channels: int = 0
-    """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, or lines of inelastic
-    scattering, at most MOST_LINES, each with a tally of its own."""
+    """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, or lines at other
+    wavelengths, at most MOST_LINES, each with a tally of its own."""
 
     @property
     def signed(self) -> int:
@@ -200,7 +200,7 @@ def check_spec(spec: Any) -> None:
             check.choice(f"spec.{name}[{index}]", kind, allowed)
     # A block has 48 KiB of shared memory for queues.
     check.integer("spec.points", spec.points, 1, 2 if len(spec.derivatives) > 4 else MOST_POINTS)
-    check.integer("spec.channels", spec.channels, 0, MOST_CHANNELS * spec.polarised + MOST_LINES * spec.inelastic)
+    check.integer("spec.channels", spec.channels, 0, MOST_CHANNELS * spec.polarised + MOST_LINES * spec.lines)
     for one, others in _EXCLUDED.items():
         if getattr(spec, one) and any(getattr(spec, other) for other in others):
             raise ArgumentError(f"spec.{one} cannot be combined with spec." + ", spec.".join(others))

@@ -19,7 +19,7 @@ from spadwarp_kernels.tally.flux import Flux
 from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
 from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64, tally_components
 from spadwarp_kernels.water.limits import Limits
-from spadwarp_kernels.water.medium import Inelastic, Layers, Medium
+from spadwarp_kernels.water.medium import Layers, Lines, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
 
 from .derivatives import Derivatives, LogDerivatives, met_count, met_entry, score_entry
@@ -42,7 +42,7 @@ class World:
     scan: Scan
     derivatives: Derivatives
     polarisation: Polarisation
-    inelastic: Inelastic
+    lines: Lines
     flux: Flux
     sea: Sea
     seed: wp.uint64
@@ -143,6 +143,7 @@ class Contribution:
     """What a photon adds to the tally."""
 
     value: float  # fraction of the emitted light; 0 for nothing
+    path: float  # by which it has come [m], for spec.lines
     index: int  # of the voxel, see `tally_index`
     rounding_sample: float  # uniform in [0, 1), see `to_fixed_point`
     factors: LogDerivatives  # of the value for the tallies that have signs: log derivatives, or channels over I
@@ -154,7 +155,7 @@ class Carried:
 
     log_derivatives: LogDerivatives  # of what the light has met, by the parameters of the spec; 0 without them
     stokes: wp.vec4  # of weight 1 when emitted, with respect to `orthonormal_basis` of the light's direction
-    shifted: wp.vec2  # light at the lines of inelastic scattering, for each unit of that of the laser's wavelength
+    shifted: wp.vec4  # light at other wavelengths, for each unit of that of the laser's
     half: int  # of `Blocks.memory`: 0 for the history of a photon, 1 for a contribution
 
 
@@ -379,10 +380,11 @@ def _deposit_signed(account: AccountRef, sink: SinkRef, index: int, units: float
 
 
 @memoised
-def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False) -> wp.Function:
+def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False, lines: bool = False) -> wp.Function:
     """The Warp function ``(account, sink, world, contribution)`` that adds a contribution to the tally, with so many
     parameters or channels that have signs and so many kinds of derivatives by block; `split`: the low words of the
-    tally are apart; `sea`: the tally has a component of light that met the surface of the sea alone."""
+    tally are apart; `sea`: the tally has a component of light that met the surface of the sea alone; `lines`:
+    the channels are lines with delays of their own."""
     deposit_unsigned = _make_deposit_unsigned(len(tally_components(sea)))
 
     @wp.func
@@ -393,7 +395,12 @@ def make_deposit(signed: int, kinds: int, split: bool, sea: bool = False) -> wp.
                 width = wp.static(signed) + wp.static(kinds) * blocks.count
                 for p in range(wp.static(signed)):
                     units = c.value * c.factors[p] * world.derivatives.scale[p]
-                    _deposit_signed(account, sink, c.index * width + p, units, c.rounding_sample)
+                    index = int(c.index)
+                    if wp.static(lines):
+                        own = gate_bin(world.gate, c.path * world.lines.delay[p])
+                        index = wp.where(own < 0, -1, c.index + own - gate_bin(world.gate, c.path))
+                    if index >= 0:
+                        _deposit_signed(account, sink, index * width + p, units, c.rounding_sample)
                 if wp.static(kinds > 0):
                     for i in range(met_count(blocks, 1)):
                         k = int(blocks.memory[met_entry(blocks, 1, i)])

@@ -36,8 +36,8 @@ def make_rider(spec: TransportSpec) -> Rider:
     rider = NOTHING
     if spec.polarised:
         rider = make_polarisation_rider(spec)
-    if spec.inelastic:
-        rider = _make_inelastic_rider(spec)
+    if spec.lines:
+        rider = _make_lines_rider(spec)
     if spec.derivatives:
         rider = _make_derivatives_rider(spec)
     if spec.blocks:
@@ -48,22 +48,25 @@ def make_rider(spec: TransportSpec) -> Rider:
 # ---- Light of other wavelengths.
 
 
-def _make_inelastic_rider(spec: TransportSpec) -> Rider:
-    """What has become light of other wavelengths, by one inelastic scattering at any of the events so far.
+def _make_lines_rider(spec: TransportSpec) -> Rider:
+    """Light of other wavelengths on the same paths: of other lines of the laser, and what has become such light by one
+    inelastic scattering at any of the events so far.
 
     Photons fly and scatter as light of the laser does; what would have been scattered inelastically at an event, in
-    place of elastically, is carried on with the coefficients of its own wavelength over those. Thus no photon is spent
-    on what few of them do, and each brings light of all wavelengths.
+    place of elastically, is carried on with the coefficients of its own wavelength over those, and so is light of a
+    line of the laser from the start. Thus no photon is spent on what few of them do, and each brings light of all
+    wavelengths.
     """
+    count = spec.channels
 
     @wp.func
     def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
-        c.shifted = wp.vec2()
+        c.shifted = world.lines.elastic
 
     @wp.func
     def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
-        for k in range(2):
-            c.shifted[k] = c.shifted[k] * wp.exp(-world.inelastic.more[k] * length)
+        for k in range(wp.static(count)):
+            c.shifted[k] = c.shifted[k] * wp.exp(-world.lines.more[k] * length)
 
     @wp.func
     def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
@@ -72,14 +75,15 @@ def _make_inelastic_rider(spec: TransportSpec) -> Rider:
             t = one_minus_cosine(snap_from(u, world.medium.axis_threshold), v)
             elastic = wp.max(water.extinction * water.albedo * spec.water.phase.pdf(t, water), 1.0e-30)
             square = (1.0 - t) * (1.0 - t)
-            for k in range(2):
-                turned = world.inelastic.source[k] * (world.inelastic.even[k] + world.inelastic.squared[k] * square)
-                c.shifted[k] = c.shifted[k] * world.inelastic.again[k] + turned / elastic
+            for k in range(wp.static(count)):
+                turned = world.lines.source[k] * (world.lines.even[k] + world.lines.squared[k] * square)
+                before = wp.where(world.lines.elastic[k] > 0.0, c.shifted[k], 1.0)
+                c.shifted[k] = c.shifted[k] * world.lines.again[k] + before * turned / elastic
 
     @wp.func
     def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
         for channel in range(wp.static(spec.channels)):
-            k.factors[channel] = world.inelastic.passed[channel] * c.shifted[channel]
+            k.factors[channel] = world.lines.passed[channel] * c.shifted[channel]
 
     return NOTHING._replace(begin=begin, fly=fly, event=event, deliver=deliver)
 

@@ -66,7 +66,7 @@ def compose(spec: TransportSpec, cuda: bool, split: bool) -> Stages:
     flights, scores = estimator.request_flight is not None, estimator.score is not None
     two_requests = flights and scores and long_queue_fits(spec, in_tree)
     meet = stages.make_meet(estimator.meet)
-    deposit = make_deposit(spec.signed, len(spec.blocks), split, spec.sea is not None)
+    deposit = make_deposit(spec.signed, len(spec.blocks), split, spec.sea is not None, spec.lines)
     memory, push, pop = make_queue(spec, flights, scores, two_requests, in_tree)
     serve = _make_serve(spec, split, deposit, waits=in_tree and not alone) if scores else push
     ask_flight, ask_event = _make_asks(spec, _make_serve_now(serve) if alone and scores else push)

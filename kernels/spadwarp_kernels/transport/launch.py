@@ -44,7 +44,7 @@ from spadwarp_kernels.tally.tally import (
     tally_components,
 )
 from spadwarp_kernels.water.limits import Limits, ready_limits
-from spadwarp_kernels.water.medium import Inelastic, Layers, Medium, ready_medium
+from spadwarp_kernels.water.medium import Layers, Lines, Medium, ready_medium
 from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
 
 from .loops import make_transport_kernel
@@ -87,8 +87,8 @@ class Model:
     """The parameters of a spec with derivatives or channels, from `make_derivatives`."""
     polarisation: Polarisation = field(default_factory=Polarisation)
     """Those of a polarised spec, from `make_polarisation`."""
-    inelastic: Inelastic = field(default_factory=Inelastic)
-    """The lines of an inelastic spec, from `make_inelastic`."""
+    lines: Lines = field(default_factory=Lines)
+    """Of a spec with `lines`, from `make_lines`."""
     flux: Flux = field(default_factory=Flux)  # sections of a spec with flux, from `make_flux`
     sea: Sea = field(default_factory=Sea)  # the surface of a sea, from `make_sea`; of index 0 without one
     split_accumulators: bool = False

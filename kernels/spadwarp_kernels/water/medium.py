@@ -18,11 +18,11 @@ from spadwarp_kernels.base import check
 from spadwarp_kernels.base.rotations import OFF_AXIS
 from spadwarp_kernels.base.tables import DensityTables
 
-__all__ = ["MOST_CONSTITUENTS", "MOST_LINES", "Grid", "Inelastic", "Layers", "Medium", "free_path", "make_inelastic"]
-__all__ += ["make_layers", "make_medium"]
+__all__ = ["MOST_CONSTITUENTS", "MOST_LINES", "Grid", "Layers", "Lines", "Medium", "free_path", "make_layers"]
+__all__ += ["make_lines", "make_medium"]
 
 MOST_CONSTITUENTS = 4  # of a mixture
-MOST_LINES = 2  # of inelastic scattering
+MOST_LINES = 4  # at other wavelengths
 
 
 @wp.struct
@@ -82,22 +82,25 @@ def ready_free_path(xi: float, medium: Medium) -> float:
     ...
 
 
-# ---- Inelastic scattering.
+# ---- Other wavelengths.
 
 
 @wp.struct
-class Inelastic:
-    """Lines at other wavelengths that the water gives off, made by `make_inelastic`; numbers by line."""
+class Lines:
+    """Lines at other wavelengths, made by `make_lines`; numbers by line. An elastic one is of the laser, the others the
+    water gives off."""
 
-    source: wp.vec2  # coefficient of what becomes light of the line [1/m]
-    even: wp.vec2  # its phase function is even + squared cos^2(theta) [1/sr]
-    squared: wp.vec2
-    more: wp.vec2  # extinction at the line less that of the medium [1/m]
-    again: wp.vec2  # scattering at the line over that of the medium
-    passed: wp.vec2  # part of the line that the receiver's filter passes
+    elastic: wp.vec4  # 1 or 0
+    source: wp.vec4  # coefficient of what becomes light of the line [1/m]
+    even: wp.vec4  # its phase function is even + squared cos^2(theta) [1/sr]
+    squared: wp.vec4
+    more: wp.vec4  # extinction at the line less that of the medium [1/m]
+    again: wp.vec4  # scattering at the line over that of the medium
+    passed: wp.vec4  # part of the line that the receiver's filter passes
+    delay: wp.vec4  # group index at the line over that of the medium
 
 
-def make_inelastic(
+def make_lines(
     source: Sequence[float],
     anisotropy: Sequence[float],
     extinction: Sequence[float],
@@ -105,26 +108,34 @@ def make_inelastic(
     passed: Sequence[float],
     *,
     medium: Medium,
-) -> Inelastic:
+    elastic: bool = False,
+    delay: Sequence[float] = (),
+) -> Lines:
     """Up to MOST_LINES lines, with the phase function of the medium for what is scattered later.
 
     Args:
-        source: Coefficients of the inelastic scattering [1/m], >= 0; the medium's absorption has it.
+        source: Coefficients of the inelastic scattering [1/m], >= 0; the medium's absorption has it. Of elastic lines
+            what they scatter by another law than the medium's, of any sign.
         anisotropy: A of its phase function, ~ 1 + A cos^2(theta), 0 or more: 0 of fluorescence.
-        extinction, scattering: Of the water at the line [1/m].
+        extinction, scattering: Of the water at the line [1/m]; of an elastic one the scattering by the medium's law.
         passed: Part of the line that the receiver's filter passes.
         medium: Of the light that is scattered; its own scattering is above 0.
+        elastic: The lines are of the laser, and light of a line is there from the start.
+        delay: Group index at the line over that of the medium, by default 1.
 
     Raises:
         ArgumentError: A number out of range, or lists of several lengths.
     """
-    lines, count = Inelastic(), check.integer("number of lines", len(check.items("source", source)), 1, MOST_LINES)
-    given = {"source": source, "anisotropy": anisotropy, "extinction": extinction, "scattering": scattering}
-    given["passed"] = passed
-    columns = [check.numbers(name, column, (count,), "[0, inf)").tolist() for name, column in given.items()]
+    lines, count = Lines(), check.integer("number of lines", len(check.items("source", source)), 1, MOST_LINES)
     b = check.number("scattering of the medium", medium.extinction * medium.albedo, "(0, inf)")
-    for k, (made, anisotropic, extinct, scattered, kept) in enumerate(zip(*columns, strict=True)):
-        lines.source[k], lines.passed[k] = made, kept
+    given = {"source": source, "anisotropy": anisotropy, "extinction": extinction, "scattering": scattering}
+    given |= {"passed": passed, "delay": delay or [1.0] * count}
+    ranges = {"source": "(-inf, inf)" if elastic else "[0, inf)", "delay": "(0, inf)"}
+    columns = [
+        check.numbers(name, column, (count,), ranges.get(name, "[0, inf)")).tolist() for name, column in given.items()
+    ]
+    for k, (made, anisotropic, extinct, scattered, kept, later) in enumerate(zip(*columns, strict=True)):
+        lines.elastic[k], lines.source[k], lines.passed[k], lines.delay[k] = float(elastic), made, kept, later
         lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + anisotropic / 3.0))
         lines.squared[k] = anisotropic * lines.even[k]
         lines.more[k], lines.again[k] = extinct - medium.extinction, scattered / b
