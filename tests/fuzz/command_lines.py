@@ -103,7 +103,8 @@ def draw(r: random.Random) -> tuple[tuple[str, ...], tuple[str, ...]]:
     named = [value for option, value in itertools.pairwise(words) if option in _NAMING]
     written = [word for word in words if not word.startswith("-")] or ["scene"]
     initial = [f"{word.removesuffix('.toml')}.toml" for word in written] if path == ("init",) else []
-    return (*path, *words), (*OUTPUTS, *named, *initial)
+    in_place = ["."] * (path == ("reconstruct",) and "--out" not in words)
+    return (*path, *words), (*OUTPUTS, *named, *initial, *in_place)
 
 
 _NAMING = {"--out", "--json", "--ply", "--write", "--report", "--traceback", "--plots", "--picture", "--matrix"}
