@@ -74,7 +74,7 @@ def _is_mesh(path: Path) -> bool:
 _KINDS = {".gif": "video", ".mp4": "video", ".png": "picture"}
 _DRAWN = {
     "page": ("--method", "--frame", "--channel"),
-    "video": ("--frame", "--window", "--pictures", "--fps", "--linear"),
+    "video": ("--frame", "--window", "--pictures", "--fps", "--linear", "--flux"),
     "picture": ("--pictures", "--split"),
     "picture of a mesh": (),
 }
@@ -93,6 +93,7 @@ def view(
     pictures: int | None = None,
     fps: float | None = None,
     linear: bool = False,
+    flux: str | None = None,
     split: Literal["train", "validation", "test", "all"] | None = None,
     device: str | None = None,
 ) -> None:
@@ -100,8 +101,9 @@ def view(
 
     The ending of --out decides. Page: one HTML file, also without a network connection: depth as a point cloud coloured
     by its error; depth, truth, error and intensity as images; click a pixel to see its histogram. Video: the light that
-    each pixel receives, from time bin to time bin; of a scene that moves its frames. Picture: frames of a dataset on
-    one sheet, with true depth, measured depth and recorded photons; or a mesh file from several sides.
+    each pixel receives, from time bin to time bin, or with --flux the light in the water; of a scene that moves its
+    frames. Picture: frames of a dataset on one sheet, with true depth, measured depth and recorded photons; or a mesh
+    file from several sides.
 
     Args:
         path (FILE): A result, frames, an analytic file, a dataset or a shard, or their directory; or a mesh file.
@@ -115,6 +117,7 @@ def view(
             over the split, by default 20.
         fps (N): Video: pictures per second, up to 50; by default 12.
         linear: Video: a linear colour scale instead of four decades.
+        flux (NAME): Video: the light's front in a volume of [[flux]] with gates, gate after gate.
         split: Dataset: split of the frames, by default all.
 
     \b
@@ -144,7 +147,7 @@ def view(
     elif kind == "picture":
         written = spadwarp.viz.draw_dataset(path, target, **opt.given(split=split, frames=pictures))
     elif kind == "video":
-        more = opt.given(pictures=pictures, fps=fps, frame=frame)
+        more = opt.given(pictures=pictures, fps=fps, frame=frame, flux=flux)
         written = spadwarp.viz.video(path, target, window_ns=window, scale="linear" if linear else "log", **more)
     else:
         written = spadwarp.viz.view(path, target, method=method, frame=frame or 0, channel=channel, device=device)
@@ -163,7 +166,7 @@ def _frames(text: str) -> int | slice:
 # one is refused. The files of each in a folder, as patterns.
 _FORMATS: dict[str, tuple[str, ...]] = {"fusion": ("{}.txt", "intensity/{}-[0-9]*.mat", "spad/{}-[0-9]*_p1.mat")}
 _FORMATS |= {one: (f"{{}}.{one}", f"{{}}-[0-9]*.{one}") for one in ("ptu", "mat", "npy", "npz", "exr", "png", "xml")}
-_FORMATS |= {one: (f"{{}}.{one}",) for one in ("parquet", "las", "laz")}
+_FORMATS |= {one: (f"{{}}.{one}",) for one in ("parquet", "las", "laz", "zarr")}
 _FORMATS["wdp"] = ("{}-waveforms.wdp", "{}-waveforms.las")
 _Format = Literal[
     "npy", "npz", "png", "mat", "ptu", "exr", "xml", "fusion", "las", "laz", "wdp", "parquet", "webdataset", "zarr"
@@ -194,6 +197,7 @@ def export(
     mat     MATLAB, one file a frame, as single-photon denoisers read: sparse spad, rates, bin from 1, bin_size [s]
     ptu     PicoQuant T3 image, one record a detection
     exr     images: depth, intensity, truth; one file a frame
+    zarr    a result with its axes and its flux: xarray.open_zarr
     xml     the camera's calibration, as OpenCV's cv::FileStorage reads it
     fusion  mat files and a camera image of finer pixels, for sensor fusion: intensity/, spad/ with bin_hr, a list
     Single photons of a result, drawn by its detector, with position and truth, as a lidar delivers them:
@@ -227,7 +231,7 @@ def export(
       spadwarp export data/small/ --format webdataset --field noisy --field clean --out data/small-tar/
     """
     source = spadwarp.files.locate(path)
-    if whole := [one for one in format if one not in _FORMATS or (one == "parquet" and source.is_dir())]:
+    if whole := [one for one in format if one not in _FORMATS or (one in ("parquet", "zarr") and source.is_dir())]:
         if len(set(format)) > 1:
             wrong(f"{whole[0]} cannot be combined with other formats", "--format")
         _export_dataset(path, whole[0], out, field, frames_per_file)

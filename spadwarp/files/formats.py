@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -32,7 +35,7 @@ from spadwarp.values import ArgumentError, FileError, check_choice, check_intege
 
 __all__ = ["FORMATS", "export", "export_sensor_fusion", "open_source", "sequence"]
 
-FORMATS = (".npy", ".npz", ".png", ".mat", ".ptu", ".exr", *LIDAR_FORMATS, *CALIBRATION_ENDINGS)
+FORMATS = (".npy", ".npz", ".png", ".mat", ".ptu", ".exr", ".zarr", *LIDAR_FORMATS, *CALIBRATION_ENDINGS)
 """Endings of the files that `export` writes."""
 
 _DATASET_IMAGES = {"Z": "noisy", "truth.Z": "clean", "background": "label", "intensity": "intensity", "bound": "bound"}
@@ -259,6 +262,7 @@ def export(
       the window's start, which the comment of the file states, as behind a delayed sync.
     - `.exr`: images of one frame: depth `Z` [m], `intensity`, `truth.Z` and what else the source has: components of a
       result, `<method>.Z` of each estimator, `background` where the pixel reports it, the bound of the depth.
+    - `.zarr`: a result as `Result.to_xarray` has it, with its flux: a folder that `xarray.open_zarr` opens.
     - `.parquet`, `.las`, `.laz`: single photons of one frame that the result's detector draws, see
       `spadwarp.files.photon_cloud`: a table with a row, or LAS 1.4 with a point (format 6, GPS time) for each, in the
       world [m]; the classes are those of ASPRS: 40 what met a target, 41 the surface, 45 the
@@ -291,9 +295,11 @@ def export(
         light = analyser_channel(opened, channel)
         if ending in LIDAR_FORMATS:
             return write_lidar(light, path, seed=seed)
+        if ending == ".zarr":
+            return [_write_zarr(light, path)]
         return [_write_result(light, path, ending, frames)]
-    if ending in LIDAR_FORMATS:
-        raise ArgumentError(f"{ending} is for a result: its photons have the truth that frames do not hold")
+    if ending in (".zarr", *LIDAR_FORMATS):
+        raise ArgumentError(f"{ending} is for a result: it has what frames do not hold")
     if channel != "I":
         raise ArgumentError(f"channel = {channel!r}: only results have channels")
     chosen = _chosen(opened, frames)
@@ -427,6 +433,23 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
 
 
 # Writers
+
+
+def _write_zarr(result: Result, path: Path) -> Path:
+    if path.exists() and not (path / "zarr.json").is_file():
+        raise FileError(f"{path} exists, and is not a Zarr store to replace")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as made, warnings.catch_warnings():
+        # Version 3 of the format does not yet have names as fixed-length text, says zarr.
+        warnings.simplefilter("ignore")
+        try:
+            result.to_xarray().to_zarr(Path(made) / "store")
+            if path.exists():
+                shutil.rmtree(path)
+            os.replace(Path(made) / "store", path)
+        except OSError as error:
+            raise FileError(f"{path}: cannot be written: {error}") from error
+    return path
 
 
 def _write_npy(frames: FrameSequence, path: Path, chosen: range) -> Path:

@@ -152,24 +152,16 @@ class Flux(Section):
 
 
 class Sun(Section):
-    """Sun and sky in place of the laser, through a calm surface: a face of the domain, which has no other bounds along
-    it. With the face's `outside_index` it refracts and reflects. All light is emitted above the camera; as the water is
-    the same along the surface, what crosses a plane anywhere stands for what crosses a unit of its area."""
+    """Sun and sky in place of the laser, through the `[surface]` of the sea, calm or rough. All light is emitted above
+    one point, or one period of the waves; as the water is the same along the surface, what crosses a plane anywhere
+    stands for what crosses a unit of its area."""
 
     zenith_deg: float = field(..., "angle of the sun from the vertical, in the air [°]", "[0, 90)")
     azimuth_deg: float = field(0.0, "of the sun's light about the vertical, as that of radiance [°]", "[-360, 360]")
     sky: float = field(0.0, "part of the irradiance on the surface that comes from a sky of even radiance", "[0, 1]")
     irradiance: float = field(1.0, "on the surface, in the air [W/m²]", "(0, 1e6]")
-    surface: Literal["x_low", "x_high", "y_low", "y_high", "z_low", "z_high"] = "z_low"
-    """face of the domain through which the light comes"""
 
-    @property
-    def down(self) -> NDArray[np.float64]:
-        """Unit vector into the water, in the world."""
-        return np.eye(3)["xyz".index(self.surface[0])] * (1.0 if self.surface.endswith("low") else -1.0)
-
-    @property
-    def direction(self) -> NDArray[np.float64]:
-        """Unit vector in which the sun's light goes in the air, in the world."""
+    def direction(self, down: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Unit vector in which the sun's light goes in the air, in the frame of `down`, a unit vector."""
         zenith = math.radians(self.zenith_deg)
-        return math.cos(zenith) * self.down + math.sin(zenith) * sideways(self.down, self.azimuth_deg)
+        return math.cos(zenith) * down + math.sin(zenith) * sideways(down, self.azimuth_deg)

@@ -24,7 +24,7 @@ from spadwarp.scene.flux import Flux, Sun
 from spadwarp.scene.laser import Laser, detection_efficiency, spectral_lines
 from spadwarp.scene.medium import Medium
 from spadwarp.scene.port import Port, PortGeometry
-from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, vector_of
+from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, unit_vector, vector_of
 from spadwarp.scene.sea import Surface
 from spadwarp.scene.sections import Document, Overrides, listed
 from spadwarp.scene.settings import Analytic, Daylight, Detector, Domain, Gate, Output, Scan, Target, Transport
@@ -136,15 +136,14 @@ class Scene(Shown, Document):
             return
         if transport.estimator != "none" or self.scan.mode != "none":
             yield f"{estimator}: [sun] is for [[flux]] alone, with 'none', and without a scan"
-        k, (low, high) = "xyz".index(sun.surface[0]), self.domain.bounds
-        if math.isinf((low, high)[sun.surface.endswith("high")][k]):
-            yield f"sun.surface = {sun.surface!r} is no face of the domain: give it a shape and that bound"
-        bounds = [side[j] for side in (low, high) for j in range(3) if j != k]
+        if self.surface is None:
+            yield "sun needs [surface], through which its light comes"
+            return
+        up = np.abs(self.surface.normal)
+        bounds = [side[j] for side in self.domain.bounds for j in range(3) if up[j] < _DOWNWARDS]
         if any(map(math.isfinite, [*bounds, transport.lateral_limit])):
             yield "sun: the domain and transport.lateral_limit bound the water along the surface; take inf there"
-        if medium.grid is not None or (
-            medium.layers and sum(map(bool, medium.layer_axis)) - bool(medium.layer_axis[k])
-        ):
+        if medium.layers and float(up @ np.abs(unit_vector(medium.layer_axis))) < _DOWNWARDS:
             yield "sun: water that varies along the surface; layers across it are allowed"
 
     def _scan_problems(self) -> Iterator[str]:
@@ -209,14 +208,12 @@ class Scene(Shown, Document):
             "daylight, a table": self.daylight is not None,
             "medium.grid, a table": self.medium.grid is not None,
             f"scan.mode = {self.scan.mode!r}": self.scan.mode == "confocal",
-            "flux, a table": bool(self.flux),
-            "sun, a table": self.sun is not None,
         }.items():
             if found:
                 yield f"{field}: cannot be combined with surface"
         if (threshold := self.transport.axis_threshold) < 1.0:
             yield f"transport.axis_threshold = {threshold} does not go with surface: set it to 1"
-        if surface.is_flat and surface.height_of(self.camera.position) < 0.0:
+        if surface.is_flat and surface.height_of(self.camera.position) < 0.0 and self.sun is None:
             yield (
                 "surface.mean_square_slope = 0 does not go with a camera in the water: a flat surface seen from below "
                 "is a face of the domain with an outside_index"
@@ -406,7 +403,8 @@ def camera_port(scene: Scene) -> PortGeometry | None:
     """The port that a scene's camera looks through, or the mean plane of the sea below it; None: it is in the water."""
     port = scene.camera.port
     if scene.surface is not None:
-        return mean_plane(scene) if scene.surface.height_of(scene.camera.position) > 0.0 else None
+        above = scene.sun is None and scene.surface.height_of(scene.camera.position) > 0.0
+        return mean_plane(scene) if above else None
     return None if port is None else _placed(scene, port, np.zeros(3), np.array(port.axis))
 
 

@@ -338,7 +338,7 @@ def within_port(scene: Scene, triangles: Floats) -> tuple[str, str] | None:
     port, or parts of triangles: the field, and a text about it."""
     port, camera, laser = camera_port(scene), scene.camera, scene.beam
     if scene.surface is not None:
-        return _within_waves(scene, scene.surface)
+        return _within_waves(scene, scene.surface) if scene.sun is None else None
     if port is None or len(set(port.index)) == 1:
         return None
     radius = 0.0 if camera.pinhole else camera.aperture_radius

@@ -289,7 +289,7 @@ def transport_spec(scene: Scene, mesh: TriangleMesh | None, *, derivatives: Sequ
         confocal=scene.scan.mode != "none",
         rotated_domain=_has_rotated_domain(scene),
         port=None if scene.surface else port_kind(camera_port(scene)),
-        laser_port=sk.FLAT_PORT if scene.sun else None if scene.surface else port_kind(laser_port(scene)),
+        laser_port=None if scene.surface else port_kind(laser_port(scene)),
         sea=None if scene.surface is None else sk.FACETS if scene.surface.waves is None else sk.WAVES,
         reflecting=bool(scene.domain.reflecting),
         grid=_grid_tracking(scene),
@@ -363,16 +363,15 @@ def _flux(scene: Scene, device: wp.Device) -> Any:
 
 def _sun(scene: Scene, sun: Sun) -> Any:
     """The light of sun and sky in the camera's frame."""
-    rotation, k = rotation_matrix(scene.camera.rotation_deg), "xyz".index(sun.surface[0])
-    level = scene.domain.bounds[sun.surface.endswith("high")][k] - scene.camera.position[k]
-    outside = scene.domain.reflecting.get(sun.surface, scene.medium.phase_index)
-    return sk.make_sun(
-        (sun.direction @ rotation).tolist(),
-        normal=(sun.down @ rotation).tolist(),
-        distance=level * float(sun.down[k]),
-        index=scene.medium.phase_index / outside,
-        sky=sun.sky,
-    )
+    surface, rotation = scene.surface, rotation_matrix(scene.camera.rotation_deg)
+    assert surface is not None
+    down, waves = -np.array(surface.normal), dict[str, Any]()
+    if (field := surface.wave_field) is not None:
+        columns = np.array(surface.wave_axis) @ rotation
+        waves["patch"] = [field.size[0] * columns, field.size[1] * np.cross(down @ rotation, columns)]
+        waves["crest"] = field.amplitude
+    direction, plane = sun.direction(down) @ rotation, mean_plane(scene)
+    return sk.make_sun(direction.tolist(), down=plane.normal, distance=plane.distance, sky=sun.sky, **waves)
 
 
 def _laser(scene: Scene, device: wp.Device) -> Any:
@@ -406,7 +405,7 @@ def _camera(scene: Scene, mesh: TriangleMesh | None, sea: Any) -> Any:
         lens.radial, lens.tangential = wp.vec3(k1, k2, k3), wp.vec2(p1, p2)
         lens.view, lens.columns = wp.vec4(*view_box(receiver)), receiver.width
     port = camera_port(scene)
-    if port is None and scene.surface is not None:
+    if port is None and scene.surface is not None and scene.sun is None:
         port = mean_plane(scene, from_below=True)
     if port is not None:
         of_port = _plane_of_shots if scene.scan.mode == "trajectory" else port_parameters
@@ -649,7 +648,7 @@ def _check_size(scene: Scene, model: sk.Model, copies: float, signed: int) -> bo
     if count >= 2**31:
         raise ConfigError(f"camera and gate: {shape} = {size} {outside}", source=scene.source)
     # On the CPU counts on the device, their copy in the result, and the total of the components.
-    needed = ((8 if cuda else 16) * size * (1 + signed) + 32 * model.flux.size) * copies / 2**30
+    needed = ((8 if cuda else 16) * size * (1 + signed) + 36 * model.flux.size) * copies / 2**30
     available = model.device.free_memory if cuda else physical_memory()
     if available is not None and needed > available / 2**30:
         raise DeviceError(

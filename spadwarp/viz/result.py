@@ -439,16 +439,22 @@ def _profiles(result: Result, section: str, left: Axes, right: Axes) -> None:
     right.legend(fontsize=6.5)
 
 
+def middle_plane(light: FluxValues, planes: str) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:
+    """Fluence on the middle plane of a volume, gate by gate, and the ends of its sides `planes`, to the right and
+    downwards [m]."""
+    axis = 1 + next(k for k in range(3) if "xyz"[k] not in planes)
+    sides = [np.asarray(light.dimensions[name][0]) for name in planes]
+    halves = [0.5 * float(side[1] - side[0]) if len(side) > 1 else 0.5 for side in sides]
+    ends = [(float(side[0]) - half, float(side[-1]) + half) for side, half in zip(sides, halves, strict=True)]
+    return np.take(light.values, light.values.shape[axis] // 2, axis=axis), ends
+
+
 def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: str) -> None:
     """Fluence in all gates on the middle plane across the third axis; z to the right."""
+    found, ends = middle_plane(light, planes)
     across = next(name for name in "xyz" if name not in planes)
-    cube = light.values.sum(axis=0)
-    image = np.take(cube, cube.shape["xyz".index(across)] // 2, axis="xyz".index(across))
-    sides = [np.asarray(light.dimensions[name][0]) for name in planes]
-    steps = [float(side[1] - side[0]) if len(side) > 1 else 1.0 for side in sides]
-    ends = [(side[0] - 0.5 * step, side[-1] + 0.5 * step) for side, step in zip(sides, steps, strict=True)]
     axis.set(xlabel=f"{planes[0]} [m]", ylabel=f"{planes[1]} [m]", title=f"{section}, across {across}")
-    top = float(cube.max())
+    top = float(light.values.sum(axis=0).max())
     if not top > 0.0:
         style.middle_text(axis, "no light")
         return
@@ -457,7 +463,7 @@ def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: 
         "cmap": style.colour_map(INTENSITY_MAP),
         "interpolation": "nearest",
     }
-    shown = axis.imshow(np.maximum(image, _LEAST * top), extent=(*ends[0], ends[1][1], ends[1][0]), **look)
+    shown = axis.imshow(np.maximum(found.sum(axis=0), _LEAST * top), extent=(*ends[0], ends[1][1], ends[1][0]), **look)
     figure.colorbar(shown, ax=axis, label=f"fluence [{light.unit}]", shrink=0.6)
 
 

@@ -28,7 +28,7 @@ from spadwarp.scene import Scene
 from spadwarp.scene.sight import lines_of_sight
 from spadwarp.values import ArgumentError, FileError, check_choice, check_integer, check_real, count
 from spadwarp.viz import style
-from spadwarp.viz.result import channel_text
+from spadwarp.viz.result import channel_text, middle_plane
 from spadwarp.viz.style import PaperFigure, colour_map, median_pixel, paper
 
 __all__ = ["video", "view"]
@@ -332,11 +332,13 @@ def video(
     fps: float = 12.0,
     scale: Literal["log", "linear"] = "log",
     frame: int = 0,
+    flux: str | None = None,
 ) -> Path:
     """Writes what each pixel receives, bin after bin, as an animated GIF or an MP4; returns its path.
 
-    Every picture is a time of flight: first backscatter, then the target from near to far. All pictures have one colour
-    scale, whose upper end is the 99.9th percentile of the values above zero.
+    Every picture is a time of flight: first backscatter, then the target from near to far; or with `flux` a gate, in
+    which the front of the light goes through the water. All pictures have one colour scale, whose upper end is the
+    99.9th percentile of the values above zero.
 
     Args:
         source: What `spadwarp.load` returns, or a path that it takes. Of an analytic file or a dataset, the frames of
@@ -347,6 +349,8 @@ def video(
         fps: Pictures per second.
         scale: "log" over four decades, or "linear".
         frame: Number of the frame, from 0, where the source holds frames.
+        flux: Of a result: name of a volume of `[[flux]]` with gates, shown on its middle plane across the edge with
+            fewest voxels.
 
     Raises `ArgumentError`: an argument out of range, or another ending; `FileError`: a file cannot be read or written,
     or ffmpeg is missing.
@@ -361,13 +365,16 @@ def video(
     if isinstance(held, SequenceFile):
         drawn = _of_sequence(held, pictures)
     else:
-        cube, edges, label, metres_per_ns = _light(held, frame)
+        if flux is None:
+            (cube, edges, label, metres_per_ns), sides = _light(held, frame), None
+        else:
+            cube, edges, label, metres_per_ns, sides = _front(held, flux)
         kept = _window(cube, edges, window_ns)
         cube, edges = cube[:, :, kept], edges[kept.start : kept.stop + 1]
         merged = -(-cube.shape[2] // pictures)
         cube, edges = _reduced(cube, 1, merged), np.append(edges[:-1:merged], edges[-1])
         label += " and picture" if merged > 1 else " and bin"
-        drawn = _of_light(cube, edges, label, metres_per_ns, scale)
+        drawn = _of_light(cube, edges, label, metres_per_ns, scale, sides)
     with atomic_path(path) as temporary:
         (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(drawn, temporary, fps)
     return path
@@ -387,6 +394,20 @@ def _light(run: Held, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float
     return cube.astype(np.float64), 1e9 * edges, f"{what} per pixel", 1e-9 * scene.medium.pulse_speed
 
 
+def _front(run: Held, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64], str, float, dict[str, Any]]:
+    """As `_light`, with the fluence on the middle plane of a volume, and its sides, see `_screen`."""
+    volumes = {one.name: one for one in run.scene.flux if one.gates > 1} if isinstance(run, Result) else {}
+    if not isinstance(run, Result) or name not in volumes:
+        raise ArgumentError(f"flux = {name!r} is no volume with gates; the source has {', '.join(volumes) or 'none'}")
+    light, volume = run.flux[name]["fluence"], volumes[name]
+    across = min("yxz", key=lambda axis: len(light.dimensions[axis][0]))
+    planes = {"x": "zy", "y": "zx", "z": "yx"}[across]
+    cube, ends = middle_plane(light, planes)
+    edges = volume.gate_start_ns + 1e-3 * (volume.gate_width_ps or 0.0) * np.arange(volume.gates + 1, dtype=np.float64)
+    sides = dict(zip(planes, ends, strict=True))
+    return np.moveaxis(cube, 0, -1), edges, "fluence [1/m²] per photon", 1e-9 * run.pulse_speed, sides
+
+
 def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tuple[float, float] | None) -> slice:
     """The bins of a window [ns], or those from the first to the last with light in them."""
     if window_ns is not None:
@@ -404,16 +425,24 @@ def _window(cube: NDArray[np.float64], edges: NDArray[np.float64], window_ns: tu
 
 @paper()
 def _screen(
-    shape: tuple[int, ...], images: Sequence[tuple[str, Normalize, Colormap, str]], width: float
+    shape: tuple[int, ...],
+    images: Sequence[tuple[str, Normalize, Colormap, str]],
+    width: float,
+    sides: dict[str, Any] | None = None,
 ) -> tuple[PaperFigure, list[AxesImage]]:
-    """The figure of all pictures, and its images; of each its title, scale, colours and label."""
-    image_height = float(np.clip((width - 0.3) / len(images) * shape[0] / shape[1], 0.9, 6.0))
+    """The figure of all pictures, and its images; of each its title, scale, colours and label. `sides`: of a plane in
+    the world, to the right and downwards, from and to [m]."""
+    (wide, (left, right)), (high, (top, bottom)) = (sides or {"": (0, shape[1]), " ": (0, shape[0])}).items()
+    image_height = float(np.clip((width - 0.3) / len(images) * (bottom - top) / (right - left), 0.9, 6.0))
     figure = style.new_figure(width, image_height + 1.0)
     axes, bars = figure.subplots(2, len(images), squeeze=False, height_ratios=[image_height, 0.1])
     drawn = []
     for axis, bar, (title, scale, colours, label) in zip(axes, bars, images, strict=True):
-        axis.set(xticks=[], yticks=[], title=title)
-        drawn.append(axis.imshow(np.zeros(shape[:2]), cmap=colours, norm=scale))
+        axis.set(title=title, xlabel=f"{wide} [m]", ylabel=f"{high} [m]")
+        if sides is None:
+            axis.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        extent = (left, right, bottom, top)
+        drawn.append(axis.imshow(np.zeros(shape[:2]), cmap=colours, norm=scale, extent=extent))
         figure.colorbar(drawn[-1], cax=bar, orientation="horizontal", label=label, extend="both")
     return figure, drawn
 
@@ -433,13 +462,19 @@ def _pictures(figure: PaperFigure, count: int, show: Callable[[int], str]) -> It
 
 
 def _of_light(
-    cube: NDArray[np.float64], edges: NDArray[np.float64], label: str, metres_per_ns: float, scale: str
+    cube: NDArray[np.float64],
+    edges: NDArray[np.float64],
+    label: str,
+    metres_per_ns: float,
+    scale: str,
+    sides: dict[str, Any] | None,
 ) -> Iterator[NDArray[np.uint8]]:
     """A picture for each bin."""
     values = cube[cube > 0]
     top = float(np.percentile(values, 99.9)) if values.size else 1.0
     norm = LogNorm(top * 10.0**-_VIDEO_DECADES, top) if scale == "log" else Normalize(0.0, top)
-    figure, (image,) = _screen(cube.shape, [("", norm, colour_map(style.LIGHT_MAP, missing="black"), label)], 3.9)
+    shown = [("", norm, colour_map(style.LIGHT_MAP, missing="black"), label)]
+    figure, (image,) = _screen(cube.shape, shown, 3.9, sides)
 
     def show(index: int) -> str:
         image.set_data(cube[:, :, index])

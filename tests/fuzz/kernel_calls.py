@@ -119,7 +119,7 @@ def _valid_calls():
             gate_start=0.0, gate_path=1.0, estimator="track", scale=1.0)),
         "make_flux_planes": (sk.make_flux_planes, dict(
             count=2, axis=(0, 0, 1.0), right=(1.0, 0, 0), centre=(0, 0, 0), radius=1.0, polar=3, azimuth=2, scale=1.0)),
-        "make_sun": (sk.make_sun, dict(direction=(0.5, 0, 1.0), normal=(0, 0, 1.0), distance=1.0, index=1.34, sky=0.2)),
+        "make_sun": (sk.make_sun, dict(direction=(0.5, 0, 1.0), down=(0, 0, 1.0), distance=1.0, sky=0.2, crest=0.1)),
         "make_records": (sk.make_records, dict(count=3, device="cpu")),
         "make_mixture": (sk.make_mixture, dict(count=2)),
         "phase_tables": (sk.make_phase_tables, dict(density=np.ones_like, device="cpu")),

@@ -14,7 +14,7 @@ from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import STREAM_EMISSION, random_block, u01, u01_fine, u01_open
 from spadwarp_kernels.base.rotations import cos_sin_turn, orthonormal_basis, rotate_direction
 
-from .port import Port, PortKind, make_flat_port
+from .port import Port, PortKind
 
 __all__ = ["LASER_PROFILES", "Laser", "Scan", "emit_photon", "make_laser", "make_sun", "profile_tables"]
 
@@ -36,6 +36,8 @@ class Laser:
     `emit_measured` alone."""
     columns: wp.array2d[float]  # likewise
     extent: wp.vec2  # tangents of the profile's half width and half height
+    down: wp.vec3  # unit vector into the water, about which the sky is even; this and the next are read by `emit_sun`
+    patch: wp.spatial_vector  # edges of the parallelogram over which light is emitted [m]
     port: Port
     """What is between the laser and the water, in the frame of the camera, see `make_flat_port`; read by specs with a
     port of the laser alone."""
@@ -172,7 +174,7 @@ def emit_measured(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
     return laser.position, wp.normalize(axis + (x * laser.extent[0]) * right + (y * laser.extent[1]) * down)
 
 
-# ---- Sun and sky above a calm sea.
+# ---- Sun and sky above a sea.
 
 
 # Height of the emission above the surface, relative to its distance from the origin, and at least [m]: in single
@@ -183,29 +185,30 @@ _ABOVE = 1e-5
 def make_sun(
     direction: Sequence[float],
     *,
-    normal: Sequence[float],
+    down: Sequence[float],
     distance: float,
-    index: float = 1.34,
     sky: float = 0.0,
+    patch: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    crest: float = 0.0,
 ) -> Laser:
-    """The light of sun and sky that falls through a calm surface, of a spec with `sun`.
+    """The light of sun and sky above the surface of a sea, of a spec with `sun`.
 
-    An emitted photon stands for the irradiance on the surface, in the air. All are emitted at one point: in water that
-    is the same along the surface a plane anywhere gets from it what a unit of its area gets from a beam without bounds.
+    An emitted photon stands for the irradiance on the mean plane, in the air. All are emitted at one point: in water
+    that is the same along the surface a plane anywhere gets from it what a unit of its area gets from a beam without
+    bounds. Over waves they come from a patch, which two edges span [m], as of their period.
 
-    `direction`: in which the sun's light goes in the air, of any length; `normal`: unit vector down into the water;
-    `distance` of the surface from the origin along it [m]; `index`: of the water over that of the air, 1: a surface
-    that does nothing; `sky`: part of the irradiance, in [0, 1], of a sky of even radiance. Raises `ArgumentError`, also
-    for a sun below the horizon.
+    `direction`: in which the sun's light goes in the air, of any length; `down`: unit vector into the water;
+    `distance` of the mean plane from the origin along it [m]; `sky`: part of the irradiance, in [0, 1], of a sky of
+    even radiance; `crest`: height of the highest wave above the mean plane [m]. Raises `ArgumentError`, also for a sun
+    below the horizon.
     """
+    check.vector("down", down, unit=True)
     height = max(_ABOVE, _ABOVE * abs(check.number("distance", distance, "(-inf, inf)")))
-    position = (distance - height) * check.numbers("normal", normal, (3,))
+    height += check.number("crest", crest, "[0, inf)")
+    position = (distance - height) * check.numbers("down", down, (3,))
     laser = make_laser("collimated", radius=0.0, axis=direction, position=position)
-    indices = (1.0, 1.0, check.number("index", index, "[1, 1e3]"))
-    laser.port = make_flat_port(
-        distance=distance, normal=normal, index=indices, group_index=indices, origin=laser.position
-    )
-    check.number("cosine of direction to normal", float(wp.dot(laser.axis, laser.port.normal)), "(0, 1.000001]")
+    laser.down, laser.patch = wp.vec3(*down), wp.spatial_vector(*check.numbers("patch", patch, (2, 3)).ravel())
+    check.number("cosine of direction to down", float(wp.dot(laser.axis, laser.down)), "(0, 1.000001]")
     laser.spread = check.number("sky", sky, "[0, 1]")
     return laser
 
@@ -217,8 +220,10 @@ def emit_sun(laser: Laser, axis: wp.vec3, seed: wp.uint64, id: wp.uint64):
     block = random_block(seed, id, wp.uint32(0), STREAM_EMISSION)
     direction = axis
     if u01(block[2]) < laser.spread:
-        direction = rotate_direction(laser.port.normal, 1.0 - wp.sqrt(u01_open(block[0])), u01(block[1]))
-    return laser.position, direction
+        direction = rotate_direction(laser.down, 1.0 - wp.sqrt(u01_open(block[0])), u01(block[1]))
+    a = float(block[3] >> wp.uint32(16)) / 65536.0
+    b = float(block[3] & wp.uint32(0xFFFF)) / 65536.0
+    return laser.position + a * wp.spatial_top(laser.patch) + b * wp.spatial_bottom(laser.patch), direction
 
 
 # ---- Positions that beam and pixel, or laser and camera, visit together.

@@ -10,7 +10,7 @@ from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.optics.camera import PLAIN, SCANNED, Lens
 from spadwarp_kernels.optics.laser import Beam, make_beam
 from spadwarp_kernels.optics.polarisation import MOST_CHANNELS
-from spadwarp_kernels.optics.port import FLAT_PORT, PortKind
+from spadwarp_kernels.optics.port import PortKind
 from spadwarp_kernels.optics.sea import WAVES, SeaKind
 from spadwarp_kernels.optics.visibility import Sight, make_sight
 from spadwarp_kernels.surface.ray_cast import Faces, make_faces
@@ -35,7 +35,7 @@ _WORDS = {
 
 # Fields that cannot be combined, and those that need another.
 _EXCLUDED = {
-    "sea": ("port", "laser_port", "reflecting", "grid", "merged", "flux"),
+    "sea": ("port", "laser_port", "reflecting", "grid", "merged"),
     "lines": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
     "grid": ("layered", "random_albedo"),
     "merged": ("reflecting", "derivatives", "channels"),
@@ -45,7 +45,7 @@ _EXCLUDED = {
     "flux": ("polarised", "random_albedo"),
     "sun": ("measured_beam", "confocal", "polarised"),
 }
-_NEEDED = {"reflecting": "bounded", "blocks": "grid"}
+_NEEDED = {"reflecting": "bounded", "blocks": "grid", "sun": "sea"}
 
 
 class TransportSpec(NamedTuple):
@@ -105,7 +105,7 @@ class TransportSpec(NamedTuple):
     """Kinds of the sections of `Model.flux`, each one of FLUX_KINDS; for estimators that neither guide light nor let
     it fly on after its last event, and without `polarised`."""
     sun: bool = False
-    """The light is that of sun and sky, see `make_sun`, through a calm surface, FLAT_PORT as `laser_port`."""
+    """The light is that of sun and sky, see `make_sun`, through the surface of a sea."""
     channels: int = 0
     """What the receiver takes of polarised light beside its intensity, at most MOST_CHANNELS, or lines at other
     wavelengths, at most MOST_LINES, each with a tally of its own."""
@@ -232,7 +232,6 @@ def check_spec(spec: Any) -> None:
             "spec.reflecting, spec.blocks and DELTA_TRACKING",
         ),
         (spec.flux and (guided or spec.estimator == "analog"), "flux cannot be combined with analog and guided"),
-        (spec.sun and spec.laser_port != FLAT_PORT, "sun needs spec.laser_port = FLAT_PORT"),
     ):
         if wrong:
             raise ArgumentError(f"spec.{text}")

@@ -1,7 +1,8 @@
 """Tallies of flux inside the water: fluence in voxels and gates of time, and light through planes, in fixed point.
 
 Any kernel may call the Warp functions with sections and an array of its own; the transport kernel calls those of the
-kinds in `TransportSpec.flux`. A tally over its section's scale and the photons is, for a volume, the weight times
+kinds in `TransportSpec.flux`. `words`: the low words of a tally where they are apart, see `tally.splitting_pays`, or an
+array of length 0. A tally over its section's scale and the photons is, for a volume, the weight times
 length [m] of an emitted photon in a voxel (its fluence over the voxel's volume), for planes the weight that crosses.
 """
 
@@ -13,6 +14,8 @@ import warp as wp
 
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
+
+from .tally import add_to_words, atomic_add_int64
 
 __all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "Leg", "add_flux_collision", "add_flux_crossings"]
 __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume"]
@@ -61,6 +64,7 @@ class Flux:
     """The sections of a tally of flux by kind, made by `make_flux`."""
 
     tracks: wp.array[FluxVolume]
+    collision: FluxVolume  # the first of the next, which CUDA reads here at no cost
     collisions: wp.array[FluxVolume]
     planes: wp.array[FluxPlanes]
     positions: wp.array[float]  # of planes, x·axis [m]
@@ -81,30 +85,55 @@ class Leg:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    unsigned long long sum = value;
-#if __CUDA_ARCH__ >= 800
-    // Warps add up 32 bits: what might not fit keeps to itself.
-    const int lane = threadIdx.x & 31, key = value >> 27 ? ~lane : index;
-    const unsigned peers = __match_any_sync(__activemask(), key);
-    if (peers & (peers - 1)) sum = __reduce_add_sync(peers, static_cast<unsigned>(value));
-    if (lane + 1 != __ffs(peers)) return;
-#endif
-    atomicAdd(reinterpret_cast<unsigned long long*>(tally.data) + index, sum);
+    return __float_as_int(__fadd_rd(x, 12582912.0f)) - 0x4b400000;
 #else
-    __atomic_fetch_add(reinterpret_cast<long long*>(tally.data) + index, (long long)value, __ATOMIC_RELAXED);
+    return x < 0.0f ? -1 : x < 4194304.0f ? static_cast<int>(x) : 4194304;
 #endif
 """)
-def _add(tally: wp.array[wp.int64], index: int, value: wp.int64):
-    """Adds a value >= 0, once for all threads of a warp that add to one entry: 1.1 to 1.3 times as fast."""
+def _floor(x: float) -> int:
+    """The whole number below x; below 0 any that is negative, from 2^22 on any from there. CUDA converts numbers no
+    faster than it computes logarithms; in the sum here it has them for nothing."""
     ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    unsigned part = __float_as_uint(__fadd_rz(units, 8388608.0f)) - 0x4b000000u;
+    const bool small = units < 8388608.0f;
+#if __CUDA_ARCH__ >= 800
+    // Warps add up 32 bits: what might not fit keeps to itself.
+    const int lane = threadIdx.x & 31;
+    const unsigned peers = __match_any_sync(__activemask(), small ? index : ~lane);
+    if (peers & (peers - 1)) part = __reduce_add_sync(peers, part);
+    if (lane + 1 != __ffs(peers)) part = 0;
+#endif
+    return small ? part : static_cast<long long>(units);
+#else
+    return static_cast<long long>(units);
+#endif
+""")
+def _sum_of_warp(index: int, units: float) -> wp.int64:
+    """The whole part of units >= 0; of all threads of a warp that add to one entry the first has their sum, the others
+    0: 1.1 to 1.3 times as fast."""
+    ...
+
+
+@wp.func
+def _add(tally: wp.array[wp.int64], words: wp.array[wp.uint32], index: int, units: float):
+    added = _sum_of_warp(index, units)
+    if added != wp.int64(0):
+        if words.shape[0] > 0:
+            add_to_words(tally, words, index, added)
+        else:
+            atomic_add_int64(tally, index, added)
 
 
 @wp.func
 def _voxel(volume: FluxVolume, p: wp.vec4) -> int:
     """The entry of a point in the box, or by a rounding error beside it."""
-    entry = wp.clamp(int(p[3]), 0, volume.gates - 1)
+    entry = wp.clamp(_floor(p[3]), 0, volume.gates - 1)
     for i in range(3):
-        entry = entry * volume.size[i] + wp.clamp(int(p[i]), 0, volume.size[i] - 1)
+        entry = entry * volume.size[i] + wp.clamp(_floor(p[i]), 0, volume.size[i] - 1)
     return volume.first + entry
 
 
@@ -115,7 +144,7 @@ def _in_voxels(volume: FluxVolume, x: wp.vec3, path: float) -> wp.vec4:
 
 
 @wp.func
-def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
+def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], words: wp.array[wp.uint32], leg: Leg):
     """Adds weight times length at a point in each of equal steps of a voxel or gate at most: unbiased, exact in sum."""
     q = _in_voxels(volume, leg.x, leg.path)
     along = volume.turn * leg.u
@@ -138,34 +167,41 @@ def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg):
     # The low bits, which the rounding of what is added hardly depends on.
     part = leg.rounding_sample * 4096.0
     p = q + (begin + (part - wp.floor(part)) * step) * v
-    added = wp.int64(leg.weight * step * volume.scale + leg.rounding_sample)
+    units = leg.weight * step * volume.scale + leg.rounding_sample
     if end > begin:
         for _step in range(steps):
-            _add(tally, _voxel(volume, p), added)
+            _add(tally, words, _voxel(volume, p), units)
             p += step * v
 
 
 @wp.func
-def add_flux_collision(volume: FluxVolume, tally: wp.array[wp.int64], leg: Leg, extinction: float):
+def add_flux_collision(
+    volume: FluxVolume, tally: wp.array[wp.int64], words: wp.array[wp.uint32], leg: Leg, extinction: float
+):
     """Adds weight over extinction [1/m] at the collision that ends a leg: the expectation of `add_flux_track`."""
     p = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
-    inside = wp.min(p) >= 0.0 and p[3] < float(volume.gates)
+    entry = _floor(p[3])
+    inside = wp.uint32(entry) < wp.uint32(volume.gates)
     for i in range(3):
-        inside = inside and p[i] < float(volume.size[i])
+        k = _floor(p[i])
+        inside = inside and wp.uint32(k) < wp.uint32(volume.size[i])
+        entry = entry * volume.size[i] + k
     if inside:
-        _add(tally, _voxel(volume, p), wp.int64(leg.weight / extinction * volume.scale + leg.rounding_sample))
+        _add(tally, words, volume.first + entry, leg.weight / extinction * volume.scale + leg.rounding_sample)
 
 
 @wp.func
-def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp.array[wp.int64], leg: Leg):
+def add_flux_crossings(
+    planes: FluxPlanes, positions: wp.array[float], tally: wp.array[wp.int64], words: wp.array[wp.uint32], leg: Leg
+):
     """Adds the weight to all planes that a leg crosses."""
     begin = wp.dot(planes.axis, leg.x)
     # As of the point where the next leg begins, so that none crosses a plane twice.
     end = wp.dot(planes.axis, leg.x + leg.length * leg.u)
     mu = wp.dot(planes.axis, leg.u)
     units = leg.weight * planes.scale
-    exact = wp.int64(units + leg.rounding_sample)
-    scalar = wp.int64(units / wp.where(wp.abs(mu) < _GRAZING, 0.5 * _GRAZING, wp.abs(mu)) + leg.rounding_sample)
+    exact = units + leg.rounding_sample
+    scalar = units / wp.where(wp.abs(mu) < _GRAZING, 0.5 * _GRAZING, wp.abs(mu)) + leg.rounding_sample
     side = wp.where(end > begin, 0, 1)
     width = 4 + planes.polar * planes.azimuth
     for k in range(planes.count):
@@ -175,15 +211,15 @@ def add_flux_crossings(planes: FluxPlanes, positions: wp.array[float], tally: wp
             across = away - wp.dot(planes.axis, away) * planes.axis
             if planes.radius2 >= 1.0e30 or wp.dot(across, across) <= planes.radius2:
                 entry = planes.first + k * width
-                _add(tally, entry + side, exact)
-                _add(tally, entry + 2 + side, scalar)
+                _add(tally, words, entry + side, exact)
+                _add(tally, words, entry + 2 + side, scalar)
                 if planes.polar > 0:
                     angle = wp.acos(wp.clamp(mu, -1.0, 1.0)) / wp.pi
                     i = wp.min(int(angle * float(planes.polar)), planes.polar - 1)
                     turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), leg.u), wp.dot(planes.right, leg.u))
                     turn = turn / (2.0 * wp.pi) + wp.where(turn < 0.0, 1.0, 0.0)
                     j = wp.min(int(turn * float(planes.azimuth)), planes.azimuth - 1)
-                    _add(tally, entry + 4 + i * planes.azimuth + j, scalar)
+                    _add(tally, words, entry + 4 + i * planes.azimuth + j, scalar)
 
 
 def make_flux_volume(
@@ -271,6 +307,7 @@ def make_flux(sections: Sequence[Any], positions: Sequence[float] = (), *, devic
     if len(positions) != begin:
         raise ArgumentError(f"positions: {len(positions)} of {begin} planes")
     flux.size = size
+    flux.collision = next(iter(kinds["collisions"]), FluxVolume())
     for name, found in kinds.items():
         setattr(flux, name, wp.array(found, dtype=FluxPlanes if name == "planes" else FluxVolume, device=device))
     flux.positions = wp.array(list(positions), dtype=float, device=device)

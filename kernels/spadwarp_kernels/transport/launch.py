@@ -139,6 +139,7 @@ class Data:
     split_accumulators: wp.array | None = None
     """uint32, as long as the tally, zero between launches; made by the first launch that is large enough, see
     `tally.splitting_pays`, and used by those after it."""
+    flux_words: wp.array | None = None  # likewise, as long as `flux`
 
 
 def make_data(
@@ -474,7 +475,9 @@ def prepare_transport(
     kernel = make_transport_kernel(spec, device.is_cuda, split_accumulators is not None)
     sink = Sink()
     sink.tally, sink.ledger, sink.scale, sink.records = data.tally, data.ledger, model.scale, data.records
-    sink.gradients, sink.low, sink.flux = data.gradients, split_accumulators, data.flux
+    sink.gradients, sink.low = data.gradients, split_accumulators
+    flux_words = _flux_words(model, data, most)
+    sink.flux, sink.flux_words = data.flux, flux_words
     shared = None if spec.blocks else _make_world(spec, model, seed, 0)
 
     def launch(first_id: int, photon_count: int) -> None:
@@ -489,6 +492,8 @@ def prepare_transport(
         wp.launch(kernel, dim=threads, inputs=[world, sink, part], device=device, block_dim=BLOCK_SIZE)
         if split_accumulators is not None:
             fold_accumulators(split_accumulators, data.tally)
+        if flux_words is not None:
+            fold_accumulators(flux_words, data.flux)
 
     return launch
 
@@ -501,6 +506,20 @@ def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_co
     if data.split_accumulators is None and not model.device.is_capturing:  # what is made there belongs to the graph
         data.split_accumulators = wp.zeros(data.tally.size, dtype=wp.uint32, device=model.device)
     return data.split_accumulators
+
+
+# Additions of a photon to a volume, about.
+_FLUX_ADDITIONS = 64
+
+
+def _flux_words(model: Model, data: Data, photon_count: int) -> wp.array | None:
+    """Those of `data` for a launch on CUDA that is large enough; None for others."""
+    size = model.flux.size
+    if not (model.device.is_cuda and splitting_pays(size, _FLUX_ADDITIONS * photon_count)):
+        return None
+    if data.flux_words is None and not model.device.is_capturing:
+        data.flux_words = wp.zeros(size, dtype=wp.uint32, device=model.device)
+    return data.flux_words
 
 
 def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> World:

@@ -14,15 +14,22 @@ SCALE = 2.0**20
 WATER = sk.make_medium(0.01, 0.99)  # g 0, albedo .99
 PHOTONS = 20_000
 DRAWS = wp.constant(512)
+NO_WORDS = wp.zeros(0, dtype=wp.uint32, device="cpu")
 
 
 @wp.kernel
-def _tracks(volume: sk.FluxVolume, x: wp.array[wp.vec3], u: wp.array[wp.vec3], tally: wp.array[wp.int64]):
+def _tracks(
+    volume: sk.FluxVolume,
+    x: wp.array[wp.vec3],
+    u: wp.array[wp.vec3],
+    tally: wp.array[wp.int64],
+    words: wp.array[wp.uint32],
+):
     i = wp.tid()
     # Any point within a step alike.
     for k in range(DRAWS):
         sample = 0.5 + (float(k) + 0.5) / (4096.0 * float(DRAWS))
-        sk.add_flux_track(volume, tally, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, sample))
+        sk.add_flux_track(volume, tally, words, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, sample))
 
 
 @wp.kernel
@@ -32,9 +39,10 @@ def _planes(
     u: wp.array[wp.vec3],
     positions: wp.array[float],
     tally: wp.array[wp.int64],
+    words: wp.array[wp.uint32],
 ):
     i = wp.tid()
-    sk.add_flux_crossings(planes, positions, tally, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, 0.5))
+    sk.add_flux_crossings(planes, positions, tally, words, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, 0.5))
 
 
 def directions(rng, count):
@@ -52,7 +60,7 @@ def test_lengths_in_voxels_and_gates_are_those_of_dense_points():
     volume = sk.make_flux_volume((4, 5, 6), lower=lower, edge=edge, rotation=turn, origin=origin, scale=SCALE, **gates)
     sk.make_flux([volume], device="cpu")
     tally = wp.zeros(3 * 4 * 5 * 6, dtype=wp.int64, device="cpu")
-    launched(_tracks, [volume, x, u, tally], out=())
+    launched(_tracks, [volume, x, u, tally, NO_WORDS], out=())
     steps = (np.arange(4_000) + 0.5) * 3.0 / 4_000
     expected = np.zeros((3, 4, 5, 6))
     for start, along in zip(x, u, strict=True):
@@ -75,7 +83,7 @@ def test_light_through_planes_of_even_radiance():
     sk.make_flux([planes], [-0.1, 0.0], device="cpu")
     tally = wp.zeros(2 * (4 + 18), dtype=wp.int64, device="cpu")
     positions = wp.array([-0.1, 0.0], dtype=float, device="cpu")
-    launched(_planes, [planes, x, u, positions, tally], out=())
+    launched(_planes, [planes, x, u, positions, tally, NO_WORDS], out=())
     down, up, scalar_down, scalar_up, *radiance = (tally.numpy().reshape(2, 22)[1] / SCALE).tolist()
     # Photons of density n per volume with legs of 3 m make the fluence n·3 m·.5; a disc of radius 2 m has 4 pi m^2.
     scalar = 0.5 * 3.0 * count / (10.0 * 6.0 * 10.0) * 4.0 * math.pi
