@@ -141,7 +141,7 @@ LINES = {
     "kernels/surface": (1700, 1887),
     "kernels/tally": (450, 966),
     "kernels/transport": (1450, 1774),
-    "kernels/water": (1350, 1672),
+    "kernels/water": (1350, 1673),
     "kernels/worlds": (1600, 2173),
 }
 

@@ -127,9 +127,10 @@ def make_lines(
         ArgumentError: A number out of range, or lists of several lengths.
     """
     lines, count = Lines(), check.integer("number of lines", len(check.items("source", source)), 1, MOST_LINES)
+    check.kind("medium", medium, Medium)
     b = check.number("scattering of the medium", medium.extinction * medium.albedo, "(0, inf)")
     given = {"source": source, "anisotropy": anisotropy, "extinction": extinction, "scattering": scattering}
-    given |= {"passed": passed, "delay": delay or [1.0] * count}
+    given |= {"passed": passed, "delay": delay if len(check.items("delay", delay)) else [1.0] * count}
     ranges = {"source": "(-inf, inf)" if elastic else "[0, inf)", "delay": "(0, inf)"}
     columns = [
         check.numbers(name, column, (count,), ranges.get(name, "[0, inf)")).tolist() for name, column in given.items()
