@@ -425,7 +425,10 @@ def check_integer(name: str, value: Any, within: str | Interval) -> int:
 
 def _inside(name: str, value: Any, number: Any, within: str | Interval) -> Any:
     if number not in (Interval.read(within) if isinstance(within, str) else within):
-        raise ArgumentError(f"{name} = {shown(value)} is outside {within}")
+        units = {"s": ("ps", "ns"), "m": ("mm", "cm")}.get(str(within).rpartition(" ")[2], ())
+        meant = " or ".join(f'"{number:g} {unit}"' for unit in units)
+        hint = f"; or was {meant} meant?" if units and 1 < number < 1e6 else ""
+        raise ArgumentError(f"{name} = {shown(value)} is outside {within}{hint}")
     return number
 
 

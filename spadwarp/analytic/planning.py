@@ -372,7 +372,7 @@ class _Planner:
             irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate,
             pulses=pulses,
             pulses_for=purpose,
-            pulses_range=(ends[0].pulses, ends[2].pulses),
+            pulses_range=(min(least := ends[0].pulses, most := ends[2].pulses), max(least, most)),
             frame_time=frame_time,
             reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
             terms=terms,

@@ -290,6 +290,8 @@ def depth_of(
     index, lines = _geometry(histograms, group_index, horizontal_fov_deg)
     counted = values.dtype.kind in "iu"
     notes: tuple[str, ...] = ()
+    if isinstance(background, int | float):
+        check_real("background", background, "[0, inf)")
     known: Any = histograms.background if background is None else background
     level_known = histograms.level_known or background is not None
     if known is None and (counted or method == "likelihood"):

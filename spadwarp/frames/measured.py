@@ -96,9 +96,9 @@ def read_histograms(
         ArgumentError: A fact that is missing, out of range, or that the file holds itself.
     """
     path = existing_file(path)
-    for name, value in {"tag_unit": tag_unit, "bin_width": bin_width}.items():
+    for name, value, within in (("tag_unit", tag_unit, "(0, 1e-3) s"), ("bin_width", bin_width, "(0, 1e-3) s")):
         if value is not None:
-            check_real(name, value, "(0, 1e-3) s")
+            check_real(name, value, within)
     if gate_start is not None:
         check_real("gate_start", gate_start, "[-1, 1] s")
     if _is_own(path):

@@ -86,7 +86,7 @@ def _bare_unit(text: str, error: str) -> str:
     for number, unit in _WITH_UNIT.findall(line.partition("=")[2]):
         if unit in UNITS:
             return f'; a number with a unit needs quotes: "{number} {unit}"'
-    return ""
+    return "; text stands in quotes" if "Invalid value" in error else ""
 
 
 def _parse_float(text: str) -> float:

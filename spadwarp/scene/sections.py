@@ -769,10 +769,10 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
             model = models_of(model.model_fields[part])[0]
         word, siblings = str(key[-1]), list(model.model_fields)
         meant = _SYNONYMS.get(word)
-        hint = f"; did you mean {meant!r}?" if meant in siblings else suggestion(word, siblings)
+        near = f"; did you mean {meant!r}?" if meant in siblings else suggestion(word, siblings)
         homes = [home for home in whole.model_fields if word in getattr(table_of(whole, home), "model_fields", ())]
-        hint = f"; did you mean {' or '.join(f'{home}.{word}' for home in homes[:2])}?" if homes else hint
-        hint = hint or f"; known are {', '.join(siblings)}"
+        hint = f"; did you mean {' or '.join(f'{home}.{word}' for home in homes[:2])}?" if homes else ""
+        hint = (near or hint if len(key) == 1 else hint or near) or f"; known are {', '.join(siblings)}"
         return f"{name} is not a known {'field' if len(key) > 1 else 'section'}{hint}"
     if kind == "missing" and not isinstance(key[-1], int):
         return f"{name} is missing" + (f" ({info.description})" if info is not None and info.description else "")

@@ -83,7 +83,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
                 spread = np.where(np.isfinite(ends), np.abs(ends - np.where(np.isfinite(y[own]), y[own], 0.0)), 0.0)
             shown, every = np.where(np.isfinite(y[own]), y[own], np.nan), -(-int(own.sum()) // 12)
             if name == "sigma_depth" and missed[own].any():
-                axis.plot(place, shown, "--", color=style_of["color"], linewidth=0.8)
+                axis.plot(place, shown, "--" if numeric else "_", color=style_of["color"], linewidth=0.8)
                 shown = np.where(missed[own], np.nan, shown)
             axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, markevery=every, **style_of)
             hollow = np.where(moved[own], shown, np.nan)
@@ -106,7 +106,7 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             axis.xaxis.minorticks_on()
     if missed.any():
         label = f"not reached: over {100 * OUTLIERS:g} % false peaks"
-        axes[0].plot([], [], color="0.4", linestyle="--", linewidth=0.8, label=label)
+        axes[0].plot([], [], "--" if numeric else "_", color="0.4", linewidth=0.8, label=label)
     if moved.any():
         axes[0].plot([], [], "o", color="0.4", markerfacecolor="white", label="gate moved to the return")
     if len(groups) > 1 or missed.any() or moved.any():

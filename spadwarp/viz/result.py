@@ -397,9 +397,10 @@ def _flux_figure(result: Result, width: float) -> Figure:
     sections = result.scene.flux
     if not sections:
         raise ConfigError("kind = 'flux' needs a result with [[flux]]", source=result.scene.source)
-    figure = style.new_figure(width, 2.7 * len(sections))
+    across = 2 if width > 5.0 else 1
+    figure = style.new_figure(width, 2.7 * len(sections) * 2 / across)
     figure.caption(_caption(result))
-    axes = figure.subplots(len(sections), 2, squeeze=False)
+    axes = figure.subplots(2 * len(sections) // across, across, squeeze=False).reshape(-1, 2)
     for section, (left, right) in zip(sections, axes, strict=True):
         if section.positions is None:
             for axis, planes in ((left, "zx"), (right, "zy")):
@@ -423,7 +424,8 @@ def _profiles(result: Result, section: str, left: Axes, right: Axes) -> None:
         left.errorbar(values, position, xerr=error, fmt=".-", color=style.SERIES[k], label=label, linewidth=0.9)
     left.set(xlabel=f"irradiance per photon [{light.unit}]", title=section)
     log_axis(left, "x")
-    left.legend(fontsize=6.5)
+    below: dict[str, Any] = {"fontsize": 6.5, "loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}
+    left.legend(**below, ncols=2)
     if light.errors is None:
         style.middle_text(right, "too few batches")
         return
@@ -436,7 +438,7 @@ def _profiles(result: Result, section: str, left: Axes, right: Axes) -> None:
         )
     right.set(xlabel="K_d, R, mean cosine", title="apparent optical properties")
     log_axis(right, "x")
-    right.legend(fontsize=6.5)
+    right.legend(**below, ncols=3)
 
 
 def middle_plane(light: FluxValues, planes: str) -> tuple[NDArray[np.float64], list[tuple[float, float]]]:

@@ -166,7 +166,7 @@ def draw_mesh(mesh: MeshSummary, path: str | Path, *, width: float = PAGE, devic
     figure = _target_sheet(targets, 0.5 * _SIDE, width, 256, device)
     _sheet_bar(figure, Normalize(-0.5 * mesh.longest, 0.5 * mesh.longest), DEPTH_MAP, "depth from the centre [m]")
     metres = " x ".join(f"{mesh.scale * side:.3g}" for side in mesh.extent)
-    figure.caption(f"{mesh.path.name}: {metres} m with scale = {mesh.scale:g}")
+    figure.caption(f"{mesh.path.name}, {metres} m, with scale = {mesh.scale:g}")
     return save(figure, path)
 
 

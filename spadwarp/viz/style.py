@@ -349,7 +349,7 @@ class Panels:
         if not axis.get_subplotspec().is_first_col():  # type: ignore[union-attr]
             axis.set_ylabel("")
         for side in (axis.xaxis, axis.yaxis):
-            side.set_major_locator(MaxNLocator(nbins=5, integer=True))
+            side.set_major_locator(MaxNLocator(nbins=5, integer=True, min_n_ticks=1))
         return axis, bar
 
     def show(
@@ -365,7 +365,8 @@ class Panels:
         axis, bar = self.place(title)
         (height, width), (low, high) = image.shape[:2], limits
         if max(height, width) > 5 * min(height, width):  # there is space for two numbers along the short side
-            (axis.yaxis if height < width else axis.xaxis).set_major_locator(MaxNLocator(nbins=1, integer=True))
+            short = axis.yaxis if height < width else axis.xaxis
+            short.set_major_locator(MaxNLocator(nbins=1, integer=True, min_n_ticks=1))
         shown = axis.imshow(image, cmap=colour_map(colours), norm=scale, clim=limits)
         if self.unclear is not None:
             hatch(axis, self.unclear)

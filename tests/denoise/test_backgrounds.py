@@ -174,3 +174,25 @@ def test_a_background_that_rises_while_the_gate_opens_is_found():
     found = estimate_background(counts_of(clean, level, 20.0), TAPS)
     assert np.abs(found.per_bin - level).sum() < 0.06 * level.sum()
     assert np.abs(found.per_bin - level)[: BINS // 5].sum() < 0.1 * level[: BINS // 5].sum()
+
+
+def test_in_a_bin_wider_than_the_response_the_light_of_a_pixel_says_where():
+    """A wall at a tenth of a bin, by methods that know bins alone."""
+    counts = np.random.default_rng(3).poisson(0.2, (16, 16, 12))
+    counts[..., 6] += 40
+    common = {"counts": counts, "response": [0.0, 1.0, 0.0], "background": "flat", "device": "cpu", "gate": (1.0, 7.0)}
+    for model in ("likelihood", "histograms"):
+        found = estimate(np.full((16, 16), 4.05, np.float32), model=model, **common)
+        assert np.median(found.depth) == pytest.approx(4.05, abs=1e-4)
+
+
+def test_frames_that_denoising_makes_worse_are_named(tmp_path):
+    """Noise of 1 mm: PyramidNet removes it, USDN moves pixels by centimetres."""
+    clean = evaluation_scene("stairs", "wall", size=SIZE).clean
+    np.save(tmp_path / "a.npy", clean + np.random.default_rng(1).normal(0.0, 1e-3, SIZE))
+    notes = {
+        model: denoise_file(tmp_path / "a.npy", tmp_path / model, model=model, gate=(13.5, 16.0), device="cpu").notes
+        for model in ("pyramid", "usdn")
+    }
+    assert not any(note.startswith("worse") for note in notes["pyramid"])
+    assert any(note.startswith("worse: the input's noise is 1") for note in notes["usdn"])
