@@ -128,7 +128,7 @@ LINES = {
     "scene": (3700, 5248),
     "transport": (2300, 3336),
     "validate": (750, 869),
-    "viz": (2200, 2543),
+    "viz": (2200, 2544),
     "water": (800, 853),
     "kernels/spadwarp_kernels": (50, 45),
     "kernels/analytic": (1650, 1681),
