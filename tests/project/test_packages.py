@@ -139,7 +139,7 @@ LINES = {
     "kernels/photon": (850, 1250),
     "kernels/riders": (750, 703),
     "kernels/surface": (1700, 1887),
-    "kernels/tally": (450, 966),
+    "kernels/tally": (450, 1001),
     "kernels/transport": (1450, 1774),
     "kernels/water": (1350, 1673),
     "kernels/worlds": (1600, 2173),
