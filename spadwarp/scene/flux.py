@@ -53,7 +53,8 @@ class Flux(Section):
     gate_width_ps: float | None = Field(None, ge=1e-3, le=1e15)
     """width of a gate [ps]; not given: all times"""
     estimator: Literal["track", "collision"] = "track"
-    """by the way of each photon through the voxels (less noise), or by its collisions (faster in small voxels)"""
+    """by the way of each photon through the voxels (less noise a photon), or by its collisions (less noise a second on
+    a GPU where a voxel is .1 free paths wide or more)"""
     positions: _Positions | None = Field(None, min_length=1, max_length=65536)
     """of planes along `axis` [m], rising"""
     axis: Direction = field((0.0, 0.0, 1.0), "normal of the planes, downwards; any length but 0")
