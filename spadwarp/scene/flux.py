@@ -53,7 +53,8 @@ class Flux(Section):
     gate_width_ps: float | None = Field(None, ge=1e-3, le=1e15)
     """width of a gate [ps]; not given: all times"""
     estimator: Literal["track", "collision"] = "track"
-    """by the way of each photon through the voxels (less noise), or by its collisions (faster in small voxels)"""
+    """by the way of each photon through the voxels (less noise a photon), or by its collisions (less noise a second on
+    a GPU where a voxel is .1 free paths wide or more)"""
     positions: _Positions | None = Field(None, min_length=1, max_length=65536)
     """of planes along `axis` [m], rising"""
     axis: Direction = field((0.0, 0.0, 1.0), "normal of the planes, downwards; any length but 0")
@@ -106,12 +107,12 @@ class Flux(Section):
     def scale(self, absorption: float) -> float:
         """Tally units per metre of weight times length, or per weight that crosses a plane: a power of two with which
         2^40 photons keep voxels below 2^62 that hold 4 times the longest way across one, or without bounds the mean
-        way to absorption."""
+        way to absorption. Fewer in large volumes, whose low 16 bits a GPU keeps apart."""
         if self.voxels is None:
             return 2.0**20
         longest = 4.0 * math.hypot(*self.edges)
         longest = min(longest, 4.0 / absorption if absorption > 0.0 else longest)
-        return 2.0 ** math.floor(22.0 - math.log2(min(longest, 1e6)))
+        return 2.0 ** math.floor((22.0 if self.size < 1 << 22 else 14.0) - math.log2(min(longest, 1e6)))
 
     def arrays(self, absorption: float, first: int = 0) -> dict[str, FluxArray]:
         """Those of its part of the tally, which begins at an entry, by name; `absorption`: the least [1/m]."""

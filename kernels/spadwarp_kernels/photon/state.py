@@ -81,7 +81,7 @@ class Sink:
     low: wp.array[wp.uint32]  # their low words, where those are apart, see `tally.splitting_pays`
     gradients: wp.array[wp.int64]  # the tallies that have signs [voxel, parameter]
     flux: wp.array[wp.int64]  # the tally of `World.flux`
-    flux_words: wp.array[wp.uint32]  # likewise its low words, or of length 0
+    flux_halves: wp.array[wp.uint32]  # its low bits, see `tally.add_to_halves`, or of length 0
     ledger: wp.array[wp.int64]  # the energy balance and counters, see `add_to_ledger`
     records: Records
     scale: float  # tally units per emitted photon

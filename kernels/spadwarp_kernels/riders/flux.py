@@ -26,15 +26,15 @@ def make_flux_score(spec: TransportSpec) -> wp.Function | None:
         leg = Leg(s.x, s.u, length, s.path, s.weight.value, u01(s.flight.block[3]))
         if wp.static(tracks):
             for k in range(world.flux.tracks.shape[0]):
-                add_flux_track(world.flux.tracks[k], sink.flux, sink.flux_words, leg)
+                add_flux_track(world.flux.tracks[k], sink.flux, sink.flux_halves, leg)
         if wp.static(planes):
             for k in range(world.flux.planes.shape[0]):
-                add_flux_crossings(world.flux.planes[k], world.flux.positions, sink.flux, sink.flux_words, leg)
+                add_flux_crossings(world.flux.planes[k], world.flux.positions, sink.flux, sink.flux_halves, leg)
         if wp.static(collisions):
             if collides:
                 extinction = spec.water.at(world.medium, world.layers, leg.x + length * leg.u).extinction
-                add_flux_collision(world.flux.collision, sink.flux, sink.flux_words, leg, extinction)
+                add_flux_collision(world.flux.collision, sink.flux, sink.flux_halves, leg, extinction)
                 for k in range(1, world.flux.collisions.shape[0]):
-                    add_flux_collision(world.flux.collisions[k], sink.flux, sink.flux_words, leg, extinction)
+                    add_flux_collision(world.flux.collisions[k], sink.flux, sink.flux_halves, leg, extinction)
 
     return score_flux

@@ -1,7 +1,7 @@
 """Tallies of flux inside the water: fluence in voxels and gates of time, and light through planes, in fixed point.
 
 Any kernel may call the Warp functions with sections and an array of its own; the transport kernel calls those of the
-kinds in `TransportSpec.flux`. `words`: the low words of a tally where they are apart, see `tally.splitting_pays`, or an
+kinds in `TransportSpec.flux`. `halves`: the low bits of a tally where they are apart, see `tally.add_to_halves`, or an
 array of length 0. A tally over its section's scale and the photons is, for a volume, the weight times
 length [m] of an emitted photon in a voxel (its fluence over the voxel's volume), for planes the weight that crosses.
 """
@@ -15,7 +15,7 @@ import warp as wp
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 
-from .tally import add_to_words, atomic_add_int64
+from .tally import add_to_halves, atomic_add_int64
 
 __all__ = ["FLUX_KINDS", "Flux", "FluxPlanes", "FluxVolume", "Leg", "add_flux_collision", "add_flux_crossings"]
 __all__ += ["add_flux_track", "make_flux", "make_flux_planes", "make_flux_volume"]
@@ -119,11 +119,11 @@ def _sum_of_warp(index: int, units: float) -> wp.int64:
 
 
 @wp.func
-def _add(tally: wp.array[wp.int64], words: wp.array[wp.uint32], index: int, units: float):
+def _add(tally: wp.array[wp.int64], halves: wp.array[wp.uint32], index: int, units: float):
     added = _sum_of_warp(index, units)
     if added != wp.int64(0):
-        if words.shape[0] > 0:
-            add_to_words(tally, words, index, added)
+        if halves.shape[0] > 0:
+            add_to_halves(tally, halves, index, added)
         else:
             atomic_add_int64(tally, index, added)
 
@@ -144,7 +144,7 @@ def _in_voxels(volume: FluxVolume, x: wp.vec3, path: float) -> wp.vec4:
 
 
 @wp.func
-def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], words: wp.array[wp.uint32], leg: Leg):
+def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], halves: wp.array[wp.uint32], leg: Leg):
     """Adds weight times length at a point in each of equal steps of a voxel or gate at most: unbiased, exact in sum."""
     q = _in_voxels(volume, leg.x, leg.path)
     along = volume.turn * leg.u
@@ -170,13 +170,13 @@ def add_flux_track(volume: FluxVolume, tally: wp.array[wp.int64], words: wp.arra
     units = leg.weight * step * volume.scale + leg.rounding_sample
     if end > begin:
         for _step in range(steps):
-            _add(tally, words, _voxel(volume, p), units)
+            _add(tally, halves, _voxel(volume, p), units)
             p += step * v
 
 
 @wp.func
 def add_flux_collision(
-    volume: FluxVolume, tally: wp.array[wp.int64], words: wp.array[wp.uint32], leg: Leg, extinction: float
+    volume: FluxVolume, tally: wp.array[wp.int64], halves: wp.array[wp.uint32], leg: Leg, extinction: float
 ):
     """Adds weight over extinction [1/m] at the collision that ends a leg: the expectation of `add_flux_track`."""
     p = _in_voxels(volume, leg.x + leg.length * leg.u, leg.path + leg.length)
@@ -187,12 +187,12 @@ def add_flux_collision(
         inside = inside and wp.uint32(k) < wp.uint32(volume.size[i])
         entry = entry * volume.size[i] + k
     if inside:
-        _add(tally, words, volume.first + entry, leg.weight / extinction * volume.scale + leg.rounding_sample)
+        _add(tally, halves, volume.first + entry, leg.weight / extinction * volume.scale + leg.rounding_sample)
 
 
 @wp.func
 def add_flux_crossings(
-    planes: FluxPlanes, positions: wp.array[float], tally: wp.array[wp.int64], words: wp.array[wp.uint32], leg: Leg
+    planes: FluxPlanes, positions: wp.array[float], tally: wp.array[wp.int64], halves: wp.array[wp.uint32], leg: Leg
 ):
     """Adds the weight to all planes that a leg crosses."""
     begin = wp.dot(planes.axis, leg.x)
@@ -211,15 +211,15 @@ def add_flux_crossings(
             across = away - wp.dot(planes.axis, away) * planes.axis
             if planes.radius2 >= 1.0e30 or wp.dot(across, across) <= planes.radius2:
                 entry = planes.first + k * width
-                _add(tally, words, entry + side, exact)
-                _add(tally, words, entry + 2 + side, scalar)
+                _add(tally, halves, entry + side, exact)
+                _add(tally, halves, entry + 2 + side, scalar)
                 if planes.polar > 0:
                     angle = wp.acos(wp.clamp(mu, -1.0, 1.0)) / wp.pi
                     i = wp.min(int(angle * float(planes.polar)), planes.polar - 1)
                     turn = wp.atan2(wp.dot(wp.cross(planes.axis, planes.right), leg.u), wp.dot(planes.right, leg.u))
                     turn = turn / (2.0 * wp.pi) + wp.where(turn < 0.0, 1.0, 0.0)
                     j = wp.min(int(turn * float(planes.azimuth)), planes.azimuth - 1)
-                    _add(tally, words, entry + 4 + i * planes.azimuth + j, scalar)
+                    _add(tally, halves, entry + 4 + i * planes.azimuth + j, scalar)
 
 
 def make_flux_volume(

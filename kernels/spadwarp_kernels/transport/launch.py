@@ -139,7 +139,7 @@ class Data:
     split_accumulators: wp.array | None = None
     """uint32, as long as the tally, zero between launches; made by the first launch that is large enough, see
     `tally.splitting_pays`, and used by those after it."""
-    flux_words: wp.array | None = None  # likewise, as long as `flux`
+    flux_halves: wp.array | None = None  # likewise the low bits of `flux`, see `tally.add_to_halves`
 
 
 def make_data(
@@ -476,8 +476,8 @@ def prepare_transport(
     sink = Sink()
     sink.tally, sink.ledger, sink.scale, sink.records = data.tally, data.ledger, model.scale, data.records
     sink.gradients, sink.low = data.gradients, split_accumulators
-    flux_words = _flux_words(model, data, most)
-    sink.flux, sink.flux_words = data.flux, flux_words
+    flux_halves = _flux_halves(model, data, most)
+    sink.flux, sink.flux_halves = data.flux, flux_halves
     shared = None if spec.blocks else _make_world(spec, model, seed, 0)
 
     def launch(first_id: int, photon_count: int) -> None:
@@ -492,8 +492,8 @@ def prepare_transport(
         wp.launch(kernel, dim=threads, inputs=[world, sink, part], device=device, block_dim=BLOCK_SIZE)
         if split_accumulators is not None:
             fold_accumulators(split_accumulators, data.tally)
-        if flux_words is not None:
-            fold_accumulators(flux_words, data.flux)
+        if flux_halves is not None:
+            fold_accumulators(flux_halves, data.flux)
 
     return launch
 
@@ -512,14 +512,14 @@ def _split_accumulators(spec: TransportSpec, model: Model, data: Data, photon_co
 _FLUX_ADDITIONS = 64
 
 
-def _flux_words(model: Model, data: Data, photon_count: int) -> wp.array | None:
+def _flux_halves(model: Model, data: Data, photon_count: int) -> wp.array | None:
     """Those of `data` for a launch on CUDA that is large enough; None for others."""
     size = model.flux.size
     if not (model.device.is_cuda and splitting_pays(size, _FLUX_ADDITIONS * photon_count)):
         return None
-    if data.flux_words is None and not model.device.is_capturing:
-        data.flux_words = wp.zeros(size, dtype=wp.uint32, device=model.device)
-    return data.flux_words
+    if data.flux_halves is None and not model.device.is_capturing:
+        data.flux_halves = wp.zeros(-(-size // 2), dtype=wp.uint32, device=model.device)
+    return data.flux_halves
 
 
 def _make_world(spec: TransportSpec, model: Model, seed: int, threads: int) -> World:

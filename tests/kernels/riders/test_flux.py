@@ -9,12 +9,13 @@ import warp as wp
 
 import spadwarp_kernels as sk
 from helpers.launch import launched
+from spadwarp_kernels.tally.tally import fold_accumulators
 
 SCALE = 2.0**20
 WATER = sk.make_medium(0.01, 0.99)  # g 0, albedo .99
 PHOTONS = 20_000
 DRAWS = wp.constant(512)
-NO_WORDS = wp.zeros(0, dtype=wp.uint32, device="cpu")
+NO_HALVES = wp.zeros(0, dtype=wp.uint32, device="cpu")
 
 
 @wp.kernel
@@ -23,13 +24,13 @@ def _tracks(
     x: wp.array[wp.vec3],
     u: wp.array[wp.vec3],
     tally: wp.array[wp.int64],
-    words: wp.array[wp.uint32],
+    halves: wp.array[wp.uint32],
 ):
     i = wp.tid()
     # Any point within a step alike.
     for k in range(DRAWS):
         sample = 0.5 + (float(k) + 0.5) / (4096.0 * float(DRAWS))
-        sk.add_flux_track(volume, tally, words, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, sample))
+        sk.add_flux_track(volume, tally, halves, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, sample))
 
 
 @wp.kernel
@@ -39,10 +40,10 @@ def _planes(
     u: wp.array[wp.vec3],
     positions: wp.array[float],
     tally: wp.array[wp.int64],
-    words: wp.array[wp.uint32],
+    halves: wp.array[wp.uint32],
 ):
     i = wp.tid()
-    sk.add_flux_crossings(planes, positions, tally, words, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, 0.5))
+    sk.add_flux_crossings(planes, positions, tally, halves, sk.Leg(x[i], u[i], 3.0, 1.0, 0.5, 0.5))
 
 
 def directions(rng, count):
@@ -60,7 +61,7 @@ def test_lengths_in_voxels_and_gates_are_those_of_dense_points():
     volume = sk.make_flux_volume((4, 5, 6), lower=lower, edge=edge, rotation=turn, origin=origin, scale=SCALE, **gates)
     sk.make_flux([volume], device="cpu")
     tally = wp.zeros(3 * 4 * 5 * 6, dtype=wp.int64, device="cpu")
-    launched(_tracks, [volume, x, u, tally, NO_WORDS], out=())
+    launched(_tracks, [volume, x, u, tally, NO_HALVES], out=())
     steps = (np.arange(4_000) + 0.5) * 3.0 / 4_000
     expected = np.zeros((3, 4, 5, 6))
     for start, along in zip(x, u, strict=True):
@@ -74,6 +75,29 @@ def test_lengths_in_voxels_and_gates_are_those_of_dense_points():
     )
 
 
+@wp.kernel
+def _collisions(volume: sk.FluxVolume, x: wp.array[wp.vec3], tally: wp.array[wp.int64], halves: wp.array[wp.uint32]):
+    for k in range(64):
+        leg = sk.Leg(x[wp.tid()], wp.vec3(0.0, 0.0, 1.0), 0.0, 0.0, float(k + 1) / 64.0, 0.5)
+        sk.add_flux_collision(volume, tally, halves, leg, 1.0)
+
+
+@pytest.mark.parametrize("scale", [2.0**13, 2.0**18])
+def test_halves_apart_keep_the_sums(device, scale):
+    """Carries into the neighbour's half, out of the word, and values of more than 16 bits; an odd number of voxels."""
+    if not wp.get_device(device).is_cuda:
+        pytest.skip("CUDA alone keeps them apart")
+    volume = sk.make_flux_volume((3, 3, 3), lower=(0, 0, 0), edge=(1, 1, 1), estimator="collision", scale=scale)
+    sk.make_flux([volume], device=device)
+    x = wp.array(np.random.default_rng(3).uniform(0.0, 3.0, (20_000, 3)), dtype=wp.vec3, device=device)
+    tally, other = (wp.zeros(27, dtype=wp.int64, device=device) for _ in range(2))
+    halves, none = (wp.zeros(size, dtype=wp.uint32, device=device) for size in (14, 0))
+    wp.launch(_collisions, dim=x.size, inputs=[volume, x, tally, none], device=device)
+    wp.launch(_collisions, dim=x.size, inputs=[volume, x, other, halves], device=device)
+    fold_accumulators(halves, other)
+    assert np.array_equal(tally.numpy(), other.numpy()) and tally.numpy().min() > 0 and not halves.numpy()[:13].any()
+
+
 def test_light_through_planes_of_even_radiance():
     """Crossings of even radiance: mean cosine 1/2 either way, scalar irradiance twice the plane's, even radiance."""
     rng, count = np.random.default_rng(2), 400_000
@@ -83,7 +107,7 @@ def test_light_through_planes_of_even_radiance():
     sk.make_flux([planes], [-0.1, 0.0], device="cpu")
     tally = wp.zeros(2 * (4 + 18), dtype=wp.int64, device="cpu")
     positions = wp.array([-0.1, 0.0], dtype=float, device="cpu")
-    launched(_planes, [planes, x, u, positions, tally, NO_WORDS], out=())
+    launched(_planes, [planes, x, u, positions, tally, NO_HALVES], out=())
     down, up, scalar_down, scalar_up, *radiance = (tally.numpy().reshape(2, 22)[1] / SCALE).tolist()
     # Photons of density n per volume with legs of 3 m make the fluence n·3 m·.5; a disc of radius 2 m has 4 pi m^2.
     scalar = 0.5 * 3.0 * count / (10.0 * 6.0 * 10.0) * 4.0 * math.pi
