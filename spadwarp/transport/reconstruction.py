@@ -36,7 +36,10 @@ __all__ = ["known_light", "reconstruct"]
 
 Cube = NDArray[np.float32]
 
-_RAYS = 64  # within a pixel, a square number
+# Truth rays of a pixel, 8 x 8, each of another column and another row of a finer grid, in an order that leaves columns
+# and rows without correlation (correlated multi-jittered sampling: Kensler 2013).
+_ORDER = np.array([4, 2, 6, 0, 7, 1, 5, 3])
+_LENS = 4  # times as many rays where they meet the lens at different points
 _STEPS = np.array([0.7548776662, 0.5698402910])  # additive sequence in two dimensions (Roberts 2018)
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
 # Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
@@ -114,9 +117,10 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
     model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
     row = count + 2  # what comes after the gate
     first = np.arange(shape[0] * shape[1]).reshape(shape) * row
-    found: list[Any] = [(np.zeros(0, np.int64), *np.zeros((2, 0)))]
-    hits = np.zeros(first.size * row)
-    for place, lens in _places(scene, focus) if model.mesh is not None else ():
+    hits, rises = np.zeros(first.size * row), np.zeros((2, first.size * row))
+    radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
+    places = list(_places(radius))
+    for place, lens in places if model.mesh is not None else ():
         corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
         view = np.concatenate([image_tangents(camera, corners + place), np.ones((*shape, 1))], axis=-1)
         view = view - lens / (focus or math.inf)
@@ -135,7 +139,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
         towards = (normal * lines.direction).sum(axis=-1)[..., None]
         slopes = []
         for unit in np.eye(3)[:2]:
-            axis = unit * camera.pixel_tangent / (slant * math.sqrt(_RAYS))
+            axis = unit * camera.pixel_tangent / (slant * len(_ORDER))
             moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
             along_sight, along_light = (moved * lines.direction).sum(axis=-1), (moved * direction).sum(axis=-1)
             slopes.append(along * (along_sight + along_light) * _FINE / (scene.medium.pulse_speed * gate.bin_width))
@@ -148,27 +152,25 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
                 edge = np.clip(start + moved * width + part * narrow[inside], 0.0, count)
                 whole = edge.astype(np.int64)
                 for step, share in ((0, 1.0 - edge + whole), (1, edge - whole)):
-                    parts = (0.5 * sign / width) * share
-                    found.append((first[inside] + whole + step, (even * lit)[inside] * parts, even[inside] * parts))
-    index, *light = (np.concatenate(rays) for rays in zip(*found, strict=True))
-    covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / _RAYS
-    rises = (np.bincount(index, part, hits.size).reshape(*shape, row) for part in light)
-    sums = (np.cumsum(part, axis=-1)[..., :count] for part in rises)
+                    for rise, light in zip(rises, (even * lit, even), strict=True):
+                        np.add.at(rise, first[inside] + whole + step, (0.5 * sign / width) * share * light[inside])
+    covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / len(places)
+    sums = (np.cumsum(rise.reshape(*shape, row), axis=-1)[..., :count] for rise in rises)
     cubes = *(np.where(part > _ROUNDING * part.max(), part, 0.0) for part in sums), covered
     return tuple(cube.astype(np.float32) for cube in cubes)  # type: ignore[return-value]
 
 
-def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """Places within a pixel, and points of a lens that is not behind a port [m]."""
-    camera = scene.camera
-    radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
-    side = math.isqrt(_RAYS)
-    for k in range(_RAYS):
-        column, line = k % side, k // side  # each of another column and another row of a finer grid
+def _places(radius: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Places within a pixel, and points of a lens of this radius [m] that is not behind a port [m]."""
+    side = len(_ORDER)
+    for k in range(side**2 * (_LENS if radius else 1)):
+        cell = np.array([k % side, k // side % side])
         u, v = (k + 0.5) * _STEPS % 1.0
         r, angle = radius * math.sqrt(u), 2.0 * math.pi * v
-        place = np.array([column + (line + 0.5) / side, line + (column + 0.5) / side]) / side
-        yield place, np.array([r * math.cos(angle), r * math.sin(angle), 0.0])
+        yield (
+            (cell + (_ORDER[cell[::-1]] + 0.5) / side) / side,
+            np.array([r * math.cos(angle), r * math.sin(angle), 0.0]),
+        )
 
 
 def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float64]:
