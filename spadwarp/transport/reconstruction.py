@@ -49,7 +49,7 @@ _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
 # Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
-_AROUND = (4, 1)
+_AROUND = (16, 1)
 _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
 _ROUNDING = 1e-9  # of the most: what sums of rises and falls leave where no ray sees light
 
@@ -97,7 +97,7 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
             return np.zeros_like(mean[k])
         predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / predictions[k].sum(dtype=np.float64))
         predicted += np.float32(k == 1) * _FLOOR * predicted.mean()
-        start = aligned if k == 1 else 0 * aligned
+        start = aligned * (k < 2)
         light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, device)
         # Windows are chosen by the same noise, which loses rare light: each aligned bin gets its own light back.
         rows = np.arange(gate.bins) + (start.max() - start)[..., None]
@@ -253,8 +253,9 @@ def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp
     launch(sk.combine_kernel, values, blended, sums)
     sk.window_sums(sums, _AROUND, work, around)
     found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
-    # A window holds its own voxel: what is less is left over by differences of float32.
-    bias = np.maximum(near[..., 0], 0.0) / np.maximum(np.maximum(near[..., 2], own[..., 1]), 1e-30) * own[..., 1]
+    # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
+    bias = np.maximum(near[..., 0] + np.sqrt(np.maximum(near[..., 3], 0.0) * own[..., 1]), 0.0)
+    bias *= own[..., 1] / np.maximum(np.maximum(near[..., 2], own[..., 1]), 1e-30)
     light = 0.5 * scale * np.maximum(found[..., 0] + found[..., 1], 0.0)  # differences of float32 end below 0
     square = scale**2 * (own[..., 0] + bias)
     return tuple(np.take_along_axis(cube, rows, axis=-1) for cube in (light, square))  # type: ignore[return-value]
