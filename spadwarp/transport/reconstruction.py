@@ -66,22 +66,18 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     Raises `ConfigError`: fewer than two batches of photons, the surface of the sea, a moving scan; what `simulate`
     raises of the scene's files.
     """
-    halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
-    return replace(result, reconstruction=reconstructed(result, halves, pick_device(device)))
-
-
-def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruction:
-    """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
     from scipy.ndimage import distance_transform_edt
 
+    halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
     if not scene.has_straight_sight:
         raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)
         focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None
-    direct, even, covered = known_light(scene, focus, device)
-    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
+    chosen = pick_device(device)
+    direct, even, covered = known_light(scene, focus, chosen)
+    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=chosen) for part in (direct, even)]
     ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
     # Scattered light of a pixel without a target is that of the nearest target.
     start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
@@ -98,16 +94,16 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
         predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / predictions[k].sum(dtype=np.float64))
         predicted += np.float32(k == 1) * _FLOOR * predicted.mean()
         start = aligned * (k < 2)
-        light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, device)
+        light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, chosen)
         # Windows are chosen by the same noise, which loses rare light: each aligned bin gets its own light back.
         rows = np.arange(gate.bins) + (start.max() - start)[..., None]
         traced, kept = (np.bincount(rows.ravel(), cube.ravel()) for cube in (result.component(COMPONENTS[k]), light))
         found[k] = light * np.divide(traced, kept, out=np.zeros_like(kept), where=kept > 0.0)[rows]
         return square
 
-    with ThreadPoolExecutor(1 if device.is_cuda else 2) as threads:
+    with ThreadPoolExecutor(1 if chosen.is_cuda else 2) as threads:
         squares = sum(threads.map(smooth, (1, 0, 2)))
-    return Reconstruction(histogram=found, error=np.sqrt(squares))
+    return replace(result, reconstruction=Reconstruction(histogram=found, error=np.sqrt(squares)))
 
 
 def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
@@ -193,18 +189,20 @@ def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
 
 def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
+    from scipy.ndimage import uniform_filter
     from scipy.optimize import nnls
 
     terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
     terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
     for radius in _BLURS:
-        blurred = _window_sums(_window_sums(ballistic, (radius, 0), direct.device), (radius, 0), direct.device)
+        box = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
+        blurred = uniform_filter(uniform_filter(ballistic, **box), **box)
         pixels: Any = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
         terms += [_delayed(pixels, delay, 1).numpy() for delay in _BLURRED_DELAYS]
     sums = [float(term.sum(dtype=np.float64)) for term in terms]
     rows = np.stack([term.ravel() / total for term, total in zip(terms, sums, strict=True) if total > 0.0])
     # Weights: the variance of light is about proportional to it.
-    level = _window_sums(light, (3, 2), direct.device).ravel()
+    level = uniform_filter(light, (7, 7, 5), mode="constant").ravel()
     root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
     rows *= root
     gram = (rows @ rows.T).astype(np.float64)
@@ -218,14 +216,6 @@ def _backscatter(covered: Cube, light: Cube) -> Cube:
     open_ = 1.0 - np.minimum(covered, 1.0)
     parts = [(part, (part * light).sum(axis=(0, 1)), part.sum(axis=(0, 1))) for part in (open_, 1.0 - open_)]
     return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
-
-
-def _window_sums(values: Cube, radius: tuple[int, int], device: wp.Device) -> Cube:
-    """Of numbers `[H, W, T]`."""
-    cubes = [wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(2)]
-    source: Any = wp.array(np.repeat(values[..., None], 4, axis=-1), dtype=wp.vec4, device=device)
-    sk.window_sums(source, radius, *cubes)
-    return cubes[1].numpy()[..., 0]
 
 
 def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp.Device) -> tuple[Cube, Cube]:
