@@ -231,16 +231,12 @@ def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp
     aligned *= np.array([1.0, 1.0, 1.0 / scale, 1.0], np.float32) / scale
     values: Any = wp.array(aligned, dtype=wp.vec4, device=device)
     sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
-
-    def launch(kernel: Any, *arrays: wp.array) -> None:
-        wp.launch(kernel, dim=shape, inputs=[*arrays], device=device)
-
     for window in _WINDOWS:
         sk.window_sums(values, window, work, sums)
-        launch(sk.estimate_kernel, values, sums, risk)
+        wp.launch(sk.estimate_kernel, dim=shape, inputs=[values, sums, risk], device=device)
         sk.window_sums(risk, _AROUND, work, around)
-        launch(sk.blend_kernel, values, sums, around, blended)
-    launch(sk.combine_kernel, values, blended, sums)
+        wp.launch(sk.blend_kernel, dim=shape, inputs=[values, sums, around, blended], device=device)
+    wp.launch(sk.combine_kernel, dim=shape, inputs=[values, blended, sums], device=device)
     sk.window_sums(sums, _AROUND, work, around)
     found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
     # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
