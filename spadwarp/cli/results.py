@@ -50,8 +50,9 @@ def info(path: Path, *, verify: bool = False) -> None:
             name: f"{one['frames']} frames of {', '.join(one['targets'])}" for name, one in facts.pop("splits").items()
         }
         del facts["targets"]
-        say(readable(facts))
-        write_json({"kind": "dataset", **manifest})
+        ratio = {k: v for k, v in spadwarp.files.summary(spadwarp.load(path)).items() if k == "noise_ratio"}
+        say(readable(facts | ratio))
+        write_json({"kind": "dataset", **manifest, **ratio})
     else:
         loaded = spadwarp.load(path)
         if isinstance(loaded, spadwarp.Result) and (problem := spadwarp.result.noise_problem(loaded)):

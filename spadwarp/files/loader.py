@@ -165,6 +165,7 @@ def summary(held: Held | Scene | Frames | AnalyticResult | Proposal) -> dict[str
         shards, targets = held.shards, list(held.manifest["targets"])
         facts = {"kind": "dataset", "name": held.manifest["name"], "folder": str(held.path)}
         facts |= {"shards": shards if len(shards) == 1 else len(shards), "frames": len(held)}
+        facts |= _median_ratio(held.scene_numbers("noise_ratio"))
         return {**facts, "image": {"width": held.shape[1], "height": held.shape[0]}, "targets": targets}
     if isinstance(held, Frames):
         intensity = on_host(held.intensity)
@@ -187,9 +188,15 @@ def summary(held: Held | Scene | Frames | AnalyticResult | Proposal) -> dict[str
         facts = {"times_s": [float(times[0]), float(times[-1])], "moving": list(held.trajectory.fields)}
         return {"kind": "sequence", **common, "pulses": held.pulses, **facts, "depth_by": list(held.methods)}
     mean = [float(held.intensity(number).mean()) for number in range(held.frames)]
-    more = {} if held.channel == "I" else {"channel": held.channel}
+    more: dict[str, Any] = {} if held.channel == "I" else {"channel": held.channel}
+    more |= _median_ratio(held.noise_ratio)
     counts = _of_frames(held, float(np.mean(mean)) if mean else None)
     return {"kind": "frames", **common, **counts, "depth_by": list(held.methods), **more}
+
+
+def _median_ratio(ratios: NDArray[Any] | None) -> dict[str, float]:
+    """Of pixels or scenes that have a noise ratio."""
+    return {"noise_ratio": float(np.nanmedian(ratios))} if ratios is not None and np.isfinite(ratios).any() else {}
 
 
 def _of_frames(held: Frames | FramesFile, counts_per_pixel: float | None) -> dict[str, Any]:

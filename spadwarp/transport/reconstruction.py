@@ -36,7 +36,10 @@ __all__ = ["known_light", "reconstruct"]
 
 Cube = NDArray[np.float32]
 
-_RAYS = 64  # within a pixel, a square number
+# Truth rays of a pixel, 8 x 8, each of another column and another row of a finer grid, in an order that leaves columns
+# and rows without correlation (correlated multi-jittered sampling: Kensler 2013).
+_ORDER = np.array([4, 2, 6, 0, 7, 1, 5, 3])
+_LENS = 4  # times as many rays where they meet the lens at different points
 _STEPS = np.array([0.7548776662, 0.5698402910])  # additive sequence in two dimensions (Roberts 2018)
 _FINE = 4  # parts of a bin: light that is less than a bin late moves to the next
 # Delays [fine bins] of direct light and of surfaces in even light; of blurred light [bins], by the blur's radius.
@@ -46,7 +49,7 @@ _BLURRED_DELAYS = ((0, 1), (1, 3), (3, 8), (8, 20), (20, 50))
 _BLURS = (1, 3, 8, 20)  # of two boxes [pixels]
 # Radii of the windows, in pixels and bins, and of the one over which their errors are averaged.
 _WINDOWS = ((0, 0), (1, 0), (2, 0), (4, 0), (8, 0), (16, 0), (32, 0), (4, 1), (8, 2), (32, 4))
-_AROUND = (4, 1)
+_AROUND = (16, 1)
 _FLOOR = 1e-3  # of the mean: forward-scattered light where none is predicted
 _ROUNDING = 1e-9  # of the most: what sums of rises and falls leave where no ray sees light
 
@@ -63,22 +66,18 @@ def reconstruct(result: Result, *, device: str | None = None) -> Result:
     Raises `ConfigError`: fewer than two batches of photons, the surface of the sea, a moving scan; what `simulate`
     raises of the scene's files.
     """
-    halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
-    return replace(result, reconstruction=reconstructed(result, halves, pick_device(device)))
-
-
-def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruction:
-    """`reconstruct` of two independent halves, `[2, 3, H, W, T]`, each of which expects the result's histogram."""
     from scipy.ndimage import distance_transform_edt
 
+    halves = np.stack([half.tallies * half.tally_value[..., None] for half in result.halves], dtype=np.float32)
     scene, gate, pixels = result.scene, result.scene.gate, result.truth.depth.size
     if not scene.has_straight_sight:
         raise ConfigError("reconstruct knows neither [surface] nor scan.mode = 'trajectory'", source=scene.source)
     if (focus := result.focus_distance) is not None:  # lens points matter where a point's image is half a pixel wide
         blur = scene.camera.aperture_radius * np.abs(1.0 / focus - 1.0 / result.truth.depth)
         focus = focus if np.nanmax(blur, initial=0.0) > 0.25 * scene.camera.pixel_tangent else None
-    direct, even, covered = known_light(scene, focus, device)
-    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=device) for part in (direct, even)]
+    chosen = pick_device(device)
+    direct, even, covered = known_light(scene, focus, chosen)
+    fine: list[Any] = [wp.array(part.reshape(pixels, -1), dtype=float, device=chosen) for part in (direct, even)]
     ballistic = _delayed(fine[0], (0, 1), _FINE).numpy().reshape(covered.shape)
     # Scattered light of a pixel without a target is that of the nearest target.
     start = (result.true_path() / scene.medium.pulse_speed - gate.start) / gate.bin_width
@@ -94,17 +93,17 @@ def reconstructed(result: Result, halves: Cube, device: wp.Device) -> Reconstruc
             return np.zeros_like(mean[k])
         predicted = predictions[k] * np.float32(mean[k].sum(dtype=np.float64) / predictions[k].sum(dtype=np.float64))
         predicted += np.float32(k == 1) * _FLOOR * predicted.mean()
-        start = aligned if k == 1 else 0 * aligned
-        light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, device)
+        start = aligned * (k < 2)
+        light, square = _smoothed(halves[0, k], halves[1, k], predicted, start, chosen)
         # Windows are chosen by the same noise, which loses rare light: each aligned bin gets its own light back.
         rows = np.arange(gate.bins) + (start.max() - start)[..., None]
         traced, kept = (np.bincount(rows.ravel(), cube.ravel()) for cube in (result.component(COMPONENTS[k]), light))
         found[k] = light * np.divide(traced, kept, out=np.zeros_like(kept), where=kept > 0.0)[rows]
         return square
 
-    with ThreadPoolExecutor(1 if device.is_cuda else 2) as threads:
+    with ThreadPoolExecutor(1 if chosen.is_cuda else 2) as threads:
         squares = sum(threads.map(smooth, (1, 0, 2)))
-    return Reconstruction(histogram=found, error=np.sqrt(squares))
+    return replace(result, reconstruction=Reconstruction(histogram=found, error=np.sqrt(squares)))
 
 
 def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[Cube, Cube, Cube]:
@@ -114,9 +113,10 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
     model, shape = build_model(scene, device, build_mesh(scene), camera=False), (camera.height, camera.width)
     row = count + 2  # what comes after the gate
     first = np.arange(shape[0] * shape[1]).reshape(shape) * row
-    found: list[Any] = [(np.zeros(0, np.int64), *np.zeros((2, 0)))]
-    hits = np.zeros(first.size * row)
-    for place, lens in _places(scene, focus) if model.mesh is not None else ():
+    hits, rises = np.zeros(first.size * row), np.zeros((2, first.size * row))
+    radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
+    places = list(_places(radius))
+    for place, lens in places if model.mesh is not None else ():
         corners = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1)
         view = np.concatenate([image_tangents(camera, corners + place), np.ones((*shape, 1))], axis=-1)
         view = view - lens / (focus or math.inf)
@@ -135,7 +135,7 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
         towards = (normal * lines.direction).sum(axis=-1)[..., None]
         slopes = []
         for unit in np.eye(3)[:2]:
-            axis = unit * camera.pixel_tangent / (slant * math.sqrt(_RAYS))
+            axis = unit * camera.pixel_tangent / (slant * len(_ORDER))
             moved = axis - lines.direction * (normal * axis).sum(axis=-1, keepdims=True) / np.minimum(towards, -1e-3)
             along_sight, along_light = (moved * lines.direction).sum(axis=-1), (moved * direction).sum(axis=-1)
             slopes.append(along * (along_sight + along_light) * _FINE / (scene.medium.pulse_speed * gate.bin_width))
@@ -148,27 +148,25 @@ def known_light(scene: Scene, focus: float | None, device: wp.Device) -> tuple[C
                 edge = np.clip(start + moved * width + part * narrow[inside], 0.0, count)
                 whole = edge.astype(np.int64)
                 for step, share in ((0, 1.0 - edge + whole), (1, edge - whole)):
-                    parts = (0.5 * sign / width) * share
-                    found.append((first[inside] + whole + step, (even * lit)[inside] * parts, even[inside] * parts))
-    index, *light = (np.concatenate(rays) for rays in zip(*found, strict=True))
-    covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / _RAYS
-    rises = (np.bincount(index, part, hits.size).reshape(*shape, row) for part in light)
-    sums = (np.cumsum(part, axis=-1)[..., :count] for part in rises)
+                    for rise, light in zip(rises, (even * lit, even), strict=True):
+                        np.add.at(rise, first[inside] + whole + step, (0.5 * sign / width) * share * light[inside])
+    covered = np.cumsum(hits.reshape(*shape, row), axis=-1)[..., _FINE - 1 : count : _FINE] / len(places)
+    sums = (np.cumsum(rise.reshape(*shape, row), axis=-1)[..., :count] for rise in rises)
     cubes = *(np.where(part > _ROUNDING * part.max(), part, 0.0) for part in sums), covered
     return tuple(cube.astype(np.float32) for cube in cubes)  # type: ignore[return-value]
 
 
-def _places(scene: Scene, focus: float | None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
-    """Places within a pixel, and points of a lens that is not behind a port [m]."""
-    camera = scene.camera
-    radius = 0.0 if camera.pinhole or camera.port is not None or focus is None else camera.aperture_radius
-    side = math.isqrt(_RAYS)
-    for k in range(_RAYS):
-        column, line = k % side, k // side  # each of another column and another row of a finer grid
+def _places(radius: float) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Places within a pixel, and points of a lens of this radius [m] that is not behind a port [m]."""
+    side = len(_ORDER)
+    for k in range(side**2 * (_LENS if radius else 1)):
+        cell = np.array([k % side, k // side % side])
         u, v = (k + 0.5) * _STEPS % 1.0
         r, angle = radius * math.sqrt(u), 2.0 * math.pi * v
-        place = np.array([column + (line + 0.5) / side, line + (column + 0.5) / side]) / side
-        yield place, np.array([r * math.cos(angle), r * math.sin(angle), 0.0])
+        yield (
+            (cell + (_ORDER[cell[::-1]] + 0.5) / side) / side,
+            np.array([r * math.cos(angle), r * math.sin(angle), 0.0]),
+        )
 
 
 def _footprint(scene: Scene, direction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -191,18 +189,20 @@ def _delayed(fine: wp.array, delay: tuple[int, int], per_bin: int) -> wp.array:
 
 def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
     """Prediction of forward-scattered light from its tallies."""
+    from scipy.ndimage import uniform_filter
     from scipy.optimize import nnls
 
     terms = [_delayed(direct, delay, _FINE).numpy() for delay in _DELAYS]
     terms += [_delayed(even, delay, _FINE).numpy() for delay in _EVEN_DELAYS]
     for radius in _BLURS:
-        blurred = _window_sums(_window_sums(ballistic, (radius, 0), direct.device), (radius, 0), direct.device)
+        box = {"size": (2 * radius + 1, 2 * radius + 1, 1), "mode": "constant"}
+        blurred = uniform_filter(uniform_filter(ballistic, **box), **box)
         pixels: Any = wp.array(blurred.reshape(direct.shape[0], -1), dtype=float, device=direct.device)
         terms += [_delayed(pixels, delay, 1).numpy() for delay in _BLURRED_DELAYS]
     sums = [float(term.sum(dtype=np.float64)) for term in terms]
     rows = np.stack([term.ravel() / total for term, total in zip(terms, sums, strict=True) if total > 0.0])
     # Weights: the variance of light is about proportional to it.
-    level = _window_sums(light, (3, 2), direct.device).ravel()
+    level = uniform_filter(light, (7, 7, 5), mode="constant").ravel()
     root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
     rows *= root
     gram = (rows @ rows.T).astype(np.float64)
@@ -218,14 +218,6 @@ def _backscatter(covered: Cube, light: Cube) -> Cube:
     return sum(part * (total / np.maximum(pixels, 1e-6)) for part, total, pixels in parts)  # type: ignore[return-value]
 
 
-def _window_sums(values: Cube, radius: tuple[int, int], device: wp.Device) -> Cube:
-    """Of numbers `[H, W, T]`."""
-    cubes = [wp.zeros(values.shape, dtype=wp.vec4, device=device) for _ in range(2)]
-    source: Any = wp.array(np.repeat(values[..., None], 4, axis=-1), dtype=wp.vec4, device=device)
-    sk.window_sums(source, radius, *cubes)
-    return cubes[1].numpy()[..., 0]
-
-
 def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp.Device) -> tuple[Cube, Cube]:
     """Light of a component and its squared error `[H, W, T]`. `start`: bin from which those of a pixel are counted."""
     bins, shift = first.shape[-1], int(start.max()) - start
@@ -239,20 +231,17 @@ def _smoothed(first: Cube, second: Cube, predicted: Cube, start: Any, device: wp
     aligned *= np.array([1.0, 1.0, 1.0 / scale, 1.0], np.float32) / scale
     values: Any = wp.array(aligned, dtype=wp.vec4, device=device)
     sums, work, risk, around, blended = (wp.zeros(shape, dtype=wp.vec4, device=device) for _ in range(5))
-
-    def launch(kernel: Any, *arrays: wp.array) -> None:
-        wp.launch(kernel, dim=shape, inputs=[*arrays], device=device)
-
     for window in _WINDOWS:
         sk.window_sums(values, window, work, sums)
-        launch(sk.estimate_kernel, values, sums, risk)
+        wp.launch(sk.estimate_kernel, dim=shape, inputs=[values, sums, risk], device=device)
         sk.window_sums(risk, _AROUND, work, around)
-        launch(sk.blend_kernel, values, sums, around, blended)
-    launch(sk.combine_kernel, values, blended, sums)
+        wp.launch(sk.blend_kernel, dim=shape, inputs=[values, sums, around, blended], device=device)
+    wp.launch(sk.combine_kernel, dim=shape, inputs=[values, blended, sums], device=device)
     sk.window_sums(sums, _AROUND, work, around)
     found, own, near = blended.numpy(), sums.numpy()[..., 1:3], around.numpy()
-    # A window holds its own voxel: what is less is left over by differences of float32.
-    bias = np.maximum(near[..., 0], 0.0) / np.maximum(np.maximum(near[..., 2], own[..., 1]), 1e-30) * own[..., 1]
+    # One standard error more than the halves show. A window holds its own voxel: differences of float32 leave less.
+    bias = np.maximum(near[..., 0] + np.sqrt(np.maximum(near[..., 3], 0.0) * own[..., 1]), 0.0)
+    bias *= own[..., 1] / np.maximum(np.maximum(near[..., 2], own[..., 1]), 1e-30)
     light = 0.5 * scale * np.maximum(found[..., 0] + found[..., 1], 0.0)  # differences of float32 end below 0
     square = scale**2 * (own[..., 0] + bias)
     return tuple(np.take_along_axis(cube, rows, axis=-1) for cube in (light, square))  # type: ignore[return-value]

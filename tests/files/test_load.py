@@ -57,6 +57,7 @@ def test_load_and_info_take_every_file(files, name, tmp_path):
     assert spadwarp.load(str(files[name])).__class__ is held.__class__
     printed = run("info", files[name], "--json", tmp_path / "printed.json").stdout
     assert kind in printed.lower() and tables(tmp_path / "printed.json").get("kind", "result") == kind
+    assert name != "frames" or tables(tmp_path / "printed.json")["noise_ratio"] > 0.0
 
 
 @pytest.mark.parametrize("name", ["unfinished", "frames", "analytic", "dataset", "shard"])

@@ -47,8 +47,8 @@ def test_no_light_is_negative_so_that_counts_can_be_drawn(runs: tuple[Result, Re
         spadwarp.crlb(result, pulses=2000, device="cpu")
 
 
-def test_brightest_bins_have_a_quarter_of_the_squared_error(runs: tuple[Result, Result]) -> None:
-    """As 4 times the photons; the other run has 1/16 of the variance, and its error is in both sums."""
+def test_brightest_bins_have_a_seventh_of_the_squared_error(runs: tuple[Result, Result]) -> None:
+    """As 7 times the photons; the other run has 1/16 of the variance, and its error is in both sums."""
     result, other = runs
     target = np.isfinite(result.truth.depth)
     peak = other.histogram.argmax(axis=-1)[..., None]
@@ -57,9 +57,9 @@ def test_brightest_bins_have_a_quarter_of_the_squared_error(runs: tuple[Result, 
         ("other", other.histogram), ("its", other.standard_error),
     )}  # fmt: skip
     best, traced = at["best"] - at["other"], at["traced"] - at["other"]
-    assert (best**2).sum() < 0.25 * (traced**2).sum()
+    assert (best**2).sum() < 0.14 * (traced**2).sum()
     # Stated errors cover it in most pixels; 0.95 is meant.
-    assert np.mean(np.abs(best) < 1.96 * np.hypot(at["error"], at["its"])) > 0.85
+    assert np.mean(np.abs(best) < 1.96 * np.hypot(at["error"], at["its"])) > 0.9
 
 
 def test_file_keeps_the_reconstruction_and_a_sum_has_none(runs: tuple[Result, Result], tmp_path) -> None:
