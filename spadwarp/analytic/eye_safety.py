@@ -221,9 +221,11 @@ def _first(is_reached: Callable[[float], bool], high: float) -> float:
 
 def as_if_bare(of: Laser | Scene, distance: float) -> float:
     """The distance [m] at which the middle of the beam has the irradiance that it has at a distance behind the laser's
-    port, if there were none: there it is narrower, and a little light is reflected."""
+    port, if there were none: there it is narrower, and a little light is reflected. Above a sea as it is."""
     port, beam = (None, of) if isinstance(of, Laser) else (laser_port(of), of.beam)
     if port is None or beam.profile == "collimated":
         return distance
     lead = float(port.enter(beam.position, beam.axis)[2])
+    if isinstance(of, Scene) and of.surface is not None and distance <= lead:
+        return distance
     return 1.0 / math.sqrt(port.spread(beam.position, beam.axis, max(distance, lead + 1e-6)))

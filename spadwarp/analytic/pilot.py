@@ -101,9 +101,9 @@ def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
     if scene.surface is None:
         light = known_light(scene, None, pick_device(device))[0].sum(axis=-1, dtype=np.float64)
     else:
-        hit = {"distance": truth.range.ravel(), "normal": truth.normal.reshape(-1, 3)}
-        view, reflectance = pixel_directions(scene.camera).reshape(-1, 3), truth.reflectance.ravel()
-        maps, _ = pixel_maps(scene, view=view, **hit, reflectance=reflectance, device=device, outliers=False)
+        view, normal = pixel_directions(scene.camera).reshape(-1, 3), truth.normal.reshape(-1, 3)
+        surface: Any = {"distance": truth.range.ravel(), "normal": normal, "reflectance": truth.reflectance.ravel()}
+        maps, _ = pixel_maps(scene, view=view, **surface, device=device, outliers=False)
         light = maps["signal"].reshape(truth.depth.shape)
     light[np.isnan(truth.depth)] = np.nan
     off = np.abs(light - np.nanmedian(light))
@@ -132,7 +132,7 @@ def trace(
         return simulate(scene, photons=each, run=RunOptions(first_photon=before + number * each), **options)
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SpadwarpWarning)  # of few photons: `plan` judges what they tell
+        warnings.simplefilter("ignore")  # of few photons: `plan` judges what they tell
         runs = [run(number) for number in range(RUNS)]
     return tuple(merge(pair) for pair in zip(earlier, runs, strict=True)) if earlier else tuple(runs)
 

@@ -486,7 +486,9 @@ class _Planner:
             reasons[distance], needed[distance] = proposal.limit, proposal.photons_needed
             return proposal.reached
 
-        near, far, unjudged = bracket(judge, start)
+        air = float(axis_line(scene).lead[0]) if scene.surface is not None else 0.0
+        near, far, unjudged = bracket(lambda below: judge(air + below), start - air)
+        near, far, unjudged = near and air + near, air + far, unjudged and (air + unjudged[0], air + unjudged[1])
         limit = reasons[far] if far < math.inf else f"not sought beyond {_FARTHEST:g} m"
         if unjudged is None:
             return near, limit, None

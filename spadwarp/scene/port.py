@@ -201,11 +201,12 @@ class PortGeometry:
         """Irradiance across a ray from x inside along the unit vector u, for an intensity of 1 in clear water, where it
         has gone a distance beyond the port [1/m²]; by differences. 1/distance² without a port."""
         start, direction, lead, _ = self.enter(x, u)
-        middle, step = start + (distance - lead) * direction, 1e-4 * distance
-        sides = step * np.linalg.svd(direction[None])[2][1:]
-        seen = self.connect(middle + np.concatenate([sides, -sides]), x)[0]
-        solid_angle = float(np.linalg.norm(np.cross(seen[0] - seen[2], seen[1] - seen[3])))
-        return float(self.transmission(x, u)) * solid_angle / (2.0 * step) ** 2
+        middle, step, axis = start + (distance - lead) * direction, 1e-4, np.asarray(u, np.float64)
+        aside = np.linalg.svd(axis[None])[2][1:]
+        y, v, _, _ = self.enter(x, math.cos(step) * axis + math.sin(step) * np.concatenate([aside, -aside]))
+        ends = y + ((middle - y) @ direction / (v @ direction))[:, None] * v
+        area = float(np.linalg.norm(np.cross(ends[0] - ends[2], ends[1] - ends[3]))) / (2.0 * step) ** 2
+        return float(self.transmission(x, u)) / area
 
     def _to_face(self, x: Floats, u: Floats, outward: float) -> Floats:
         if self.shape == "flat":

@@ -95,11 +95,9 @@ class Scene(Shown, Document):
             yield f"medium.layers: {len(medium.layers)} given; daylight takes one water"
         if self.daylight is not None and medium.grid is not None:
             yield f"medium.grid {goes} daylight, which takes one water: leave one of them out"
-        if self.polarised and transport.axis_threshold < 1.0:
-            yield (
-                f"transport.axis_threshold = {transport.axis_threshold} {goes} polarised light: leave it out, or set "
-                "it to 1, for directions without the near-axis rule"
-            )
+        exact = {"polarised light": self.polarised, "flux": bool(self.flux), "surface": self.surface is not None}
+        for name in (name for name, needs in exact.items() if needs and transport.axis_threshold < 1.0):
+            yield f"transport.axis_threshold = {transport.axis_threshold} {goes} {name}: set 1, for exact directions"
         if medium.inelastic and (self.polarised or self.surface is not None):
             yield f"medium.inelastic {goes} polarised light and surface: leave one of them out"
         lost = math.fsum(one.source(self.laser.wavelength_nm) for one in medium.inelastic)
@@ -118,7 +116,7 @@ class Scene(Shown, Document):
     def _flux_exclusions(self) -> Iterator[str]:
         """Why flux is not tallied, or not what it seems."""
         transport, names, sun, medium = self.transport, [section.name for section in self.flux], self.sun, self.medium
-        estimator, threshold = f"transport.estimator = {transport.estimator!r}", transport.axis_threshold
+        estimator = f"transport.estimator = {transport.estimator!r}"
         if len(set(names)) < len(names):
             yield f"flux: the names {', '.join(names)} are not all different"
         if self.flux and transport.estimator in ("analog", "guided"):
@@ -126,8 +124,6 @@ class Scene(Shown, Document):
                 f"{estimator} does not go with flux, whose balance with absorption holds for light that nothing guides:"
                 " take 'next_event', or 'none' for flux alone"
             )
-        if self.flux and threshold < 1.0:
-            yield f"transport.axis_threshold = {threshold} does not go with flux: set it to 1, for exact directions"
         if self.flux and (self.polarised or isinstance(medium.albedo, str)):
             yield "flux goes neither with polarised light nor with a random albedo"
         if transport.estimator == "none" and not self.flux:
@@ -211,8 +207,6 @@ class Scene(Shown, Document):
         }.items():
             if found:
                 yield f"{field}: cannot be combined with surface"
-        if (threshold := self.transport.axis_threshold) < 1.0:
-            yield f"transport.axis_threshold = {threshold} does not go with surface: set it to 1"
         if surface.is_flat and surface.height_of(self.camera.position) < 0.0 and self.sun is None:
             yield (
                 "surface.mean_square_slope = 0 does not go with a camera in the water: a flat surface seen from below "

@@ -228,7 +228,7 @@ def test_fluence_of_a_beam_from_a_turned_camera_by_gate():
     ("sections", "text"),
     [
         ({"transport": {"estimator": "guided"}}, "take 'next_event', or 'none' for flux alone"),
-        ({"transport": {"axis_threshold": 0.99}}, "does not go with flux: set it to 1"),
+        ({"transport": {"axis_threshold": 0.99}}, "does not go with flux: set 1"),
         ({"surface": None}, r"sun needs \[surface\]"),
         ({"domain": {"shape": "box", "upper": [1.0, math.inf, math.inf]}}, "bound the water along the surface"),
         (
