@@ -125,7 +125,7 @@ LINES = {
     "mesh": (1800, 1820),
     "parallel": (600, 566),
     "result": (1500, 2145),
-    "scene": (3700, 5258),
+    "scene": (3700, 5278),
     "transport": (2300, 3337),
     "validate": (750, 869),
     "viz": (2200, 2500),
@@ -137,11 +137,11 @@ LINES = {
     "kernels/estimators": (1300, 1099),
     "kernels/optics": (1350, 2647),
     "kernels/photon": (850, 1250),
-    "kernels/riders": (750, 699),
+    "kernels/riders": (750, 713),
     "kernels/surface": (1700, 1887),
     "kernels/tally": (450, 929),
     "kernels/transport": (1450, 1755),
-    "kernels/water": (1350, 1672),
+    "kernels/water": (1350, 1684),
     "kernels/worlds": (1600, 2173),
 }
 
