@@ -101,7 +101,7 @@ def typical_pixels(scene: Scene, device: str | None = None) -> Mask:
     if scene.surface is None:
         light = known_light(scene, None, pick_device(device))[0].sum(axis=-1, dtype=np.float64)
     else:
-        hit = {"distance": truth.range.ravel(), "normal": truth.normal.reshape(-1, 3)}
+        hit: dict[str, Any] = {"distance": truth.range.ravel(), "normal": truth.normal.reshape(-1, 3)}
         view, reflectance = pixel_directions(scene.camera).reshape(-1, 3), truth.reflectance.ravel()
         maps, _ = pixel_maps(scene, view=view, **hit, reflectance=reflectance, device=device, outliers=False)
         light = maps["signal"].reshape(truth.depth.shape)
