@@ -103,12 +103,12 @@ CASES: dict[str, Case] = {
 
 def _scaling(cuda: bool) -> list[Case]:
     """How cost and memory grow with photons, faces and bins; to larger sizes on a GPU than on a CPU."""
-    images = [(32, 32, 256), (64, 64, 1024), (128, 128, 1024), (256, 192, 1024), (256, 192, 4096)]
+    images = [(32, 32, 256), (64, 64, 1024), (128, 128, 1024), (256, 192, 1024), (256, 192, 4096), (4096, 4096, 8)]
     cases = [
         Case(f"photons_1e{power}", f"staircase_5m, 1e{power} photons", scene=_STAIRCASE, photons=10**power)
         for power in range(5, 11 if cuda else 8)
     ]
-    for n in (0, 2, 4, 6, 8):
+    for n in (0, 2, 4, 6, 8, 10)[: 6 if cuda else 5]:
         faces, scene = 12 * 4**n, Scene.merged(_at_5m("box"), {"targets": {0: {"subdivisions": n}}})
         cases.append(Case(f"faces_{faces}", f"a box of {faces} faces", scene=scene))
     for width, height, bins in images if cuda else images[:3]:
