@@ -158,16 +158,25 @@ class Constituent(PhaseLaw):
         return self.absorption + self.scattering
 
 
+def _one_or_more(value: Any) -> Any:
+    return (value,) if isinstance(value, int | float) else listed(value)
+
+
+# One for the medium and one for each layer, or one for all.
+ByWater = Annotated[tuple[Annotated[float, Field(ge=0, le=1e6)], ...], BeforeValidator(_one_or_more)]
+
+
 class Inelastic(Section):
-    """Light of the laser that the water gives off at another wavelength, as a channel of the result by this name."""
+    """Light of the laser that the water gives off at another wavelength, as a channel of the result by this name.
+
+    Coefficients are one number for all water, or a list for the medium and its layers.
+    """
 
     process: Literal["raman", "fluorescence"] = "raman"
     """scattering by water, or light of chlorophyll, in all directions"""
-    coefficient: float | None = field(
-        None, "what becomes such light, in photons [1/m]; raman: default by wavelength", "[0, 1e6]"
-    )
-    absorption: float = field(..., "of the water at the new wavelength [1/m]", "[0, 1e6]")
-    scattering: float | None = field(None, "likewise; default: that at the laser's [1/m]", "[0, 1e6]")
+    coefficient: ByWater | None = field(None, "what becomes such light, in photons [1/m]; raman: default by wavelength")
+    absorption: ByWater = field(..., "of the water at the new wavelength [1/m]")
+    scattering: ByWater | None = field(None, "likewise; default: that at the laser's [1/m]")
     passed: float = field(1.0, "part of the new light that the receiver's filter for it passes", "[0, 1]")
     decay_time_ns: float = field(0.0, "fluorescence: after which 1/e of the light is still to come [ns]", "[0, 1e6]")
 
@@ -179,10 +188,16 @@ class Inelastic(Section):
         if not fluoresces and self.decay_time_ns > 0.0:
             yield self._that("decay_time_ns", "goes with process = 'fluorescence' only")
 
-    def source(self, wavelength_nm: float) -> float:
-        """`coefficient`, or that of Raman scattering by water, 2.7e-4 1/m at 488 nm, falling with the power 5.3 of the
-        wavelength in photons (Bartlett, Voss, Sathyendranath & Vodacek, Appl. Opt. 37, 3324, 1998)."""
-        return 2.7e-4 * (488.0 / wavelength_nm) ** 5.3 if self.coefficient is None else self.coefficient
+    def in_waters(self, waters: Sequence[Medium | Layer], wavelength_nm: float) -> list[tuple[float, float, float]]:
+        """Of the medium and its layers: `coefficient`, extinction and scattering [1/m].
+
+        The coefficient of Raman scattering by water is 2.7e-4 1/m at 488 nm, falling with the power 5.3 of the
+        wavelength in photons (Bartlett, Voss, Sathyendranath & Vodacek, Appl. Opt. 37, 3324, 1998).
+        """
+        raman = 2.7e-4 * (488.0 / wavelength_nm) ** 5.3
+        rows = self.coefficient or (raman,), self.absorption, self.scattering or [one.scattering for one in waters]
+        made, absorbed, scattered = ([*row] * (len(waters) if len(row) == 1 else 1) for row in rows)
+        return [(s, a + b, b) for s, a, b in zip(made, absorbed, scattered, strict=True)]
 
     @property
     def anisotropy(self) -> float:
@@ -297,7 +312,7 @@ class Medium(PhaseLaw, Water):
     """what the water is made of, in place of coefficients and phase function: their coefficients add up, those of pure
     water among them; at most 4"""
     inelastic: Annotated[tuple[Inelastic, ...], BeforeValidator(listed), Field(max_length=2)] = ()
-    """light of other wavelengths, one of each process, which the absorption has lost; not with layers and grid"""
+    """light of other wavelengths, one of each process, which the absorption has lost; not with grid"""
     group_index: float = Field(WATER_INDICES["seawater"][1], ge=1, le=3)
     """index for the time of flight; "seawater" and "fresh" stand for 1.3638 and 1.3566"""
     phase_index: float = Field(WATER_INDICES["seawater"][0], ge=1, le=3)
@@ -337,8 +352,12 @@ class Medium(PhaseLaw, Water):
         processes = [one.process for one in self.inelastic]
         if len(set(processes)) < len(processes):
             yield f"inelastic: {', '.join(processes)} are not different processes"
-        if self.inelastic and (self.layers or self.grid is not None or self.albedo == "lu2024"):
-            yield "inelastic goes neither with layers, grid nor albedo = 'lu2024': it takes one water"
+        if self.inelastic and (self.grid is not None or self.albedo == "lu2024"):
+            yield "inelastic goes neither with grid nor albedo = 'lu2024': it takes one water, or layers"
+        for k, one in enumerate(self.inelastic):
+            for name in ("coefficient", "absorption", "scattering"):
+                if len(row := getattr(one, name) or (0.0,)) not in (1, len(self.waters)):
+                    yield f"inelastic[{k}].{name}: {len(row)} given; one for all water, or {len(self.waters)} for each"
         if self.grid is not None and self.layers:
             yield f"grid does not go with layers, {len(self.layers)} given; cells can repeat them, from a file"
         if self.grid is not None and self.albedo == "lu2024":

@@ -98,14 +98,15 @@ class Scene(Shown, Document):
         exact = {"polarised light": self.polarised, "flux": bool(self.flux), "surface": self.surface is not None}
         for name in (name for name, needs in exact.items() if needs and transport.axis_threshold < 1.0):
             yield f"transport.axis_threshold = {transport.axis_threshold} {goes} {name}: set 1, for exact directions"
-        if medium.inelastic and (self.polarised or self.surface is not None):
-            yield f"medium.inelastic {goes} polarised light and surface: leave one of them out"
-        lost = math.fsum(one.source(self.laser.wavelength_nm) for one in medium.inelastic)
-        if medium.inelastic and (lost > medium.absorption or medium.scattering <= 0.0):
-            yield (
-                f"medium.inelastic takes {lost:g} 1/m from absorption = {medium.absorption:g}, beside scattering = "
-                f"{medium.scattering:g}: it can take no more than that, in water that scatters"
-            )
+        if medium.inelastic and self.polarised:
+            yield f"medium.inelastic {goes} polarised light: leave one of them out"
+        parts = [one.in_waters(medium.waters, self.laser.wavelength_nm) for one in medium.inelastic]
+        for water, *taken in zip(medium.waters, *parts, strict=True) if parts else ():
+            if (lost := math.fsum(row[0] for row in taken)) > water.absorption or water.scattering <= 0.0:
+                yield (
+                    f"medium.inelastic takes {lost:g} 1/m from absorption = {water.absorption:g}, beside scattering = "
+                    f"{water.scattering:g}: it can take no more than that, in water that scatters"
+                )
         for k, target in enumerate(self.targets if self.polarised else ()):
             if target.specular > 0.0 and abs(target.specular_index / medium.phase_index - 1.0) < 1e-3:
                 yield (

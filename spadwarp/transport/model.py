@@ -542,23 +542,22 @@ def _lines(scene: Scene, scale: float, device: wp.Device) -> dict[str, Any]:
             [one.extinction for one in water.beside],
             [part * water.scattering for part in again],
             [1.0] * count,
-            medium=_medium(scene, device),
+            media=[_medium(scene, device)],
             elastic=True,
+            device=device,
             delay=[one.group_index / water.group_index for one in water.beside],
         )
         tallies = sk.make_derivatives([], [], [scale] * count, channels=count, device=device)
         return {"lines": found, "derivatives": tallies}
     lines, least = water.inelastic, float(phase_function(water).density(np.linspace(0.01, math.pi, 500)).min())
-    scattering = [water.scattering if one.scattering is None else one.scattering for one in lines]
+    rows = np.array([one.in_waters(water.waters, wavelength) for one in lines])  # [line, water, coefficient]
+    source, extinction, scattering = np.moveaxis(rows, (0, 1, 2), (2, 1, 0))
+    passed = [one.passed for one in lines]
+    media = [sk.make_medium(float(one.absorption), one.scattering) for one in water.waters]
     found = sk.make_lines(
-        [one.source(wavelength) for one in lines],
-        [one.anisotropy for one in lines],
-        [one.absorption + b for one, b in zip(lines, scattering, strict=True)],
-        scattering,
-        [one.passed for one in lines],
-        medium=_medium(scene, device),
+        source, [one.anisotropy for one in lines], extinction, scattering, passed, media=media, device=device
     )
-    parts = [one.passed * one.source(wavelength) / (4.0 * math.pi * water.scattering * least) for one in lines]
+    parts = passed * (source / [[one.scattering] for one in water.waters]).max(axis=0) / (4.0 * math.pi * least)
     scales = [scale / 2.0 ** math.floor(math.log2(max(part, 1e-12))) for part in parts]
     return {"lines": found, "derivatives": sk.make_derivatives([], [], scales, channels=len(lines), device=device)}
 

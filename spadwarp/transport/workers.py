@@ -263,7 +263,7 @@ class DeviceWorker:
             balance = added(*balances)
             signed, histogram, last = self._signed_tallies(), self._histograms[0], self._histograms[-1]
             flux = None if self.data.flux is None else last.total
-            if self._spec.lines and not self.model.lines.elastic[0]:
+            if self._spec.lines and not (self._spec.layered or self.model.lines.elastic[0]):
                 balance = self._with_shifted(balance)
             return Tallies(
                 tallies=_on_host(histogram.total).reshape(self._shape),
@@ -290,8 +290,8 @@ class DeviceWorker:
 
     def _with_shifted(self, energy_balance: dict[str, int]) -> dict[str, int]:
         """Of what the water has absorbed, the part that is scattered inelastically in entries of its own: at every
-        collision it is the same."""
-        medium, source, balance = self.model.medium, self.model.lines.source, energy_balance
+        collision in one water it is the same."""
+        medium, balance, source = self.model.medium, energy_balance, self.model.lines.source.numpy()[0]
         absorption, lost = medium.extinction * (1.0 - medium.albedo), balance["absorbed_water"]
         for k, name in enumerate(self._signed):
             balance[name] = round(lost * min(float(source[k]) / absorption, 1.0))

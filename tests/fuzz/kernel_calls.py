@@ -113,7 +113,7 @@ def _valid_calls():
             shares=[[0.25, 0.75], [0.5, 0.5]], device="cpu")),
         "make_lines": (sk.make_lines, dict(
             source=[1e-3, 1e-3], anisotropy=[0.55, 0.0], extinction=[0.4, 0.5], scattering=[0.1, 0.1],
-            passed=[1.0, 0.5], medium=sk.make_medium(0.1, 0.1))),
+            passed=[1.0, 0.5], media=[sk.make_medium(0.1, 0.1)], device="cpu")),
         "make_flux_volume": (sk.make_flux_volume, dict(
             shape=(2, 3, 4), lower=(0, 0, 0), edge=(1.0, 1.0, 2.0), rotation=np.eye(3), origin=(0, 0, 1.0), gates=2,
             gate_start=0.0, gate_path=1.0, estimator="track", scale=1.0)),

@@ -11,7 +11,7 @@ from helpers.runs import of_seeds
 from helpers.scenes import BEYOND, PENCIL, scene
 from helpers.statistics_of_samples import equal_means_p
 from spadwarp.result import analyser_channel
-from spadwarp.scene.medium import Inelastic
+from spadwarp.scene.medium import Inelastic, Medium
 from spadwarp.values import ConfigError
 
 pytestmark = pytest.mark.physics
@@ -34,6 +34,9 @@ def pencil(*lines, medium=(), camera=(), **transport):
         targets=BEYOND,
         transport={"max_collisions": 1, "estimator": "guided", **transport},
     )
+
+
+DEEPER = {"start": 2.3, "absorption": 0.25, "scattering": 0.4}
 
 
 def by_path(run, channel=0):
@@ -59,6 +62,43 @@ def test_single_scatter_is_the_quadrature_with_both_coefficients(estimator, devi
         expected = quadrature(0.3, new, b, anisotropy)
         assert by_path(run, k).sum() == pytest.approx(expected.sum(), rel=5e-3)
         np.testing.assert_allclose(by_path(run, k), expected, rtol=2e-2)
+
+
+@pytest.mark.parametrize("start", [2.3, -5.0])
+def test_each_layer_has_coefficients_of_its_own(start, device):
+    """Two waters, and two of which the second is everywhere in sight, against quadrature of single scattering."""
+    line = {**RAMAN, "coefficient": [2e-3, 8e-3], "absorption": [0.3, 0.1], "scattering": [0.15, 0.05]}
+    (run,) = of_seeds(pencil(line, medium={"layers": [{**DEEPER, "start": start}]}), device, 100_000, [1])
+    z = np.linspace(0.3, 8.0, 100_001)
+    r, area, deep = np.hypot(0.1, z), math.pi * 0.005**2, np.clip(z - start, 0.0, z)
+    p = (1.0 + A * (z / r) ** 2) / (4.0 * math.pi * (1.0 + A / 3.0))
+    depth = 0.3 * (z - deep) + 0.65 * deep + (0.45 * (z - deep) + 0.15 * deep) * r / z
+    light = np.where(z > start, 8e-3, 2e-3) * p * np.exp(-depth) * area * z / r**3
+    bins = np.digitize(z + r, EDGES) - 1
+    expected = np.array([np.trapezoid(np.where(bins == k, light, 0.0), z) for k in range(len(EDGES) - 1)])
+    assert by_path(run).sum() == pytest.approx(expected.sum(), rel=1e-2)
+    np.testing.assert_allclose(by_path(run), expected, rtol=3e-2)
+
+
+@pytest.mark.slow
+def test_estimators_agree_under_a_sea_and_in_layers():
+    """Light of another wavelength by way of a rough surface, out of two waters."""
+    line = {**RAMAN, "coefficient": [0.05, 0.1], "absorption": [0.3, 0.1]}
+    layers = [{"start": 1.0, "absorption": 0.25, "scattering": 0.4}]
+    water = {"absorption": 0.1, "scattering": 0.4, "extinction": None, "albedo": None}
+    found = {}
+    for estimator, photons in (("guided", 20_000), ("analog", 100_000)):
+        one = scene(
+            medium={**water, "inelastic": [line], "layers": layers},
+            surface={"point": [0.0, 0.0, 0.6], "up": [0.0, 0.0, -1.0], "wind": 5.0},
+            laser={"position": [-0.3, 0.0, 0.2]},
+            camera={"aperture_diameter": 0.5},
+            transport={"estimator": estimator},
+        )
+        runs = of_seeds(one, "cpu", photons, range(12))
+        found[estimator] = np.array([run.signed[0].sum(axis=(1, 2)).ravel() for run in runs])
+    assert equal_means_p(found["analog"], found["guided"], 0.5) > 1e-3
+    assert found["guided"].sum() > 0.0
 
 
 @pytest.mark.slow
@@ -159,9 +199,11 @@ def test_fluorescence_decays():
 
 def test_raman_coefficient_is_that_of_bartlett():
     line = Inelastic(process="raman", absorption=0.3)
-    assert line.source(488.0) == 2.7e-4 and line.source(532.0) == pytest.approx(1.71e-4, rel=2e-3)
+    water = [Medium(absorption=0.1, scattering=0.2)]
+    assert line.in_waters(water, 488.0) == [(2.7e-4, 0.5, 0.2)]
+    assert line.in_waters(water, 532.0)[0][0] == pytest.approx(1.71e-4, rel=2e-3)
     # p = 0.0673 (1 + 0.550 cos²θ), of unit integral.
-    found = sk.make_lines([1e-4], [A], [0.3], [0.1], [1.0], medium=sk.make_medium(0.1, 0.1))
+    found = sk.make_lines([1e-4], [A], [0.3], [0.1], [1.0], media=[sk.make_medium(0.1, 0.1)], device="cpu")
     assert found.even[0] == pytest.approx(0.0673, abs=5e-5)
     assert pytest.approx(0.550, abs=5e-4) == A
 
@@ -174,7 +216,9 @@ def test_raman_coefficient_is_that_of_bartlett():
         ([{**GLOW, "coefficient": None}], {}, "needs coefficient"),
         ([{**RAMAN, "decay_time_ns": 1.0}], {}, "goes with process = 'fluorescence' only"),
         ([RAMAN], {"albedo": "lu2024", "extinction": 0.5, "absorption": None, "scattering": None}, "takes one water"),
-        ([RAMAN], {"layers": [{"start": 1.0, "extinction": 0.5, "albedo": 0.5}]}, "neither with layers"),
+        ([{**RAMAN, "absorption": [0.3, 0.3, 0.3]}], {"layers": [DEEPER]}, "3 given; one for all water, or 2"),
+        ([{**RAMAN, "coefficient": [2e-3, 0.3]}], {"layers": [DEEPER]}, "it can take no more"),
+        ([RAMAN], {"grid": {"shape": "cloud", "size": 1.0, "extinction": 1.0}}, "neither with grid"),
     ],
 )
 def test_what_inelastic_scattering_excludes_is_named(lines, medium, text):

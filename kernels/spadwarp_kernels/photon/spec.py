@@ -36,7 +36,7 @@ _WORDS = {
 # Fields that cannot be combined, and those that need another.
 _EXCLUDED = {
     "sea": ("port", "laser_port", "reflecting", "grid", "merged"),
-    "lines": ("polarised", "derivatives", "layered", "grid", "random_albedo", "sea"),
+    "lines": ("polarised", "derivatives", "grid", "random_albedo"),
     "grid": ("layered", "random_albedo"),
     "merged": ("reflecting", "derivatives", "channels"),
     "blocks": ("reflecting", "merged"),
@@ -96,8 +96,7 @@ class TransportSpec(NamedTuple):
     polarised: bool = False
     """Photons carry a Stokes vector, and scores are of the light that it stands for, see `Model.polarisation`."""
     lines: bool = False
-    """Photons carry light of other wavelengths, see `Model.lines`, of which each of `channels` is one; in homogeneous
-    water."""
+    """Photons carry light of other wavelengths, see `Model.lines`, of which each of `channels` is one; not in cells."""
     points: int = 1
     """At how many points of a flight `guided` scores it, 1 to MOST_POINTS; more than one without `reflecting`, `blocks`
     and DELTA_TRACKING, three with up to 4 derivatives."""

@@ -64,28 +64,59 @@ def _make_lines_rider(spec: TransportSpec) -> Rider:
         c.shifted = world.lines.elastic
 
     @wp.func
-    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
+    def fade(c: CarriedRef, world: WorldRef, layer: int, length: float):
+        more = world.lines.more[layer]
         for k in range(wp.static(count)):
-            c.shifted[k] = c.shifted[k] * wp.exp(-world.lines.more[k] * length)
+            c.shifted[k] = c.shifted[k] * wp.exp(-more[k] * length)
 
     @wp.func
     def event(c: CarriedRef, world: WorldRef, slot: int, x: wp.vec3, u: wp.vec3, v: wp.vec3):
-        if slot < 0:
+        if slot == -1:
             water = spec.water.at(world.medium, world.layers, x)
+            layer = int(0)
+            if wp.static(spec.water.layered):
+                layer = layer_index(world.layers, wp.dot(world.layers.axis, x))
+            source = world.lines.source[layer]
+            again = world.lines.again[layer]
             t = one_minus_cosine(snap_from(u, world.medium.axis_threshold), v)
             elastic = wp.max(water.extinction * water.albedo * spec.water.phase.pdf(t, water), 1.0e-30)
             square = (1.0 - t) * (1.0 - t)
             for k in range(wp.static(count)):
-                turned = world.lines.source[k] * (world.lines.even[k] + world.lines.squared[k] * square)
+                turned = source[k] * (world.lines.even[k] + world.lines.squared[k] * square)
                 before = wp.where(world.lines.elastic[k] > 0.0, c.shifted[k], 1.0)
-                c.shifted[k] = c.shifted[k] * world.lines.again[k] + before * turned / elastic
+                c.shifted[k] = c.shifted[k] * again[k] + before * turned / elastic
 
     @wp.func
     def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):
         for channel in range(wp.static(spec.channels)):
             k.factors[channel] = world.lines.passed[channel] * c.shifted[channel]
 
-    return NOTHING._replace(begin=begin, fly=fly, event=event, deliver=deliver)
+    return NOTHING._replace(begin=begin, fly=_make_by_layer(spec, fade), event=event, deliver=deliver)
+
+
+def _make_by_layer(spec: TransportSpec, through: wp.Function) -> wp.Function:
+    """The Warp function ``(c, world, x, u, length)`` of a way in the water, from that of a way in one of its layers, or
+    in the medium (0), ``(c, world, layer, length)``."""
+
+    @wp.func
+    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
+        if wp.static(not spec.water.layered):
+            through(c, world, 0, length)
+        else:
+            along = wp.dot(world.layers.axis, x)
+            slope = wp.dot(world.layers.axis, u)
+            step = wp.where(slope > 0.0, 1, -1)
+            layer = layer_index(world.layers, along)
+            begin = float(0.0)
+            boundary = boundary_ahead(world.layers, layer, step, along, slope)
+            while boundary < length:
+                through(c, world, layer, boundary - begin)
+                layer += step
+                begin = boundary
+                boundary = boundary_ahead(world.layers, layer, step, along, slope)
+            through(c, world, layer, length - begin)
+
+    return fly
 
 
 # ---- Derivatives.
@@ -117,35 +148,18 @@ def _make_fly(spec: TransportSpec) -> wp.Function:
     on_path = _bits(spec.derivatives, "absorption", "scattering") | by_concentration
 
     @wp.func
-    def shorter(d: LogDerivatives, world: WorldRef, parameters: int, length: float) -> LogDerivatives:
+    def shorten(c: CarriedRef, world: WorldRef, layer: int, length: float):
+        parameters = int(wp.static(on_path))
+        if wp.static(spec.water.layered):
+            parameters = parameters & world.derivatives.waters[layer]
         for p in range(wp.static(count)):
             if (parameters >> p) & 1 == 1:
                 if (wp.static(by_concentration) >> p) & 1 == 1:
-                    d[p] = d[p] - world.derivatives.extinction[p] * length
+                    c.log_derivatives[p] = c.log_derivatives[p] - world.derivatives.extinction[p] * length
                 else:
-                    d[p] = d[p] - length
-        return d
+                    c.log_derivatives[p] = c.log_derivatives[p] - length
 
-    @wp.func
-    def fly(c: CarriedRef, world: WorldRef, x: wp.vec3, u: wp.vec3, length: float):
-        if wp.static(not spec.water.layered):
-            c.log_derivatives = shorter(c.log_derivatives, world, wp.static(on_path), length)
-        else:
-            d = c.log_derivatives
-            along = wp.dot(world.layers.axis, x)
-            slope = wp.dot(world.layers.axis, u)
-            step = wp.where(slope > 0.0, 1, -1)
-            layer = layer_index(world.layers, along)
-            begin = float(0.0)
-            boundary = boundary_ahead(world.layers, layer, step, along, slope)
-            while boundary < length:
-                d = shorter(d, world, world.derivatives.waters[layer] & wp.static(on_path), boundary - begin)
-                layer += step
-                begin = boundary
-                boundary = boundary_ahead(world.layers, layer, step, along, slope)
-            c.log_derivatives = shorter(d, world, world.derivatives.waters[layer] & wp.static(on_path), length - begin)
-
-    return fly
+    return _make_by_layer(spec, shorten)
 
 
 def _make_event(spec: TransportSpec) -> wp.Function:

@@ -91,55 +91,68 @@ class Lines:
     water gives off."""
 
     elastic: wp.vec4  # 1 or 0
-    source: wp.vec4  # coefficient of what becomes light of the line [1/m]
-    even: wp.vec4  # its phase function is even + squared cos^2(theta) [1/sr]
+    even: wp.vec4  # the phase function of what becomes light of it is even + squared cos^2(theta) [1/sr]
     squared: wp.vec4
-    more: wp.vec4  # extinction at the line less that of the medium [1/m]
-    again: wp.vec4  # scattering at the line over that of the medium
     passed: wp.vec4  # part of the line that the receiver's filter passes
     delay: wp.vec4  # group index at the line over that of the medium
+    # By water, the medium or the layers:
+    source: wp.array[wp.vec4]  # coefficient of what becomes light of the line [1/m]
+    more: wp.array[wp.vec4]  # extinction at the line less that of the water [1/m]
+    again: wp.array[wp.vec4]  # scattering at the line over that of the water
 
 
 def make_lines(
-    source: Sequence[float],
+    source: ArrayLike,
     anisotropy: Sequence[float],
-    extinction: Sequence[float],
-    scattering: Sequence[float],
+    extinction: ArrayLike,
+    scattering: ArrayLike,
     passed: Sequence[float],
     *,
-    medium: Medium,
+    media: Sequence[Medium],
     elastic: bool = False,
     delay: Sequence[float] = (),
+    device: wp.DeviceLike = None,
 ) -> Lines:
     """Up to MOST_LINES lines, with the phase function of the medium for what is scattered later.
 
     Args:
-        source: Coefficients of the inelastic scattering [1/m], >= 0; the medium's absorption has it. Of elastic lines
-            what they scatter by another law than the medium's, of any sign.
+        source: Coefficients of the inelastic scattering [1/m], >= 0, `[water, line]`; the water's absorption has it. Of
+            elastic lines what they scatter by another law than the medium's, of any sign.
         anisotropy: A of its phase function, ~ 1 + A cos^2(theta), 0 or more: 0 of fluorescence.
-        extinction, scattering: Of the water at the line [1/m]; of an elastic one the scattering by the medium's law.
+        extinction, scattering: Of the waters at the lines [1/m], `[water, line]`; of an elastic one the scattering by
+            the medium's law.
         passed: Part of the line that the receiver's filter passes.
-        medium: Of the light that is scattered; its own scattering is above 0.
+        media: The medium, or the waters of the layers, at the laser's wavelength; the scattering is above 0.
         elastic: The lines are of the laser, and light of a line is there from the start.
         delay: Group index at the line over that of the medium, by default 1.
 
     Raises:
         ArgumentError: A number out of range, or lists of several lengths.
     """
-    lines, count = Lines(), check.integer("number of lines", len(check.items("source", source)), 1, MOST_LINES)
-    check.kind("medium", medium, Medium)
-    b = check.number("scattering of the medium", medium.extinction * medium.albedo, "(0, inf)")
-    given = {"source": source, "anisotropy": anisotropy, "extinction": extinction, "scattering": scattering}
-    given |= {"passed": passed, "delay": delay if len(check.items("delay", delay)) else [1.0] * count}
-    ranges = {"source": "(-inf, inf)" if elastic else "[0, inf)", "delay": "(0, inf)"}
-    columns = [
-        check.numbers(name, column, (count,), ranges.get(name, "[0, inf)")).tolist() for name, column in given.items()
-    ]
-    for k, (made, anisotropic, extinct, scattered, kept, later) in enumerate(zip(*columns, strict=True)):
-        lines.elastic[k], lines.source[k], lines.passed[k], lines.delay[k] = float(elastic), made, kept, later
-        lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + anisotropic / 3.0))
-        lines.squared[k] = anisotropic * lines.even[k]
-        lines.more[k], lines.again[k] = extinct - medium.extinction, scattered / b
+    device, lines, waters = check.device("device", device), Lines(), len(check.items("media", media))
+    count = check.integer("number of lines", len(check.items("passed", passed)), 1, MOST_LINES)
+    for one in media:
+        check.kind("media", one, Medium)
+    b = [check.number("scattering of the medium", one.extinction * one.albedo, "(0, inf)") for one in media]
+    law = check.numbers("anisotropy", anisotropy, (count,), "[0, inf)")
+    passed = check.numbers("passed", passed, (count,), "[0, inf)")
+    late = delay if len(check.items("delay", delay)) else [1.0] * count
+    late = check.numbers("delay", late, (count,), "(0, inf)")
+    for k in range(count):
+        lines.elastic[k], lines.passed[k], lines.delay[k] = float(elastic), passed[k], late[k]
+        lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + law[k] / 3.0))
+        lines.squared[k] = law[k] * lines.even[k]
+    rows = {"source": source, "extinction": extinction, "scattering": scattering}
+    columns = dict[str, Any]()
+    for name, row in rows.items():
+        within = "(-inf, inf)" if elastic and name == "source" else "[0, inf)"
+        columns[name] = check.numbers(name, np.atleast_2d(check.numbers(name, row)), (waters, count), within)
+    columns["more"] = columns.pop("extinction") - np.array([[one.extinction] for one in media])
+    columns["again"] = columns.pop("scattering") / np.array(b)[:, None]
+    for name, column in columns.items():
+        filled = np.zeros((waters, MOST_LINES), np.float32)
+        filled[:, :count] = column
+        setattr(lines, name, wp.array(filled, dtype=wp.vec4, device=device))
     return lines
 
 
