@@ -42,7 +42,8 @@ class Spectrum:
     scene: Scene
     """The scene with its laser and filter; those of the results have lasers of one line."""
     results: Mapping[float, Result]
-    """Wavelength in vacuum [nm], ascending → the run at it, with the photons of all the others."""
+    """Wavelength in vacuum [nm], ascending → the run at it, with the photons of all the others. Lines that ride
+    together have the energy balance and the counters of one of them."""
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
@@ -182,7 +183,7 @@ def _ride_together(lines: Sequence[Scene]) -> bool:
     medium = one.medium
     if medium.varies or medium.inelastic or medium.albedo == "lu2024" or one.polarised or one.surface or one.flux:
         return False
-    if one.camera.port or one.laser.port or one.domain.reflecting or one.transport.max_path is not None:
+    if one.camera.port or one.laser.port or one.sun or one.domain.reflecting or one.transport.max_path is not None:
         return False
     coloured = any(target.reflectance == "from_file" for target in one.targets)
     if coloured or one.transport.estimator == "none" or medium.particle_scattering <= 0.0:

@@ -129,24 +129,24 @@ def make_lines(
     Raises:
         ArgumentError: A number out of range, or lists of several lengths.
     """
-    lines, waters = Lines(), len(check.items("media", media))
+    device, lines, waters = check.device("device", device), Lines(), len(check.items("media", media))
     count = check.integer("number of lines", len(check.items("passed", passed)), 1, MOST_LINES)
     for one in media:
         check.kind("media", one, Medium)
     b = [check.number("scattering of the medium", one.extinction * one.albedo, "(0, inf)") for one in media]
     law = check.numbers("anisotropy", anisotropy, (count,), "[0, inf)")
     passed = check.numbers("passed", passed, (count,), "[0, inf)")
-    late = check.numbers("delay", delay if len(check.items("delay", delay)) else [1.0] * count, (count,), "(0, inf)")
+    late = delay if len(check.items("delay", delay)) else [1.0] * count
+    late = check.numbers("delay", late, (count,), "(0, inf)")
     for k in range(count):
         lines.elastic[k], lines.passed[k], lines.delay[k] = float(elastic), passed[k], late[k]
         lines.even[k] = 1.0 / (4.0 * math.pi * (1.0 + law[k] / 3.0))
         lines.squared[k] = law[k] * lines.even[k]
     rows = {"source": source, "extinction": extinction, "scattering": scattering}
-    ranges = {"source": "(-inf, inf)"} if elastic else {}
-    columns = {
-        name: check.numbers(name, np.atleast_2d(row), (waters, count), ranges.get(name, "[0, inf)"))
-        for name, row in rows.items()
-    }
+    columns = dict[str, Any]()
+    for name, row in rows.items():
+        within = "(-inf, inf)" if elastic and name == "source" else "[0, inf)"
+        columns[name] = check.numbers(name, np.atleast_2d(check.numbers(name, row)), (waters, count), within)
     columns["more"] = columns.pop("extinction") - np.array([[one.extinction] for one in media])
     columns["again"] = columns.pop("scattering") / np.array(b)[:, None]
     for name, column in columns.items():
