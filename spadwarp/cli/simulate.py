@@ -204,6 +204,8 @@ def _simulate_lines(scene: Scene, out: Path, source: Path | None, **options: Any
     rows = {f"{line:.9g} nm": one.summary() for line, one in spectrum.results.items()}
     shown = {name: f"{row['detections_per_pulse']:.3g} detections per pulse" for name, row in rows.items()}
     answer({"kind": "spectrum", "lines": rows, "files": files}, shown=shown)
+    if spectrum.partial:
+        fail(f"interrupted after {len(rows)} lines, which are written", INTERRUPTED)
 
 
 def _parameters(scene: Scene, names: str | None, earlier: Result | None) -> tuple[str, ...]:

@@ -44,6 +44,8 @@ class Spectrum:
     results: Mapping[float, Result]
     """Wavelength in vacuum [nm], ascending → the run at it, with the photons of all the others. Lines that ride
     together have the energy balance and the counters of one of them."""
+    partial: bool = False
+    """Whether the runs were interrupted: lines are missing, or have fewer photons."""
 
     @property
     def wavelengths(self) -> tuple[float, ...]:
@@ -65,8 +67,10 @@ class Spectrum:
         all that takes a result (eq 7 of the paper by Monte Carlo).
 
         It has no standard errors: those of runs with the same photons are not independent. Raises `ConfigError` where
-        the wavelengths are others than those of the spectrum.
+        the wavelengths are others than those of the spectrum, or the runs were interrupted.
         """
+        if self.partial:
+            raise ConfigError("laser.spectrum: the runs were interrupted, so that lines lack photons")
         lines = spectral_lines(self.scene.laser, self.scene.detector)
         if {line.wavelength_nm for line in lines} != set(self.results):
             text = f"{len(self.results)} wavelengths are not the {len(lines)} lines of the spectrum"
@@ -142,7 +146,8 @@ def simulate_spectrum(
 
     Raises:
         ArgumentError: No wavelengths, too many, one twice or out of range; ConfigError and others as `simulate`.
-        KeyboardInterrupt: After Ctrl-C, which ends all lines and keeps none.
+        KeyboardInterrupt: Ctrl-C before the first launch was done. Later it ends all lines, and the lines so far are
+            returned, marked `partial`.
     """
     scene = as_scene(scene)
     wavelengths = scene.laser.wavelengths_nm or "spectrum" if wavelengths is None else wavelengths
@@ -158,17 +163,21 @@ def simulate_spectrum(
         changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
     options = {"mesh_cache": {}, **options} if options.get("engine") is None else options
     left = [scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)]
-    results = dict[float, Result]()
-    while left:
+    results, partial = dict[float, Result](), False
+    while left and not partial:
         # As many neighbours as ride on the photons of the one in their middle.
         sizes = range(min(len(left), _MOST_TOGETHER), 0, -1) if _options_allow(options) else (1,)
         size = next(size for size in sizes if size == 1 or _ride_together(left[:size]))
         group, left = left[:size], left[size:]
-        found = _simulate_together(group, **options) if size > 1 else [simulate(group[0], **options)]
-        if any(one.partial for one in found):
-            raise KeyboardInterrupt
+        try:
+            found = _simulate_together(group, **options) if size > 1 else [simulate(group[0], **options)]
+        except KeyboardInterrupt:
+            if not results:
+                raise
+            return Spectrum(scene, MappingProxyType(results), partial=True)
         results |= {line.laser.wavelength_nm: one for line, one in zip(group, found, strict=True)}
-    return Spectrum(scene, MappingProxyType(results))
+        partial = any(one.partial for one in found)
+    return Spectrum(scene, MappingProxyType(results), partial)
 
 
 def _options_allow(options: Mapping[str, Any]) -> bool:

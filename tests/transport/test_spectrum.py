@@ -103,6 +103,23 @@ def test_the_file_has_an_axis_of_wavelength(tmp_path):
             np.testing.assert_array_equal(file["depth"][number], one.depth().astype(np.float32))
 
 
+def test_lines_done_before_an_interrupt_are_kept(monkeypatch):
+    runs = iter([spadwarp.simulate])
+
+    def run(scene, **options):
+        if (one := next(runs, None)) is None:
+            raise KeyboardInterrupt
+        return one(scene, **options)
+
+    monkeypatch.setattr("spadwarp.transport.spectrum.simulate", run)
+    found = simulate_spectrum(broad(), [480.0, 650.0], photons=500, device="cpu")
+    assert found.partial and found.wavelengths == (480.0,) and found.results[480.0].photons == 500
+    with pytest.raises(ConfigError, match="interrupted"):
+        found.combined()
+    with pytest.raises(KeyboardInterrupt):
+        simulate_spectrum(broad(), [480.0, 650.0], photons=500, device="cpu")
+
+
 def test_wavelengths_that_cannot_be_are_named():
     for given, text in (([], "0 given"), ([500.0, 500.0], "2 given"), ([0.0], "outside")):
         with pytest.raises(ArgumentError, match=text):
