@@ -205,9 +205,10 @@ def _forward(direct: Any, even: Any, ballistic: Cube, light: Cube) -> Cube:
     level = uniform_filter(light, (7, 7, 5), mode="constant").ravel()
     root = 1.0 / np.sqrt(level + 0.02 * level.max() + 1e-300)
     rows *= root
-    gram = (rows @ rows.T).astype(np.float64)
-    lower = np.linalg.cholesky(gram + 1e-9 * np.trace(gram) / len(gram) * np.eye(len(gram)))
-    factors, _ = nnls(lower.T, np.linalg.solve(lower, rows @ (light.ravel() * root)))
+    # Least squares by the products of the terms, of which float32 leaves no more than its rounding.
+    values, vectors = np.linalg.eigh((rows @ rows.T).astype(np.float64))
+    scale = np.sqrt(np.maximum(values, np.finfo(np.float32).eps * values[-1]))[:, None]
+    factors, _ = nnls(scale * vectors.T, (vectors.T / scale) @ (rows @ (light.ravel() * root)))
     return ((factors.astype(np.float32) @ rows) / root).reshape(light.shape)
 
 
