@@ -126,7 +126,7 @@ LINES = {
     "parallel": (600, 566),
     "result": (1500, 2145),
     "scene": (3700, 5264),
-    "transport": (2300, 3334),
+    "transport": (2300, 3335),
     "validate": (750, 869),
     "viz": (2200, 2544),
     "water": (800, 853),
