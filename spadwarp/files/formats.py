@@ -436,6 +436,8 @@ def _write_result(result: Result, path: Path, ending: str, frames: Any) -> Path:
 
 
 def _write_zarr(result: Result, path: Path) -> Path:
+    import zarr  # noqa: F401, xarray's own error names no package
+
     if path.exists() and not (path / "zarr.json").is_file():
         raise FileError(f"{path} exists, and is not a Zarr store to replace")
     path.parent.mkdir(parents=True, exist_ok=True)

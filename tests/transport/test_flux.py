@@ -2,6 +2,7 @@
 
 import functools
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -135,7 +136,7 @@ def test_apparent_properties():
     assert (radiance.values[..., 0] @ -np.diff(polar)) * 2 * math.pi == pytest.approx(scalar_down + scalar_up)
 
 
-def test_zarr_has_flux_with_its_axes(tmp_path):
+def test_zarr_has_flux_with_its_axes(tmp_path, monkeypatch):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("zarr")
     found = result("rayleigh")
@@ -149,6 +150,9 @@ def test_zarr_has_flux_with_its_axes(tmp_path):
     (tmp_path / "mine.zarr").mkdir()
     with pytest.raises(spadwarp.FileError, match="not a Zarr store"):
         spadwarp.export(found, tmp_path / "mine.zarr")
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(spadwarp.FileError, match=r"needs the package zarr: pip install 'spadwarp\[datasets\]'"):
+        spadwarp.export(found, tmp_path / "light.zarr")
 
 
 def test_a_video_follows_the_front_of_the_light(tmp_path):
