@@ -15,7 +15,7 @@ from spadwarp.arrays import labelled
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.result.file import as_result
-from spadwarp.result.result import Result, Truth
+from spadwarp.result.result import ARRAYS, Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import gate_deviation, lines_of_sight
@@ -53,10 +53,7 @@ _MAPS = {
 # Dimensions, unit and meaning of the arrays of a file, by name.
 _ARRAYS = {
     **{f"maps/{name}": (PIXELS, unit, name.replace("_", " ")) for name, unit in _MAPS.items()},
-    "truth/depth": (PIXELS, "m", "true depth"),
-    "truth/range": (PIXELS, "m", "true range"),
-    "truth/normal": ((*PIXELS, "axis"), "1", "true normal"),
-    "truth/reflectance": (PIXELS, "1", "true reflectance"),
+    **{name: entry[1:] for name, entry in ARRAYS.items() if name.startswith("truth/")},
     "depth": (("frame", *PIXELS), "m", "planar depth of the frame"),
     "labels": (("frame", *PIXELS), "1", "whether the pixel reports background"),
 }

@@ -17,7 +17,7 @@ import sys
 import tomllib
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -455,17 +455,21 @@ def with_paths(model: type[BaseModel], tables: Mapping[str, Any], change: Callab
     return {name: value if name not in places else changed(value, *places[name]) for name, value in tables.items()}
 
 
-def read_table(field: str, path: str | Path, columns: Mapping[str, str]) -> NDArray[np.float64]:
-    """Columns of the .csv file that a field names, `[columns, rows]`.
-
-    Raises what `read_columns` raises, with the name of the field.
-    """
+@contextmanager
+def file_of(field: str) -> Iterator[None]:
+    """Errors of a file that is read in the block name the field that names the file."""
     try:
-        return read_columns(path, columns).T
+        yield
     except FileError as error:
         raise FileError(f"{field} = {error}") from None
     except ConfigError as error:
         raise ConfigError(f"{field}: {error}") from None
+
+
+def read_table(field: str, path: str | Path, columns: Mapping[str, str]) -> NDArray[np.float64]:
+    """Columns of the .csv file that a field names, `[columns, rows]`; raises what `read_columns` raises."""
+    with file_of(field):
+        return read_columns(path, columns).T
 
 
 # Documents
