@@ -386,12 +386,6 @@ def table_of(model: type[BaseModel], name: str) -> type[Section] | None:
     return next((one for one in models_of(info) if issubclass(one, Section)), None)
 
 
-@cache
-def takes_any_table(model: type[BaseModel], name: str) -> bool:
-    """Whether a field is a table without a model."""
-    return any(typing.get_origin(part) is dict for part in parts_of(model.model_fields.get(name)))
-
-
 def field_unit(info: FieldInfo) -> str | None:
     """The unit of a field's numbers, "1" for a ratio; None where it takes no real numbers."""
     if not any(part is float for part in parts_of(info)):
@@ -687,7 +681,7 @@ def _insert(model: type[BaseModel], layer: dict[Any, Any], key: Key, value: Any)
             raise unfit
         if table is not None and isinstance(part, str):
             origins = [typing.get_origin(one) for one in parts_of(table.model_fields.get(part))]
-            is_known = part in table.model_fields and not takes_any_table(table, part)
+            is_known = part in table.model_fields and dict not in origins
             table = table_of(table, part)
             is_list = table is not None and tuple in origins
         else:
