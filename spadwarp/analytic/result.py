@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, response_sigma, scene_optics, warn_of_model
 from spadwarp.arrays import labelled
 from spadwarp.device import pick_device
-from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
+from spadwarp.io.hdf5 import PACKED, PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.result.file import as_result
-from spadwarp.result.result import Result, Truth
+from spadwarp.result.result import ARRAYS, Result, Truth
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.sight import gate_deviation, lines_of_sight
@@ -30,7 +30,6 @@ __all__ = ["AnalyticFile", "AnalyticResult", "simulate_analytic"]
 _FORMAT, _FORMAT_VERSION = "spadwarp analytic", 1
 _PART_PIXELS = 1 << 26  # of frames that are drawn at a time: 0.3 GB
 _PART_BYTES = 1 << 28  # of frames that are held at a time while a file is written
-_PACKED = {"compression": "gzip", "shuffle": True, "compression_opts": 1}
 _READ_ME = (
     "Depth frames [frame, height, width] in metres along z, NaN for no estimate; labels: the pixel reports background "
     "light. maps/: signal, backscatter and alpha are expected detections per pulse within the gate, arrival and "
@@ -53,10 +52,7 @@ _MAPS = {
 # Dimensions, unit and meaning of the arrays of a file, by name.
 _ARRAYS = {
     **{f"maps/{name}": (PIXELS, unit, name.replace("_", " ")) for name, unit in _MAPS.items()},
-    "truth/depth": (PIXELS, "m", "true depth"),
-    "truth/range": (PIXELS, "m", "true range"),
-    "truth/normal": ((*PIXELS, "axis"), "1", "true normal"),
-    "truth/reflectance": (PIXELS, "1", "true reflectance"),
+    **{name: entry[1:] for name, entry in ARRAYS.items() if name.startswith("truth/")},
     "depth": (("frame", *PIXELS), "m", "planar depth of the frame"),
     "labels": (("frame", *PIXELS), "1", "whether the pixel reports background"),
 }
@@ -203,9 +199,9 @@ class AnalyticResult(Shown):
             for name, (dimensions, _, _) in _ARRAYS.items():
                 if frames is None or "frame" not in dimensions:
                     values = self._array(name)
-                    file.create_dataset(name, data=values, **(_PACKED if values.size else {}))
+                    file.create_dataset(name, data=values, **(PACKED if values.size else {}))
             if frames is not None:
-                packed = {"chunks": (1, *shape), **_PACKED} if frames else {}
+                packed = {"chunks": (1, *shape), **PACKED} if frames else {}
                 depth = file.create_dataset("depth", (frames, *shape), np.float32, **packed)
                 labels = file.create_dataset("labels", (frames, *shape), np.bool_, **packed)
                 part = max(1, _PART_BYTES // (5 * self.truth.depth.size))

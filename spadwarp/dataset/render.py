@@ -231,11 +231,12 @@ def render_transport(plan: Plan, draw: SceneDraw, *, device: str | None, threads
     time_bound = bound_of_result(result, pulses=pulses, device=device).sigma
     per_time = depth_per_time(scene, np.nan_to_num(result.truth.range.astype(np.float64)))
     profile = np.concatenate([[0.0], np.cumsum(water.sum(axis=(0, 1)))])
+    exposed = result.scene.with_overrides({"analytic.pulses_per_depth_frame": pulses})
     return RenderedScene(
         draw=draw,
         scene=scene,
         photons=photons,
-        noise_ratio=_noise_ratio(result, pulses),
+        noise_ratio=replace(result, scene=exposed).target_noise_ratio if result.batches > 1 else math.nan,
         truth=result.truth,
         bound=np.where(seen & np.isfinite(time_bound), time_bound * per_time, np.nan).astype(np.float32),
         signal=float(np.median(returned[seen])) if seen.any() else 0.0,
@@ -252,11 +253,6 @@ def _returned(result: Result) -> Floats:
     light = result.tallies[:2].sum(axis=(0, 3)) * result.tally_value
     scale = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
     return np.where(np.isfinite(result.truth.depth), light * scale, 0.0)
-
-
-def _noise_ratio(result: Result, pulses: int) -> float:
-    exposed = result.scene.with_overrides({"analytic.pulses_per_depth_frame": pulses})
-    return replace(result, scene=exposed).target_noise_ratio if result.batches > 1 else math.nan
 
 
 def _stored(plan: Plan, scene: Scene, frames: Frames, *, device: str | None) -> dict[str, Any]:

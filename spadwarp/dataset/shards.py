@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from spadwarp.dataset.plan import Plan, Shard
 from spadwarp.dataset.render import PROFILE_BINS, RenderedScene, render_analytic, render_transport
 from spadwarp.device import core_count, pick_device
-from spadwarp.io.hdf5 import Hdf5File, open_hdf5, write_hdf5
+from spadwarp.io.hdf5 import PACKED, Hdf5File, open_hdf5, write_hdf5
 from spadwarp.io.paths import remove_temporaries, sha256
 from spadwarp.scene import Scene, phase_function
 from spadwarp.scene.sight import port_advance
@@ -35,7 +35,6 @@ from spadwarp.values import DeviceError, FileError, SpadwarpError, check_choice,
 FORMAT_VERSION = 1
 
 _LIBRARY = ("v110", "v110")  # one version of the file format, whichever HDF5 writes it
-_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 _READ_OFTEN = ("depth", "label", "intensity", "bound")
 _COUNTS = (np.uint8, np.uint16, np.uint32, np.uint64)
 
@@ -145,7 +144,7 @@ def write_shard(
 def _store(file: Any, name: str, column: Column, data: NDArray[Any], packed: bool) -> None:
     """Writes a column; what is read often is not packed unless the recipe says so."""
     pack = name == "config" or (data.ndim > 2 and (packed or name not in _READ_OFTEN))
-    how = {"chunks": (1, *data.shape[1:]), **_PACKED} if pack else {}
+    how = {"chunks": (1, *data.shape[1:]), **PACKED} if pack else {}
     file.create_dataset(name, data=data, track_times=False, **how).attrs.update(column.attributes)
 
 
@@ -250,7 +249,7 @@ class _HistogramWriter:
             stored.attrs.update(HISTOGRAM_COLUMNS[name].attributes)
 
     def _create(self, name: str, shape: tuple[int, ...], kind: Any, **choices: Any) -> Any:
-        return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **_PACKED, **choices)
+        return self._file.create_dataset(name, shape, kind, chunks=self._chunk, track_times=False, **PACKED, **choices)
 
     def _write_counts(self) -> None:
         indices, counts = zip(*self._events, strict=True)
@@ -266,7 +265,7 @@ class _HistogramWriter:
         self._file.create_dataset("event_start", data=starts, track_times=False)
         events = {"event_index": np.concatenate(indices), "event_count": np.concatenate(counts).astype(kind)}
         for name, values in events.items():
-            packed = {"chunks": (min(values.size, 1 << 18),), **_PACKED} if values.size else {}
+            packed = {"chunks": (min(values.size, 1 << 18),), **PACKED} if values.size else {}
             self._file.create_dataset(name, data=values, track_times=False, **packed)
 
 

@@ -18,6 +18,7 @@ from spadwarp.frames.depth import METHODS, Method
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.frames.spad import Frames, MonteCarloNoise, detect, monte_carlo_noise
 from spadwarp.io.hdf5 import (
+    PACKED,
     PIXELS,
     Hdf5File,
     hdf5_format,
@@ -26,7 +27,7 @@ from spadwarp.io.hdf5 import (
     read_hdf5,
     write_hdf5,
 )
-from spadwarp.result.result import Result, Truth
+from spadwarp.result.result import ARRAYS, Result, Truth
 from spadwarp.scene import Scene, SceneLike, Trajectory, as_scene, load_trajectory
 from spadwarp.scene.camera import camera_attributes
 from spadwarp.scene.sight import depth_from_time, depth_per_time
@@ -40,12 +41,11 @@ Progress = Callable[[str, int, int], None]
 
 FORMAT_VERSION = 1
 
-_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 _CHUNK_BYTES, _CHUNK_TAGS = 1 << 20, 1 << 16
 _PART_BYTES = 1 << 26  # of counts that are held at a time
 _IMAGES, _DETECTION = ("frame", *PIXELS), "tags/detection"
 _TAGS: dict[str, Any] = {"frame": np.int64, "y": np.int32, "x": np.int32, "pulse": np.int64, "bin": np.int32}
-_TRUTH = {"depth": "m", "range": "m", "normal": "1", "reflectance": "1"}
+_TRUTH = {name.partition("/")[2]: entry for name, entry in ARRAYS.items() if name.startswith("truth/")}
 _OF_A_FRAME = ("pulses", "seed", "gate_start", "bin_width", "edges", "period", "irf", "monte_carlo_noise")
 
 _READ_ME = (
@@ -329,12 +329,12 @@ class _Writer:
         for name, (dimensions, values, _, _) in arrays.items():
             array = np.asarray(values)
             if dimensions[0] == _DETECTION:
-                file.create_dataset(name, (0,), array.dtype, maxshape=(None,), chunks=(_CHUNK_TAGS,), **_PACKED)
+                file.create_dataset(name, (0,), array.dtype, maxshape=(None,), chunks=(_CHUNK_TAGS,), **PACKED)
             elif dimensions[0] != "frame":
-                file.create_dataset(name, data=array, **(_PACKED if array.ndim > 1 else {}))
+                file.create_dataset(name, data=array, **(PACKED if array.ndim > 1 else {}))
             else:
                 shape, packed = (self._frames, *array.shape[1:]), dimensions[:3] == _IMAGES
-                chunks = {"chunks": _chunks(shape, array.itemsize), **_PACKED} if packed else {}
+                chunks = {"chunks": _chunks(shape, array.itemsize), **PACKED} if packed else {}
                 file.create_dataset(name, shape, array.dtype, **chunks)
         edges, (height, width, _) = part.gate_start + part.edges, part.expected.shape
         axes: dict[str, Any] = {
@@ -599,15 +599,9 @@ def _moving(result: Result, part: Frames, moves: Trajectory, row: int) -> _Layou
         "expected": ((*_IMAGES, "time"), part.expected, "1", "expected detections per pulse before pile-up"),
         "background": (("frame",), background, "1", "part of `expected` that is not target, mean over pixels and bins"),
         "camera_position": (axes[:2], position, "m", "the lens in the world"),
-        "camera_rotation": (
-            ("frame", "axis", "camera_axis"),
-            rotation,
-            "1",
-            "the camera's axes in the world as columns",
-        ),
+        "camera_rotation": (axes, rotation, "1", "the camera's axes in the world as columns"),
     }
-    for name, unit in _TRUTH.items():
-        image = (*_IMAGES, "axis") if name == "normal" else _IMAGES
-        arrays[f"truth/{name}"] = (image, getattr(result.truth, name), unit, f"true {name}")
+    for name, (_, dimensions, unit, meaning) in _TRUTH.items():
+        arrays[f"truth/{name}"] = (("frame", *dimensions), getattr(result.truth, name), unit, meaning)
     rows = {name: (axes, np.asarray(values)[None], unit, text) for name, (axes, values, unit, text) in arrays.items()}
     return _Layout(rows, attributes, coordinates)

@@ -40,6 +40,7 @@ _LARGEST_CHUNK = 1 << 26  # bytes that may be larger than the array itself
 _FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32"}
 _MOST_ARRAYS, _DEEPEST = 10_000, 32  # that are listed; groups in each other
 _REQUIRED: Any = object()
+PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -296,18 +297,18 @@ class Hdf5File:
 
     def integers(self, name: str, *, bits: int = 128) -> dict[str, int]:
         """A dataset that is the text of a JSON object of integers, of less than so many bits."""
-        table = self.table(name)
-        for entry, value in table.items():
-            if type(value) is not int or abs(value) >> (bits - 1):
-                self.refuse(f"{name}, {entry}", f"is not an integer of less than {bits} bits")
-        return table
+        needed = f"an integer of less than {bits} bits"
+        return self._entries(name, lambda value: type(value) is int and not abs(value) >> (bits - 1), needed)
 
     def numbers(self, name: str) -> dict[str, float]:
         """A dataset that is the text of a JSON object of finite numbers."""
+        return self._entries(name, lambda value: type(value) in (int, float) and abs(value) < 1e300, "a finite number")
+
+    def _entries(self, name: str, fits: Callable[[Any], bool], needed: str) -> dict[str, Any]:
         table = self.table(name)
         for entry, value in table.items():
-            if type(value) not in (int, float) or not abs(value) < 1e300:
-                self.refuse(f"{name}, {entry}", "is not a finite number")
+            if not fits(value):
+                self.refuse(f"{name}, {entry}", f"is not {needed}")
         return table
 
     # Checks

@@ -50,8 +50,7 @@ class Flux(Section):
     upper: Corner = field((math.inf,) * 3, "upper corner of the box [m]; one number for all three")
     gates: Whole = field(1, "number of gates of time; more than one need gate_width_ps", "[1, 4096]")
     gate_start_ns: float = field(0.0, "begin of the first gate [ns]", "[0, 1e12]")
-    gate_width_ps: float | None = Field(None, ge=1e-3, le=1e15)
-    """width of a gate [ps]; not given: all times"""
+    gate_width_ps: float | None = field(None, "width of a gate [ps]; not given: all times", "[1e-3, 1e15]")
     estimator: Literal["track", "collision"] = "track"
     """by the way of each photon through the voxels (less noise a photon), or by its collisions (less noise a second on
     a GPU where a voxel is .1 free paths wide or more)"""

@@ -16,7 +16,7 @@ from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
 from spadwarp.scene.pose import rotation_matrix, vector_of
-from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range
+from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range, file_of
 from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 
 __all__: list[str] = []
@@ -387,10 +387,8 @@ def cells_of(grid: Grid, water: tuple[float, float, float], has_table: bool, sta
 
 @functools.lru_cache(maxsize=2)
 def _read(path: str, stamp: Any) -> GridFile:
-    try:
+    with file_of("medium.grid.file"):
         return read_grid(path)
-    except FileError as error:
-        raise FileError(f"medium.grid.file: {error}") from None
 
 
 def _frame(grid: Grid, values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
 from spadwarp.io.arrays import read_exr, read_npy
-from spadwarp.io.paths import existing_file
+from spadwarp.io.paths import existing_file, reading
 from spadwarp.scene.port import Port
 from spadwarp.scene.pose import unit_vector
 from spadwarp.scene.sections import (
@@ -28,11 +28,12 @@ from spadwarp.scene.sections import (
     Vector,
     field,
     field_range,
+    file_of,
     listed,
     read_table,
 )
 from spadwarp.scene.settings import Detector
-from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval, SpadwarpError
+from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Interval
 from spadwarp.water.seawater import RANGES
 
 __all__ = ["Laser", "SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]
@@ -146,20 +147,15 @@ def load_profile(laser: Laser) -> Floats:
     `FileError` if the file cannot be read, or holds no image of finite values ≥ 0 with light in it.
     """
     path = Path(laser.profile_image or "")
-    where, ending = f"laser.profile_image = {str(path)!r}", path.suffix.lower()
-    if ending not in _READERS:
-        raise FileError(f"{where}: ending {path.suffix!r} is not one of {', '.join(_READERS)}")
-    try:
+    with file_of("laser.profile_image"), reading(path):
+        if (ending := path.suffix.lower()) not in _READERS:
+            raise FileError(f"{path}: ending {path.suffix!r} is not one of {', '.join(_READERS)}")
         image = _READERS[ending](existing_file(path))
-    except SpadwarpError as error:
-        raise FileError(f"{where}: {error}") from error
-    except Exception as error:  # what a reader raises depends on the format
-        raise FileError(f"{where}: damaged or not readable: {error}") from error
-    if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "biuf":
-        raise FileError(f"{where}: {image.dtype} {image.shape}; real numbers [height, width] are needed")
-    values = image.astype(np.float64)
-    if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() > 0.0):
-        raise FileError(f"{where}: holds {values.min()} to {values.max()}; finite values >= 0 with light are needed")
+        if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "biuf":
+            raise FileError(f"{path}: {image.dtype} {image.shape}; real numbers [height, width] are needed")
+        values = image.astype(np.float64)
+        if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() > 0.0):
+            raise FileError(f"{path}: holds {values.min()} to {values.max()}; finite values >= 0 with light are needed")
     return values
 
 
@@ -177,7 +173,7 @@ def _read_png(path: Path) -> NDArray[np.generic]:
         warnings.simplefilter("ignore")  # of Pillow's own limit
         width, height = image.size
     if width * height > _LARGEST:
-        raise FileError(f"{width} x {height} pixels; at most {_LARGEST} are read")
+        raise FileError(f"{path}: {width} x {height} pixels; at most {_LARGEST} are read")
     pixels = np.asarray(imread(path))
     without_alpha = {2: 1, 4: 3}.get(pixels.shape[-1], pixels.shape[-1])
     return pixels if pixels.ndim == 2 else pixels[..., :without_alpha].mean(axis=-1)

@@ -27,6 +27,7 @@ from spadwarp.scene.sections import (
     Section,
     field,
     field_range,
+    file_of,
     listed,
     read_table,
 )
@@ -716,10 +717,8 @@ def scattering_matrix(medium: Medium) -> Matrix | None:
     Raises `FileError` or `ConfigError` if its table cannot be read.
     """
     if medium.scattering_matrix == "tabulated":
-        try:
+        with file_of("medium.matrix_table"):
             return read_matrix_table(str(medium.matrix_table))
-        except ConfigError as error:
-            raise ConfigError(f"medium.matrix_table: {error}") from None
     return {
         "none": None,
         "rayleigh": partial(rayleigh_matrix, depolarisation_ratio=medium.depolarisation_ratio),

@@ -7,18 +7,17 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from spadwarp.io.paths import existing_file
+from spadwarp.io.arrays import read_npy
 from spadwarp.scene.port import air_indices
 from spadwarp.scene.pose import unit_vector, vector_of
-from spadwarp.scene.sections import Direction, FilePath, Section, Vector, Whole, field
-from spadwarp.values import FileError, SpadwarpError
+from spadwarp.scene.sections import Direction, FilePath, Section, Vector, Whole, field, file_of
+from spadwarp.values import FileError
 
 __all__: list[str] = []
 
@@ -40,8 +39,7 @@ class Waves(Section):
     size: float = field(
         20.0, "period of the field along the waves, and across them unless heights has it [m]", "[0.1, 1e5]"
     )
-    cells: Whole = Field(512, ge=8, le=8192)
-    """nodes of the field along each side, for a spectrum"""
+    cells: Whole = field(512, "nodes of the field along each side, for a spectrum", "[8, 8192]")
     spectrum: Literal["jonswap"] = field("jonswap", "of the waves that surface.wind makes (Hasselmann et al. 1973)")
     fetch: float = field(10e3, "length of sea over which the wind blows [m]", "[10, 1e7]")
     spreading: float = field(
@@ -50,8 +48,7 @@ class Waves(Section):
     direction: Direction | None = field(None, "in which the waves go, in the world; default: surface.direction, or any")
     shortest: float | None = Field(None, ge=1e-3, le=1e4)
     """length of the shortest waves [m]; default: four nodes, or more until facets keep a quarter of the slopes"""
-    seed: Whole = Field(0, ge=0, le=2**63 - 1)
-    """of the phases and heights of the waves"""
+    seed: Whole = field(0, "of the phases and heights of the waves", "[0, 9223372036854775807]")
     time: float = field(0.0, "at which the waves are seen [s]", "[-1e9, 1e9]")
     heights: Annotated[str | None, FilePath(".npy")] = field(None, "heights [rows, columns] in place of a spectrum [m]")
 
@@ -245,16 +242,11 @@ def _largest_number(
 
 @lru_cache(2)
 def _read_heights(path: str, size: float, changed: float) -> WaveField:
-    where = f"surface.waves.heights = {path!r}"
-    try:
-        heights = np.load(existing_file(Path(path)), allow_pickle=False)
-    except SpadwarpError as error:
-        raise FileError(f"{where}: {error}") from error
-    except Exception as error:  # a damaged header raises what it likes
-        raise FileError(f"{where}: damaged or not readable: {error}") from error
-    if heights.ndim != 2 or min(heights.shape) < 2 or heights.dtype.kind not in "iuf":
-        raise FileError(f"{where}: {heights.dtype} {heights.shape}; real numbers [rows, columns] are needed")
-    values = heights.astype(np.float64)
-    if not (np.abs(values) <= 1e4).all():
-        raise FileError(f"{where}: holds {values.min()} to {values.max()}; heights in [-1e4, 1e4] m are needed")
+    with file_of("surface.waves.heights"):
+        heights = read_npy(path)
+        if heights.ndim != 2 or min(heights.shape) < 2 or heights.dtype.kind not in "iuf":
+            raise FileError(f"{path}: {heights.dtype} {heights.shape}; real numbers [rows, columns] are needed")
+        values = heights.astype(np.float64)
+        if not (np.abs(values) <= 1e4).all():
+            raise FileError(f"{path}: holds {values.min()} to {values.max()}; heights in [-1e4, 1e4] m are needed")
     return WaveField(values - values.mean(), (size, size * heights.shape[0] / heights.shape[1]))

@@ -17,7 +17,7 @@ import sys
 import tomllib
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -386,12 +386,6 @@ def table_of(model: type[BaseModel], name: str) -> type[Section] | None:
     return next((one for one in models_of(info) if issubclass(one, Section)), None)
 
 
-@cache
-def takes_any_table(model: type[BaseModel], name: str) -> bool:
-    """Whether a field is a table without a model."""
-    return any(typing.get_origin(part) is dict for part in parts_of(model.model_fields.get(name)))
-
-
 def field_unit(info: FieldInfo) -> str | None:
     """The unit of a field's numbers, "1" for a ratio; None where it takes no real numbers."""
     if not any(part is float for part in parts_of(info)):
@@ -455,17 +449,21 @@ def with_paths(model: type[BaseModel], tables: Mapping[str, Any], change: Callab
     return {name: value if name not in places else changed(value, *places[name]) for name, value in tables.items()}
 
 
-def read_table(field: str, path: str | Path, columns: Mapping[str, str]) -> NDArray[np.float64]:
-    """Columns of the .csv file that a field names, `[columns, rows]`.
-
-    Raises what `read_columns` raises, with the name of the field.
-    """
+@contextmanager
+def file_of(field: str) -> Iterator[None]:
+    """Errors of a file that is read in the block name the field that names the file."""
     try:
-        return read_columns(path, columns).T
+        yield
     except FileError as error:
         raise FileError(f"{field} = {error}") from None
     except ConfigError as error:
         raise ConfigError(f"{field}: {error}") from None
+
+
+def read_table(field: str, path: str | Path, columns: Mapping[str, str]) -> NDArray[np.float64]:
+    """Columns of the .csv file that a field names, `[columns, rows]`; raises what `read_columns` raises."""
+    with file_of(field):
+        return read_columns(path, columns).T
 
 
 # Documents
@@ -683,7 +681,7 @@ def _insert(model: type[BaseModel], layer: dict[Any, Any], key: Key, value: Any)
             raise unfit
         if table is not None and isinstance(part, str):
             origins = [typing.get_origin(one) for one in parts_of(table.model_fields.get(part))]
-            is_known = part in table.model_fields and not takes_any_table(table, part)
+            is_known = part in table.model_fields and dict not in origins
             table = table_of(table, part)
             is_list = table is not None and tuple in origins
         else:

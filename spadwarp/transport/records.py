@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import spadwarp_kernels as sk
 from spadwarp.device import pick_device
-from spadwarp.io.hdf5 import Coordinate, name_dimensions, read_hdf5, write_hdf5
+from spadwarp.io.hdf5 import PACKED, Coordinate, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.mesh import build_mesh
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.camera import to_world
@@ -147,7 +147,7 @@ def save_records(records: PhotonRecords, path: str | Path, *, scene: Scene | Non
     with write_hdf5(path) as file:
         file.attrs.update({**head, "energy_balance_unit": records.energy_balance_unit})
         for name in _ARRAYS if records.derivatives else list(_ARRAYS)[:-1]:
-            file.create_dataset(name, data=getattr(records, name), compression="gzip", compression_opts=1, shuffle=True)
+            file.create_dataset(name, data=getattr(records, name), **PACKED)
         file.create_dataset("energy_balance", data=json.dumps(records.energy_balance))  # integers without limit
         if scene is not None:
             file.create_dataset("config", data=scene.to_toml())

@@ -164,9 +164,11 @@ def simulate_spectrum(
     options = {"mesh_cache": {}, **options} if options.get("engine") is None else options
     left = [scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)]
     results, partial = dict[float, Result](), False
+    alone = any(options.get(name) is not None for name in ("derivatives", "blocks", "tallies"))
+    most = 1 if alone else _MOST_TOGETHER
     while left and not partial:
         # As many neighbours as ride on the photons of the one in their middle.
-        sizes = range(min(len(left), _MOST_TOGETHER), 0, -1) if _options_allow(options) else (1,)
+        sizes = range(min(len(left), most), 0, -1)
         size = next(size for size in sizes if size == 1 or _ride_together(left[:size]))
         group, left = left[:size], left[size:]
         try:
@@ -178,10 +180,6 @@ def simulate_spectrum(
         results |= {line.laser.wavelength_nm: one for line, one in zip(group, found, strict=True)}
         partial = any(one.partial for one in found)
     return Spectrum(scene, MappingProxyType(results), partial)
-
-
-def _options_allow(options: Mapping[str, Any]) -> bool:
-    return all(options.get(name) is None for name in ("derivatives", "blocks", "tallies"))
 
 
 def _ride_together(lines: Sequence[Scene]) -> bool:
