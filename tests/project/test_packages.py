@@ -140,8 +140,8 @@ LINES = {
     "kernels/riders": (750, 717),
     "kernels/surface": (1700, 1887),
     "kernels/tally": (450, 1002),
-    "kernels/transport": (1450, 1774),
-    "kernels/water": (1350, 1686),
+    "kernels/transport": (1450, 1712),
+    "kernels/water": (1350, 1668),
     "kernels/worlds": (1600, 2173),
 }
 
