@@ -134,7 +134,7 @@ LINES = {
     "kernels/analytic": (1650, 1681),
     "kernels/base": (950, 1219),
     "kernels/detection": (1000, 1349),
-    "kernels/estimators": (1300, 1099),
+    "kernels/estimators": (1300, 1096),
     "kernels/optics": (1350, 2652),
     "kernels/photon": (850, 1249),
     "kernels/riders": (750, 717),
