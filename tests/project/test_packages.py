@@ -134,14 +134,14 @@ LINES = {
     "kernels/analytic": (1650, 1681),
     "kernels/base": (950, 1219),
     "kernels/detection": (1000, 1349),
-    "kernels/estimators": (1300, 1099),
+    "kernels/estimators": (1300, 1096),
     "kernels/optics": (1350, 2652),
     "kernels/photon": (850, 1249),
     "kernels/riders": (750, 717),
     "kernels/surface": (1700, 1887),
     "kernels/tally": (450, 1002),
-    "kernels/transport": (1450, 1774),
-    "kernels/water": (1350, 1686),
+    "kernels/transport": (1450, 1712),
+    "kernels/water": (1350, 1668),
     "kernels/worlds": (1600, 2173),
 }
 

@@ -17,15 +17,9 @@ from spadwarp_kernels.photon.state import PhotonState, World
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.reflectance import sample_cosine_law
 from spadwarp_kernels.tally.tally import BACKSCATTER, FORWARD_SCATTERED
+from spadwarp_kernels.water import phase_functions
 from spadwarp_kernels.water.medium import Medium
-from spadwarp_kernels.water.phase_functions import (
-    HENYEY_GREENSTEIN,
-    HENYEY_GREENSTEIN_GUIDE,
-    Guiding,
-    PhaseFunction,
-    henyey_greenstein_pdf,
-    sample_henyey_greenstein,
-)
+from spadwarp_kernels.water.phase_functions import HENYEY_GREENSTEIN, HENYEY_GREENSTEIN_GUIDE, Guiding, PhaseFunction
 
 from .contribution import make_event_request, make_score, scores_collision
 from .estimator import Direction, Estimator, FlightPlan, Meeting
@@ -185,13 +179,15 @@ def make_sample_angle(phase: PhaseFunction) -> wp.Function:
         xi = u01_fine(word)
         if wp.static(one_family):
             # One draw for both: the lanes of a warp take theirs together.
-            t = sample_henyey_greenstein(xi, wp.where(directed, guiding.return_anisotropy, here.anisotropy))
+            t = phase_functions.sample_henyey_greenstein(
+                xi, wp.where(directed, guiding.return_anisotropy, here.anisotropy)
+            )
         else:
             t = phase.sample(xi, here)
         if to_lens:
             t = guide.lobe_sample(xi, medium, guiding)
         elif wp.static(not one_family) and directed:
-            t = sample_henyey_greenstein(xi, guiding.return_anisotropy)
+            t = phase_functions.sample_henyey_greenstein(xi, guiding.return_anisotropy)
         return t
 
     return sample_angle
@@ -289,7 +285,7 @@ def make_direct(spec: TransportSpec) -> wp.Function:
         density = spec.faces.pdf(world.surfaces, s.hit, s.u, new.u, lobe, density)
         mixture = (1.0 - to_lens_chance - to_view_chance) * density
         mixture += to_lens_chance * guide.lobe_pdf(one_minus_cosine(v, new.u), world.medium, world.guiding)
-        mixture += to_view_chance * henyey_greenstein_pdf(
+        mixture += to_view_chance * phase_functions.henyey_greenstein_pdf(
             one_minus_cosine(to_axis, new.u), world.guiding.return_anisotropy
         )
         new.factor = density / wp.max(mixture, 1.0e-30)

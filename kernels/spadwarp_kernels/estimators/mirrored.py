@@ -19,7 +19,6 @@ from spadwarp_kernels.water.limits import (
     image_reflectance,
     next_face,
     reflections_of,
-    to_next_face,
 )
 
 from .contribution import make_scattering
@@ -69,8 +68,10 @@ def _make_follow(spec: TransportSpec) -> wp.Function:
             part = float(rest)
             face = int(0)
             if k < reflections:
-                part = wp.min(rest, to_next_face(limits, begin, along))
-                face = next_face(limits, 9.0e29, begin, along).face
+                # Less than what stands for none, which is no face.
+                leaves = next_face(limits, 9.0e29, begin, along)
+                part = wp.min(rest, leaves.distance)
+                face = leaves.face
             start = domain.point_back(limits, begin)
             extinction = spec.water.extinction(world.medium, world.layers, start, heading, part, seed + wp.uint64(k))
             found.depth += part * extinction

@@ -10,38 +10,9 @@ import warp as wp
 from spadwarp_kernels.base.kernels import memoised
 from spadwarp_kernels.base.philox import PREFETCHED_WORDS
 from spadwarp_kernels.base.rotations import inverse_direction
-from spadwarp_kernels.photon.queue import (
-    MOST_LEFT,
-    READ_SIZE,
-    SET_SIZE,
-    count_lanes,
-    exchange,
-    queue_size,
-    take_photons,
-    vote,
-)
+from spadwarp_kernels.photon import queue, state
 from spadwarp_kernels.photon.spec import TransportSpec, check_spec
-from spadwarp_kernels.photon.state import (
-    DONE,
-    END,
-    EVENT,
-    FLIGHT,
-    NO_RAY,
-    RAY,
-    SCATTER,
-    SHADOW_RAY,
-    START,
-    SURFACE_RAY,
-    Draws,
-    Launch,
-    PhotonRef,
-    Sink,
-    SinkRef,
-    World,
-    WorldRef,
-    first_state,
-    is_planned,
-)
+from spadwarp_kernels.photon.state import Draws, Launch, PhotonRef, Sink, SinkRef, World, WorldRef
 from spadwarp_kernels.surface.bvh import NO_NODE, Stack, place, step_leaf, step_node
 from spadwarp_kernels.surface.ray_cast import surface_hit
 
@@ -82,7 +53,7 @@ def _make_loop_alone(stages: Stages, cuda: bool, options: dict) -> wp.Kernel:
     @wp.kernel(**options)
     def transport(world: World, sink: Sink, launch: Launch):
         draws = Draws()
-        s = first_state(world, stages.prepare(draws, world, wp.tid(), launch))
+        s = state.first_state(world, stages.prepare(draws, world, wp.tid(), launch))
         if wp.static(cuda):  # noqa: SIM108, Warp has no such choice between arrays
             words = launch.cursor  # any: it is not used
         else:
@@ -91,13 +62,13 @@ def _make_loop_alone(stages: Stages, cuda: bool, options: dict) -> wp.Kernel:
             s.photon = number
             id = draws.base + wp.uint64(number)
             stages.begin(s, world, sink, stages.emit(world.laser, world.scan, world.seed, id), id)
-            while s.stage != END:
+            while s.stage != state.END:
                 stages.fly(s, world, draws, words)
                 stages.trace(s, world)
                 stages.ask_flight(s, world, sink, 0)
                 stages.cross(s, world, sink)
                 stages.collide(s, world, sink)
-                if s.stage == SCATTER:
+                if s.stage == state.SCATTER:
                     stages.ask_event(s, world, sink, 0)
                     stages.scatter(s, world, sink, draws)
             stages.finish(s, sink)
@@ -123,25 +94,25 @@ def _make_renew(stages: Stages) -> wp.Function:
     def renew(
         s: PhotonRef, world: WorldRef, sink: SinkRef, base: wp.uint64, launch: wp.ref[Launch], memory: int, lane: int
     ):
-        if s.stage == END:
+        if s.stage == state.END:
             stages.finish(s, sink)
-            s.stage = START
-        wanting = s.stage == START
-        votes = vote(wanting)
+            s.stage = state.START
+        wanting = s.stage == state.START
+        votes = queue.vote(wanting)
         entry = votes[0]
         # All lanes emit a photon each, which those that have ended take one by one.
         if s.taken >= 32:
-            s.first = take_photons(launch.cursor)
+            s.first = queue.take_photons(launch.cursor)
             s.taken = 0
             own = stages.emit(world.laser, world.scan, world.seed, base + wp.uint64(s.first + lane))
-            exchange(memory, True, lane, own)
+            queue.exchange(memory, True, lane, own)
         entry += s.taken
         s.taken += votes[1]
         if wanting and entry < 32:
             s.photon = s.first + entry
-            s.stage = DONE
+            s.stage = state.DONE
             if s.photon < launch.photon_count:
-                emitted = exchange(memory, False, entry, wp.spatial_vector())
+                emitted = queue.exchange(memory, False, entry, wp.spatial_vector())
                 stages.begin(s, world, sink, emitted, base + wp.uint64(s.photon))
 
     return renew
@@ -156,16 +127,16 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
     def transport(world: World, sink: Sink, launch: Launch):
         lane = wp.tid() % 32
         draws = Draws()
-        s = first_state(world, stages.prepare(draws, world, wp.tid(), launch))
+        s = state.first_state(world, stages.prepare(draws, world, wp.tid(), launch))
         memory = stages.memory()
         status = WarpStatus()
         status.enough = 32
         queued = int(0)
         if wp.static(used):
-            queued = queue_size(memory, SET_SIZE, 0)
+            queued = queue.queue_size(memory, queue.SET_SIZE, 0)
 
         while status.waiting < 32:
-            flying = s.stage == FLIGHT
+            flying = s.stage == state.FLIGHT
             if wp.static(not fused) and flying:
                 stages.fly(s, world, draws, launch.cursor)
             round = int(wp.static(2 - rounds))
@@ -176,32 +147,32 @@ def _make_loop_flat(stages: Stages, options: dict) -> wp.Kernel:
                         stages.ask_flight(s, world, sink, memory)
                         stages.cross(s, world, sink)
                         stages.collide(s, world, sink)
-                        if s.stage == SCATTER:
+                        if s.stage == state.SCATTER:
                             stages.ask_event(s, world, sink, memory)
                             stages.scatter(s, world, sink, draws)
-                elif s.stage == EVENT:
+                elif s.stage == state.EVENT:
                     if round == 0:
                         stages.ask_flight(s, world, sink, memory)
                     else:
                         stages.cross(s, world, sink)
                         stages.collide(s, world, sink)
-                        if s.stage == SCATTER:
+                        if s.stage == state.SCATTER:
                             stages.ask_event(s, world, sink, memory)
                 round += 1
                 # ---- Scores, 32 together
                 if wp.static(used):
-                    queued = queue_size(memory, READ_SIZE, 0)
+                    queued = queue.queue_size(memory, queue.READ_SIZE, 0)
                     ready = queued >= status.enough
                     while ready:
                         request = stages.pop(memory, lane, True, queued, 32)
-                        queued = queue_size(memory, SET_SIZE, wp.max(queued - 32, 0))
+                        queued = queue.queue_size(memory, queue.SET_SIZE, wp.max(queued - 32, 0))
                         ready = wp.static(stages.drains) and queued >= 32
                         stages.serve(s, request, world, sink)
-            if wp.static(not fused) and s.stage == SCATTER:
+            if wp.static(not fused) and s.stage == state.SCATTER:
                 stages.scatter(s, world, sink, draws)
-            if count_lanes(s.stage >= START) >= wp.static(stages.start_lanes):
+            if queue.count_lanes(s.stage >= state.START) >= wp.static(stages.start_lanes):
                 renew(s, world, sink, draws.base, launch, memory, lane)
-                done = count_lanes(s.stage == DONE)
+                done = queue.count_lanes(s.stage == state.DONE)
                 status.enough = wp.where(done == 32, 1, 32)
                 status.waiting = wp.where(queued > 0, 0, done)
 
@@ -233,8 +204,8 @@ class Ray:
 def next_ray(s: PhotonRef) -> int:
     """The ray that a thread traces: that which it has begun, that of its photon, or a shadow ray."""
     ray = s.ray
-    if ray == NO_RAY:
-        ray = wp.where(s.stage == RAY, SURFACE_RAY, wp.where(s.hidden, SHADOW_RAY, NO_RAY))
+    if ray == state.NO_RAY:
+        ray = wp.where(s.stage == state.RAY, state.SURFACE_RAY, wp.where(s.hidden, state.SHADOW_RAY, state.NO_RAY))
     return ray
 
 
@@ -248,7 +219,7 @@ def _make_ray_geometry(scores: bool) -> wp.Function:
         ray.direction = s.u
         ray.length = s.flight.reach
         if wp.static(scores):
-            if s.ray == SHADOW_RAY:
+            if s.ray == state.SHADOW_RAY:
                 ray.origin = s.origin
                 ray.direction = wp.normalize(s.lens - s.origin)
                 ray.length = wp.length(s.lens - s.origin)
@@ -262,18 +233,18 @@ def _make_end_walk(stages: Stages) -> wp.Function:
 
     @wp.func
     def end_walk(s: PhotonRef, world: WorldRef, sink: SinkRef):
-        if s.ray == SURFACE_RAY:
+        if s.ray == state.SURFACE_RAY:
             s.surface_queries += 1
             if s.walk.found >= 0:
                 if stages.meet(s, world, s.walk.nearest):
                     s.hit = surface_hit(world.surfaces, s.walk, s.u)
-            s.stage = EVENT
+            s.stage = state.EVENT
         else:
             s.shadow_queries += 1
             s.hidden = False
             if s.walk.found < 0:
                 stages.deposit(s.account, sink, world, s.pending)
-        s.ray = NO_RAY
+        s.ray = state.NO_RAY
 
     return end_walk
 
@@ -290,7 +261,7 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
     def transport(world: World, sink: Sink, launch: Launch):
         lane = wp.tid() % 32
         draws = Draws()
-        s = first_state(world, stages.prepare(draws, world, wp.tid(), launch))
+        s = state.first_state(world, stages.prepare(draws, world, wp.tid(), launch))
         stack = Stack()
         stack[0] = NO_NODE
         memory = stages.memory()
@@ -298,47 +269,47 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
         status.enough = 32
         queued = int(0)
         if wp.static(used):
-            queued = queue_size(memory, SET_SIZE, 0)
+            queued = queue.queue_size(memory, queue.SET_SIZE, 0)
 
-        while count_lanes(s.stage == DONE and not s.hidden) < 32 or (wp.static(used) and queued > 0):
+        while queue.count_lanes(s.stage == state.DONE and not s.hidden) < 32 or (wp.static(used) and queued > 0):
             # ---- Water: until enough lanes of the warp wait for a ray
             status.waiting = 0
             while status.waiting < wp.static(ray_lanes):
-                if s.stage == FLIGHT:
+                if s.stage == state.FLIGHT:
                     stages.fly(s, world, draws, launch.cursor)
                 round = int(wp.static(2 - rounds))
                 while round < 2:
-                    if s.stage == EVENT and (wp.static(not used) or queued <= MOST_LEFT):
+                    if s.stage == state.EVENT and (wp.static(not used) or queued <= queue.MOST_LEFT):
                         if wp.static(flights):
                             if round == wp.static(2 - rounds):
                                 stages.ask_flight(s, world, sink, memory)
-                        if round == 1 and (wp.static(not flights) or not is_planned(s.flight)):
+                        if round == 1 and (wp.static(not flights) or not state.is_planned(s.flight)):
                             stages.cross(s, world, sink)
                             stages.collide(s, world, sink)
-                            if s.stage == SCATTER:
+                            if s.stage == state.SCATTER:
                                 stages.ask_event(s, world, sink, memory)
                                 if wp.static(scatter_first):
                                     stages.scatter(s, world, sink, draws)
                     round += 1
                     # ---- Scores, by all lanes that have room for what they find
                     if wp.static(used):
-                        queued = queue_size(memory, READ_SIZE, 0)
-                        free = count_lanes(not s.hidden)
+                        queued = queue.queue_size(memory, queue.READ_SIZE, 0)
+                        free = queue.count_lanes(not s.hidden)
                         if queued >= status.enough and free >= wp.static(FREE_LANES):
                             request = stages.pop(memory, lane, not s.hidden, queued, free)
-                            queued = queue_size(memory, SET_SIZE, wp.max(queued - free, 0))
+                            queued = queue.queue_size(memory, queue.SET_SIZE, wp.max(queued - free, 0))
                             stages.serve(s, request, world, sink)
-                if wp.static(not scatter_first) and s.stage == SCATTER:
+                if wp.static(not scatter_first) and s.stage == state.SCATTER:
                     stages.scatter(s, world, sink, draws)
-                if count_lanes(s.stage >= START) >= wp.static(stages.start_lanes):
+                if queue.count_lanes(s.stage >= state.START) >= wp.static(stages.start_lanes):
                     renew(s, world, sink, draws.base, launch, memory, lane)
-                    status.enough = wp.where(count_lanes(s.stage == DONE) == 32, 1, 32)
-                status.waiting = count_lanes(s.stage != FLIGHT)
+                    status.enough = wp.where(queue.count_lanes(s.stage == state.DONE) == 32, 1, 32)
+                status.waiting = queue.count_lanes(s.stage != state.FLIGHT)
 
             # ---- Surfaces: the warp traces its rays together
             s.ray = next_ray(s)
             ray = ray_geometry(s)
-            if s.ray != NO_RAY and s.walk.node == NO_NODE:
+            if s.ray != state.NO_RAY and s.walk.node == NO_NODE:
                 s.walk.node = 0
                 s.walk.found = -1
                 s.walk.nearest = ray.length
@@ -346,8 +317,8 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
             inverse = inverse_direction(ray.direction)
             shift = wp.cw_mul(ray.origin, inverse)
             # Until so few walk on that new rays should join them; all take steps of one kind.
-            in_nodes = count_lanes(s.walk.node > NO_NODE)
-            at_faces = count_lanes(s.walk.node < NO_NODE)
+            in_nodes = queue.count_lanes(s.walk.node > NO_NODE)
+            at_faces = queue.count_lanes(s.walk.node < NO_NODE)
             least = int(1)
             while in_nodes + at_faces >= least:
                 least = wp.static(walking_lanes)
@@ -371,11 +342,11 @@ def _make_loop_tree(stages: Stages, options: dict) -> wp.Kernel:
                     if step.hit:
                         s.walk.nearest = step.distance
                         s.walk.found = step.slot
-                        if s.ray == SHADOW_RAY:
+                        if s.ray == state.SHADOW_RAY:
                             s.walk.node = NO_NODE
-                in_nodes = count_lanes(s.walk.node > NO_NODE)
-                at_faces = count_lanes(s.walk.node < NO_NODE)
-            if s.ray != NO_RAY and s.walk.node == NO_NODE:
+                in_nodes = queue.count_lanes(s.walk.node > NO_NODE)
+                at_faces = queue.count_lanes(s.walk.node < NO_NODE)
+            if s.ray != state.NO_RAY and s.walk.node == NO_NODE:
                 end_walk(s, world, sink)
 
         stages.flush(s, sink)

@@ -2,45 +2,14 @@
 
 import warp as wp
 
-from spadwarp_kernels.base.philox import (
-    STREAM_FLIGHT_SAMPLE,
-    STREAM_ROULETTE,
-    STREAM_SURFACE,
-    STREAM_TRANSPORT,
-    hold_keys,
-    join_words,
-    make_prefetch,
-    prefetched_block,
-    random_block_keyed,
-    u01,
-    u01_fine,
-    u01_tail,
-)
+from spadwarp_kernels.base import philox
+from spadwarp_kernels.base.philox import join_words, random_block_keyed, u01, u01_fine, u01_tail
 from spadwarp_kernels.base.rotations import cos_sin_word, rotate_by, snap_from
 from spadwarp_kernels.estimators.estimator import Direction
 from spadwarp_kernels.optics.sea import FACETS, sample_passage
+from spadwarp_kernels.photon import state
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import (
-    END,
-    EVENT,
-    FLIGHT,
-    RAY,
-    SCATTER,
-    SEA_FACE,
-    SEA_SLOT,
-    TOO_LONG,
-    Draws,
-    Launch,
-    PhotonRef,
-    SinkRef,
-    Weight,
-    WorldRef,
-    book,
-    book_weight,
-    is_planned,
-    reweigh,
-    shorten,
-)
+from spadwarp_kernels.photon.state import Draws, Launch, PhotonRef, SinkRef, WorldRef
 from spadwarp_kernels.riders.riders import make_rider
 from spadwarp_kernels.surface.bvh import NOWHERE, segment_meets_box
 from spadwarp_kernels.surface.patches import nearest_patch
@@ -69,7 +38,7 @@ def make_prepare(stepped: bool, in_blocks: bool, cuda: bool) -> wp.Function:
         draws.base = launch.first_id
         if wp.static(stepped):
             draws.base += launch.offset[0]
-        draws.keys = hold_keys(world.keys)
+        draws.keys = philox.hold_keys(world.keys)
         if wp.static(cuda):
             return thread
         return slot_of_core(launch.first_id)
@@ -94,12 +63,12 @@ def make_begin(spec: TransportSpec) -> wp.Function:
         s.weight.absorbed_water += to_ledger(1.0)
         if wp.static(has_port):
             passage = beam.enter(world.laser.port, s.x, s.u)
-            reweigh(s.weight, passage.transmission)
+            state.reweigh(s.weight, passage.transmission)
             if passage.transmission > 0.0:
                 s.x = passage.x
                 s.u = passage.u
                 s.path = passage.path
-            book_weight(s.weight, s.account, sink, ledger.LASER_PORT)
+            state.book_weight(s.weight, s.account, sink, ledger.LASER_PORT)
         s.x = beam.pose.point_out(world.scan, s.target, s.x)
         s.u = beam.pose.turn_out(world.scan, s.target, s.u)
         if wp.static(sea):
@@ -108,7 +77,7 @@ def make_begin(spec: TransportSpec) -> wp.Function:
         s.collisions = 0
         s.surface_count = 0
         rider.begin(s.carried, world, s.target, emitted, s.x, s.u)
-        s.stage = FLIGHT
+        s.stage = state.FLIGHT
 
     return begin
 
@@ -130,7 +99,7 @@ def make_finish(records: bool, derivatives: int) -> wp.Function:
                 sink.records.log_derivatives[s.photon, p] = s.carried.log_derivatives[p]
         rest = to_ledger(s.weight.value)
         s.weight.absorbed_water -= rest
-        book(s.account, sink, s.reason, rest)
+        state.book(s.account, sink, s.reason, rest)
         s.water_collisions += s.collisions - s.surface_count - s.bounces.count
         s.bounces.total += s.bounces.count
         s.bounces.count = 0
@@ -148,21 +117,21 @@ def make_flush(adds: bool, reflecting: bool, sea: bool) -> wp.Function:
     def flush(s: PhotonRef, sink: SinkRef):
         if wp.static(adds):
             atomic_add_int64(sink.tally, int(s.account.pending[0]), s.account.pending[1])
-        book(s.account, sink, ledger.ABSORBED_WATER, s.weight.absorbed_water - s.absorbed_surface - s.directed)
-        book(s.account, sink, ledger.ABSORBED_SURFACE, s.absorbed_surface)
-        book(s.account, sink, ledger.DIRECTED, s.directed)
-        book(s.account, sink, ledger.WATER_COLLISIONS, wp.int64(s.water_collisions))
-        book(s.account, sink, ledger.SURFACE_EVENTS, wp.int64(s.surface_events))
-        book(s.account, sink, ledger.SURFACE_QUERIES, wp.int64(s.surface_queries))
-        book(s.account, sink, ledger.SHADOW_QUERIES, wp.int64(s.shadow_queries))
-        book(s.account, sink, ledger.CONTRIBUTIONS, wp.int64(s.contributions))
+        state.book(s.account, sink, ledger.ABSORBED_WATER, s.weight.absorbed_water - s.absorbed_surface - s.directed)
+        state.book(s.account, sink, ledger.ABSORBED_SURFACE, s.absorbed_surface)
+        state.book(s.account, sink, ledger.DIRECTED, s.directed)
+        state.book(s.account, sink, ledger.WATER_COLLISIONS, wp.int64(s.water_collisions))
+        state.book(s.account, sink, ledger.SURFACE_EVENTS, wp.int64(s.surface_events))
+        state.book(s.account, sink, ledger.SURFACE_QUERIES, wp.int64(s.surface_queries))
+        state.book(s.account, sink, ledger.SHADOW_QUERIES, wp.int64(s.shadow_queries))
+        state.book(s.account, sink, ledger.CONTRIBUTIONS, wp.int64(s.contributions))
         if wp.static(sea):
-            book(s.account, sink, ledger.ABSORBED_WATER, -s.absorbed_air)
-            book(s.account, sink, ledger.ABSORBED_AIR, s.absorbed_air)
-            book(s.account, sink, ledger.CROSSINGS, wp.int64(s.bounces.total))
+            state.book(s.account, sink, ledger.ABSORBED_WATER, -s.absorbed_air)
+            state.book(s.account, sink, ledger.ABSORBED_AIR, s.absorbed_air)
+            state.book(s.account, sink, ledger.CROSSINGS, wp.int64(s.bounces.total))
         if wp.static(reflecting):
-            book(s.account, sink, ledger.REFLECTIONS, wp.int64(s.bounces.total))
-            book(s.account, sink, ledger.BEYOND_MAX_REFLECTIONS, wp.int64(s.bounces.dropped))
+            state.book(s.account, sink, ledger.REFLECTIONS, wp.int64(s.bounces.total))
+            state.book(s.account, sink, ledger.BEYOND_MAX_REFLECTIONS, wp.int64(s.bounces.dropped))
 
     return flush
 
@@ -182,7 +151,7 @@ def make_meet(choose: wp.Function | None) -> wp.Function:
             s.flight.factor = meeting.factor
             s.flight.distance = wp.where(meeting.meets, distance, s.flight.distance)
             meets = meeting.meets
-        shorten(s.flight, distance)
+        state.shorten(s.flight, distance)
         return meets
 
     return meet
@@ -198,7 +167,7 @@ def make_fly(
     several flights at once, so that it must be called for each flight of a photon in turn.
     """
     plans, tried, surface = plan_flight is not None, spec.faces.tried, spec.sight.sea or FACETS
-    events, prefetch = make_prefetch(STREAM_TRANSPORT, *([STREAM_FLIGHT_SAMPLE] if plans else []))
+    events, prefetch = philox.make_prefetch(philox.STREAM_TRANSPORT, *([philox.STREAM_FLIGHT_SAMPLE] if plans else []))
     last = events - 1
     has_bvh, sea = spec.faces.mesh and not tried, spec.sight.sea is not None
 
@@ -207,12 +176,12 @@ def make_fly(
         id = draws.base + wp.uint64(s.photon)
         event = wp.uint32(s.collisions + 1)
         if wp.static(cuda):
-            s.flight.block = random_block_keyed(draws.keys, id, event, STREAM_TRANSPORT)
+            s.flight.block = random_block_keyed(draws.keys, id, event, philox.STREAM_TRANSPORT)
         else:
             k = s.collisions & last
             if k == 0:
                 prefetch(words, draws.keys, id, event)
-            s.flight.block = prefetched_block(words, k)
+            s.flight.block = philox.prefetched_block(words, k)
         seed = join_words(s.flight.block[0], s.flight.block[2])
         xi = u01_tail(s.flight.block[0], s.flight.block[2])
         s.flight.distance = spec.water.free_path(world.medium, world.layers, s.x, s.u, xi, seed)
@@ -224,23 +193,23 @@ def make_fly(
         s.flight.reach = wp.min(s.flight.distance, limit)
         if wp.static(plans):
             if wp.static(cuda):
-                s.flight.sample_block = random_block_keyed(draws.keys, id, event, STREAM_FLIGHT_SAMPLE)
+                s.flight.sample_block = random_block_keyed(draws.keys, id, event, philox.STREAM_FLIGHT_SAMPLE)
             else:
-                s.flight.sample_block = prefetched_block(words, events + k)
+                s.flight.sample_block = philox.prefetched_block(words, events + k)
             plan = plan_flight(s, s.flight.sample_block, world)
             s.flight.lens = plan.lens
             s.flight.lens_weight = plan.lens_weight
             s.flight.interval = plan.interval
-            if is_planned(s.flight):
+            if state.is_planned(s.flight):
                 s.flight.reach = wp.max(s.flight.reach, s.flight.interval[1])
         s.hit.face = -1
         s.flight.factor = 1.0
-        s.stage = EVENT
+        s.stage = state.EVENT
         if wp.static(random_albedo):
-            s.albedo = world.medium.albedo * u01(random_block_keyed(draws.keys, id, event, STREAM_ROULETTE)[1])
+            s.albedo = world.medium.albedo * u01(random_block_keyed(draws.keys, id, event, philox.STREAM_ROULETTE)[1])
         if wp.static(has_bvh):
             if segment_meets_box(s.x, s.u, s.flight.reach, world.surfaces.lower, world.surfaces.upper):
-                s.stage = RAY
+                s.stage = state.RAY
         if wp.static(spec.faces.tried):
             # Of any length: what lies beyond the reach shortens nothing that counts, as does no hit.
             met = nearest_patch(world.surfaces.patches, s.x, s.u, NOWHERE)
@@ -257,13 +226,13 @@ def make_trace(meet: wp.Function, has_bvh: bool) -> wp.Function:
     @wp.func
     def trace(s: PhotonRef, world: WorldRef):
         if wp.static(has_bvh):
-            if s.stage == RAY:
+            if s.stage == state.RAY:
                 s.surface_queries += 1
                 hit = intersect_surfaces(world.surfaces, s.x, s.u, s.flight.reach, False)
                 if hit.face >= 0:
                     if meet(s, world, hit.distance):
                         s.hit = hit
-                s.stage = EVENT
+                s.stage = state.EVENT
 
     return trace
 
@@ -319,7 +288,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
                     c.reason = ledger.EXIT + face
         if wp.static(sea):
             if c.reason < 0 and s.hit.face < 0 and s.flight.distance == s.flight.sea:
-                c.mirror = SEA_FACE
+                c.mirror = state.SEA_FACE
         if wp.static(flies_on):
             if s.collisions > 0 and s.reason >= 0:
                 c.reason = s.reason
@@ -332,7 +301,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
     def collide(s: PhotonRef, world: WorldRef, sink: SinkRef):
         c = end_of_flight(s, world)
         if wp.static(chosen):
-            reweigh(s.weight, s.flight.factor)
+            state.reweigh(s.weight, s.flight.factor)
             s.directed += s.weight.taken
         rider.fly(s.carried, world, s.x, s.u, wp.where(s.above, 0.0, c.distance))
         if wp.static(tallies_flux):
@@ -342,12 +311,12 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
             if s.above:
                 s.path -= (1.0 - world.sea.delay) * c.distance
                 passed = wp.exp(-world.sea.extinction * c.distance)
-                reweigh(s.weight, passed)
+                state.reweigh(s.weight, passed)
                 s.absorbed_air += s.weight.taken
                 s.analog_weight *= passed
         s.path += c.distance
         s.reason = c.reason
-        s.stage = END
+        s.stage = state.END
         if c.reason < 0:
             if wp.static(spec.local_albedo):
                 s.albedo = spec.water.at(world.medium, world.layers, s.x).albedo
@@ -358,7 +327,7 @@ def make_collide(spec: TransportSpec, chosen: bool, flies_on: bool, score_flux: 
             s.bounces.leg = wp.where(c.mirror > 0, s.bounces.leg + 1, 0)
             s.bounces.count += wp.where(c.mirror > 0, 1, 0)
         if c.reason < 0 or c.mirror > 0:
-            s.stage = SCATTER
+            s.stage = state.SCATTER
 
     return collide
 
@@ -372,7 +341,7 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
     def cross_aperture(s: PhotonRef, world: WorldRef, sink: SinkRef):
         if wp.static(crosses):
             c = cross(s, world)
-            s.bounces.dropped += wp.where(c.index == TOO_LONG, 1, 0)
+            s.bounces.dropped += wp.where(c.index == state.TOO_LONG, 1, 0)
             if wp.static(rider.rides):
                 if c.value > 0.0:
                     carried = s.carried
@@ -395,7 +364,7 @@ def make_cross(spec: TransportSpec, cross: wp.Function | None, deposit: wp.Funct
 class Outcome:
     """What an event makes of a photon: see `PhotonState`, which takes it over once nothing asks for the old weight."""
 
-    weight: Weight
+    weight: state.Weight
     analog_weight: float
     reason: int
 
@@ -448,27 +417,50 @@ def make_terminate(spec: TransportSpec) -> wp.Function:
         if new.analog_weight < world.limits.weight_cutoff:
             new.reason = ledger.WEIGHT_CUTOFF
             if wp.static(spec.roulette):
-                chance = u01(random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_ROULETTE)[0])
+                chance = u01(random_block_keyed(world.keys, id, wp.uint32(s.collisions), philox.STREAM_ROULETTE)[0])
                 new.reason = ledger.ROULETTE
                 if chance < 0.1 and new.analog_weight > 0.0:
                     new.reason = -1
-                    reweigh(new.weight, 10.0)
+                    state.reweigh(new.weight, 10.0)
                     new.analog_weight *= 10.0
-                    book_weight(new.weight, s.account, sink, ledger.ROULETTE)
+                    state.book_weight(new.weight, s.account, sink, ledger.ROULETTE)
         if new.reason < 0 and s.collisions >= world.limits.max_collisions:
             new.reason = ledger.MAX_COLLISIONS
 
     return terminate
 
 
-def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
-    """The Warp function ``(s, world, sink, id)`` of a photon that a face of the domain reflects; what is not reflected
-    leaves by the face.
+def make_lose(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
+    """The Warp function ``(s, world, sink, id, part, entry) -> bool``: a boundary sends on a part of the photon, and an
+    entry of the ledger takes the rest; whether there is a flight.
 
     `directed`: weight and analog weight differ; `flies_on`: see `make_continues`.
     """
-    domain, rider = spec.domain, make_rider(spec)
     terminate, continues = make_terminate(spec), make_continues(flies_on)
+
+    @wp.func
+    def lose(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64, part: float, entry: int) -> bool:
+        new = Outcome()
+        new.reason = s.reason
+        new.weight = s.weight
+        state.reweigh(new.weight, part)
+        # The light of an event that was the last is accounted for by what has ended the history.
+        state.book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, entry, s.reason))
+        if s.reason < 0:
+            new.analog_weight = wp.where(wp.static(directed), s.analog_weight * part, new.weight.value)
+            terminate(new, s, world, sink, id)
+        s.weight = new.weight
+        s.analog_weight = new.analog_weight
+        s.reason = new.reason
+        return continues(new.reason)
+
+    return lose
+
+
+def make_bounce(spec: TransportSpec, lose: wp.Function) -> wp.Function:
+    """The Warp function ``(s, world, sink, id)`` of a photon that a face of the domain reflects; what is not reflected
+    leaves by the face. `lose`: see `make_lose`."""
+    domain, rider = spec.domain, make_rider(spec)
 
     @wp.func
     def bounce(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
@@ -480,56 +472,31 @@ def make_bounce(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Funct
         u = domain.turn_back(world.limits, limits.flipped(u, axis))
         if wp.static(domain.rotated):
             u = wp.normalize(u)
-        new = Outcome()
-        new.reason = s.reason
-        new.weight = s.weight
-        reweigh(new.weight, part)
         rider.mirror(s.carried, s.u, u, index)
-        # The light of an event that was the last is accounted for by what has ended the history.
-        book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.EXIT + face, s.reason))
-        if s.reason < 0:
-            new.analog_weight = wp.where(wp.static(directed), s.analog_weight * part, new.weight.value)
-            terminate(new, s, world, sink, id)
-        if continues(new.reason):
+        if lose(s, world, sink, id, part, ledger.EXIT + face):
             s.u = u
-        s.weight = new.weight
-        s.analog_weight = new.analog_weight
-        s.reason = new.reason
 
     return bounce
 
 
-def make_meet_sea(spec: TransportSpec, directed: bool, flies_on: bool) -> wp.Function:
+def make_meet_sea(spec: TransportSpec, lose: wp.Function) -> wp.Function:
     """The Warp function ``(s, world, sink, id)`` of a photon that the surface of a sea reflects or lets through.
-
-    `directed`, `flies_on`: see `make_bounce`.
-    """
-    terminate, continues = make_terminate(spec), make_continues(flies_on)
+    `lose`: see `make_lose`."""
     surface, rider = spec.sight.sea or FACETS, make_rider(spec)
 
     @wp.func
     def meet_sea(s: PhotonRef, world: WorldRef, sink: SinkRef, id: wp.uint64):
-        draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
+        draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), philox.STREAM_SURFACE)
         passage = sample_passage(surface.at(world.sea, s.x), s.u, s.above, draw)
-        rider.event(s.carried, world, SEA_SLOT, s.x, s.u, passage.u)
-        new = Outcome()
-        new.reason = s.reason
-        new.weight = s.weight
+        rider.event(s.carried, world, state.SEA_SLOT, s.x, s.u, passage.u)
         # The light of an event that was the last goes to the lens; what is reflected would come from an event here.
         scored_here = passage.reflected
         if wp.static(spec.waves):
             scored_here = passage.reflected or s.bounces.leg > 1
-        reweigh(new.weight, wp.where(s.reason >= 0 and scored_here, 0.0, passage.part))
-        book_weight(new.weight, s.account, sink, wp.where(s.reason < 0, ledger.SURFACE_MASKING, s.reason))
-        if s.reason < 0:
-            new.analog_weight = wp.where(wp.static(directed), s.analog_weight * passage.part, new.weight.value)
-            terminate(new, s, world, sink, id)
-        if continues(new.reason):
+        part = wp.where(s.reason >= 0 and scored_here, 0.0, passage.part)
+        if lose(s, world, sink, id, part, ledger.SURFACE_MASKING):
             s.u = passage.u
             s.above = s.above == passage.reflected
-        s.weight = new.weight
-        s.analog_weight = new.analog_weight
-        s.reason = new.reason
 
     return meet_sea
 
@@ -541,8 +508,8 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
     """
     directed, sea, rider = direct is not None, spec.sight.sea is not None, make_rider(spec)
     sample_direction, terminate = make_sample_direction(spec, direct), make_terminate(spec)
-    bounce, meet_sea = make_bounce(spec, directed, flies_on), make_meet_sea(spec, directed, flies_on)
-    continues = make_continues(flies_on)
+    continues, lose = make_continues(flies_on), make_lose(spec, directed, flies_on)
+    bounce, meet_sea = make_bounce(spec, lose), make_meet_sea(spec, lose)
 
     @wp.func
     def turn(
@@ -551,13 +518,13 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         reflected = s.u
         if wp.static(spec.faces.specular):
             if on_surface:
-                draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), STREAM_SURFACE)
+                draw = random_block_keyed(world.keys, id, wp.uint32(s.collisions), philox.STREAM_SURFACE)
                 roughness = world.surfaces.roughness[s.hit.face]
                 reflected = sample_reflection(s.u, s.hit.normal, roughness, lobe, draw)
         heading = sample_direction(s, reflected, lobe, world, id)
         rider.event(s.carried, world, wp.where(on_surface, s.hit.slot, -1), s.x, s.u, heading.u)
         if wp.static(directed):
-            reweigh(new.weight, heading.factor)
+            state.reweigh(new.weight, heading.factor)
             s.directed += new.weight.taken
             if new.weight.value <= 0.0:
                 new.reason = ledger.DIRECTED
@@ -565,12 +532,12 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
             if on_surface:
                 # What one facet takes of another's light stays in the surface.
                 leaving = unshadowed(s.u, heading.u, s.hit.normal, world.surfaces.roughness[s.hit.face], lobe)
-                reweigh(new.weight, leaving)
+                state.reweigh(new.weight, leaving)
                 new.analog_weight *= leaving
                 if new.reason < 0:
                     s.absorbed_surface += new.weight.taken
                 else:
-                    book_weight(new.weight, s.account, sink, new.reason)
+                    state.book_weight(new.weight, s.account, sink, new.reason)
                 if new.weight.value <= 0.0 and new.reason < 0:
                     new.reason = ledger.WEIGHT_CUTOFF
         s.u = heading.u
@@ -583,7 +550,7 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
         on_surface = s.hit.face >= 0
         survival = spec.faces.survival(world.surfaces, s.hit, s.x, s.albedo)
         if on_surface:
-            reweigh(new.weight, survival[0])
+            state.reweigh(new.weight, survival[0])
             s.absorbed_surface += new.weight.taken
         else:
             new.weight.value *= survival[0]
@@ -612,6 +579,6 @@ def make_scatter(spec: TransportSpec, direct: wp.Function | None, flies_on: bool
                 meet_sea(s, world, sink, id)
         if not bounced:
             collision(s, world, sink, id)
-        s.stage = wp.where(continues(s.reason), FLIGHT, END)
+        s.stage = wp.where(continues(s.reason), state.FLIGHT, state.END)
 
     return scatter

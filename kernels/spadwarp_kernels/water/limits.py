@@ -192,15 +192,6 @@ def _to_plane(x: float, u: float, lower: float, upper: float) -> float:
     return wp.where(u > 0.0 or u < 0.0, distance, 1.0e30)
 
 
-@wp.func
-def to_next_face(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-    """Distance [m] from x along u to a face of the domain; both in its own axes."""
-    distance = float(1.0e30)
-    for i in range(3):
-        distance = wp.min(distance, _to_plane(x[i], u[i], limits.lower[i], limits.upper[i]))
-    return distance
-
-
 @wp.struct
 class Exit:
     """Where a ray leaves the domain: distance [m], and index into EXIT_FACES, 0 for the lateral limit."""
@@ -285,7 +276,7 @@ def make_domain(bounded: bool, rotated: bool, reflects: bool) -> Domain:
 
     @wp.func
     def exit_distance(limits: Limits, x: wp.vec3, u: wp.vec3) -> float:
-        return wp.min(to_sides(limits, x, u), to_next_face(limits, point(limits, x), turn(limits, u)))
+        return exit(limits, x, u).distance
 
     @wp.func
     def within(limits: Limits, length: float, x: wp.vec3, u: wp.vec3) -> float:

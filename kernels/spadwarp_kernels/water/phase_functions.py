@@ -8,21 +8,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from spadwarp_kernels.base import check
+from spadwarp_kernels.base import check, tables
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import memoised
-from spadwarp_kernels.base.tables import (
-    DensityTables,
-    Floats,
-    fold,
-    folded_quadrature,
-    lower_ends,
-    make_density_tables,
-    table_cumulative,
-    table_density,
-    table_sample,
-    tabulate,
-)
+from spadwarp_kernels.base.tables import DensityTables, Floats, fold
 
 from .medium import MOST_CONSTITUENTS, Medium
 
@@ -135,7 +124,7 @@ def interpolated_density(angles: ArrayLike, values: ArrayLike) -> Callable[[Arra
 
 def sphere_integral(function: Callable[[Floats], Floats]) -> float:
     """Integral over the unit sphere of a function of t = 1 - cos(theta)."""
-    z, weight = folded_quadrature()
+    z, weight = tables.folded_quadrature()
     if not callable(function):
         raise ArgumentError(f"function = {function!r} is not a function of t")
     found = check.numbers("what function returns", function(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
@@ -338,38 +327,38 @@ def _turn(theta: float) -> float:
 
 @wp.func
 def _pdf(t: float, medium: Medium) -> float:
-    return _INV_4PI * table_density(medium.phase, _SCATTERING, fold(0.5 * t))
+    return _INV_4PI * tables.table_density(medium.phase, _SCATTERING, fold(0.5 * t))
 
 
 @wp.func
 def _sample(xi: float, medium: Medium) -> float:
-    return _one_minus_cosine(table_sample(medium.phase, _SCATTERING, xi))
+    return _one_minus_cosine(tables.table_sample(medium.phase, _SCATTERING, xi))
 
 
 @wp.func
 def _complement(theta: float, medium: Medium) -> float:
-    return table_cumulative(medium.phase, _TURNING, _turn(theta))
+    return tables.table_cumulative(medium.phase, _TURNING, _turn(theta))
 
 
 @wp.func
 def _angle(value: float, medium: Medium) -> float:
-    z = table_sample(medium.phase, _TURNING, value)
+    z = tables.table_sample(medium.phase, _TURNING, value)
     return wp.where(z < 0.0, -_PI * z, _PI * (1.0 - z))
 
 
 @wp.func
 def _angle_density(theta: float, medium: Medium) -> float:
-    return _INV_PI * table_density(medium.phase, _TURNING, _turn(theta))
+    return _INV_PI * tables.table_density(medium.phase, _TURNING, _turn(theta))
 
 
 @wp.func
 def _lobe_pdf(t: float, medium: Medium, guiding: Guiding) -> float:
-    return _INV_4PI * table_density(medium.phase, _LOBE, fold(0.5 * t))
+    return _INV_4PI * tables.table_density(medium.phase, _LOBE, fold(0.5 * t))
 
 
 @wp.func
 def _lobe_sample(xi: float, medium: Medium, guiding: Guiding) -> float:
-    return _one_minus_cosine(table_sample(medium.phase, _LOBE, xi))
+    return _one_minus_cosine(tables.table_sample(medium.phase, _LOBE, xi))
 
 
 TABULATED = PhaseFunction(
@@ -395,7 +384,7 @@ def _mixture(count: int) -> PhaseFunction:
         z = fold(0.5 * t)
         density = float(0.0)
         for i in range(wp.static(count)):
-            density += medium.shares[i] * table_density(medium.phase, _OWN_ROWS + i, z)
+            density += medium.shares[i] * tables.table_density(medium.phase, _OWN_ROWS + i, z)
         return _INV_4PI * density
 
     @wp.func
@@ -411,11 +400,11 @@ def _mixture(count: int) -> PhaseFunction:
                 share = medium.shares[i]
             end += medium.shares[i]
         part = wp.clamp((xi - below) / wp.max(share, 1.0e-30), 0.0, 0.99999994)
-        return _one_minus_cosine(table_sample(medium.phase, _OWN_ROWS + chosen, part))
+        return _one_minus_cosine(tables.table_sample(medium.phase, _OWN_ROWS + chosen, part))
 
     @wp.func
     def part(t: float, medium: Medium, constituent: int) -> float:
-        own = _INV_4PI * table_density(medium.phase, _OWN_ROWS + constituent, fold(0.5 * t))
+        own = _INV_4PI * tables.table_density(medium.phase, _OWN_ROWS + constituent, fold(0.5 * t))
         return own / wp.max(pdf(t, medium), 1.0e-30)
 
     return PhaseFunction(f"mixture_{count}", pdf, sample, TABULATED.guide, count, part)
@@ -441,7 +430,7 @@ def make_phase_tables(
     check.kind("density", density, Callable)
 
     def over_t(one: Callable[[Floats], Floats]) -> Floats:
-        return tabulate(lambda z: one(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
+        return tables.tabulate(lambda z: one(np.where(z < 0.0, 2.0 + 2.0 * z, 2.0 * z)))
 
     scattering = over_t(density)
 
@@ -449,8 +438,8 @@ def make_phase_tables(
         t = 2.0 * np.sin(0.5 * np.pi * np.where(z < 0.0, -z, 1.0 - z)) ** 2
         return density(np.maximum(t, _FLAT))  # where the density over t stays finite, its integral over theta does
 
-    turning = tabulate(over_angle)
-    below = np.append(turning[:, 0], 1.0), np.append(lower_ends(), 1.0)
+    turning = tables.tabulate(over_angle)
+    below = np.append(turning[:, 0], 1.0), np.append(tables.lower_ends(), 1.0)
 
     def lobe(z: Floats) -> Floats:
         """What a flight at an angle theta to the lens brings, up to factors that vary little: integral of p from theta
@@ -459,7 +448,9 @@ def make_phase_tables(
         position = np.where(z < 0.0, angle, np.pi - angle) / np.pi
         return np.interp(position, below[1], below[0]) / np.sin(angle)
 
-    return make_density_tables(scattering, turning, tabulate(lobe), *map(over_t, constituents), device=device)
+    return tables.make_density_tables(
+        scattering, turning, tables.tabulate(lobe), *map(over_t, constituents), device=device
+    )
 
 
 # ---- The phase functions by name.
