@@ -150,23 +150,13 @@ def simulate_spectrum(
             returned, marked `partial`.
     """
     scene = as_scene(scene)
-    wavelengths = scene.laser.wavelengths_nm or "spectrum" if wavelengths is None else wavelengths
-    if isinstance(wavelengths, str):
-        check_choice("wavelengths", wavelengths, ("spectrum",))
-        given = [line.wavelength_nm for line in spectral_lines(scene.laser, scene.detector)]
-    else:
-        given = [check_real("wavelengths", one, "[1e-9, 1e6] nm") for one in wavelengths]
-    if not 1 <= len(given) <= _MOST_LINES or len(set(given)) < len(given):
-        raise ArgumentError(f"wavelengths: {len(given)} given; 1 to {_MOST_LINES} different ones are needed")
-    changes: dict[str, Any] = {f"laser.{name}": None for name in ("linewidth_nm", "spectrum", "wavelengths_nm")}
-    if scene.detector.filter_fwhm_nm is not None and scene.detector.filter_centre_nm is None:
-        changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
     options = {"mesh_cache": {}, **options} if options.get("engine") is None else options
-    left = [scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)]
+    left = scenes_of_lines(scene, wavelengths)
     results, partial = dict[float, Result](), False
+    alone = any(options.get(name) is not None for name in ("derivatives", "blocks", "tallies"))
     while left and not partial:
         # As many neighbours as ride on the photons of the one in their middle.
-        sizes = range(min(len(left), _MOST_TOGETHER), 0, -1) if _options_allow(options) else (1,)
+        sizes = range(min(len(left), _MOST_TOGETHER), 0, -1) if not alone else (1,)
         size = next(size for size in sizes if size == 1 or _ride_together(left[:size]))
         group, left = left[:size], left[size:]
         try:
@@ -180,8 +170,20 @@ def simulate_spectrum(
     return Spectrum(scene, MappingProxyType(results), partial)
 
 
-def _options_allow(options: Mapping[str, Any]) -> bool:
-    return all(options.get(name) is None for name in ("derivatives", "blocks", "tallies"))
+def scenes_of_lines(scene: Scene, wavelengths: Iterable[float] | Literal["spectrum"] | None = None) -> list[Scene]:
+    """The scene at each wavelength alone, see `simulate_spectrum`, whose `ArgumentError` it raises; shortest first."""
+    wavelengths = scene.laser.wavelengths_nm or "spectrum" if wavelengths is None else wavelengths
+    if isinstance(wavelengths, str):
+        check_choice("wavelengths", wavelengths, ("spectrum",))
+        given = [line.wavelength_nm for line in spectral_lines(scene.laser, scene.detector)]
+    else:
+        given = [check_real("wavelengths", one, "[1e-9, 1e6] nm") for one in wavelengths]
+    if not 1 <= len(given) <= _MOST_LINES or len(set(given)) < len(given):
+        raise ArgumentError(f"wavelengths: {len(given)} given; 1 to {_MOST_LINES} different ones are needed")
+    changes: dict[str, Any] = {f"laser.{name}": None for name in ("linewidth_nm", "spectrum", "wavelengths_nm")}
+    if scene.detector.filter_fwhm_nm is not None and scene.detector.filter_centre_nm is None:
+        changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
+    return [scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)]
 
 
 def _ride_together(lines: Sequence[Scene]) -> bool:
