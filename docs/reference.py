@@ -12,14 +12,14 @@ import inspect
 import math
 import pkgutil
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 import typer
-from pydantic import AfterValidator, BaseModel
+from pydantic import AfterValidator, BaseModel, BeforeValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -157,23 +157,24 @@ def _flat(annotation: Any) -> Iterator[Any]:
 
 def _kind(info: FieldInfo) -> str:
     options = [one for one in _union(info.annotation) if one is not type(None)]
-    return " or ".join(dict.fromkeys(_one_kind(one) for one in options))
+    return " or ".join(dict.fromkeys(_one_kind(one, info.metadata) for one in options))
 
 
 def _union(annotation: Any) -> tuple[Any, ...]:
     return get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
 
 
-def _one_kind(annotation: Any) -> str:
+def _one_kind(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     if get_origin(annotation) is Annotated:
-        return _one_kind(get_args(annotation)[0])
+        return _one_kind(get_args(annotation)[0], get_args(annotation)[1:])
     if get_origin(annotation) is Literal:
         return ", ".join(f'`"{value}"`' for value in get_args(annotation))
     if get_origin(annotation) is tuple:
         parts = get_args(annotation)
         what = "texts" if parts[0] is str else "numbers"
         what = "tables" if inspect.isclass(parts[0]) and issubclass(parts[0], BaseModel) else what
-        return f"list of {what}" if parts[-1] is Ellipsis else f"{len(parts)} {what}"
+        alone = any(isinstance(one, BeforeValidator) and isinstance(one.func(1.0), tuple) for one in metadata)
+        return ("number or " * alone) + (f"list of {what}" if parts[-1] is Ellipsis else f"{len(parts)} {what}")
     if get_origin(annotation) is dict:
         return "table"
     names = {Distribution: "distribution", float: "number", int: "integer", bool: "true or false", str: "text"}

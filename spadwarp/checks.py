@@ -20,7 +20,7 @@ from spadwarp.device import pick_devices
 from spadwarp.frames import detector_response
 from spadwarp.mesh import TriangleMesh, build_mesh, focus_distance, guess_unit
 from spadwarp.mesh.targets import target_balls
-from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, downwelling_irradiance, shot_at, shots_of
+from spadwarp.scene import Scene, SceneLike, as_scene, daylight_rate, shot_at, shots_of
 from spadwarp.scene.camera import image_points, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_extent, spectral_lines
 from spadwarp.scene.medium import (
@@ -38,6 +38,7 @@ from spadwarp.scene.sections import field_unit
 from spadwarp.scene.sight import beam_planes, lines_of_sight, points_inside, port_advance, view_planes, within_port
 from spadwarp.transport import points_per_flight
 from spadwarp.transport.model import first_hits
+from spadwarp.transport.spectrum import scenes_of_lines
 from spadwarp.values import ConfigError, guarded, path_from_time, quantity, range_from_time, time_from_path, with_prefix
 from spadwarp.water import group_index, molecular_density, pure_water_absorption
 
@@ -80,6 +81,7 @@ class Survey:
     def __init__(self, scene: Scene, mesh: TriangleMesh | None, device: str | None = "cpu") -> None:
         mesh = build_mesh(scene) if mesh is None and scene.targets else mesh
         self.histogram_bytes = 3 * 8 * scene.camera.width * scene.camera.height * scene.gate.bins
+        self.mesh = mesh
         self.moving = None if scene.scan.mode != "trajectory" else scene
         if self.moving is not None:  # all else is of one of its shots
             self.balls = target_balls(scene, mesh)
@@ -221,7 +223,28 @@ def check(scene: SceneLike, mesh: TriangleMesh | None = None, *, device: str | N
         raise ConfigError(f"detector.irf: {error}", source=survey.scene.source) from None
     for find in _CHECKS:
         find(survey)
+    if survey.scene.laser.wavelengths_nm:
+        _check_lines(survey)
     return sorted(survey.messages, key=lambda message: message.level != "warning")
+
+
+def _check_lines(survey: Survey) -> None:
+    """What lines of `laser.wavelengths_nm` are warned of, and the wavelength of everything else is not."""
+    known, lines = {one.field for one in survey.messages if one.level == "warning"}, scenes_of_lines(survey.scene)
+    found = dict[str, dict[float, CheckMessage]]()
+    for line in lines:
+        of_line = Survey(line, survey.mesh, survey.device)
+        for find in _CHECKS:
+            find(of_line)
+        for one in of_line.messages:
+            if one.level == "warning" and one.field not in known:
+                found.setdefault(one.field, {})[line.laser.wavelength_nm] = one
+    for field, by_line in found.items():
+        first = next(iter(by_line.values()))
+        survey.warn(field, f"at {', '.join(f'{one:g}' for one in by_line)} nm: {first.text}", **first.values)
+    if len(lines) > 1 and len({line.medium.extinction for line in lines}) == 1 and survey.scene.medium.preset is None:
+        text = "all lines have the same water, by coefficients in numbers; medium.chlorophyll follows the wavelength"
+        survey.warn("laser.wavelengths_nm", text)
 
 
 def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any]:
@@ -246,10 +269,8 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
     del axis["distance"]
     if axis["samples_per_pixel"] == math.inf:  # of as many photons as it takes
         axis["samples_per_pixel"] = None
-    waters = [
-        {"attenuation_length": water.attenuation_length, "albedo": water.scattering / water.extinction}
-        for water in medium.waters
-    ]
+    names = "attenuation_length", "albedo"
+    waters = [dict(zip(names, (1.0 / w.extinction, w.scattering / w.extinction), strict=True)) for w in medium.waters]
     return {
         **waters[0],
         "layers": [{"start": layer.start, **water} for layer, water in zip(medium.layers, waters[1:], strict=True)],
@@ -267,9 +288,7 @@ def summary(scene: SceneLike, mesh: TriangleMesh | None = None) -> dict[str, Any
         "vertical_fov_deg": math.degrees(camera.vertical_fov),
         "aperture_area": camera.aperture_area,
         "focus_distance": survey.focus_distance,
-        "photons_per_pulse": laser.photons_per_pulse,
-        "average_power": laser.average_power,
-        "peak_power": laser.peak_power,
+        **{name: getattr(laser, name) for name in ("photons_per_pulse", "average_power", "peak_power")},
         "pde": scene.detections_per_photon,
         "histogram_bytes": survey.histogram_bytes,
     }
@@ -508,7 +527,7 @@ def _check_ports(survey: Survey) -> None:
 
 
 def _check_scan(survey: Survey) -> None:
-    """Whether the beam of a confocal scan is where its pixel looks, and what of the detector is then one pixel's."""
+    """Whether the beam of a confocal scan is where its pixel looks."""
     scene, laser, axis = survey.scene, survey.scene.beam, survey.on_axis
     if scene.scan_positions == 1:
         return
@@ -522,10 +541,6 @@ def _check_scan(survey: Survey) -> None:
             f"axis as if it went along it, and a pixel sees {pixel_deg:.3g}°: 1 is exact"
         )
         survey.warn("transport.axis_threshold", text, degrees=snapped, pixel_deg=pixel_deg)
-    for name in ("crosstalk_probability", "dark_count_spread", "hot_pixel_fraction"):
-        if value := getattr(scene.detector, name):
-            text = f"{name} = {value:g} is drawn between positions of the scan, where one pixel looks at all of them"
-            survey.note(f"detector.{name}", text, **{name: value})
     if axis is None:
         return
     aside = math.hypot(*laser.position[:2]) * abs(1.0 - axis.distance / scene.scan.distance)
@@ -653,9 +668,6 @@ def _check_daylight(survey: Survey) -> None:
     rate = float(daylight_rate(scene, view=np.array([[0.0, 0.0, 1.0]]))[0])
     per_pulse = rate * min(scene.gate.stop - scene.gate.start, 1.0 / scene.laser.repetition_rate)
     text = f"a pixel on the optical axis detects {rate:.3g} photons of daylight per second in open water"
-    if scene.laser.is_visible:
-        irradiance = downwelling_irradiance(scene, scene.laser.wavelength_nm)
-        text += f"; the irradiance from above is {irradiance:.3g} W/m²/nm at {scene.laser.wavelength_nm:g} nm"
     if per_pulse > PILE_UP:
         text += f"; that is {per_pulse:.2g} a pulse, and more than {PILE_UP:g} distort the histogram (pile-up)"
         text += "" if scene.detector.has_filter else ": there is no filter (detector.filter_fwhm_nm)"
@@ -675,8 +687,7 @@ def _check_polarisation(survey: Survey) -> None:
         survey.note("medium.scattering_matrix", text)
     measured, cameras = scene.camera.polarisation != "none", "polarisation = 'analyser' or 'stokes'"
     if scene.polarised and not measured:
-        text = "light is polarised, but the result will have no channels: 'analyser' or 'stokes' records them"
-        survey.note("camera.polarisation", text)
+        survey.note("camera.polarisation", f"light is polarised, but no channel records it; {cameras} does")
     if measured and laser.polarisation == "none":
         survey.note("laser.polarisation", "the camera measures polarisation, but the laser's light is not polarised")
     rayleigh = "rayleigh" in (medium.scattering_matrix, medium.phase_function)
@@ -706,8 +717,8 @@ def _check_peak(survey: Survey) -> None:
         return
     angle, unseen = scene.unseen_peak(photons, survey.target_range or ())
     if unseen > NOTABLE_UNSEEN:
-        text = scene.unseen_warning(photons, angle, unseen)
-        survey.warn("transport.estimator", text, unseen=unseen, angle_deg=math.degrees(angle))
+        values = {"unseen": unseen, "angle_deg": math.degrees(angle)}
+        survey.warn("transport.estimator", scene.unseen_warning(photons, angle, unseen), **values)
 
 
 def _check_statistics(survey: Survey) -> None:
@@ -727,21 +738,15 @@ def _check_statistics(survey: Survey) -> None:
     if signal > 0.05:
         text = f"{signal:.3g} target detections per pulse and pixel: first-photon counting piles up"
         survey.note("laser.pulse_energy", text, signal_per_pulse=signal)
+    emitted = scene.laser.photons_per_pulse * scene.detections_per_photon or math.inf
+    where, field, name, reach = "what a pixel sees", "transport.photons", "samples_per_pixel", samples
     if scene.transport.estimator == "analog":
-        emitted = scene.laser.photons_per_pulse * scene.detections_per_photon or math.inf
-        photons = signal * traced / scene.scan_positions / emitted
-        if photons < 10.0:
-            text = f"analog: only about {photons:.2g} of {traced:.3g} photons reach a pixel unscattered"
-            text += _enough(traced, photons)
-            survey.warn("transport.estimator", text, photons_per_pixel=photons)
-    elif samples < 10.0:
-        text = f"only about {samples:.2g} of {traced:.3g} photons reach what a pixel sees unscattered"
-        text += _enough(traced, samples)
-        survey.warn("transport.photons", text, samples_per_pixel=samples)
-
-
-def _enough(traced: float, samples: float) -> str:
-    return f"; about {10.0 * traced / samples:.1e} would be enough" if samples > 0.0 else ""
+        reach = signal * traced / scene.scan_positions / emitted
+        where, field, name = "a pixel", "transport.estimator", "photons_per_pixel"
+    if reach < 10.0:
+        enough = f"; about {10.0 * traced / reach:.1e} would be enough" if reach > 0.0 else ""
+        text = f"only about {reach:.2g} of {traced:.3g} photons reach {where} unscattered{enough}"
+        survey.warn(field, text, **{name: reach})
 
 
 # The water: its coefficients, phase function and cells, and what ends a photon's history in it
@@ -757,17 +762,11 @@ def _check_medium(survey: Survey) -> None:
         if water.absorption < 0.95 * pure:
             text = f"absorption = {water.absorption:.3g} 1/m is below pure water's {pure:.3g} 1/m"
             survey.note(f"{name}.absorption", text, absorption=water.absorption, pure_water=pure)
-    for name, water in waters.items():
-        if water.preset is None or abs(laser.wavelength_nm - 532.0) <= 10.0:
-            continue
-        text = f"the coefficients of {water.preset} are for about 532 nm, the laser has {laser.wavelength_nm:g} nm"
-        values = {"wavelength_nm": laser.wavelength_nm}
-        if laser.is_visible:
-            green = pure_water_absorption(532.0)
-            values |= {"pure_water": pure, "pure_water_532": green}
-            text += f", where pure water absorbs {pure:.3g} 1/m and not {green:.3g}"
-        survey.warn(f"{name}.preset", text, **values)
-    for name, water in waters.items():
+        if water.preset is not None and abs(laser.wavelength_nm - 532.0) > 10.0:
+            text = f"the coefficients of {water.preset} are for about 532 nm, the laser has {laser.wavelength_nm:g} nm"
+            if laser.is_visible:
+                text += f", where pure water absorbs {pure:.3g} 1/m and not {pure_water_absorption(532.0):.3g}"
+            survey.warn(f"{name}.preset", text, wavelength_nm=laser.wavelength_nm, pure_water=pure)
         if medium.phase_function == "henyey_greenstein" and laser.is_visible and water.is_natural:
             _check_backscatter(survey, name, water)
 

@@ -480,7 +480,7 @@ def suggestion(word: Any, known: Sequence[str]) -> str:
     if not (isinstance(word, str) and 0 < len(word) <= 100):
         return ""
     close = [one for one in known if one.lower().startswith(word.lower())]
-    close = close or difflib.get_close_matches(word, known, n=1)
+    close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.61)
     return f"; did you mean {' or '.join(map(repr, close[:2]))}?" if close else ""
 
 
@@ -609,6 +609,7 @@ _KINDS: tuple[tuple[str, str, str, dict[str, Fraction]], ...] = (
         | {"1/cm": Fraction(100), "1/km": Fraction(1, 1000)},
     ),
     ("a concentration", "0.5 mg/m³", "", dict.fromkeys(("mg/m³", "mg/m3", "mg/m^3", "µg/L", "ug/L"), Fraction(1))),
+    ("a speed", "5 m/s", "", {"m/s": Fraction(1), "km/h": Fraction(5, 18), "kn": Fraction(1852, 3600)}),
     ("a salinity", "35 g/kg", "", {"g/kg": Fraction(1)}),
     ("a temperature", "20 °C", "", {"°C": Fraction(1), "degC": Fraction(1)}),
     ("a ratio", "20 %", "", {"1": Fraction(1), "%": Fraction(1, 100)}),
@@ -634,9 +635,8 @@ def quantity(text: str, unit: str) -> float:
     """The number of a text such as "150 nJ" in another unit of its kind, such as "J"; correctly rounded.
 
     Units: m, s, Hz, J and W with the prefixes f p n u µ m k M G; cm, min, h, deg, °, rad, mrad, 1/s, cps, kcps, Mcps,
-    1/m, 1/cm, 1/km, mg/m³, g/kg, °C, %. Raises `ValueError` for text without a number or unit, an unknown unit
-    (capitals count: "mJ" and "MJ" differ), and a unit of another kind; its text begins with a verb, to be put behind
-    the value.
+    1/m, 1/cm, 1/km, m/s, km/h, kn, mg/m³, g/kg, °C, %. Raises `ValueError`, whose text begins with a verb, to be put
+    behind the value, for text without a number or a known unit ("mJ" and "MJ" differ), and a unit of another kind.
     """
     kind, example, factor = UNITS[unit]
     if factor not in (1, UNITS[example.partition(" ")[2]][2]):

@@ -76,7 +76,8 @@ _SECONDS, _FEWEST, _MOST = 60.0, 400_000, 2**40  # of a run that is as long as i
 _PART = 1.0 / 12.0  # of these seconds for one range of the search
 _LONGER = 4.0  # times as long where that would judge it
 _UNKNOWN = 1e6  # ratio that stands for what parts of the runs do not know
-_WIDE = 4.0  # ratio of pulses, from which on their number is not known
+_WIDE, _NARROW = 4.0, 1.2  # ratios of pulses: from which on their number is not known; which is worth a short time
+_SHORT = 10.0  # of it [s]
 _SHARE = 8  # part of a number of photons, for one range of the search
 _FARTHEST = 200.0  # of the search for the largest range [m]
 _STEP, _RESOLUTION = 1.35, 1.03  # of the search, as ratios
@@ -332,14 +333,18 @@ class _Planner:
             last = photons is not None or traced > _MOST
             try:
                 scene, energy_limit, piled, eye, pilot = self._settle(asked, runs, typical, even)
-                quarters = (runs[i : i + 2] for i in range(0, RUNS, 2))
-                found = _Sample(pilot, [self._settle(asked, two, typical, even)[-1] for two in quarters])
+                parts = [self._settle(asked, runs[i : i + 2], typical, even)[-1] for i in range(0, RUNS, 2)]
+                # Noise of the runs moves a median of moduli away from 0, in quarters of the photons about twice as far.
+                moved = {key: float(np.mean([one.floor[key] for one in parts])) - pilot.floor[key] for key in METHODS}
+                floor = {key: max(value - moved[key], 0.0) for key, value in pilot.floor.items()}
+                found = _Sample(dataclasses.replace(pilot, floor=floor), parts)
             except NoLight:
                 if last or 2.0 * elapsed > budget:
                     raise
                 continue
             factor = self._missing(scene, found)
-            if factor <= 1.0 or last or 2.0 * elapsed > max(budget, min(factor * elapsed, longest)):
+            least = even or 2.0 * elapsed > _SHORT or self._missing(scene, found, _NARROW) <= 1.0
+            if last or (least if factor <= 1.0 else 2.0 * elapsed > max(budget, min(factor * elapsed, longest))):
                 break
         low, pilot, high = found.ends(1.0)
         ends = [self._outcome(scene, one) for one in (low, pilot, high)]
@@ -406,13 +411,13 @@ class _Planner:
         limit = _limit(scene, pilot, terms, pulses, self.method)
         return _Outcome(pulses, purpose, terms, limit, pulses * scene.scan_positions / scene.laser.repetition_rate)
 
-    def _missing(self, scene: Scene, found: _Sample) -> float:
-        """Times as many photons that would judge; 1 where these do, infinite where 10⁴ times as many do not."""
+    def _missing(self, scene: Scene, found: _Sample, wide: float = _WIDE) -> float:
+        """Times as many photons that would know the pulses to a ratio, and all else; infinite: not even 10⁴ times."""
         factor = max(1.0, (found.centre.light_noise / _LIGHT_NOISE) ** 2)
         while factor < 1e4:
             ends = [self._outcome(scene, pilot) for pilot in found.ends(factor)]
             kinds = {(one.purpose in _ENOUGH, one.purpose in _ENOUGH and one.time <= self.time) for one in ends}
-            if len(kinds) == 1 and (ends[0].purpose not in _ENOUGH or ends[2].pulses <= _WIDE * ends[0].pulses):
+            if len(kinds) == 1 and (ends[0].purpose not in _ENOUGH or ends[2].pulses <= wide * ends[0].pulses):
                 return factor
             factor *= 2.0
         return math.inf

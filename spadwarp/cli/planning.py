@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -301,8 +301,16 @@ def sweep(
     show_table(
         ({**key, **cells(row)} for key, row in zip(keys, lines, strict=True)), keys=len(keys[0]) + (of == "budget")
     )
-    for text in _budget_notes(lines, read) if of == "budget" else ():
-        say(text)
+    if of == "budget" and any(row.gate_moved for row in lines):
+        say(
+            f"* not the scene's gate, {read.gate.start_ns:.4g}-{read.gate.stop * 1e9:.4g} ns, which misses the return "
+            "of one of the ranges, but one as long around the return"
+        )
+    own, detector = read.analytic.pulses_per_depth_frame, read.detector.pulses_per_frame
+    if of == "budget" and read.analytic.count_law == "per_pulse" and own not in (None, detector):
+        say(
+            f"pulses: analytic.pulses_per_depth_frame = {own}; without it, detector.pulses_per_frame = {detector} count"
+        )
     written(files)
     write_json({**summary, "rows": plain, "notes": spadwarp.analytic.model_notes(read), "files": files})
 
@@ -350,24 +358,6 @@ def _plan_cells(row: PlanRow, pulses: int) -> dict[str, Any]:
         **({} if math.isnan(row.largest_range) else {"largest range [m]": row.largest_range}),
         "limit": row.limit,
     }
-
-
-def _budget_notes(found: Sequence[BudgetRow], scene: Scene) -> list[str]:
-    """Notes below the table of a budget."""
-    notes = []
-    if any(row.gate_moved for row in found):
-        gate = scene.gate
-        notes.append(
-            f"* not the scene's gate, {gate.start_ns:.4g}-{gate.stop * 1e9:.4g} ns, which misses the return of one of "
-            "the ranges, but one as long around the return"
-        )
-    own, detector = scene.analytic.pulses_per_depth_frame, scene.detector.pulses_per_frame
-    if scene.analytic.count_law == "per_pulse" and own is not None and own != detector:
-        notes.append(
-            f"pulses: analytic.pulses_per_depth_frame = {own}; without it, detector.pulses_per_frame = {detector} "
-            "would count"
-        )
-    return notes
 
 
 # Values of --particles, by theory.

@@ -82,11 +82,13 @@ def _bare_unit(text: str, error: str) -> str:
     """Addition to the error of a line such as `aperture_diameter = 20 mm`."""
     if (place := re.search(r"at line (\d+)", error)) is None:
         return ""
-    line = text.split("\n")[int(place[1]) - 1][:200]
-    for number, unit in _WITH_UNIT.findall(line.partition("=")[2]):
+    value = text.split("\n")[int(place[1]) - 1][:200].partition("=")[2].partition(" #")[0]
+    for number, unit in _WITH_UNIT.findall(value):
         if unit in UNITS:
             return f'; a number with a unit needs quotes: "{number} {unit}"'
-    return "; text stands in quotes" if "Invalid value" in error else ""
+    if re.fullmatch(r"\s*\d+,\d+\s*", value):
+        return f"; a decimal point is needed: {value.strip().replace(',', '.')}"
+    return "; text stands in quotes" if re.match(r"\s*[^\W\d]", value) and "Invalid value" in error else ""
 
 
 def _parse_float(text: str) -> float:

@@ -159,12 +159,9 @@ class Constituent(PhaseLaw):
         return self.absorption + self.scattering
 
 
-def _one_or_more(value: Any) -> Any:
-    return (value,) if isinstance(value, int | float) else listed(value)
-
-
 # One for the medium and one for each layer, or one for all.
-ByWater = Annotated[tuple[Annotated[float, Field(ge=0, le=1e6)], ...], BeforeValidator(_one_or_more)]
+_one_or_more = BeforeValidator(lambda value: (value,) if isinstance(value, int | float) else listed(value))
+ByWater = Annotated[tuple[Annotated[float, Field(ge=0, le=1e6)], ...], _one_or_more]
 
 
 class Inelastic(Section):
@@ -268,11 +265,6 @@ class Water(Section):
     def is_natural(self) -> bool:
         """Whether chlorophyll or a preset says that it is of a sea or harbour, not of a tank or a paper's model."""
         return self.chlorophyll is not None or (self.preset or "").startswith(("petzold-", "uwoc-", "jerlov-"))
-
-    @property
-    def attenuation_length(self) -> float:
-        """1/c [m]."""
-        return 1.0 / self.extinction
 
 
 class Layer(Water):

@@ -130,7 +130,7 @@ def shot_scene(scene: Scene, shot: int) -> Scene:
     receiver = scene.receiver
     pose = {"position": vector_of(shots.position[at]), "rotation_deg": rotation_angles(shots.rotation[at])}
     size = {"width": receiver.width, "height": 1}
-    return scene.with_overrides({"camera": {**size, **pose}, "scan": {"mode": "none", "path": None}})
+    return scene.with_overrides({"camera": {**size, **pose}, "scan": dict.fromkeys(type(scene.scan).model_fields)})
 
 
 def shot_at(scene: Scene, points: Sequence[Floats]) -> Scene:

@@ -724,9 +724,10 @@ def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[
     lines: dict[Key, str] = {}
     problems = error.errors(include_url=False)
     located = [(*locate(model, problem["loc"]), problem) for problem in problems[:_MOST]]
-    values = {key for key, _, problem in located if problem["type"] != "literal_error"}
+    values = [key for key, _, problem in located if problem["type"] != "literal_error"]
     for key, info, problem in located:
-        if problem["type"] != "literal_error" or key not in values:  # of a word or a value the value counts
+        # Of a word or a value, or a list of values, the value counts.
+        if problem["type"] != "literal_error" or not any(one[: len(key)] == key for one in values):
             lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
     more = [f"{len(problems) - _MOST} more problems"] if len(problems) > _MOST else []
     return [*dict.fromkeys(lines.values()), *more]  # a list that is too short misses each item
@@ -769,6 +770,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         meant = _SYNONYMS.get(word)
         near = f"; did you mean {meant!r}?" if meant in siblings else suggestion(word, siblings)
         homes = [home for home in whole.model_fields if word in getattr(table_of(whole, home), "model_fields", ())]
+        homes = [] if isinstance(key[-2:][0], int) else homes  # an item of a list is not confused with a section
         hint = f"; did you mean {' or '.join(f'{home}.{word}' for home in homes[:2])}?" if homes else ""
         hint = (near or hint if len(key) == 1 else hint or near) or f"; known are {', '.join(siblings)}"
         return f"{name} is not a known {'field' if len(key) > 1 else 'section'}{hint}"
@@ -793,9 +795,9 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
     literals = (part for part in parts_of(info) if typing.get_origin(part) is typing.Literal)
     choices = tuple(texts[1]) if len(texts) > 1 else tuple(w for part in literals for w in typing.get_args(part))
     if kind in _LIMITS and info is not None:
-        others = "".join(f" and not {word!r}" for word in choices)
+        others = "" if isinstance(key[-1], int) else "".join(f" and not {word!r}" for word in choices)
         return f"{entry} is outside {interval_of(info)}{others}{_percentage(info, value)}"
-    if choices and not (kind in _KINDS and isinstance(value, str)):
+    if choices and kind not in _KINDS:
         listed = ", ".join([*map(repr, choices), *texts[2:]])
         listed = listed if len(choices) < 9 else f"those of `spadwarp list presets {key[0]}`"
         return f"{entry} is not one of {listed}{suggestion(value, choices)}"
@@ -805,6 +807,8 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         if choices:
             words = f" neither {' nor '.join([_KINDS[kind], *map(repr, choices)])}"
         return f"{entry} is{words}{_instead(key, info, kind, value)}"
+    if kind == "string_pattern_mismatch" and info is not None:
+        return f"{entry} is no {info.description}"
     message = problem["msg"]
     return f"{entry}: {message[0].lower()}{message[1:]}"
 

@@ -244,6 +244,10 @@ class Scan(Section):
     """trajectory: .csv of time and pose, as `load_trajectory` reads it, in place of velocity: the first shot is at its
     first time, and the camera's own pose is an origin near it"""
 
+    def _problems(self) -> Iterator[str]:
+        of_trajectory = "pattern", "half_angle_deg", "half_angle_y_deg", "rosette_ratio", "velocity", "path"
+        yield from self._only_with("mode = 'trajectory'", self.mode == "trajectory", *of_trajectory)
+
 
 class Transport(Section):
     """How photons are traced."""

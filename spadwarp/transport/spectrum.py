@@ -150,19 +150,8 @@ def simulate_spectrum(
             returned, marked `partial`.
     """
     scene = as_scene(scene)
-    wavelengths = scene.laser.wavelengths_nm or "spectrum" if wavelengths is None else wavelengths
-    if isinstance(wavelengths, str):
-        check_choice("wavelengths", wavelengths, ("spectrum",))
-        given = [line.wavelength_nm for line in spectral_lines(scene.laser, scene.detector)]
-    else:
-        given = [check_real("wavelengths", one, "[1e-9, 1e6] nm") for one in wavelengths]
-    if not 1 <= len(given) <= _MOST_LINES or len(set(given)) < len(given):
-        raise ArgumentError(f"wavelengths: {len(given)} given; 1 to {_MOST_LINES} different ones are needed")
-    changes: dict[str, Any] = {f"laser.{name}": None for name in ("linewidth_nm", "spectrum", "wavelengths_nm")}
-    if scene.detector.filter_fwhm_nm is not None and scene.detector.filter_centre_nm is None:
-        changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
     options = {"mesh_cache": {}, **options} if options.get("engine") is None else options
-    left = [scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)]
+    left = scenes_of_lines(scene, wavelengths)
     results, partial = dict[float, Result](), False
     alone = any(options.get(name) is not None for name in ("derivatives", "blocks", "tallies"))
     most = 1 if alone else _MOST_TOGETHER
@@ -180,6 +169,22 @@ def simulate_spectrum(
         results |= {line.laser.wavelength_nm: one for line, one in zip(group, found, strict=True)}
         partial = any(one.partial for one in found)
     return Spectrum(scene, MappingProxyType(results), partial)
+
+
+def scenes_of_lines(scene: Scene, wavelengths: Iterable[float] | Literal["spectrum"] | None = None) -> list[Scene]:
+    """The scene at each wavelength alone, see `simulate_spectrum`, whose `ArgumentError` it raises; shortest first."""
+    wavelengths = scene.laser.wavelengths_nm or "spectrum" if wavelengths is None else wavelengths
+    if isinstance(wavelengths, str):
+        check_choice("wavelengths", wavelengths, ("spectrum",))
+        given = [line.wavelength_nm for line in spectral_lines(scene.laser, scene.detector)]
+    else:
+        given = [check_real("wavelengths", one, "[1e-9, 1e6] nm") for one in wavelengths]
+    if not 1 <= len(given) <= _MOST_LINES or len(set(given)) < len(given):
+        raise ArgumentError(f"wavelengths: {len(given)} given; 1 to {_MOST_LINES} different ones are needed")
+    changes: dict[str, Any] = {f"laser.{name}": None for name in ("linewidth_nm", "spectrum", "wavelengths_nm")}
+    if scene.detector.filter_fwhm_nm is not None and scene.detector.filter_centre_nm is None:
+        changes["detector.filter_centre_nm"] = scene.laser.wavelength_nm
+    return [scene.with_overrides({**changes, "laser.wavelength_nm": one}) for one in sorted(given)]
 
 
 def _ride_together(lines: Sequence[Scene]) -> bool:

@@ -72,29 +72,28 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
         label, scale, (least, most) = _COLUMNS[name]
         y = curves.column(name) * scale
         y[np.isfinite(y) & ~((y >= least) & (y <= most))] = np.nan
+        ends = [curves.column(end) if name == "pulses" else y for end in ("pulses_least", "pulses_most")]
         for number, group in enumerate(groups):
             own = np.array([repr(other) == group for other in others])
             place = x[own] + (0.0 if numeric else 0.12 * (number - 0.5 * (len(groups) - 1)))
             words = ", ".join(f"{x:.5g}" if isinstance(x, float) else str(x) for x in others[int(own.argmax())])
             style_of: dict[str, Any] = {"color": SERIES[number % len(SERIES)], "label": words or None}
-            spread = None
-            if name == "pulses":
-                ends = np.array([curves.column("pulses_least")[own], curves.column("pulses_most")[own]])
-                spread = np.where(np.isfinite(ends), np.abs(ends - np.where(np.isfinite(y[own]), y[own], 0.0)), 0.0)
             shown, every = np.where(np.isfinite(y[own]), y[own], np.nan), -(-int(own.sum()) // 12)
+            spread = np.nan_to_num(np.abs(np.array(ends)[:, own] - shown), posinf=0.0) if name == "pulses" else None
             if name == "sigma_depth" and missed[own].any():
                 axis.plot(place, shown, "--" if numeric else "_", color=style_of["color"], linewidth=0.8)
                 shown = np.where(missed[own], np.nan, shown)
             axis.errorbar(place, shown, spread, fmt="o-" if numeric else "o", capsize=2.0, markevery=every, **style_of)
             hollow = np.where(moved[own], shown, np.nan)
             axis.plot(place, hollow, "o", color=style_of["color"], markerfacecolor="white", markevery=every, zorder=3)
-            if name == "sigma_depth" and curves.fields == ("range", "water"):
-                axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":")
             beyond, top = place[np.isinf(y[own])][::every], axis.get_xaxis_transform()
             axis.plot(beyond, np.full(len(beyond), 0.97), "x", transform=top, color=style_of["color"])
+        if name == "sigma_depth" and curves.fields == ("range", "water"):
+            asked = f"depth error of {100 * TOLERANCE:g} cm"
+            axis.axhline(TOLERANCE * 1e3, color="0.4", linewidth=0.8, linestyle=":", label=asked)
         label = label if len(label) < 26 else label.replace(" [", "\n[")  # longer than an axis
         axis.set(xlabel=curves.fields[0] + _unit(curves.fields[0]), ylabel=label)
-        _value_axis(axis, y)
+        _value_axis(axis, np.array([y, *ends]))
         if np.isnan(y).all():
             axis.text(0.5, 0.5, "not enough photons\nto judge", transform=axis.transAxes, ha="center", va="center")
         if not numeric:
@@ -104,13 +103,14 @@ def draw_sweep(curves: Sweep, path: str | Path | None = None, *, width: float = 
             log_axis(axis, "x")
         else:
             axis.xaxis.minorticks_on()
-    if missed.any():
-        label = f"not reached: over {100 * OUTLIERS:g} % false peaks"
-        axes[0].plot([], [], "--" if numeric else "_", color="0.4", linewidth=0.8, label=label)
-    if moved.any():
-        axes[0].plot([], [], "o", color="0.4", markerfacecolor="white", label="gate moved to the return")
-    if len(groups) > 1 or missed.any() or moved.any():
-        figure.key(axes, 2.3, title=", ".join(curves.fields[1:]))
+    marks = {"--" if numeric else "_": (missed, f"not reached: over {100 * OUTLIERS:g} % false peaks")}
+    marks |= {"o": (moved, "gate moved to the return")}
+    marks |= {"x": (np.isinf(curves.column("pulses_for_1cm" if budgets else "pulses")), "out of reach")}
+    marks = {mark: (where, label) for mark, (where, label) in marks.items() if where.any()}
+    for mark, (_, label) in marks.items():
+        axes[0].plot([], [], mark, color="0.4", markerfacecolor="white", linewidth=0.8, label=label)
+    if len(groups) > 1 or marks:
+        figure.key(axes, 2.3, title=", ".join(name + _unit(name) for name in curves.fields[1:]))
     if path is not None:
         save(figure, path)
     return figure
@@ -128,9 +128,8 @@ def _value_axis(axis: Axes, y: NDArray[np.float64]) -> None:
     known = y[np.isfinite(y)]
     positive = known[known > 0]
     if positive.size and positive.max() > 20 * positive.min():
-        log_axis(axis, "y")
-        return
-    elif known.size:
+        return log_axis(axis, "y")
+    if known.size:
         axis.set_ylim(min(0.0, 1.1 * known.min()), 1.1 * known.max() or 1.0)
         span = np.ptp(known) / max(np.abs(known).max(), 1e-300)
         if 1e-6 < span < 0.1:
@@ -191,7 +190,7 @@ def draw_validation(rows: Sequence[Mapping[str, Any]], path: str | Path, *, titl
     ratio.set(xlabel="value / reference − 1", ylim=(len(rows) - 0.5, -0.5))
     ratio.set_yticks(range(len(rows)), names)
     deviation.axvspan(-2.0, 2.0, color="0.92", zorder=0)
-    deviation.set_xlabel(wrapped("z [standard errors]", 0.22 * width))
+    deviation.set_xlabel(wrapped("z [standard errors]; grey: within 2", 0.22 * width))
     for axis in (ratio, deviation):
         axis.locator_params(axis="x", nbins=4)
         axis.xaxis.minorticks_on()

@@ -295,23 +295,22 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
     Where light is sparse, bins are added up until their sum is known to a third, see `merged_edges`; returns whether.
     """
     per_pulse = result.scene.laser.photons_per_pulse * result.scene.detections_per_photon
-    better = result.reconstruction
-    if better is None:
-        parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
-    else:
-        parts = better.histogram[:, row, column].astype(np.float64) * per_pulse
-    time = 1e9 * result.bin_edges
-    total = parts.sum(axis=0)
-    error = np.zeros_like(total)  # without batches it is not known, and bins stay as they are
+    time, better = 1e9 * result.bin_edges, result.reconstruction
+    error = np.zeros(len(time) - 1)  # without batches it is not known, and bins stay as they are
     if better is not None:
-        error = better.error[row, column].astype(np.float64) * per_pulse
-    elif result.batches > 1:
-        error = pixel_standard_error(result, row, column) * per_pulse
+        cubes = better.histogram[:, row, column], better.error[row, column]
+        parts, error = (cube.astype(np.float64) * per_pulse for cube in cubes)
+    else:
+        parts = result.tallies[:, row, column] * (result.tally_value[row, column] * per_pulse)
+        error = pixel_standard_error(result, row, column) * per_pulse if result.batches > 1 else error
+    total = parts.sum(axis=0)
     weight = np.divide(error**2, total, out=np.zeros_like(total), where=total > 0)
-    edges = merged_edges(total, weight * total, [int(part.argmax()) for part in parts > 0])  # no light before its time
+    # No light before its time, and none of unscattered light's bins in a mean of later ones.
+    breaks = [*(int(part.argmax()) for part in parts > 0), *(np.flatnonzero(parts[0])[-1:] + 1)]
+    edges = merged_edges(total, weight * total, breaks)
     curves: list[tuple[NDArray[Any], NDArray[Any], dict[str, Any]]] = []
     for name, part in zip(result.scene.components, parts, strict=True):
-        own = np.arange(len(time)) if name == "ballistic" else merged_edges(part, weight * part)
+        own = np.arange(len(time)) if name == "ballistic" else merged_edges(part, weight * part, breaks)
         wide = {"linewidth": 1.4, "zorder": 3} if name == "ballistic" else {"linewidth": 0.9, "zorder": 2}
         label, colour = style.COMPONENTS[name]
         curves.append((merged_means(part, own), own, {"label": label, "color": colour, **wide}))
@@ -326,7 +325,8 @@ def _plot_pixel(result: Result, axis: Axes, row: int, column: int) -> bool:
     for channel, line in _CHANNEL_LINES.items() if result.scene.camera.channels else ():
         seen = pixel_channel(result, channel, row, column).sum(axis=0) * per_pulse
         curves.append((merged_means(seen, edges), edges, {"label": style.CHANNEL_NAMES[channel], **line}))
-    for heights, own, drawn in curves:  # zeros lie below the axis, so that a single bin still shows as a spike
+    # Zeros lie below the axis, so that a single bin still shows as a spike.
+    for heights, own, drawn in (curve for curve in curves if curve[0].any()):
         axis.stairs(np.maximum(heights, 0.01 * bottom), time[own], baseline=None, **drawn)
     style.arrival_line(axis, 1e9 * float(result.true_path()[row, column]) / result.pulse_speed, time)
     axis.set(ylim=(bottom, 3.0 * top), yscale="log", ylabel="detections\nper pulse and bin")
@@ -431,11 +431,9 @@ def _profiles(result: Result, section: str, left: Axes, right: Axes) -> None:
         return
     found = apparent(result, section)
     for k, (name, label) in enumerate(_PROPERTIES.items()):
-        places = found.middle if name == "attenuation" else found.position
-        error = found.errors[name]
-        right.errorbar(
-            getattr(found, name), places, xerr=error, fmt=".-", color=style.SERIES[k], label=label, linewidth=0.9
-        )
+        places, values = found.middle if name == "attenuation" else found.position, getattr(found, name)
+        look: Any = {"fmt": ".-", "color": style.SERIES[k], "label": label, "linewidth": 0.9}
+        right.errorbar(values, places, xerr=found.errors[name], **look)
     right.set(xlabel="K_d, R, mean cosine", title="apparent optical properties")
     log_axis(right, "x")
     right.legend(**below, ncols=3)
@@ -460,12 +458,9 @@ def _slice(figure: Figure, axis: Axes, section: str, light: FluxValues, planes: 
     if not top > 0.0:
         style.middle_text(axis, "no light")
         return
-    look: Any = {
-        "norm": LogNorm(_LEAST * top, top),
-        "cmap": style.colour_map(INTENSITY_MAP),
-        "interpolation": "nearest",
-    }
-    shown = axis.imshow(np.maximum(found.sum(axis=0), _LEAST * top), extent=(*ends[0], ends[1][1], ends[1][0]), **look)
+    look: Any = {"norm": LogNorm(_LEAST * top, top), "cmap": style.colour_map(INTENSITY_MAP)}
+    look |= {"interpolation": "nearest", "extent": (*ends[0], ends[1][1], ends[1][0])}
+    shown = axis.imshow(np.maximum(found.sum(axis=0), _LEAST * top), **look)
     figure.colorbar(shown, ax=axis, label=f"fluence [{light.unit}]", shrink=0.6)
 
 

@@ -246,8 +246,13 @@ def log_ticks(line: Axis, most: float) -> None:
         return values[(values > low * (1 - 1e-9)) & (values < high * (1 + 1e-9))].tolist()
 
     plain = low >= 1e-3 and high <= 2e4
+
+    def fit(values: list[float]) -> bool:  # also where they are close, such as 5000, 7000 and 10000
+        apart = np.diff(np.log10(values)).min(initial=math.inf) / math.log10(high / low)
+        return len(values) <= most and apart * most > 0.7
+
     choices = [ticks(digits) for digits in _DIGITS if plain or digits != (1.0, 3.0)] + [ticks((1.0,), stride)]
-    line.set_major_locator(FixedLocator(next((values for values in choices if len(values) <= most), choices[-1])))
+    line.set_major_locator(FixedLocator(next(filter(fit, choices), choices[-1])))
     line.set_minor_locator(FixedLocator(ticks((1.0,) if stride > 1 else range(1, 10))))
     line.set_major_formatter(lambda value, _: f"{value:g}" if plain else power_text(value))
     line.set_minor_formatter(NullFormatter())
@@ -376,7 +381,9 @@ class Panels:
         self.figure.set_figheight(self.figure.get_figheight() + 0.17 * max(taller - self._lines[row], 0))
         self._lines[row] = max(taller, self._lines[row])
         colour_bar = self.figure.colorbar(shown, cax=bar, orientation="horizontal", label=label, extend=extend)
-        bar.set_visible(bool(np.isfinite(image).any()))  # it would have no values
+        if not np.isfinite(image).any():
+            bar.set_visible(False)
+            middle_text(axis, "no values")
         if scale == "log":
             log_ticks(bar.xaxis, self._line / 0.4)
         else:

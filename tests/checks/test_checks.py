@@ -160,6 +160,17 @@ def test_findings_have_their_numbers(field):
     assert not any(words in other.text for other in check(BASE, plate(5.0)) if other.field == field)
 
 
+def test_each_line_is_checked_in_its_own_water():
+    lines = {"laser__wavelengths_nm": [480.0, 532.0, 600.0], "medium__group_index": 1.34}
+    assert find(checked(**lines), "laser.wavelengths_nm").text.startswith("all lines have the same water")
+    coastal = {
+        "medium": {"preset": "uwoc-coastal", "group_index": 1.36},
+        "laser": {"wavelengths_nm": [480.0, 532.0, 600.0]},
+    }
+    messages = check(Scene.from_dict({**BASE.to_dict(), **coastal}), plate(5.0))
+    assert find(messages, "medium.preset").text.startswith("at 480, 600 nm: ")
+
+
 def test_what_is_not_there_is_noted():
     assert "not given" in find(checked(medium__group_index=None), "medium.group_index", "note").text
     empty = BASE.with_overrides({"targets": []})
@@ -255,7 +266,7 @@ def test_polarised_light_that_is_not_recorded_and_fields_that_are_not_used_are_n
     light = {"laser__polarisation": "right_circular", "laser__polarisation_angle_deg": 30}
     light["transport__axis_threshold"] = 1.0
     messages = checked(**light, medium__scattering_matrix="voss_fry")
-    assert "no channels" in find(messages, "camera.polarisation", "note").text
+    assert "no channel records" in find(messages, "camera.polarisation", "note").text
     assert "'linear'" in find(messages, "laser.polarisation_angle_deg", "note").text
     table = tmp_path / "matrix.csv"
     table.write_text("angle_deg,m12,m22,m33,m34,m44\n0,0,1,1,0,1\n170,0,1,-1,0,-1\n")

@@ -46,6 +46,7 @@ def port(*names, **fields):
         ("medium.albedo=1.5", "medium.albedo = 1.5 (an override) is outside [0, 1] and not 'lu2024'"),
         ("medium.extinction=-1", "medium.extinction = -1 (an override) is outside [1e-12, 1e6] 1/m"),
         ("camera.width=3.5", "camera.width = 3.5 (an override) is not an integer"),
+        ("laser.wavelengths_nm=[0, 532]", "laser.wavelengths_nm[0] = 0 (an override) is outside [1e-9, 1e6] nm"),
         ("detector.wrap=1", "detector.wrap = 1 (an override) is not true or false"),
         ("laser.position=[1, 2]", "laser.position = [1, 2] has the wrong number of values"),
         ("laser.direction=[0, 0, 'up']", "laser.direction[2] = 'up' (an override) is not a number"),

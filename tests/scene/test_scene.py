@@ -159,7 +159,6 @@ def test_derived_quantities():
     assert one.laser.axis == pytest.approx((0.0, 0.6, 0.8))
     assert one.laser.half_angle == pytest.approx(math.pi / 12)
     assert one.detector.pde == pytest.approx(0.05)
-    assert one.medium.attenuation_length == pytest.approx(1 / 0.3)
     assert one.camera.aperture_area == pytest.approx(math.pi * 0.005**2)
 
 
