@@ -64,6 +64,19 @@ def _deviance_at_most(n: float, mean: float, excess: float, left: float) -> floa
 
 
 @wp.func
+def _may_be_best(n: float, mean: float, trials: float, pulses: float, best: float) -> bool:
+    """Whether the square of the excess over the variance, which the deviance does not exceed, may be above the best
+    one: in float32, from that side. It falls as the mean rises, of which 1 - exp(-x) >= x (1 - x / 2) is a bound."""
+    least = float(mean)
+    if pulses > 0.0:
+        x = mean / pulses
+        least = trials * x * (1.0 - 0.5 * x)
+    least *= 0.999995
+    rest = 1.0 - 1.00001 * least / trials
+    return n > least and 1.0001 * (n - least) * (n - least) >= best * least * rest
+
+
+@wp.func
 def _stirling_error(n: wp.float64) -> wp.float64:
     """ln n! less Stirling's formula, n >= 1, to 3e-4."""
     return (ONE - ONE / (wp.float64(30.0) * n * n)) / (wp.float64(12.0) * n)
@@ -144,17 +157,19 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
         trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
         if s.pulses > ZERO:
             trials = wp.max(s.pulses - s.before, n)
-            mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
-        # The deviance is at most the square of the excess over the variance: most windows end here.
         single = search.stop - search.first <= search.half_width
-        offered = (s.begin > search.first or single) and n > mean
-        offered = offered and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials)
-        bound = _deviance_at_most(float(n), float(mean), float(n - mean), float(trials - n))
-        if offered and bound >= float(s.best[0]):
-            value = _deviance(n, mean, trials)
-            if value > s.best[0]:
-                s.best = wp.vec4d(value, n, mean, trials)
-                s.window = wp.max(s.begin - search.half_width, search.first)
+        offered = s.begin > search.first or single
+        if offered and _may_be_best(float(n), float(mean), float(trials), float(s.pulses), float(s.best[0])):
+            if s.pulses > ZERO:
+                mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
+            # Most windows end above or here.
+            offered = n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials)
+            bound = _deviance_at_most(float(n), float(mean), float(n - mean), float(trials - n))
+            if offered and bound >= float(s.best[0]):
+                value = _deviance(n, mean, trials)
+                if value > s.best[0]:
+                    s.best = wp.vec4d(value, n, mean, trials)
+                    s.window = wp.max(s.begin - search.half_width, search.first)
         s.begin = k + 1
         s.before += s.last_n
         s.last_n = s.own_n
