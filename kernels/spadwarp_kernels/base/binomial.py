@@ -61,17 +61,17 @@ def _stirling_rest(k: wp.float64) -> wp.float64:
 
 @wp.func
 def _inversion(n: wp.float64, hazard: wp.float64, u: wp.float64) -> wp.float64:
-    # Sequential search from 0: P(0) = exp(-n hazard), P(k) / P(k - 1) = (n + 1 - k) / k * p / q.
+    # Sequential search from 0: P(0) = exp(-n hazard), P(k) / P(k - 1) = (n + 1 - k) / k * p / q, both sides times k! so
+    # that nothing is divided. Of means below 10, none ends above 100.
     odds = expm1(hazard)
     probability = wp.exp(-n * hazard)
     rest = wp.float64(u)
     count = wp.float64(0.0)
-    while rest > probability and count < n:
-        rest = rest - probability
+    last = wp.min(n, wp.float64(100.0))
+    while rest > probability and count < last:
         count = count + ONE
-        probability = probability * odds * (n + ONE - count) / count
-        if probability < wp.float64(1e-300):
-            return count
+        rest = (rest - probability) * count
+        probability = probability * odds * (n + ONE - count)
     return count
 
 
