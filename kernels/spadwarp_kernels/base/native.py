@@ -1,5 +1,7 @@
 """The bits of floats as integers, and back."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -94,12 +96,13 @@ def expm1(x: wp.float64) -> wp.float64:
 
 
 @wp.func
-def log1p(x: wp.float64) -> wp.float64:
+def log1p(x: Any):
     """ln(1 + x) without cancellation (Kahan's correction)."""
-    y = ONE + x
-    if y == ONE:
+    one = type(x)(1.0)
+    y = one + x
+    if y == one:
         return x
-    return x * wp.log(y) / (y - ONE)
+    return x * wp.log(y) / (y - one)
 
 
 @wp.func
