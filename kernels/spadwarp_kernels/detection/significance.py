@@ -49,31 +49,31 @@ class Windows:
 
 
 @wp.func
-def _deviance(n: wp.float64, mean: wp.float64, trials: wp.float64) -> wp.float64:
-    """ln of the likelihood of n at its own expectation over that at the mean, n >= 1."""
-    value = n * wp.log(n / mean)
+def _deviance(n: Any, mean: Any, trials: Any):
+    """ln of the likelihood of n at its own expectation over that at the mean, n >= 1; float32 or float64."""
+    excess = n - mean
+    value = n * log1p(excess / mean)
     if n < trials:
-        value += (trials - n) * log1p((mean - n) / (trials - mean))
+        value += (trials - n) * log1p(-excess / (trials - mean))
     return value
 
 
 @wp.func
-def _deviance_at_most(n: float, mean: float, excess: float, left: float) -> float:
-    """What `_deviance` does not exceed, for a tenth of its time; excess = n - mean, left = trials - n."""
-    return n * (wp.log(n / mean) + 2.0e-6) - excess * left / (left + excess)  # ln(1 + x) <= x, and float32's rounding
+def _counting(mean: wp.float64, trials: wp.float64, pulses: wp.float64) -> wp.float64:
+    """Expected counts of so many pulses, each of which counts one of the photons at most; see `DetectionTest`."""
+    if pulses > ZERO:
+        return wp.max(trials * one_minus_exp(mean / pulses), _LEAST)
+    return mean
 
 
 @wp.func
-def _may_be_best(n: float, mean: float, trials: float, pulses: float, best: float) -> bool:
-    """Whether the square of the excess over the variance, which the deviance does not exceed, may be above the best
-    one: in float32, from that side. It falls as the mean rises, of which 1 - exp(-x) >= x (1 - x / 2) is a bound."""
-    least = float(mean)
+def _roughly_counting(mean: float, trials: float, pulses: float) -> float:
     if pulses > 0.0:
         x = mean / pulses
-        least = trials * x * (1.0 - 0.5 * x)
-    least *= 0.999995
-    rest = 1.0 - 1.00001 * least / trials
-    return n > least and 1.0001 * (n - least) * (n - least) >= best * least * rest
+        if x < 0.05:
+            return trials * x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0))))
+        return trials * (1.0 - wp.exp(-x))
+    return mean
 
 
 @wp.func
@@ -125,7 +125,8 @@ class WindowSearch:
     last_b: wp.float64
     own_n: wp.float64
     own_b: wp.float64
-    best: wp.vec4d  # deviance, counts, mean, trials
+    deviance: float  # of the best window
+    best: wp.vec3d  # its counts, mean photons, trials
     window: int  # its first bin
     begin: int  # first bin of this half
     state: wp.uint32  # hash of the counts
@@ -137,7 +138,6 @@ def begin_search(search: Windows, pixel: int) -> WindowSearch:
     s = WindowSearch()
     s.pulses = search.pulses
     s.level = ONE
-    s.best = wp.vec4d(ZERO, ZERO, ONE, ONE)
     s.window = search.first
     s.begin = search.first
     s.state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
@@ -158,18 +158,19 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
         if s.pulses > ZERO:
             trials = wp.max(s.pulses - s.before, n)
         single = search.stop - search.first <= search.half_width
-        offered = s.begin > search.first or single
-        if offered and _may_be_best(float(n), float(mean), float(trials), float(s.pulses), float(s.best[0])):
-            if s.pulses > ZERO:
-                mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
-            # Most windows end above or here.
-            offered = n > mean and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials)
-            bound = _deviance_at_most(float(n), float(mean), float(n - mean), float(trials - n))
-            if offered and bound >= float(s.best[0]):
-                value = _deviance(n, mean, trials)
-                if value > s.best[0]:
-                    s.best = wp.vec4d(value, n, mean, trials)
-                    s.window = wp.max(s.begin - search.half_width, search.first)
+        # Which window is the best, float32 tells: of two that it confuses, either will do.
+        found = float(n)
+        of = float(trials)
+        expected = _roughly_counting(float(mean), of, float(s.pulses))
+        excess = found - expected
+        # The deviance is at most the square of the excess over the variance: most windows end here.
+        bound = s.deviance * expected * (1.0 - expected / of)
+        if (s.begin > search.first or single) and excess > 0.0 and excess * excess > bound:
+            value = _deviance(found, expected, of)
+            if value > s.deviance:
+                s.deviance = value
+                s.best = wp.vec3d(n, mean, trials)
+                s.window = wp.max(s.begin - search.half_width, search.first)
         s.begin = k + 1
         s.before += s.last_n
         s.last_n = s.own_n
@@ -182,12 +183,13 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
 @wp.func
 def significance_of(search: Windows, s: WindowSearch) -> float:
     """Of the best window of all."""
-    if s.best[0] <= ZERO:
+    if s.deviance <= 0.0:
         return 0.0
     halves = (search.stop - search.first + search.half_width - 1) / search.half_width
     number = wp.float64(wp.max(halves - 1, 1))
     u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(s.state)))))
-    return float(_significance(s.best[1], s.best[2], s.best[3], number, u, search.level_known))
+    mean = _counting(s.best[1], s.best[2], s.pulses)
+    return float(_significance(s.best[0], mean, s.best[2], number, u, search.level_known))
 
 
 @memoised
