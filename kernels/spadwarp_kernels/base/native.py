@@ -87,12 +87,13 @@ TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.func
-def expm1(x: wp.float64) -> wp.float64:
-    """exp(x) − 1 without cancellation: relative error below 1e-13."""
-    if wp.abs(x) > wp.float64(0.01):
-        return wp.exp(x) - ONE
-    series = ONE + x * (HALF + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0))))
-    return x * series
+def expm1(x: Any):
+    """exp(x) − 1 without cancellation: relative error below 1e-13, of float32 1e-5."""
+    one = type(x)(1.0)
+    if wp.abs(x) > type(x)(0.01):
+        return wp.exp(x) - one
+    series = type(x)(1.0 / 6.0) + x * (type(x)(1.0 / 24.0) + x * type(x)(1.0 / 120.0))
+    return x * (one + x * (type(x)(0.5) + x * series))
 
 
 @wp.func

@@ -17,7 +17,7 @@ import warp as wp
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
-from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO, log1p, one_minus_exp
+from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO, expm1, log1p, one_minus_exp
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, u01_open
 
 __all__ = ["MIN_SIGNIFICANCE", "DetectionTest"]
@@ -59,20 +59,10 @@ def _deviance(n: Any, mean: Any, trials: Any):
 
 
 @wp.func
-def _counting(mean: wp.float64, trials: wp.float64, pulses: wp.float64) -> wp.float64:
-    """Expected counts of so many pulses, each of which counts one of the photons at most; see `DetectionTest`."""
-    if pulses > ZERO:
-        return wp.max(trials * one_minus_exp(mean / pulses), _LEAST)
-    return mean
-
-
-@wp.func
-def _roughly_counting(mean: float, trials: float, pulses: float) -> float:
-    if pulses > 0.0:
-        x = mean / pulses
-        if x < 0.05:
-            return trials * x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0))))
-        return trials * (1.0 - wp.exp(-x))
+def _counting(mean: Any, trials: Any, pulses: Any):
+    """Expected counts of so many pulses, each of which counts one of its photons at most; see `DetectionTest`."""
+    if pulses > type(mean)(0.0):
+        return -trials * expm1(-mean / pulses)
     return mean
 
 
@@ -161,7 +151,7 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
         # Which window is the best, float32 tells: of two that it confuses, either will do.
         found = float(n)
         of = float(trials)
-        expected = _roughly_counting(float(mean), of, float(s.pulses))
+        expected = _counting(float(mean), of, float(s.pulses))
         excess = found - expected
         # The deviance is at most the square of the excess over the variance: most windows end here.
         bound = s.deviance * expected * (1.0 - expected / of)
@@ -188,7 +178,7 @@ def significance_of(search: Windows, s: WindowSearch) -> float:
     halves = (search.stop - search.first + search.half_width - 1) / search.half_width
     number = wp.float64(wp.max(halves - 1, 1))
     u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(s.state)))))
-    mean = _counting(s.best[1], s.best[2], s.pulses)
+    mean = wp.max(_counting(s.best[1], s.best[2], s.pulses), _LEAST)
     return float(_significance(s.best[0], mean, s.best[2], number, u, search.level_known))
 
 
