@@ -132,7 +132,7 @@ LINES = {
     "water": (800, 853),
     "kernels/spadwarp_kernels": (50, 45),
     "kernels/analytic": (1650, 1681),
-    "kernels/base": (950, 1219),
+    "kernels/base": (950, 1245),
     "kernels/detection": (1000, 1349),
     "kernels/estimators": (1300, 1096),
     "kernels/optics": (1350, 2652),
@@ -142,7 +142,7 @@ LINES = {
     "kernels/tally": (450, 1002),
     "kernels/transport": (1450, 1712),
     "kernels/water": (1350, 1668),
-    "kernels/worlds": (1600, 2173),
+    "kernels/worlds": (1600, 2170),
 }
 
 

@@ -61,18 +61,49 @@ def _stirling_rest(k: wp.float64) -> wp.float64:
 
 @wp.func
 def _inversion(n: wp.float64, hazard: wp.float64, u: wp.float64) -> wp.float64:
-    # Sequential search from 0: P(0) = exp(-n hazard), P(k) / P(k - 1) = (n + 1 - k) / k * p / q.
+    # Sequential search from 0: P(0) = exp(-n hazard), P(k) / P(k - 1) = (n + 1 - k) / k * p / q, both sides times k! so
+    # that nothing is divided. Of means below 10, none ends above 100.
     odds = expm1(hazard)
     probability = wp.exp(-n * hazard)
     rest = wp.float64(u)
     count = wp.float64(0.0)
-    while rest > probability and count < n:
-        rest = rest - probability
+    last = wp.min(n, wp.float64(100.0))
+    while rest > probability and count < last:
         count = count + ONE
-        probability = probability * odds * (n + ONE - count) / count
-        if probability < wp.float64(1e-300):
-            return count
+        rest = (rest - probability) * count
+        probability = probability * odds * (n + ONE - count)
     return count
+
+
+@wp.func
+def _rest(x: float) -> float:
+    """As `_stirling_rest`, of 1 / (k + 1); 1e-5 for k >= 1."""
+    y = x * x
+    return (1.0 / 12.0 - (1.0 / 360.0 - y * (1.0 / 1260.0)) * y) * x
+
+
+@wp.func
+def _log_ratio(k: wp.float64, mode: wp.float64, trials: wp.float64, p: wp.float64, q: wp.float64) -> float:
+    """ln of the probability of k over that of the mode, in float32: what cancels in the large terms is left out."""
+    shift = float(k - mode)
+    x = 1.0 / float(mode + ONE)
+    y = 1.0 / float(trials - mode + ONE)
+    part = float(((trials + ONE) * p - mode) / q) - 1.0
+    value = shift * log1p(part * x) - float(k + HALF) * log1p(shift * x) - float(trials - k + HALF) * log1p(-shift * y)
+    return value + _rest(x) - _rest(1.0 / float(k + ONE)) + _rest(y) - _rest(1.0 / float(trials - k + ONE))
+
+
+@wp.func
+def _exact_log_ratio(k: wp.float64, mode: wp.float64, trials: wp.float64, odds: wp.float64) -> wp.float64:
+    return (
+        (mode + HALF) * wp.log((mode + ONE) / (odds * (trials - mode + ONE)))
+        + _stirling_rest(mode)
+        + _stirling_rest(trials - mode)
+        + (trials + ONE) * wp.log((trials - mode + ONE) / (trials - k + ONE))
+        + (k + HALF) * wp.log(odds * (trials - k + ONE) / (k + ONE))
+        - _stirling_rest(k)
+        - _stirling_rest(trials - k)
+    )
 
 
 @wp.func
@@ -103,16 +134,12 @@ def binomial(
         return int(few), block + wp.uint32(1)
 
     q = ONE - p
-    odds = p / q
     deviation = wp.sqrt(mean * q)
     b = wp.float64(1.15) + wp.float64(2.53) * deviation
     a = wp.float64(-0.0873) + wp.float64(0.0248) * b + wp.float64(0.01) * p
+    alpha = (2.83 + 5.1 / float(b)) * float(deviation)
     centre = mean + HALF
-    squeeze = wp.float64(0.92) - wp.float64(4.2) / b
-    alpha = (wp.float64(2.83) + wp.float64(5.1) / b) * deviation
     mode = wp.floor((trials + ONE) * p)
-    at_mode = wp.float64(0.0)
-    ready = int(0)
     count = wp.float64(-1.0)
     while count < ZERO:
         draw = uniforms(seed, id, purpose, block)
@@ -121,24 +148,19 @@ def binomial(
         v = draw[1]
         us = HALF - wp.abs(u)
         k = wp.floor((TWO * a / us + b) * u + centre)
-        if us >= wp.float64(0.07) and v <= squeeze:
+        if us >= wp.float64(0.07) and v * b <= wp.float64(0.92) * b - wp.float64(4.2):
             count = k
         elif us > ZERO and k >= ZERO and k <= trials:
-            if ready == 0:
-                at_mode = (
-                    (mode + HALF) * wp.log((mode + ONE) / (odds * (trials - mode + ONE)))
-                    + _stirling_rest(mode)
-                    + _stirling_rest(trials - mode)
-                )
-                ready = 1
-            bound = (
-                at_mode
-                + (trials + ONE) * wp.log((trials - mode + ONE) / (trials - k + ONE))
-                + (k + HALF) * wp.log(odds * (trials - k + ONE) / (k + ONE))
-                - _stirling_rest(k)
-                - _stirling_rest(trials - k)
-            )
-            if wp.log(v * alpha / (a / (us * us) + b)) <= bound:
+            # ln(v alpha / (a / us^2 + b)) decides: float32 does where its errors allow.
+            square = float(us) * float(us)
+            hat = wp.log(float(v) * alpha * square / (float(a) + float(b) * square))
+            gap = _log_ratio(k, mode, trials, p, q) - hat
+            doubt = wp.where(wp.min(k, trials - k) < ONE, 2.0e-3, 1.0e-5 + 2.0e-6 * wp.abs(float(k - mode)))
+            accepted = gap > doubt
+            if not accepted and gap >= -doubt:
+                ratio = v * (wp.float64(2.83) + wp.float64(5.1) / b) * deviation / (a / (us * us) + b)
+                accepted = wp.log(ratio) <= _exact_log_ratio(k, mode, trials, p / q)
+            if accepted:
                 count = k
     if swapped:
         count = trials - count

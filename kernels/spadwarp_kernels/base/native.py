@@ -1,5 +1,7 @@
 """The bits of floats as integers, and back."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -85,21 +87,23 @@ TWO = wp.constant(wp.float64(2.0))
 
 
 @wp.func
-def expm1(x: wp.float64) -> wp.float64:
-    """exp(x) − 1 without cancellation: relative error below 1e-13."""
-    if wp.abs(x) > wp.float64(0.01):
-        return wp.exp(x) - ONE
-    series = ONE + x * (HALF + x * (wp.float64(1.0 / 6.0) + x * (wp.float64(1.0 / 24.0) + x * wp.float64(1.0 / 120.0))))
-    return x * series
+def expm1(x: Any):
+    """exp(x) − 1 without cancellation: relative error below 1e-13, of float32 1e-5."""
+    one = type(x)(1.0)
+    if wp.abs(x) > type(x)(0.01):
+        return wp.exp(x) - one
+    series = type(x)(1.0 / 6.0) + x * (type(x)(1.0 / 24.0) + x * type(x)(1.0 / 120.0))
+    return x * (one + x * (type(x)(0.5) + x * series))
 
 
 @wp.func
-def log1p(x: wp.float64) -> wp.float64:
+def log1p(x: Any):
     """ln(1 + x) without cancellation (Kahan's correction)."""
-    y = ONE + x
-    if y == ONE:
+    one = type(x)(1.0)
+    y = one + x
+    if y == one:
         return x
-    return x * wp.log(y) / (y - ONE)
+    return x * wp.log(y) / (y - one)
 
 
 @wp.func

@@ -302,16 +302,13 @@ def coates(counts: wp.array, *, pulses: float) -> wp.array:
 
 
 def _check_exposure(
-    hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int, first_frame: int | wp.array
+    hazard: wp.array, pulses: int, counter_depth: int, seed: int, frames: int, first_frame: int
 ) -> tuple[int, int, int, int]:
     """Pulses, frames, the largest count of a bin and the seed, in range; on the CPU, rates are checked, too."""
     check.array("hazard", hazard, wp.float32, (None, None))
-    if isinstance(first_frame, wp.array):
-        check.array("first_frame", first_frame, wp.int64, (1,), hazard.device)
-    else:
-        check.integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31)
-        if hazard.device.is_cpu and (row := first_invalid_row(hazard)) is not None:
-            raise ArgumentError(f"hazard of pixel {row} holds numbers that are negative or not finite")
+    check.integer("first_frame", first_frame, 0, 2**63 - 1 - 2**31)
+    if hazard.device.is_cpu and (row := first_invalid_row(hazard)) is not None:
+        raise ArgumentError(f"hazard of pixel {row} holds numbers that are negative or not finite")
     return (
         check.integer("pulses", pulses, 0),
         check.integer("frames", frames, 1, (2**31 - 1) // max(hazard.shape[0], 1)),
@@ -386,7 +383,7 @@ def _first_photon_kernel(
     first_row: int,
     hazard: wp.array2d[float],
     pulses: int,
-    first_frame: wp.array[wp.int64],
+    first_frame: wp.int64,
     summed: int,
     depth: int,
     seed: wp.uint64,
@@ -398,7 +395,7 @@ def _first_photon_kernel(
     pixels = hazard.shape[0]
     pixel = row % pixels
     for part in range(summed):
-        frame = wp.uint64(first_frame[0]) + wp.uint64(row / pixels * summed + part)
+        frame = wp.uint64(first_frame) + wp.uint64(row / pixels * summed + part)
         id = frame * wp.uint64(pixels) + wp.uint64(pixel)
         draws = FirstPhotons()
         draws.left = pulses
@@ -413,7 +410,7 @@ def first_photon_counts(
     *,
     pulses: int,
     frames: int = 1,
-    first_frame: int | wp.array = 0,
+    first_frame: int = 0,
     summed: bool = False,
     counter_depth: int = 0,
     seed: int,
@@ -425,9 +422,7 @@ def first_photon_counts(
         hazard: λ, float32 `[pixel, bin]`, finite and not negative, which is checked on the CPU alone: on a GPU every
             call would wait for it.
         pulses: per frame, below 2^31.
-        frames, first_frame: numbers of the frames; a frame's counts depend on its number, not on the call. A first
-            frame that is int64 `[1]` on the device is for a step that is captured in a graph: with `counts` nothing is
-            then allocated or read on the host, and λ is not checked.
+        frames, first_frame: numbers of the frames; a frame's counts depend on its number, not on the call.
         summed: add the frames up.
         counter_depth: largest count of a bin and frame, 0: unlimited.
         seed: 64 bits.
@@ -443,8 +438,6 @@ def first_photon_counts(
     pixels, bins = hazard.shape
     rows = pixels if summed else frames * pixels
     counts = _zeroed_counts(counts, (rows, bins), hazard.device)
-    if not isinstance(first_frame, wp.array):
-        first_frame = wp.array([first_frame], dtype=wp.int64, device=hazard.device)
     return _by_row(_first_photon_kernel, [hazard, pulses, first_frame, frames if summed else 1, depth, seed], counts)
 
 

@@ -17,7 +17,7 @@ import warp as wp
 from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.base.kernels import launch_pixels, memoised
-from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO, log1p, one_minus_exp
+from spadwarp_kernels.base.native import HALF, ONE, TWO, ZERO, expm1, log1p, one_minus_exp
 from spadwarp_kernels.base.philox import begin_sequence, sequence_word, u01_open
 
 __all__ = ["MIN_SIGNIFICANCE", "DetectionTest"]
@@ -49,18 +49,21 @@ class Windows:
 
 
 @wp.func
-def _deviance(n: wp.float64, mean: wp.float64, trials: wp.float64) -> wp.float64:
-    """ln of the likelihood of n at its own expectation over that at the mean, n >= 1."""
-    value = n * wp.log(n / mean)
+def _deviance(n: Any, mean: Any, trials: Any):
+    """ln of the likelihood of n at its own expectation over that at the mean, n >= 1; float32 or float64."""
+    excess = n - mean
+    value = n * log1p(excess / mean)
     if n < trials:
-        value += (trials - n) * log1p((mean - n) / (trials - mean))
+        value += (trials - n) * log1p(-excess / (trials - mean))
     return value
 
 
 @wp.func
-def _deviance_at_most(n: float, mean: float, excess: float, left: float) -> float:
-    """What `_deviance` does not exceed, for a tenth of its time; excess = n - mean, left = trials - n."""
-    return n * (wp.log(n / mean) + 2.0e-6) - excess * left / (left + excess)  # ln(1 + x) <= x, and float32's rounding
+def _counting(mean: Any, trials: Any, pulses: Any):
+    """Expected counts of so many pulses, each of which counts one of its photons at most; see `DetectionTest`."""
+    if pulses > type(mean)(0.0):
+        return -trials * expm1(-mean / pulses)
+    return mean
 
 
 @wp.func
@@ -112,7 +115,8 @@ class WindowSearch:
     last_b: wp.float64
     own_n: wp.float64
     own_b: wp.float64
-    best: wp.vec4d  # deviance, counts, mean, trials
+    deviance: float  # of the best window
+    best: wp.vec3d  # its counts, mean photons, trials
     window: int  # its first bin
     begin: int  # first bin of this half
     state: wp.uint32  # hash of the counts
@@ -124,7 +128,6 @@ def begin_search(search: Windows, pixel: int) -> WindowSearch:
     s = WindowSearch()
     s.pulses = search.pulses
     s.level = ONE
-    s.best = wp.vec4d(ZERO, ZERO, ONE, ONE)
     s.window = search.first
     s.begin = search.first
     s.state = (_HASH_START ^ wp.uint32(pixel % search.pixels)) * _HASH_FACTOR
@@ -144,16 +147,19 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
         trials = wp.where(search.level_known, _MANY * (n + mean), s.total)
         if s.pulses > ZERO:
             trials = wp.max(s.pulses - s.before, n)
-            mean = wp.max(trials * one_minus_exp(mean / s.pulses), _LEAST)
-        # The deviance is at most the square of the excess over the variance: most windows end here.
         single = search.stop - search.first <= search.half_width
-        offered = (s.begin > search.first or single) and n > mean
-        offered = offered and (n - mean) * (n - mean) > s.best[0] * mean * (ONE - mean / trials)
-        bound = _deviance_at_most(float(n), float(mean), float(n - mean), float(trials - n))
-        if offered and bound >= float(s.best[0]):
-            value = _deviance(n, mean, trials)
-            if value > s.best[0]:
-                s.best = wp.vec4d(value, n, mean, trials)
+        # Which window is the best, float32 tells: of two that it confuses, either will do.
+        found = float(n)
+        of = float(trials)
+        expected = _counting(float(mean), of, float(s.pulses))
+        excess = found - expected
+        # The deviance is at most the square of the excess over the variance: most windows end here.
+        bound = s.deviance * expected * (1.0 - expected / of)
+        if (s.begin > search.first or single) and excess > 0.0 and excess * excess > bound:
+            value = _deviance(found, expected, of)
+            if value > s.deviance:
+                s.deviance = value
+                s.best = wp.vec3d(n, mean, trials)
                 s.window = wp.max(s.begin - search.half_width, search.first)
         s.begin = k + 1
         s.before += s.last_n
@@ -167,12 +173,13 @@ def offer_bin(search: Windows, s: WindowSearch, k: int, count: wp.int64, backgro
 @wp.func
 def significance_of(search: Windows, s: WindowSearch) -> float:
     """Of the best window of all."""
-    if s.best[0] <= ZERO:
+    if s.deviance <= 0.0:
         return 0.0
     halves = (search.stop - search.first + search.half_width - 1) / search.half_width
     number = wp.float64(wp.max(halves - 1, 1))
     u = wp.float64(u01_open(sequence_word(begin_sequence(wp.uint64(s.state)))))
-    return float(_significance(s.best[1], s.best[2], s.best[3], number, u, search.level_known))
+    mean = wp.max(_counting(s.best[1], s.best[2], s.pulses), _LEAST)
+    return float(_significance(s.best[0], mean, s.best[2], number, u, search.level_known))
 
 
 @memoised

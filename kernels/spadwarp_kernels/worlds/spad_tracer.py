@@ -252,7 +252,6 @@ class SpadTracer(WorldCameras):
         estimator: "guided" or "next_event".
         oversampling: Bins of the tally in one of the histogram: what lies within one of them arrives in its middle.
         lanes: Cameras that a GPU traces side by side, each with memory of its own: 16 B a pixel and bin of the tally.
-        use_warp_bvh: See `make_surfaces`.
 
     Attributes:
         rates, histogram, counts, depth, distance, status, significance, true_depth, normal, reflectance, step: As of
@@ -281,7 +280,6 @@ class SpadTracer(WorldCameras):
         estimator: str = "guided",
         oversampling: int = 4,
         lanes: int = 8,
-        use_warp_bvh: bool = False,
         device: wp.DeviceLike = None,
     ) -> None:
         check.kind("shapes", shapes, Shapes)
@@ -298,7 +296,7 @@ class SpadTracer(WorldCameras):
             raise ArgumentError(f"shapes are on {shapes.device} and not on {self.device}")
         check.choice("estimator", estimator, ESTIMATORS)
         self.photons = check.integer("photons", photons, 1, 1 << 26)
-        self.shapes, self._use_warp_bvh = shapes, use_warp_bvh
+        self.shapes, self._estimator = shapes, estimator
         worlds = self._world.numpy().tolist()
         if max(worlds) >= shapes.worlds:
             raise ArgumentError(f"world = {max(worlds)} is none of the {shapes.worlds} worlds of the shapes")
@@ -307,7 +305,6 @@ class SpadTracer(WorldCameras):
         self._taps = wp.array(np.pad(taps, (_RUN - 1) * self._parts), dtype=float, device=self.device)
         lanes = check.integer("lanes", lanes, 1, 64)
         self._lane_count = min(lanes, self.cameras if self.device.is_cuda else 1)
-        self._estimator = estimator
         self._models: list[Model] = []
         # Memory that cameras share which are traced one after the other; lanes run side by side on a GPU, each on its
         # stream, None for the current one. Tally and cursor are a lane's own, ledger and offset those of all.
@@ -375,7 +372,7 @@ class SpadTracer(WorldCameras):
         # 2^62 units hold the thousandth part of all photons in one bin; 2^58 units are the largest contribution.
         scale = min(2.0**72 / self.photons, 2.0**58)
         extent = gate.stop + math.hypot(*config.laser_position)  # no photon that counts comes further
-        moving: dict[str, Any] = {"camera": camera, "extent": extent, "use_warp_bvh": self._use_warp_bvh}
+        moving: dict[str, Any] = {"camera": camera, "extent": extent}
         self._face_shape, models = [], []
         for mesh, owner in zip(self._meshes.build(), self._meshes.face_shape, strict=True):
             self._face_shape.append(wp.array(owner, dtype=int, device=self.device))

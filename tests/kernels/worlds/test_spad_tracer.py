@@ -10,8 +10,7 @@ from helpers.worlds import SMALL, STILL, garden, square, transforms
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("use_warp_bvh", [False, True])
-def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
+def test_without_scattering_both_cameras_see_the_same(device):
     """Light of the whole image and of its parts, in absorbing water; edges of polygons aside."""
     config = sk.SpadConfig(**SMALL, absorption=0.05, scattering=0.0, dark_rate=2e3)
     fine = dataclasses.replace(config, width=64, height=48, dark_rate=0.0)  # the camera's rays are at pixel centres
@@ -21,7 +20,7 @@ def test_without_scattering_both_cameras_see_the_same(use_warp_bvh, device):
     camera.update(shapes, poses, bodies)
     dark = config.dark_rate * config.bin_path / config.speed
     theirs = camera.rates.numpy().astype(float).reshape(2, 12, 4, 16, 4, 64).sum(axis=(2, 4))
-    tracer = sk.SpadTracer(shapes, config, 2, photons=400_000, frame="optical", use_warp_bvh=use_warp_bvh)
+    tracer = sk.SpadTracer(shapes, config, 2, photons=400_000, frame="optical")
     tracer.update(poses, bodies)
     mine = tracer.rates.numpy() - dark
     for world in range(2):
