@@ -263,6 +263,7 @@ def test_the_hazard_distance_is_where_the_limit_is(profile):
     assert eye_limit(laser, distance=5.0).pulse_energy == pytest.approx(per_area / axis_fluence(laser, 5.0), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_safe_distance_in_water_is_that_of_absorption_alone_where_nothing_scatters():
     """Of a beam narrower than the pupil, which `plan` reports as well; on the safe side, by 12 % at most."""
     laser = {"profile": "collimated", "beam_radius": 0.002, "half_angle_deg": None, "pulse_energy": 1e-7}

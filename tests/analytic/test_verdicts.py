@@ -54,6 +54,7 @@ def test_a_range_that_is_not_judged_counts_neither_as_reached_nor_as_not(start, 
         assert gap is None and near == pytest.approx(23.0, rel=0.04) == far
 
 
+@pytest.mark.slow
 def test_the_page_shows_verdicts_as_they_are_printed():
     page = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
     found, terms = plan(20_000), dict.fromkeys(("shot noise", "total"), 0.0)

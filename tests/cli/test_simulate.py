@@ -91,9 +91,13 @@ def test_lines_are_runs_of_their_own_beside_what_has_all_of_them(scene, tmp_path
         assert np.array_equal(spadwarp.load(out / f"{line:g}nm").tallies, own.tallies)
     refused = run("simulate", scene, "--out", out, *changes, "--records", code=2)
     assert "--records" in refused.output and "cannot be combined" in refused.output
+
+
+@pytest.mark.slow
+def test_a_spectrum_is_a_result_beside_its_lines(scene, tmp_path):
     broad = ["--set=laser.linewidth_nm=1", "--set=laser.wavelengths_nm=spectrum", "--photons=500"]
-    run("simulate", scene, "--out", tmp_path / "broad", *DEVICE, *broad)
-    assert {path.name for path in (tmp_path / "broad").iterdir()} == FILES | {"spectrum.h5"}
+    run("simulate", scene, "--out", tmp_path / "out", *DEVICE, *broad)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES | {"spectrum.h5"}
 
 
 def test_records_are_those_of_trace(scene, tmp_path):

@@ -48,6 +48,7 @@ def assert_is_frame(row, item, manifest, name="{}"):
     assert numbers["target"] == manifest["targets"][item["target"]]
 
 
+@pytest.mark.slow
 def test_hugging_face_loads_parquet_in_one_line(folder, parquet, tmp_path, monkeypatch):
     datasets = pytest.importorskip("datasets")
     loaded = datasets.load_dataset(str(parquet), cache_dir=str(tmp_path / "cache"))
@@ -111,6 +112,7 @@ def test_archives_are_read_by_webdataset_and_without_a_library(folder, tmp_path)
     gc.collect()  # it leaves archives open
 
 
+@pytest.mark.slow
 def test_xarray_opens_zarr(folder, tmp_path):
     pytest.importorskip("zarr")
     xarray = pytest.importorskip("xarray")

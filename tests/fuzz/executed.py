@@ -6,6 +6,7 @@ import io
 import math
 import os
 import re
+import subprocess
 import sys
 import tempfile
 import warnings
@@ -113,6 +114,11 @@ def _changed(scene: str, name: str, command: str) -> tuple[int, str]:
 
 def _command(arguments: tuple[str, ...]) -> tuple[int, str]:
     """Exit code and stderr."""
+    if arguments[0] == "train":  # what torch knows of threads and of GPUs does not survive a fork
+        run = [sys.executable, "-m", "spadwarp", *arguments]
+        done = subprocess.run(run, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True)
+        text = done.stderr.decode(errors="replace")
+        return (done.returncode, text) if done.returncode >= 0 else (BUG, f"signal {-done.returncode}: {text}")
     out, err = io.TextIOWrapper(io.BytesIO()), io.TextIOWrapper(io.BytesIO(), errors="replace")
     code = 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

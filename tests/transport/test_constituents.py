@@ -152,6 +152,7 @@ def thinner(molecules=1.0, algae=0.6, **sections):
     return scene(**sections | {"medium": mixed(*parts, **sections.get("medium", {}))})
 
 
+@pytest.mark.slow
 def test_single_scatter_and_its_derivatives_are_those_of_the_quadrature(device):
     one = thinner(**ONCE | {"medium": {"group_index": 1.0}})
     found = spadwarp.simulate(one, photons=400_000, device=device, derivatives=["molecules", "algae"])

@@ -56,7 +56,7 @@ WATERS = {
         pytest.param("layers", "next_event", marks=pytest.mark.slow),
         ("layers", "guided"),
         pytest.param("cells", "guided", marks=pytest.mark.slow),
-        ("cells by delta tracking", "next_event"),
+        pytest.param("cells by delta tracking", "next_event", marks=pytest.mark.slow),
     ],
 )
 def test_ballistic_return_of_a_lambertian_plate_meets_the_closed_form(estimator, water, device):

@@ -198,6 +198,7 @@ def test_parts_of_a_run_and_files_keep_the_bits(tmp_path):
     assert data["sea_fluence"].item() == whole.flux["sea"]["fluence"].values.item()
 
 
+@pytest.mark.slow
 def test_fluence_of_a_beam_from_a_turned_camera_by_gate():
     """In water that only absorbs; sections are in the world's frame."""
     edges, speed = np.linspace(0.5, 4.5, 9), 0.299792458

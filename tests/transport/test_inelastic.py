@@ -64,6 +64,7 @@ def test_single_scatter_is_the_quadrature_with_both_coefficients(estimator, devi
         np.testing.assert_allclose(by_path(run, k), expected, rtol=2e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [2.3, -5.0])
 def test_each_layer_has_coefficients_of_its_own(start, device):
     """Two waters, and two of which the second is everywhere in sight, against quadrature of single scattering."""

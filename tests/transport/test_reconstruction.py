@@ -18,8 +18,8 @@ def runs() -> tuple[Result, Result]:
     scene = spadwarp.load_scene("configs/scenes/staircase_15m.toml").with_overrides(
         {"camera.width": 32, "camera.height": 24, "medium.extinction": 0.1}
     )
-    few = spadwarp.simulate(scene, photons=100_000, seed=1, device="cpu")
-    return spadwarp.reconstruct(few, device="cpu"), spadwarp.simulate(scene, photons=1_600_000, seed=2, device="cpu")
+    few = spadwarp.simulate(scene, photons=50_000, seed=1, device="cpu")
+    return spadwarp.reconstruct(few, device="cpu"), spadwarp.simulate(scene, photons=800_000, seed=2, device="cpu")
 
 
 def test_energy_of_each_component_is_that_of_the_tallies(runs: tuple[Result, Result]) -> None:

@@ -215,7 +215,7 @@ def test_wrong_use_is_named(arguments, text, whole):
 # Checkpoints and failures
 
 
-@pytest.mark.parametrize("device", ["cpu", "cpu,cpu"])
+@pytest.mark.parametrize("device", [pytest.param("cpu", marks=pytest.mark.slow), "cpu,cpu"])
 def test_a_device_that_disappears_costs_what_was_not_in_a_checkpoint(device, whole, tmp_path, monkeypatch):
     """After 120 launches."""
     place, prepare, calls = tmp_path / "checkpoint.h5", sk.prepare_transport, itertools.count()

@@ -192,6 +192,7 @@ def test_the_estimators_agree_in_a_moving_scan(device, pattern):
     agreeing_cells(one, device, photons=photons, seeds=16, converged=0.1, pixels=pattern == "push_broom", clear=True)
 
 
+@pytest.mark.slow
 def test_a_row_of_a_push_broom_array_shares_the_photons_of_its_shot():
     one = _moving(scan={**MOVING, "pattern": "push_broom"})
     result = simulate(one, photons=1001, seed=5, device="cpu")

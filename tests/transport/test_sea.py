@@ -146,6 +146,7 @@ def test_derivatives_are_differences_of_runs_with_the_same_random_numbers():
     assert (error < 0.03 * mean)[mean > 0.0].all()
 
 
+@pytest.mark.slow
 def test_masking_is_an_entry_of_the_energy_balance():
     """At most 1.4 % of light from the air up to 60°, and 3 % of light from the water up to 48°, up to 12 m/s."""
     for angle, place, most in ((0.0, "both in air", 0.014), (60.0, "both in air", 0.014), (45.0, "below", 0.03)):

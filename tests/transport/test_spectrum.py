@@ -76,6 +76,7 @@ def test_lines_have_an_axis():
     assert (data["histogram"].sel(wavelength=480.0) != data["histogram"].sel(wavelength=500.0)).any()
 
 
+@pytest.mark.slow
 @pytest.mark.physics
 def test_monte_carlo_over_the_spectrum_is_the_analytic_sum():
     """Eq 7: unscattered light of the target through a filter, of a laser over whose width the water changes much."""

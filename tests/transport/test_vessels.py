@@ -59,6 +59,7 @@ def test_guided_is_next_event_in_a_bright_vessel_with_at_most_its_error(name, de
     assert errors[1][1] / math.sqrt(seeds) < 0.01  # the comparison has teeth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("extinction", "reflectance", "bound"), [(1e-4, 1.0, 4.0), (4.0, 1.0, float(LARGEST_WEIGHT_RATIO))]
 )

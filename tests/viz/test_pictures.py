@@ -219,6 +219,10 @@ def draw_measured(path, width):
     module.draw(one, one, path)
 
 
+# Of each module of pictures some; those of results, frames and scenes are drawn in notebooks and commands, too.
+QUICK = {"histogram", "frames", "denoised_alone", "sweep", "sweep_names", "budget", "targets", "scores", "reliability"}
+QUICK |= {"curves", "case", "narrow", "video"}
+
 PICTURES_OF_THE_DOCS = {
     "limits": draw_limits,
     "measured": draw_measured,
@@ -233,8 +237,7 @@ PICTURES_OF_THE_DOCS = {
         pytest.param(
             kind,
             width,
-            marks=[pytest.mark.slow]
-            * (kind == "sweep_plan" or (width == style.PAGE and draw not in AS_WIDE_AS_A_PAGE)),
+            marks=[pytest.mark.slow] * (kind not in QUICK or (width == style.PAGE and draw not in AS_WIDE_AS_A_PAGE)),
         )
         for kind, draw in PICTURES.items()
         for width in (style.PAGE, style.COLUMN)[: 1 + (draw not in AS_WIDE_AS_A_PAGE)]

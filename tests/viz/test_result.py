@@ -18,7 +18,10 @@ NAMES = ["depth.png", "intensity.png", "histogram.png", "truth.png"]
     "result",
     [
         make_result(make_scene(targets=[]), empty=True),
-        dataclasses.replace(make_result(make_scene(distance=1000.0)), partial=True, seed=2**64 - 1),
+        pytest.param(
+            dataclasses.replace(make_result(make_scene(distance=1000.0)), partial=True, seed=2**64 - 1),
+            marks=pytest.mark.slow,
+        ),
         make_result(make_scene(width=1, height=1, bins=8)),
     ],
     ids=["empty", "far away", "a pixel"],

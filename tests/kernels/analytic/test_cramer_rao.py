@@ -107,8 +107,9 @@ def outlier_probability(signal, level, window):
     return analytic.outlier_probabilities(*arrays).numpy().reshape(values[0].shape)
 
 
-HARD = [(20, 20, 50), (40, 20, 50), (20, 20, 200), (60, 200, 100)]
-HARD += [(8, 1, 1000), (12, 1, 1000), (5, 0.1, 1000), (3, 0.03, 500)]
+HARD = [(20, 20, 50), (60, 200, 100), (5, 0.1, 1000)]
+MORE = [(40, 20, 50), (20, 20, 200), (8, 1, 1000), (12, 1, 1000), (3, 0.03, 500)]
+HARD += [pytest.param(*one, marks=pytest.mark.slow) for one in MORE]
 
 
 @pytest.mark.physics

@@ -122,7 +122,12 @@ SMALL = {"width": 80, "height": 60}
 
 @pytest.mark.parametrize(
     ("method", "world"),
-    [("peak", "water"), ("centroid", "air"), ("matched", "dark counts"), ("likelihood", "water")],
+    [
+        pytest.param("peak", "water", marks=pytest.mark.slow),
+        ("centroid", "air"),
+        pytest.param("matched", "dark counts", marks=pytest.mark.slow),
+        ("likelihood", "water"),
+    ],
 )
 def test_a_camera_sees_nothing_in_an_empty_world(method, world, device):
     """One false alarm in a hundred pixels, which shows in few of them."""
