@@ -130,7 +130,7 @@ LINES = {
     "validate": (750, 869),
     "viz": (2200, 2545),
     "water": (800, 853),
-    "kernels/spadwarp_kernels": (50, 45),
+    "kernels/spadwarp_kernels": (50, 50),
     "kernels/analytic": (1650, 1681),
     "kernels/base": (950, 1214),
     "kernels/detection": (1000, 1349),
