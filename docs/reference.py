@@ -314,6 +314,7 @@ def kernels() -> str:
         "Warp functions (`wp.func`) go into kernels of your own; structs and the other functions are for Python. "
         "All names stand at the top, as `sk.NAME`, too."
     ]
+    assert spadwarp_kernels.__all__  # which lists those of each package
     for folder in pkgutil.iter_modules(spadwarp_kernels.__path__):
         package = import_module(f"spadwarp_kernels.{folder.name}")
         if names := getattr(package, "__all__", ()):

@@ -111,20 +111,6 @@ def may_be_hidden(view: wp.vec4, near_depth: wp.array2d[float], x: wp.vec3) -> b
 
 
 @wp.func
-def _same_gate(camera: Camera, gate: Gate) -> Gate:
-    return gate
-
-
-@wp.func
-def _gate_behind_port(camera: Camera, gate: Gate) -> Gate:
-    """For the least and the largest time that the port may save against the straight line."""
-    wide = gate
-    wide.start = gate.start - camera.port.late
-    wide.stop = gate.stop + camera.port.early
-    return wide
-
-
-@wp.func
 def _side(view: wp.vec4, k: int) -> wp.vec3:
     """Side plane k of a view (left, top, right, bottom): a normal outwards, for planes through the origin."""
     if k == 0:
@@ -517,8 +503,7 @@ def _make_clear(sea: SeaKind) -> wp.Function:
 
 @memoised
 def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
-    """`clip`, `shows` and `gate` of a `Sight` with the surface of a sea, for flights in the water; `shows` of the
-    lens."""
+    """`clip` and `shows` of a `Sight` with the surface of a sea, for flights in the water; `shows` of the lens."""
 
     @wp.func
     def clip(camera: Camera, view: wp.vec4, x: wp.vec3, u: wp.vec3, o: wp.vec3, limit: float) -> wp.vec2:
@@ -539,13 +524,13 @@ def _make_sea_view(shows: wp.Function) -> tuple[wp.Function, ...]:
         # Some of the water is above the mean plane.
         return shown or wp.abs(wp.dot(x, camera.port.normal) - camera.port.distance) < camera.port.amplitude
 
-    return clip, shows_point, _gate_behind_port
+    return clip, shows_point
 
 
-# Of what lies behind a kind of port: `clip`, `shows` and `gate`.
+# Of what lies behind a kind of port: `clip` and `shows`.
 _VIEWS = {
-    FLAT_PORT.name: (clip_to_flat_view, flat_view_shows, _gate_behind_port),
-    DOME_PORT.name: (clip_to_dome_view, dome_view_shows, _gate_behind_port),
+    FLAT_PORT.name: (clip_to_flat_view, flat_view_shows),
+    DOME_PORT.name: (clip_to_dome_view, dome_view_shows),
 }
 
 
@@ -583,6 +568,7 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind |
     """For a way of imaging, a kind of port or None, and whether pixels are scanned; `sea`: the surface of a sea, and no
     port."""
     moves, waves = lens.name == SCANNED.name, sea is not None and sea.name == WAVES.name
+    bends = port is not None or sea is not None
 
     @wp.func
     def scan_view(camera: Camera, scan: Scan, target: int) -> wp.vec4:
@@ -591,7 +577,16 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind |
             view = scan.view[target]
         return view
 
-    cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows, _same_gate)
+    @wp.func
+    def gate_of(camera: Camera, gate: Gate) -> Gate:
+        """For the least and the largest time that a port may save against the straight line."""
+        wide = gate
+        if wp.static(bends):
+            wide.start = gate.start - camera.port.late
+            wide.stop = gate.stop + camera.port.early
+        return wide
+
+    cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows)
     if port is not None:
         cosines, may_hide, view = port.cosines, _may_hide_anywhere, _VIEWS[port.name]
     leave, link = _make_link(port)
@@ -604,4 +599,4 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind |
     pose = make_pose(moves)
     placed = _make_placed(pose, moves and sea is not None, waves)
     clear = _make_clear(sea) if sea and waves else _always_clear
-    return Sight(cosines, *imaging, *view, may_hide, *ways, make_sample_lens(port), pose, *placed, sea, clear)
+    return Sight(cosines, *imaging, *view, gate_of, may_hide, *ways, make_sample_lens(port), pose, *placed, sea, clear)

@@ -203,16 +203,6 @@ _UPPER_24 = wp.constant(wp.uint32(0xFFFFFF00))
 _KIB_IN_TREE = 31
 
 
-@wp.func
-def _lane(lane: int, takes: bool) -> int:
-    return lane
-
-
-@wp.func
-def _among_takers(lane: int, takes: bool) -> int:
-    return vote(takes)[0]
-
-
 def _has_more(spec: TransportSpec, flights: bool) -> bool:
     """Whether a request has an interval, a point of the lens or a target."""
     return flights or spec.confocal
@@ -304,8 +294,7 @@ def make_queue(
         traces: Whether there are lanes that take none, since they wait for a shadow ray.
     """
     confocal, polarised, has_slot, more = spec.confocal, spec.polarised, spec.mesh or spec.sea, _has_more(spec, flights)
-    rank_of, lines = _among_takers if traces else _lane, spec.lines
-    derivative_vectors = -(-len(spec.derivatives) // 4)
+    lines, derivative_vectors = spec.lines, -(-len(spec.derivatives) // 4)
     carried = 3 + more
     entries, vectors = _size(spec, flights, long)
     write_words, read_words = _make_words(spec, more, 2 * entries)
@@ -346,7 +335,10 @@ def make_queue(
     @wp.func
     def pop(memory: int, lane: int, takes: bool, size: int, count: int) -> Request:
         request = Request()
-        index = wp.max(size - count, 0) + rank_of(lane, takes)
+        rank = lane
+        if wp.static(traces):
+            rank = vote(takes)[0]
+        index = wp.max(size - count, 0) + rank
         request.wanted = takes and index < size
         entry = wp.min(index, size - 1)
         a = get(memory, entry, 0)

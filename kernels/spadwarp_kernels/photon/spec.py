@@ -129,8 +129,7 @@ class TransportSpec(NamedTuple):
     @property
     def water(self) -> Water:
         """Of the water, with the phase function."""
-        water = self.grid or (LAYERED if self.layered else HOMOGENEOUS)
-        return water._replace(phase=self.phase, at=water.mixture_at if self.phase.constituents else water.at)
+        return (self.grid or (LAYERED if self.layered else HOMOGENEOUS))._replace(phase=self.phase)
 
     @property
     def domain(self) -> Domain:

@@ -17,11 +17,13 @@ the thread keeps a list of them.
 import warp as wp
 
 from spadwarp_kernels.base.kernels import memoised
+from spadwarp_kernels.base.philox import u01
 from spadwarp_kernels.base.rotations import one_minus_cosine, snap_from
 from spadwarp_kernels.photon.derivatives import NOT_MET, Blocks, LogDerivatives, met_count, met_entry, score_entry
 from spadwarp_kernels.photon.spec import TransportSpec
-from spadwarp_kernels.photon.state import SEA_SLOT, Carried, CarriedRef, Contribution, WorldRef
+from spadwarp_kernels.photon.state import SEA_SLOT, Carried, CarriedRef, Contribution, PhotonRef, SinkRef, WorldRef
 from spadwarp_kernels.surface.triangle import face_in
+from spadwarp_kernels.tally.flux import Leg, add_flux_collision, add_flux_crossings, add_flux_track
 from spadwarp_kernels.water.grid import first_place, grid_cell, grid_line, next_place
 from spadwarp_kernels.water.medium import boundary_ahead, layer_index
 from spadwarp_kernels.water.phase_functions import henyey_greenstein_log_derivative
@@ -331,3 +333,37 @@ def _make_block_event(spec: TransportSpec, beside: Rider) -> wp.Function:
                     blocks.memory[entry] = blocks.memory[entry] + 1.0 / coefficient
 
     return event
+
+
+# ---- The tally of flux: what the legs and collisions of a photon add to the sections of a spec's kinds.
+
+
+@memoised
+def make_flux_score(spec: TransportSpec) -> wp.Function | None:
+    """The Warp function ``(s, world, sink, length, collides)``, of a leg of that length [m], which may end in a
+    collision with the water; None without flux. Legs are drawn with the extinction itself, so that their weight is
+    that of the light all the way. Legs in the air above a sea add nothing."""
+    if not spec.flux:
+        return None
+    tracks, collisions, planes = (kind in spec.flux for kind in ("track", "collision", "planes"))
+
+    @wp.func
+    def score_flux(s: PhotonRef, world: WorldRef, sink: SinkRef, length: float, collides: bool):
+        if wp.static(spec.sight.sea is not None):
+            if s.above:
+                return
+        leg = Leg(s.x, s.u, length, s.path, s.weight.value, u01(s.flight.block[3]))
+        if wp.static(tracks):
+            for k in range(world.flux.tracks.shape[0]):
+                add_flux_track(world.flux.tracks[k], sink.flux, sink.flux_halves, leg)
+        if wp.static(planes):
+            for k in range(world.flux.planes.shape[0]):
+                add_flux_crossings(world.flux.planes[k], world.flux.positions, sink.flux, sink.flux_halves, leg)
+        if wp.static(collisions):
+            if collides:
+                extinction = spec.water.at(world.medium, world.layers, leg.x + length * leg.u).extinction
+                add_flux_collision(world.flux.collision, sink.flux, sink.flux_halves, leg, extinction)
+                for k in range(1, world.flux.collisions.shape[0]):
+                    add_flux_collision(world.flux.collisions[k], sink.flux, sink.flux_halves, leg, extinction)
+
+    return score_flux

@@ -12,7 +12,7 @@ from spadwarp_kernels.estimators.registry import make_estimator
 from spadwarp_kernels.photon.queue import Request, long_queue_fits, make_queue
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import PhotonRef, SinkRef, WorldRef, is_planned, make_deposit
-from spadwarp_kernels.riders.flux import make_flux_score
+from spadwarp_kernels.riders.riders import make_flux_score
 from spadwarp_kernels.surface.bvh import segment_meets_box
 
 from . import stages

@@ -328,21 +328,15 @@ def grid_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     if cell >= 0:
         water.extinction = load_float(layers.grid.extinction, cell)
         water.albedo = load_float(layers.grid.albedo, cell)
-    # Apart, so that who asks for the phase function alone looks up nothing without it.
+    # Apart, so that who asks for the phase function alone looks up nothing without them.
     if layers.grid.anisotropy.shape[0] > 0:
         cell = grid_cell(layers.grid, x)
         if cell >= 0:
             water.anisotropy = load_float(layers.grid.anisotropy, cell)
-    return water
-
-
-@wp.func
-def grid_mixture(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
-    """`grid_water` with the shares of its constituents."""
-    water = grid_water(medium, layers, x)
-    cell = grid_cell(layers.grid, x)
-    if cell >= 0:
-        water.shares = layers.grid.shares[cell]
+    if layers.grid.shares.shape[0] > 0:
+        cell = grid_cell(layers.grid, x)
+        if cell >= 0:
+            water.shares = layers.grid.shares[cell]
     return water
 
 
@@ -425,10 +419,8 @@ def ratio_extinction(medium: Medium, layers: Layers, x: wp.vec3, u: wp.vec3, len
     return (depth - wp.log(wp.max(part, 1.0e-30))) / wp.max(length, 1.0e-30)
 
 
-REGULAR_TRACKING = Water(
-    regular_free_path, regular_extinction, grid_water, grid_mixture, Profile(depth_along, draw_by_cells)
-)
-DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, grid_mixture, Profile(depth_by_block))
+REGULAR_TRACKING = Water(regular_free_path, regular_extinction, grid_water, Profile(depth_along, draw_by_cells))
+DELTA_TRACKING = Water(delta_free_path, ratio_extinction, grid_water, Profile(depth_by_block))
 
 
 # ---- Grids from arrays.

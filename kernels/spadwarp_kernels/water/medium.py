@@ -270,14 +270,8 @@ def layered_water(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
     water.extinction = layers.extinction[layer]
     water.albedo = layers.albedo[layer]
     water.anisotropy = layers.anisotropy[layer]
-    return water
-
-
-@wp.func
-def layered_mixture(medium: Medium, layers: Layers, x: wp.vec3) -> Medium:
-    """`layered_water` with the shares of its constituents."""
-    water = layered_water(medium, layers, x)
-    water.shares = layers.shares[layer_index(layers, wp.dot(layers.axis, x))]
+    if layers.shares.shape[0] > 0:
+        water.shares = layers.shares[layer]
     return water
 
 
@@ -325,14 +319,13 @@ class Water(NamedTuple):
     # exp(-extinction length) has the expectation of what passes
     extinction: wp.Function
     at: wp.Function  # ``(medium, layers, x) -> Medium``, the water at a point
-    mixture_at: wp.Function  # the same with the shares of several constituents
     profile: Profile | None = None  # how `guided` draws a point of a flight in a grid; None: with the mean extinction
     layered: bool = False
     phase: Any = None  # the phase function, of the water of a spec
 
 
-HOMOGENEOUS = Water(_free_path, _extinction, _water, _water)
-LAYERED = Water(layered_free_path, layered_extinction, layered_water, layered_mixture, layered=True)
+HOMOGENEOUS = Water(_free_path, _extinction, _water)
+LAYERED = Water(layered_free_path, layered_extinction, layered_water, layered=True)
 
 
 def mixture_shares(shares: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
