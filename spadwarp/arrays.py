@@ -13,14 +13,16 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from spadwarp.values import ArgumentError, guarded, shown
+from spadwarp.values import ArgumentError, Interval, guarded, shown
 
 __all__ = ["Variable", "as_warp", "caller_tallies", "histogram_rows", "in_torch_order", "is_torch", "labelled"]
 __all__ += ["on_host", "output_tensor", "real_array", "tensor_of", "to_pandas"]
 
 if TYPE_CHECKING:
+    import pandas
     import torch
     import warp as wp
+    import xarray
 
 
 def as_warp(array: Any, *, name: str, device: Any = None) -> Any:
@@ -92,15 +94,23 @@ def on_host(array: Any) -> Any:
     return array.detach().cpu().numpy() if is_torch(array) else array
 
 
-def real_array(name: str, values: Any, dtype: DTypeLike = np.float32) -> NDArray[Any]:
-    """A copy of an argument as an array of real numbers, also of a tensor. Raises `ArgumentError`."""
+def real_array(
+    name: str, values: Any, dtype: DTypeLike = np.float32, *, shapes: Sequence[tuple[int, ...]] = (), within: str = ""
+) -> NDArray[Any]:
+    """A copy of an argument as an array of real numbers, also of a tensor: of one of the shapes, and with all values in
+    the range, such as "[0, inf)", where these are given. Raises `ArgumentError`."""
     try:
         given, kind = np.asarray(on_host(values)), np.dtype(dtype)
     except (TypeError, ValueError) as error:  # rows of several lengths, no type
         raise ArgumentError(f"{name} = {shown(values)}, dtype = {shown(dtype)}: {error}") from error
     if given.dtype.kind not in "biuf" or kind.kind not in "biuf":
         raise ArgumentError(f"{name} = {shown(values)} is not an array of real numbers ({kind})")
-    return given.astype(kind)
+    if shapes and given.shape not in shapes:
+        raise ArgumentError(f"{name} has shape {given.shape}; {' or '.join(map(str, shapes))} is needed")
+    array = given.astype(kind)
+    if within and not (inside := Interval.read(within).holds(array)).all():
+        raise ArgumentError(f"{name} holds {array[~inside][0]}, which is outside {within}")
+    return array
 
 
 def is_torch(array: Any) -> bool:
@@ -157,10 +167,8 @@ def output_tensor(out: Any, *, name: str, shape: Sequence[int], device: wp.Devic
     if not is_torch(out):
         raise ArgumentError(f"{name} is a {type(out).__name__}; a torch tensor is needed")
     if out.dtype != torch.int32 or out.shape != shape or not out.is_contiguous() or out.device != place:
-        raise ArgumentError(
-            f"{name} is {out.dtype} {tuple(out.shape)} on {out.device}; contiguous torch.int32 {shape} on {place} is "
-            "needed"
-        )
+        needed = f"contiguous torch.int32 {shape} on {place} is needed"
+        raise ArgumentError(f"{name} is {out.dtype} {tuple(out.shape)} on {out.device}; {needed}")
     return out
 
 
@@ -176,21 +184,14 @@ def caller_tallies(tallies: Any, *, shape: Sequence[int], device: wp.Device) -> 
     array: Any = wp.from_torch(tallies, requires_grad=False) if is_torch(tallies) else tallies
     size = int(np.prod(shape))
     if array.dtype is not wp.int64 or array.size != size or not array.is_contiguous or array.device != device:
-        raise ArgumentError(
-            f"tallies are {array.dtype.__name__} {tuple(array.shape)} on {array.device}; contiguous int64 "
-            f"{tuple(shape)} on {device} is needed"
-        )
+        needed = f"contiguous int64 {tuple(shape)} on {device} is needed"
+        raise ArgumentError(f"tallies are {array.dtype.__name__} {tuple(array.shape)} on {array.device}; {needed}")
     with in_torch_order(tallies):
         array.zero_()
     return array.reshape((size,))
 
 
 # ---- Labelled arrays (xarray) and data frames (pandas); both are optional.
-
-
-if TYPE_CHECKING:
-    import pandas
-    import xarray
 
 
 Variable = tuple[tuple[str, ...], Any, str, str]

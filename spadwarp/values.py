@@ -317,12 +317,12 @@ def _fits(value: Any, kind: Any) -> bool:
         return any(value is item or (isinstance(value, str | int) and value == item) for item in inner)
     if kind is None or kind is Any:
         return kind is Any or value is None
-    if kind is float or kind is int:
-        needed = "__float__" if kind is float else "__index__"
+    if kind in (complex, float, int):  # of which each takes those behind it
+        needed = "__index__" if kind is int else "__float__"
         single = not isinstance(value, type | bool) and getattr(value, "ndim", 0) == 0
         if kind is int and getattr(getattr(value, "dtype", None), "kind", "i") not in ("i", "u", "b"):
             return False
-        return single and (hasattr(value, needed) or (kind is float and hasattr(value, "__index__")))
+        return single and (isinstance(value, kind) or hasattr(value, needed) or hasattr(value, "__index__"))
     plain = dict if is_typeddict(kind) else origin or kind
     if not isinstance(plain, type):
         return True
@@ -436,14 +436,12 @@ def read_real(name: str, cell: Any, within: str | Interval) -> float:
     """A number, or a text that stands for one, with a unit if the range has one; as `check_real`, whose errors it
     raises."""
     unit = (Interval.read(within) if isinstance(within, str) else within).unit
-    try:
-        if isinstance(cell, str):
+    if isinstance(cell, str):
+        try:
             cell = quantity(cell, unit) if unit else parse_number(cell)
-        return check_real(name, cell, within)
-    except ArgumentError:
-        raise
-    except ValueError as error:
-        raise ArgumentError(f"{name} = {shown(cell)} {error}") from None
+        except ValueError as error:
+            raise ArgumentError(f"{name} = {shown(cell)} {error}") from None
+    return check_real(name, cell, within)
 
 
 def check_part(name: str, value: Any) -> tuple[int, int]:

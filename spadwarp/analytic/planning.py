@@ -46,7 +46,6 @@ from spadwarp.values import (
     check_integer,
     range_from_time,
     read_real,
-    shown,
     time_from_path,
     time_from_range,
     with_prefix,
@@ -223,9 +222,8 @@ def plan(
         else:
             span = float(np.nanmin(distance)), float(np.nanmax(distance))
     else:
-        if not (isinstance(ranges, tuple | list) and len(ranges) == 2):
-            raise ArgumentError(f"ranges = {shown(ranges)} is not (least, largest) [m]")
-        span = read_real("ranges", ranges[0], "(-inf, inf) m"), read_real("ranges", ranges[1], "(-inf, inf) m")
+        least, largest = ranges
+        span = read_real("ranges", least, "(-inf, inf) m"), read_real("ranges", largest, "(-inf, inf) m")
         if not 0 < span[0] <= span[1] < math.inf:
             raise ArgumentError(f"ranges = {span} m: 0 < least <= largest < inf is needed")
         scene = with_plane(scene, span[1])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spadwarp.analytic.model import BackscatterTable, Map, pixel_maps, response_sigma, scene_optics, warn_of_model
-from spadwarp.arrays import labelled
+from spadwarp.arrays import labelled, real_array
 from spadwarp.device import pick_device
 from spadwarp.io.hdf5 import PACKED, PIXELS, Coordinate, image_coordinates, name_dimensions, read_hdf5, write_hdf5
 from spadwarp.result.file import as_result
@@ -301,12 +301,9 @@ def _profile(scene: Scene, profile: Any) -> NDArray[np.float32] | None:
         run = as_result(profile, "backscatter_profile")
         values = run.component("backscatter") * (scene.laser.photons_per_pulse * scene.detections_per_photon)
     else:
-        values = np.asarray(profile, np.float64)
-    shape = (camera.height, camera.width, bins)
-    if values.shape not in ((bins,), shape):
-        raise ArgumentError(f"backscatter_profile has shape {values.shape}; ({bins},) or {shape} is needed")
-    if not (np.isfinite(values).all() and (values >= 0).all()):
-        raise ArgumentError("backscatter_profile holds a value outside [0, inf)")
+        values = profile
+    shapes = ((bins,), (camera.height, camera.width, bins))
+    values = real_array("backscatter_profile", values, np.float64, shapes=shapes, within="[0, inf)")
     return np.ascontiguousarray(values.reshape(-1, bins), np.float32)
 
 

@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import real_array
 from spadwarp.device import pick_device
 from spadwarp.frames.response import InstrumentResponse, detector_response
 from spadwarp.result.file import ResultLike, as_result
@@ -79,13 +80,13 @@ def information_from_histogram(
 
     from spadwarp_kernels import analytic as kernels
 
-    signal = np.ascontiguousarray(signal_cube, np.float32)
-    background = np.asarray(background_cube, np.float32)
-    bins = signal.shape[-1] if signal.ndim else 0
-    if background.shape not in ((), (bins,), signal.shape) or signal.size == 0:
-        raise ArgumentError(f"background_cube has shape {background.shape}; (), ({bins},) or {signal.shape} is needed")
-    _check_cube("signal_cube", signal, signal.shape)
-    _check_cube("background_cube", background, background.shape)
+    signal = np.ascontiguousarray(real_array("signal_cube", signal_cube, within="[0, inf)"))
+    if signal.size == 0:
+        raise ArgumentError(f"signal_cube has shape {signal.shape}: no values")
+    bins = signal.shape[-1]
+    alike: Any = {"shapes": (signal.shape,), "within": "[0, inf)"}
+    either = ((), (bins,), signal.shape)
+    background = real_array("background_cube", background_cube, shapes=either, within="[0, inf)")
     bin_width = check_real("bin_width", bin_width, BIN_WIDTH)
     check_choice("law", law, ("poisson", "first_photon"))
     # Response per bin, and the derivative by the delay in bins of what one bin's photons leave in the others.
@@ -104,22 +105,14 @@ def information_from_histogram(
     noise = np.zeros_like(information)
     total = np.asarray(signal + background, np.float64).reshape(-1, bins)
     if signal_halves is not None:
-        halves = [_check_cube("signal_halves", np.asarray(half, np.float64), signal.shape) for half in signal_halves]
+        halves = [real_array("signal_halves", half, np.float64, **alike) for half in signal_halves]
         # The product of two slopes is the square of their mean less the square of half their difference.
         noise = _information_of_noise(0.5 * (halves[0] - halves[1]).reshape(-1, bins), total, taps, slope_taps, law)
     elif signal_variance is not None:
-        variance = _check_cube("signal_variance", np.asarray(signal_variance, np.float64), signal.shape)
+        variance = real_array("signal_variance", signal_variance, np.float64, **alike)
         noise = _information_of_noise(variance.reshape(-1, bins), total, taps, slope_taps, law, is_variance=True)
     shape = signal.shape[:-1]
     return information.reshape(shape) / bin_width**2, noise.reshape(shape) / bin_width**2
-
-
-def _check_cube(name: str, cube: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    if cube.shape != shape:
-        raise ArgumentError(f"{name} has shape {cube.shape}; {shape} is needed")
-    if not (np.isfinite(cube).all() and (cube >= 0).all()):
-        raise ArgumentError(f"{name} holds a value outside [0, inf)")
-    return cube
 
 
 def _information_of_noise(

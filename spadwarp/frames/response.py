@@ -15,7 +15,7 @@ from spadwarp.arrays import real_array
 from spadwarp.io.arrays import read_npy
 from spadwarp.io.text import read_columns, read_text
 from spadwarp.scene import Detector, Laser
-from spadwarp.values import BIN_WIDTH, TIME, ArgumentError, ConfigError, FileError, check_integer, check_real, shown
+from spadwarp.values import BIN_WIDTH, TIME, ArgumentError, ConfigError, FileError, check_integer, check_real
 
 __all__ = ["InstrumentResponse", "detector_response", "instrument_response", "read_response", "response_matrix"]
 
@@ -285,8 +285,6 @@ def response_matrix(
     `source_start`, `source_width`, `source_bins`: the axis of the source [s]; `edges`: of the detector bins [s],
     ascending, `[bins + 1]`; `period`: of the pulses [s], None: time does not wrap. Raises `ArgumentError`.
     """
-    if not isinstance(irf, InstrumentResponse):
-        raise ArgumentError(f"irf = {shown(irf)} is not an InstrumentResponse")
     source_start = check_real("source_start", source_start, TIME)
     source_width = check_real("source_width", source_width, BIN_WIDTH)
     source_bins = check_integer("source_bins", source_bins, "[1, 2147483647]")

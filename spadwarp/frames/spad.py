@@ -23,6 +23,7 @@ from spadwarp.arrays import (
     labelled,
     on_host,
     output_tensor,
+    real_array,
     tensor_of,
 )
 from spadwarp.frames.depth import Method, arrival_time
@@ -39,7 +40,6 @@ from spadwarp.values import (
     SpadwarpWarning,
     check_integer,
     check_real,
-    shown,
 )
 
 if TYPE_CHECKING:
@@ -70,21 +70,16 @@ class Window(NamedTuple):
         cls, detector: Detector, laser: Laser | None, window: tuple[float, int], bin_width: float, tdc_widths: Any
     ) -> Self:
         """The window of (start [s], bins); arguments as in `spadwarp.detect`. Raises `ArgumentError`."""
-        if not (isinstance(window, tuple | list) and len(window) == 2):
-            raise ArgumentError(f"window = {shown(window)} is not (start [s], bins)")
-        start = check_real("start of window", window[0], TIME)
-        bins = check_integer("bins of window", window[1], "[1, 1000000]")
+        start, bins = window
+        start, bins = check_real("start of window", start, TIME), check_integer("bins of window", bins, "[1, 1000000]")
         wrap, period = detector.wrap, math.inf if laser is None else 1.0 / laser.repetition_rate
         if wrap:
             # The detector knows no time beyond that from one pulse to the next.
             bins = min(bins, math.floor(period / bin_width * (1 + 1e-12)))
             if bins < 1:
                 raise ArgumentError(f"bin_width = {bin_width} s is longer than the pulse period, {period} s")
-        widths = np.ones(bins) if tdc_widths is None else np.asarray(tdc_widths, np.float64)
-        if widths.shape != (bins,):
-            raise ArgumentError(f"tdc_widths has shape {widths.shape}; ({bins},), the window's bins, is needed")
-        if not (np.isfinite(widths).all() and (widths > 0).all()):
-            raise ArgumentError(f"tdc_widths = {widths.min()} … {widths.max()} is outside (0, inf) s")
+        given = np.ones(bins) if tdc_widths is None else tdc_widths
+        widths = real_array("tdc_widths", given, np.float64, shapes=((bins,),), within="(0, inf)")
         edges = np.append(0.0, np.cumsum(widths / widths.mean())) * bin_width
         period = period if wrap else max(period, edges[-1])
         rest = period - edges[-1]
@@ -153,11 +148,7 @@ class Receiver:
             device=device,
         )
         if ambient is not None:
-            values: NDArray[np.float64] = np.asarray(ambient, np.float64)
-            if values.shape not in ((), shape[:2]):
-                raise ArgumentError(f"ambient has shape {values.shape}; a number or {shape[:2]} is needed")
-            if not (np.isfinite(values).all() and (values >= 0).all()):
-                raise ArgumentError("ambient holds a value outside [0, inf)")
+            values = real_array("ambient", ambient, np.float64, shapes=((), shape[:2]), within="[0, inf)")
             rates = noise.numpy() + np.broadcast_to(values, shape[:2]).reshape(-1)
             noise = wp.array(rates.astype(np.float32), dtype=wp.float32, device=noise.device)
         matrix = response_matrix(
@@ -578,9 +569,6 @@ def detect(
 
     source = as_result(source) if isinstance(source, str | os.PathLike) else source
     result, scene = source, getattr(source, "scene", None)
-    for name, value, kind in (("detector", detector, Detector), ("laser", laser, Laser)):
-        if not (value is None or isinstance(value, kind)):
-            raise ArgumentError(f"{name} = {shown(value)} is not the section {name} of a scene")
     if scene is not None:
         if gate_start is not None or bin_width is not None:
             raise ArgumentError("gate_start and bin_width are for arrays: a result has its own; give window instead")

@@ -80,9 +80,7 @@ def read_unknowns(scene: Scene, names: str | Sequence[str]) -> tuple[Unknown, ..
     return tuple(unknowns.values())
 
 
-def _read(scene: Scene, word: Any) -> Unknown:
-    if not isinstance(word, str):
-        raise ArgumentError(f"unknown: {shown(word)} is not a name")
+def _read(scene: Scene, word: str) -> Unknown:
     name, _, spread = word.partition(":")
     if spread not in ("", "pixel"):
         raise ArgumentError(f"unknown: {shown(word)} ends neither with a name nor with ':pixel'")

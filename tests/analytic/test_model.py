@@ -173,7 +173,7 @@ REFUSED = {
     "backscatter_profile is missing": profiled(None),
     r"shape \(7,\); \(200,\) or \(12, 16, 200\) is needed": profiled(np.zeros(7)),
     r"outside \[0, inf\)": profiled(np.full(200, -1e-9)),
-    r"a value outside \[0, inf\)": profiled(np.full(200, np.nan)),
+    r"backscatter_profile holds nan": profiled(np.full(200, np.nan)),
     "'lu2024' needs": uncovered(analytic={"form": "lu2024"}, laser=GAUSSIAN),
     "needs a diverging laser.profile": uncovered(laser={"profile": "collimated", "beam_radius": 0.5}),
     "the analytic model needs 'gaussian'": uncovered(detector={"irf": "exponentially_modified_gaussian"}),

@@ -8,7 +8,7 @@ import pytest
 import spadwarp
 from helpers.scenes import scene
 from reference import crlb
-from spadwarp.frames import InstrumentResponse, crlb_from_histogram
+from spadwarp.frames import InstrumentResponse, crlb_from_histogram, information_from_histogram
 from spadwarp.frames.response import FWHM_PER_SIGMA
 
 BIN = 1e-11
@@ -58,8 +58,8 @@ def test_pile_up_loses_information():
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"signal": [-1.0, 1.0]}, r"signal_cube holds a value outside \[0, inf\)"),
-        ({"background": [np.nan, 1.0]}, r"background_cube holds a value outside"),
+        ({"signal": [-1.0, 1.0]}, r"signal_cube holds -1.0, which is outside \[0, inf\)"),
+        ({"background": [np.nan, 1.0]}, r"background_cube holds nan"),
         ({"background": np.zeros(3)}, r"background_cube has shape \(3,\)"),
         ({"bin_width": 0.0}, r"bin_width = 0.0 is outside"),
         ({"irf": [1.0, 1.0]}, r"irf = \[1.0, 1.0\] is not an InstrumentResponse"),
@@ -69,6 +69,8 @@ def test_pile_up_loses_information():
 def test_wrong_input_is_named(changes, match):
     with pytest.raises(ValueError, match=match):
         bound(**{"signal": [1.0, 2.0], **changes})
+    with pytest.raises(ValueError, match="signal_halves = 5 is not of the type tuple"):  # and not the number before it
+        information_from_histogram([1.0, 2.0], 2.0, bin_width=BIN, signal_halves=5)
 
 
 def test_the_bound_of_a_monte_carlo_result_is_the_analytic_one_in_clear_water():

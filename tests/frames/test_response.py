@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from spadwarp.frames.response import (
-    InstrumentResponse,
-    instrument_response,
-    read_response,
-    response_matrix,
-)
+from spadwarp.frames import InstrumentResponse, instrument_response, read_response, response_matrix
 from spadwarp.values import ArgumentError
 
 PS = 1e-12
@@ -151,7 +146,7 @@ REFUSED = [
     ("times of a measured response", measured([0.0, 5e-324, 1e-323])),  # of no usable length
     ("pulse_fwhm = -1", response(pulse_fwhm=-1)),
     ("no density", lambda: InstrumentResponse().density(0.0)),
-    ("irf = 1e-10 is not an InstrumentResponse", matrix(irf=1e-10)),
+    ("irf = 1e-10 is not of the type InstrumentResponse", matrix(irf=1e-10)),
     ("source_width = -1e-10 is outside", matrix(source_width=-1e-10)),
     ("finite, ascending times", matrix(edges=[2.0, 1.0])),
     # In the wrong unit; fills no memory.

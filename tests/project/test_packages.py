@@ -110,8 +110,8 @@ def test_one_line_methods_have_one_line():
 # Lines of `*.py`: what a package is to come to, and what it has. What it has may only fall; a feature that needs more
 # lines deletes as many, or brings its own with a reason.
 LINES = {
-    "spadwarp": (750, 1502),
-    "analytic": (2000, 2519),
+    "spadwarp": (750, 1501),
+    "analytic": (2000, 2514),
     "benchmark": (500, 505),
     "checks": (800, 899),
     "cli": (2900, 3084),
@@ -119,8 +119,8 @@ LINES = {
     "denoise": (4300, 5054),
     "evaluation": (1600, 1598),
     "files": (1150, 1486),
-    "frames": (2500, 3052),
-    "inverse": (1900, 2344),
+    "frames": (2500, 3031),
+    "inverse": (1900, 2342),
     "io": (1200, 1485),
     "mesh": (1800, 1820),
     "parallel": (600, 566),
