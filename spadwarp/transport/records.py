@@ -40,12 +40,7 @@ _ARRAYS: dict[str, tuple[Any, tuple[str, ...], str, str]] = {
     "path": (np.float32, ("photon",), "m", "geometric path"),
     "collisions": (np.int32, ("photon",), "1", "events, surfaces included"),
     "reason": (np.int32, ("photon",), "1", "index into reasons"),
-    "log_derivatives": (
-        np.float32,
-        ("photon", "parameter"),
-        "1",
-        "derivative of the logarithm of what the history has met",
-    ),
+    "log_derivatives": (np.float32, ("photon", "parameter"), "1", "derivative of the logarithm of what was met"),
 }
 _READ_ME = "One row per photon. World: for a camera without pose its frame, +x right, +y down, +z forward."
 

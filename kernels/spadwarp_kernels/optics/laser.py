@@ -281,8 +281,7 @@ class Beam(NamedTuple):
     emit: wp.Function
     """``(laser, scan, seed, id) -> spatial_vector``: start [m], then unit direction, in the frame of the camera."""
     axis: wp.Function  # ``(laser, scan, target) -> vec3``, the beam's, for a position of the scan
-    enter: wp.Function | None  # this and the next: see `PortKind`; None without a port
-    cosines: wp.Function | None
+    port: PortKind | None  # what is between the laser and the water
     scans: bool
     pose: Pose
 
@@ -304,4 +303,4 @@ def make_beam(measured: bool, port: PortKind | None, scans: bool, moves: bool = 
         start, heading = emit_from(laser, axis(laser, scan, target), seed, id)
         return wp.spatial_vector(start, heading)
 
-    return Beam(emit, axis, port and port.enter, port and port.cosines, scans, make_pose(moves))
+    return Beam(emit, axis, port, scans, make_pose(moves))

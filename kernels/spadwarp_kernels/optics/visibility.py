@@ -296,7 +296,7 @@ class Sight(NamedTuple):
     """How the lens sees the water, as Warp functions: x and u are of the water, o is a point of the lens; in the frame
     of the camera, see `pose`."""
 
-    cosines: wp.Function | None  # see `PortKind`; None without a port
+    port: PortKind | None  # what is between the lens and the water
     project: wp.Function  # this and the next two: see `Lens`
     view: wp.Function
     toward_middle: wp.Function
@@ -586,17 +586,12 @@ def make_sight(lens: Lens, port: PortKind | None, confocal: bool, sea: SeaKind |
             wide.stop = gate.stop + camera.port.early
         return wide
 
-    cosines, may_hide, view = None, may_be_hidden, (clip_to_view, lens.shows)
-    if port is not None:
-        cosines, may_hide, view = port.cosines, _may_hide_anywhere, _VIEWS[port.name]
     leave, link = _make_link(port)
     ways = (leave, _make_sea_link(sea) if sea else link, *_make_ways(port, sea))
-    if sea:
-        view = _make_sea_view(lens.shows)
-    if moves or sea:
-        may_hide = _may_hide_anywhere
+    view = _make_sea_view(lens.shows) if sea else _VIEWS[port.name] if port else (clip_to_view, lens.shows)
+    may_hide = _may_hide_anywhere if bends or moves else may_be_hidden
     imaging = (lens.project, lens.view, lens.toward_middle, scan_view)
     pose = make_pose(moves)
     placed = _make_placed(pose, moves and sea is not None, waves)
     clear = _make_clear(sea) if sea and waves else _always_clear
-    return Sight(cosines, *imaging, *view, gate_of, may_hide, *ways, make_sample_lens(port), pose, *placed, sea, clear)
+    return Sight(port, *imaging, *view, gate_of, may_hide, *ways, make_sample_lens(port), pose, *placed, sea, clear)

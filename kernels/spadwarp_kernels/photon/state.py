@@ -17,7 +17,7 @@ from spadwarp_kernels.surface.ray_cast import SurfaceHit
 from spadwarp_kernels.tally import ledger
 from spadwarp_kernels.tally.flux import Flux
 from spadwarp_kernels.tally.ledger import add_to_ledger, to_ledger
-from spadwarp_kernels.tally.tally import COMPONENTS, add_pending, add_to_words, atomic_add_int64, tally_components
+from spadwarp_kernels.tally.tally import BACKSCATTER, add_pending, add_to_words, atomic_add_int64, tally_components
 from spadwarp_kernels.water.limits import Limits
 from spadwarp_kernels.water.medium import Layers, Lines, Medium
 from spadwarp_kernels.water.phase_functions import Guiding
@@ -317,9 +317,6 @@ def tally_index(camera: Camera, gate: Gate, pixel: int, path: float, component: 
     if k < 0:
         return k
     return (component * camera.width * camera.height + pixel) * gate.bins + k
-
-
-BACKSCATTER = wp.constant(COMPONENTS.index("backscatter"))
 
 
 @wp.func

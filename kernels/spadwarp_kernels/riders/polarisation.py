@@ -11,7 +11,7 @@ import warp as wp
 
 from spadwarp_kernels.base.rotations import one_minus_cosine, orthonormal_basis, set_apart
 from spadwarp_kernels.optics.laser import beam_frame
-from spadwarp_kernels.optics.port import Port
+from spadwarp_kernels.optics.port import Port, PortKind
 from spadwarp_kernels.optics.sea import FACETS, Sea
 from spadwarp_kernels.photon.spec import TransportSpec
 from spadwarp_kernels.photon.state import SEA_SLOT, Carried, CarriedRef, Contribution, WorldRef
@@ -175,11 +175,11 @@ def passage_elements(sea: Sea, u: wp.vec3, v: wp.vec3) -> Elements:
     return window_elements(wp.vec4(1.0, 1.0, 1.0, ratio), wp.vec4(before, before, before, ratio * wp.abs(wp.dot(v, m))))
 
 
-def make_port_elements(cosines: wp.Function | None) -> wp.Function | None:
-    """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u, for those of a
-    `PortKind`; None without."""
-    if cosines is None:
+def make_port_elements(kind: PortKind | None) -> wp.Function | None:
+    """The Warp function ``(port, x, u) -> Elements`` of the ray through x in the water along u; None without a port."""
+    if kind is None:
         return None
+    cosines = kind.cosines
 
     @wp.func
     def port_elements(port: Port, x: wp.vec3, u: wp.vec3) -> Elements:
@@ -201,7 +201,7 @@ def make_polarisation_rider(spec: TransportSpec) -> Rider:
 
 def _make_begin(spec: TransportSpec) -> wp.Function:
     """A beam's field on its axis is turned to the direction of each photon by the smallest rotation."""
-    elements, has_port = make_port_elements(spec.beam.cosines), spec.beam.cosines is not None
+    elements, has_port = make_port_elements(spec.beam.port), spec.beam.port is not None
 
     @wp.func
     def begin(c: CarriedRef, world: WorldRef, target: int, emitted: wp.spatial_vector, x: wp.vec3, u: wp.vec3):
@@ -256,7 +256,7 @@ def _mirror(c: CarriedRef, u: wp.vec3, v: wp.vec3, index: float):
 def _make_deliver(spec: TransportSpec) -> wp.Function:
     """What a port does to the light, and what the receiver takes of it: with respect to the image's x, to which the
     lens turns all light by the smallest rotation to the optical axis."""
-    elements, has_port = make_port_elements(spec.sight.cosines), spec.sight.cosines is not None
+    elements, has_port = make_port_elements(spec.sight.port), spec.sight.port is not None
 
     @wp.func
     def deliver(k: wp.ref[Contribution], c: Carried, world: WorldRef, end: wp.vec3, u: wp.vec3, inside: wp.vec3):

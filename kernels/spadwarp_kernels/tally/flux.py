@@ -243,8 +243,7 @@ def make_flux_volume(
     """
     for name, vector in (("shape", shape), ("lower", lower), ("origin", origin)):
         check.vector(name, vector)
-    if estimator not in FLUX_KINDS[:2]:
-        raise ArgumentError(f"estimator = {estimator!r} is not one of 'track', 'collision'")
+    check.choice("estimator", estimator, FLUX_KINDS[:2])
     volume: Any = FluxVolume()
     rows, shift = [], []
     edge, turn = check.numbers("edge", edge, (3,)), check.numbers("rotation", rotation, (3, 3))

@@ -49,7 +49,7 @@ def make_prepare(stepped: bool, in_blocks: bool, cuda: bool) -> wp.Function:
 def make_begin(spec: TransportSpec) -> wp.Function:
     """The Warp function ``(s, world, sink, emitted, id)``: the photon that `Beam.emit` has emitted, in the water."""
     beam, rider, sight, surface = spec.beam, make_rider(spec), spec.sight, spec.sight.sea or FACETS
-    has_port, sea = beam.enter is not None, sight.sea is not None
+    has_port, sea = beam.port is not None, sight.sea is not None
 
     @wp.func
     def begin(s: PhotonRef, world: WorldRef, sink: SinkRef, emitted: wp.spatial_vector, id: wp.uint64):
@@ -62,7 +62,7 @@ def make_begin(spec: TransportSpec) -> wp.Function:
         s.weight.value = 1.0
         s.weight.absorbed_water += to_ledger(1.0)
         if wp.static(has_port):
-            passage = beam.enter(world.laser.port, s.x, s.u)
+            passage = beam.port.enter(world.laser.port, s.x, s.u)
             state.reweigh(s.weight, passage.transmission)
             if passage.transmission > 0.0:
                 s.x = passage.x
