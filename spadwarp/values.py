@@ -38,13 +38,6 @@ from typing import (
     is_typeddict,
 )
 
-__all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
-__all__ += ["DeviceError", "FileError", "Interval", "MeshError", "Shown", "SpadwarpError", "SpadwarpWarning"]
-__all__ += ["bounds", "check_choice", "check_integer", "check_part", "check_real", "count", "environment_integer"]
-__all__ += ["guarded", "in_words", "parse_number", "path_from_time", "percent", "pulse_speed", "quantity"]
-__all__ += ["range_from_time", "read_real", "rounded", "shown", "suggestion", "time_from_path", "time_from_range"]
-__all__ += ["with_prefix"]
-
 __version__ = "0.1.0"
 
 try:

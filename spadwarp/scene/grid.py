@@ -19,8 +19,6 @@ from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range, file_of
 from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 
-__all__: list[str] = []
-
 COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
 """Of water; two of them determine all."""
 

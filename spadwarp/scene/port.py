@@ -20,8 +20,6 @@ from pydantic import Field
 from spadwarp.scene.pose import unit_vector, vector_of
 from spadwarp.scene.sections import Direction, Section, Vector, field
 
-__all__: list[str] = []
-
 Floats = NDArray[np.float64]
 
 # Steps of Newton's method, which has converged after 4 to 12, and the last: the error is its square.

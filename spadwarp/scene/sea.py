@@ -19,8 +19,6 @@ from spadwarp.scene.pose import unit_vector, vector_of
 from spadwarp.scene.sections import Direction, FilePath, Section, Vector, Whole, field, file_of
 from spadwarp.values import FileError
 
-__all__: list[str] = []
-
 Floats = NDArray[np.float64]
 
 _LEAST_VARIANCE = 1e-9

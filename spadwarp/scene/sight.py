@@ -23,8 +23,6 @@ from spadwarp.scene.scene import Scene, camera_port, laser_port
 from spadwarp.scene.sea import Surface
 from spadwarp.values import path_from_time
 
-__all__: list[str] = []
-
 Floats = NDArray[np.float64]
 
 # Nearest to a port that is asked for [m], and steps of Newton's method, which has converged after a few.
