@@ -641,10 +641,8 @@ def quantity(text: str, unit: str) -> float:
     if not given:
         raise ValueError(f"has no unit; write {number} without quotes for {unit}, or {example!r}")
     if given not in UNITS:
-        close = [one for one in UNITS if one.casefold() == given.casefold()]
-        hint = (
-            f"did you mean {' or '.join(repr(f'{number} {one}') for one in close)}?" if close else f"e.g. {example!r}"
-        )
+        meant = " or ".join(repr(f"{number} {one}") for one in UNITS if one.casefold() == given.casefold())
+        hint = f"did you mean {meant}?" if meant else f"e.g. {example!r}"
         raise ValueError(f"has the unit {given!r}, which is not known; {hint}")
     other, _, given_factor = UNITS[given]
     if other != kind:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from spadwarp.arrays import Floats
 from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
@@ -22,7 +23,6 @@ from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
 """Of water; two of them determine all."""
 
-Floats = NDArray[np.float64]
 Cells = NDArray[np.floating]
 
 GRID_ENDINGS = (".npz", ".h5", ".hdf5", ".nvdb")
