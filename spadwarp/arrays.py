@@ -18,6 +18,8 @@ from spadwarp.values import ArgumentError, Interval, guarded, shown
 __all__ = ["Variable", "as_warp", "caller_tallies", "histogram_rows", "in_torch_order", "is_torch", "labelled"]
 __all__ += ["on_host", "output_tensor", "real_array", "tensor_of", "to_pandas"]
 
+Floats = NDArray[np.float64]
+
 if TYPE_CHECKING:
     import pandas
     import torch

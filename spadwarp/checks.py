@@ -233,7 +233,7 @@ def _check_lines(survey: Survey) -> None:
     known, lines = {one.field for one in survey.messages if one.level == "warning"}, scenes_of_lines(survey.scene)
     found = dict[str, dict[float, CheckMessage]]()
     for line in lines:
-        of_line = Survey(line, survey.mesh, survey.device)
+        of_line = Survey(line, survey.mesh, survey.device.alias)
         for find in _CHECKS:
             find(of_line)
         for one in of_line.messages:

@@ -38,13 +38,6 @@ from typing import (
     is_typeddict,
 )
 
-__all__ = ["BIN_WIDTH", "PLANCK", "SEED", "SPEED_OF_LIGHT", "TIME", "UNITS", "ArgumentError", "ConfigError"]
-__all__ += ["DeviceError", "FileError", "Interval", "MeshError", "Shown", "SpadwarpError", "SpadwarpWarning"]
-__all__ += ["bounds", "check_choice", "check_integer", "check_part", "check_real", "count", "environment_integer"]
-__all__ += ["guarded", "in_words", "parse_number", "path_from_time", "percent", "pulse_speed", "quantity"]
-__all__ += ["range_from_time", "read_real", "rounded", "shown", "suggestion", "time_from_path", "time_from_range"]
-__all__ += ["with_prefix"]
-
 __version__ = "0.1.0"
 
 try:
@@ -648,10 +641,8 @@ def quantity(text: str, unit: str) -> float:
     if not given:
         raise ValueError(f"has no unit; write {number} without quotes for {unit}, or {example!r}")
     if given not in UNITS:
-        close = [one for one in UNITS if one.casefold() == given.casefold()]
-        hint = (
-            f"did you mean {' or '.join(repr(f'{number} {one}') for one in close)}?" if close else f"e.g. {example!r}"
-        )
+        meant = " or ".join(repr(f"{number} {one}") for one in UNITS if one.casefold() == given.casefold())
+        hint = f"did you mean {meant}?" if meant else f"e.g. {example!r}"
         raise ValueError(f"has the unit {given!r}, which is not known; {hint}")
     other, _, given_factor = UNITS[given]
     if other != kind:

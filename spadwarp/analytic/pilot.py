@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from spadwarp.analytic.budgets import central_pixel
 from spadwarp.analytic.model import pixel_maps
+from spadwarp.arrays import Floats
 from spadwarp.device import pick_device
 from spadwarp.frames import Frames, detect, detector_response, first_photon_probabilities, information_from_histogram
 from spadwarp.frames.depth import METHODS, arrival_time
@@ -33,7 +34,6 @@ from spadwarp.values import ConfigError, SpadwarpWarning
 
 __all__ = ["Pilot"]
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _SIDE = 16  # largest width and height of the window [pixels]

@@ -333,8 +333,8 @@ class _Planner:
                 scene, energy_limit, piled, eye, pilot = self._settle(asked, runs, typical, even)
                 parts = [self._settle(asked, runs[i : i + 2], typical, even)[-1] for i in range(0, RUNS, 2)]
                 # Noise of the runs moves a median of moduli away from 0, in quarters of the photons about twice as far.
-                moved = {key: float(np.mean([one.floor[key] for one in parts])) - pilot.floor[key] for key in METHODS}
-                floor = {key: max(value - moved[key], 0.0) for key, value in pilot.floor.items()}
+                twice = {key: float(np.mean([one.floor[key] for one in parts])) for key in pilot.floor}
+                floor = {key: max(value - (twice[key] - value), 0.0) for key, value in pilot.floor.items()}
                 found = _Sample(dataclasses.replace(pilot, floor=floor), parts)
             except NoLight:
                 if last or 2.0 * elapsed > budget:
@@ -375,7 +375,7 @@ class _Planner:
             irradiance=fluence * scene.laser.pulse_energy * scene.laser.repetition_rate,
             pulses=pulses,
             pulses_for=purpose,
-            pulses_range=(min(least := ends[0].pulses, most := ends[2].pulses), max(least, most)),
+            pulses_range=(min(ends[0].pulses, ends[2].pulses), max(ends[0].pulses, ends[2].pulses)),
             frame_time=frame_time,
             reached=None if factor > 1.0 else purpose in _ENOUGH and frame_time <= self.time,
             terms=terms,

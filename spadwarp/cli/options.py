@@ -23,10 +23,6 @@ from spadwarp.values import parse_number, quantity, shown, suggestion
 if TYPE_CHECKING:
     from spadwarp import Ray, Result, Scene
 
-__all__ = ["MEASURED", "Channel", "Length", "Measured", "Method", "Part", "Seconds", "command", "from_to", "from_unit"]
-__all__ += ["given", "items", "load_run", "number_or_text", "numbers", "read_engine", "read_measured"]
-__all__ += ["read_scene", "real_number", "refuse", "whole_number"]
-
 Method = Literal["peak", "centroid", "matched", "likelihood"]
 """`spadwarp.frames.METHODS`, known without loading it."""
 Channel = Literal["I", "co", "cross", "raman", "fluorescence"]

@@ -22,9 +22,6 @@ import spadwarp
 from spadwarp.cli.app import running, say, until_the_end, wrong
 from spadwarp.values import FileError
 
-__all__ = ["Report", "answer", "check_outputs", "in_bytes", "progress", "readable", "rows"]
-__all__ += ["short", "show_table", "write_json", "written"]
-
 Report = Callable[[str, int, int], None]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spadwarp.analytic.model import pixel_maps, scene_optics
+from spadwarp.arrays import Floats
 from spadwarp.dataset.plan import Plan, SceneDraw
 from spadwarp.device import pick_device
 from spadwarp.frames import Frames, detect
@@ -30,8 +31,6 @@ _MOST_PULSES = 2**40
 _MOST_COUNTED_PULSES = 2**31 - 1  # the camera counts in 32 bits
 _PILOT_PHOTONS = 1 << 18
 _COARSE = 8  # every eighth pixel of every eighth row decides the exposure
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.frames import Frames, Receiver, detect
 from spadwarp.io.paths import write_file
 from spadwarp.result import Result
@@ -24,8 +25,6 @@ __all__ = ["LIDAR_FORMATS", "PhotonCloud", "photon_cloud", "write_lidar"]
 
 LIDAR_FORMATS = (".parquet", ".las", ".laz", ".wdp")
 """Endings of the files that `write_lidar` writes."""
-
-Floats = NDArray[np.float64]
 
 NOISE = "noise"
 

@@ -11,15 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spadwarp.arrays import real_array
+from spadwarp.arrays import Floats, real_array
 from spadwarp.io.arrays import read_npy
 from spadwarp.io.text import read_columns, read_text
 from spadwarp.scene import Detector, Laser
 from spadwarp.values import BIN_WIDTH, TIME, ArgumentError, ConfigError, FileError, check_integer, check_real
 
 __all__ = ["InstrumentResponse", "detector_response", "instrument_response", "read_response", "response_matrix"]
-
-Floats = NDArray[np.float64]
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 _SUPPORT_SIGMAS = 6.0  # 1e-9 of a Gaussian lies beyond on either side

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.inverse.equations import pseudo_inverse
 from spadwarp.inverse.exposure import Exposure
 from spadwarp.inverse.fitting import BATCHES, SIMULATION, Fitter, Joint, Prior, State
@@ -18,8 +18,6 @@ from spadwarp.scene import SceneLike, as_scene
 from spadwarp.values import check_integer, percent
 
 __all__ = ["Bound", "Bounds", "bounds"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

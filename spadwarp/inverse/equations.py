@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.device import core_count
 from spadwarp.inverse.rendering import Half
 from spadwarp.inverse.unknowns import DEPTH, Unknown
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
 Cell = tuple[int, int, int]  # rows, columns and bins

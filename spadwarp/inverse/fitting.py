@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.device import pick_device
 from spadwarp.frames.spad import DRAWN_EFFECTS
 from spadwarp.inverse.equations import Equations, Law, Moments, Solution, pseudo_inverse, solve, solve_pooled
@@ -36,7 +37,6 @@ from spadwarp.values import SEED, ArgumentError, ConfigError, check_integer, che
 
 __all__ = ["Estimate", "EstimateMap", "Fit", "Fitter", "Iteration", "fit"]
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 Prior = Mapping[str, tuple[float, float]]
 

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.values import percent
 
 __all__ = ["Deviance", "Goodness"]
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.float32]
 
 _ENOUGH = 5.0  # counts that a cell expects: then noise of its mean is small against the mean

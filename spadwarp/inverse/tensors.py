@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.inverse.unknowns import read_unknowns, with_values
 from spadwarp.scene import Scene, SceneLike, as_scene
 from spadwarp.scene.grid import Grid
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     import torch
 
 __all__ = ["render"]
-
-Floats = NDArray[np.float64]
 
 
 def render(

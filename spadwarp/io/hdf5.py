@@ -31,9 +31,6 @@ from spadwarp.values import FileError, check_integer, check_real
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["PIXELS", "Coordinate", "Hdf5File", "Stored", "hdf5_format", "image_coordinates", "name_dimensions"]
-__all__ += ["open_hdf5", "read_hdf5", "write_hdf5", "write_packed"]
-
 _DEFLATE, _SMALL = 1100, 1 << 16  # gzip makes data smaller by no more than this; bytes that need no comparison
 _LARGEST_ATTRIBUTE = 1 << 20  # bytes
 _LARGEST_CHUNK = 1 << 26  # bytes that may be larger than the array itself

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from spadwarp.io.hdf5 import Hdf5File, open_hdf5
 from spadwarp.io.paths import reading
 
-__all__ = ["SparseMatrix", "Variable", "open_mat"]
-
 _MATRIX, _COMPRESSED = 14, 15
 _CELL, _SPARSE = 1, 5
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}

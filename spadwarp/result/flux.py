@@ -10,6 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.io.hdf5 import Coordinate
 from spadwarp.result.tallies import FluxTallies
 from spadwarp.scene import Scene
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from spadwarp.result.result import Result
 
 __all__ = ["Apparent", "FluxValues", "apparent"]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.io.text import duration
 from spadwarp.scene import Scene, noise_rate
 from spadwarp.values import check_real
@@ -27,8 +28,6 @@ _NARROW = 0.2  # standard deviation [bins] of a response that leaves light in it
 _PART_VOXELS = 1 << 22
 _KNOWN = 1.0 / 3.0  # relative standard error of a bin that means something
 _SAMPLE = 1024  # pixels whose median stands for the target
-
-Floats = NDArray[np.float64]
 
 
 def noise_ratios(result: Result, pixels: NDArray[np.intp]) -> Floats:

@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.io.hdf5 import PIXELS, Coordinate, image_coordinates
 from spadwarp.result.flux import FluxValues, check_flux, flux_arrays, flux_of
 from spadwarp.result.noise import noise_ratios, photons_needed, target_noise_ratio
@@ -35,8 +36,6 @@ CHANNELS: tuple[Channel, ...] = get_args(Channel)
 across it; or light of other wavelengths."""
 POLARISED: tuple[Channel, ...] = ("co", "cross")
 """Those of an analyser."""
-
-Floats = NDArray[np.float64]
 
 # Share of the variance between batches from which one batch is said to decide a standard error. Chance alone exceeds
 # it with a probability of _FALSE_ALARM at most, see `_threshold`.

@@ -12,8 +12,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from spadwarp.arrays import Floats
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.laser import filter_band, filter_transmission, widths_of
 from spadwarp.scene.medium import Medium, PhaseFunction, phase_function
@@ -24,8 +25,6 @@ from spadwarp.water import daylight as skylight
 from spadwarp.water.seawater import RANGES
 
 __all__ = ["daylight_radiance", "daylight_rate", "downwelling_irradiance", "noise_rate"]
-
-Floats = NDArray[np.float64]
 
 _ANGLES = np.linspace(0.0, math.pi, 1441)  # of scattering
 _BAND_NODES = 13

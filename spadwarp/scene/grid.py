@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from spadwarp.arrays import Floats
 from spadwarp.io.arrays import read_npz
 from spadwarp.io.hdf5 import read_hdf5
 from spadwarp.io.paths import existing_file
@@ -19,12 +20,9 @@ from spadwarp.scene.pose import rotation_matrix, vector_of
 from spadwarp.scene.sections import AnyFile, Counts, Scale, Section, Size, Vector, Whole, field, field_range, file_of
 from spadwarp.values import ConfigError, FileError, Interval, SpadwarpError
 
-__all__: list[str] = []
-
 COEFFICIENTS = ("absorption", "scattering", "extinction", "albedo")
 """Of water; two of them determine all."""
 
-Floats = NDArray[np.float64]
 Cells = NDArray[np.floating]
 
 GRID_ENDINGS = (".npz", ".h5", ".hdf5", ".nvdb")

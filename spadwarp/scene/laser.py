@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
+from spadwarp.arrays import Floats
 from spadwarp.io.arrays import read_exr, read_npy
 from spadwarp.io.paths import existing_file, reading
 from spadwarp.scene.port import Port
@@ -37,8 +38,6 @@ from spadwarp.values import PLANCK, SPEED_OF_LIGHT, ConfigError, FileError, Inte
 from spadwarp.water.seawater import RANGES
 
 __all__ = ["Laser", "SpectralLine", "detection_efficiency", "filter_transmission", "spectral_lines"]
-
-Floats = NDArray[np.float64]
 
 ENERGIES = ("pulse_energy", "average_power", "peak_power")
 """How the energy of a pulse is given."""

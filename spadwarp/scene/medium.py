@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import BeforeValidator, Field, PrivateAttr, field_validator
 
+from spadwarp.arrays import Floats
 from spadwarp.scene.grid import COEFFICIENTS, Grid, GridCells, cells_of
 from spadwarp.scene.laser import Laser
 from spadwarp.scene.sections import (
@@ -36,8 +37,6 @@ from spadwarp.water import rayleigh_matrix, read_matrix_table, scaled_rayleigh_m
 from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION, molecular_density, water_optics
 
 __all__ = ["Layer", "Matrix", "Medium", "PhaseFunction", "phase_function", "scattering_matrix"]
-
-Floats = NDArray[np.float64]
 
 # (phase index, group index) of water at 532 nm and 20 °C, seawater of salinity 35, after Quan & Fry 1995 (`water`).
 # Time of flight uses the group index.

@@ -14,15 +14,12 @@ from importlib.resources import files
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
+from spadwarp.arrays import Floats
 from spadwarp.scene.pose import unit_vector, vector_of
 from spadwarp.scene.sections import Direction, Section, Vector, field
-
-__all__: list[str] = []
-
-Floats = NDArray[np.float64]
 
 # Steps of Newton's method, which has converged after 4 to 12, and the last: the error is its square.
 _STEPS, _CONVERGED = 30, 1e-9

@@ -12,11 +12,11 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.values import ArgumentError
 
 __all__ = ["look_at", "opencv_pose"]
 
-Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.scene.camera import pixel_directions
 from spadwarp.scene.pose import rotation_angles, rotation_matrix, turned, vector_of
 from spadwarp.scene.scene import Scene, load_trajectory
 from spadwarp.values import ArgumentError, ConfigError, check_integer
 
 __all__ = ["Shots", "shot_at", "shot_scene", "shots_of"]
-
-Floats = NDArray[np.float64]
 
 _POSE = tuple(f"camera.{name}[{axis}]" for name in ("position", "rotation_deg") for axis in range(3))
 

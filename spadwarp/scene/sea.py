@@ -10,18 +10,14 @@ from functools import lru_cache
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from spadwarp.arrays import Floats
 from spadwarp.io.arrays import read_npy
 from spadwarp.scene.port import air_indices
 from spadwarp.scene.pose import unit_vector, vector_of
 from spadwarp.scene.sections import Direction, FilePath, Section, Vector, Whole, field, file_of
 from spadwarp.values import FileError
-
-__all__: list[str] = []
-
-Floats = NDArray[np.float64]
 
 _LEAST_VARIANCE = 1e-9
 _GRAVITY = 9.81  # [m/s^2]

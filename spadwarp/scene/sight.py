@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from spadwarp.arrays import Floats
 from spadwarp.scene.camera import Camera, pixel_directions, to_camera, to_world
 from spadwarp.scene.laser import Laser, profile_axes, profile_extent
 from spadwarp.scene.port import PortGeometry
@@ -22,10 +23,6 @@ from spadwarp.scene.scan import shots_of
 from spadwarp.scene.scene import Scene, camera_port, laser_port
 from spadwarp.scene.sea import Surface
 from spadwarp.values import path_from_time
-
-__all__: list[str] = []
-
-Floats = NDArray[np.float64]
 
 # Nearest to a port that is asked for [m], and steps of Newton's method, which has converged after a few.
 _LEAST = 1e-9

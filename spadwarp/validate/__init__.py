@@ -6,8 +6,7 @@
 True
 """
 
-from spadwarp.validate.cases import CASES, FAMILY_LEVEL, Case, CaseResult, draw_results, report, run
+from spadwarp.validate.cases import *
 from spadwarp.values import guarded
 
-__all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run"]
 guarded(__name__)

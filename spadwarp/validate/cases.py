@@ -22,8 +22,7 @@ from spadwarp.validate import references
 from spadwarp.values import check_choice, check_integer, path_from_time, time_from_path
 from spadwarp.viz import draw_validation
 
-__all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run", "vessel_reading"]
-__all__ += ["vessel_scene"]
+__all__ = ["CASES", "FAMILY_LEVEL", "Case", "CaseResult", "draw_results", "report", "run"]
 
 BLOCK = 1 << 20  # photons whose records are held at a time
 BATCHES = 32  # independent runs behind a standard error of a histogram

@@ -8,7 +8,7 @@ import math
 import os
 import re
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -247,7 +247,7 @@ def log_ticks(line: Axis, most: float) -> None:
 
     plain = low >= 1e-3 and high <= 2e4
 
-    def fit(values: list[float]) -> bool:  # also where they are close, such as 5000, 7000 and 10000
+    def fit(values: Sequence[float]) -> bool:  # also where they are close, such as 5000, 7000 and 10000
         apart = np.diff(np.log10(values)).min(initial=math.inf) / math.log10(high / low)
         return len(values) <= most and apart * most > 0.7
 

@@ -12,14 +12,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from spadwarp.values import check_real
 from spadwarp.water.seawater import RANGES, check_ranges, table_columns
 
 __all__ = ["Skylight", "clear_sky_irradiance", "daylight_attenuation", "surface_reflectance"]
-
-Floats = NDArray[np.float64]
 
 SKY_REFLECTANCE = 0.066
 """Of a calm surface for an evenly bright sky (Burt 1954; Gregg & Carder 1990)."""

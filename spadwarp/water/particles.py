@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.io import write_text
 from spadwarp.values import ArgumentError, check_integer, check_real
 from spadwarp.water.scattering_matrix import MATRIX_COLUMNS, rayleigh_matrix
@@ -38,8 +39,6 @@ from spadwarp.water.seawater import (
 
 __all__ = ["ParticleOptics", "SizeDistribution", "kopelevich_particles", "log_normal", "mie_particles", "mixture"]
 __all__ += ["power_law", "save_matrix_table", "save_phase_table", "single_size"]
-
-Floats = NDArray[np.float64]
 
 _ANGLES = np.concatenate([np.geomspace(0.01, 10.0, 181)[:-1], np.linspace(10.0, 180.0, 341)])  # [°]
 _PPM = 1e-6

@@ -14,15 +14,13 @@ import os
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from spadwarp.arrays import Floats
 from spadwarp.io.text import read_columns
 from spadwarp.values import ConfigError, check_real
 from spadwarp.water.seawater import RANGES, WATER_DEPOLARISATION
 
 __all__ = ["MATRIX_COLUMNS", "rayleigh_matrix", "read_matrix_table", "scaled_rayleigh_matrix", "voss_fry_matrix"]
-
-Floats = NDArray[np.float64]
 
 MATRIX_COLUMNS = {"angle_deg": "[0, 180]"} | dict.fromkeys(("m12", "m22", "m33", "m34", "m44"), "[-1, 1]")
 """Columns of a table of a scattering matrix: scattering angle [°] and five elements, each over m11."""
