@@ -167,6 +167,7 @@ def test_an_answer_that_cannot_be_written_is_an_error():
     assert (done.returncode, done.stderr) == (1, "error: No space left on device\n")
 
 
+@pytest.mark.slow
 def test_streams_may_be_closed():
     done = process(*PRESETS, stdout=None, preexec_fn=lambda: os.close(1))
     assert (done.returncode, done.stderr) == (0, "")

@@ -27,6 +27,7 @@ def test_analytic_frames_are_those_of_python(scene, tmp_path):
     assert re.search(r"background probability +0\.2\n", printed.stdout) and (tmp_path / "analytic.png").is_file()
 
 
+@pytest.mark.slow
 def test_analytic_takes_truth_and_profile_from_files(scene, done, tmp_path):
     result = spadwarp.load(done / "result.h5")
     exported = save_truth_maps(result, tmp_path / "truth.exr")

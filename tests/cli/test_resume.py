@@ -144,6 +144,7 @@ def test_a_killed_run_resumes_from_its_checkpoint(scene, tmp_path):
     assert "photon ranges" in run("info", out).stdout and {path.name for path in out.iterdir()} == FILES
 
 
+@pytest.mark.slow
 def test_a_run_whose_directory_is_removed_is_written_all_the_same(scene, tmp_path):
     out = tmp_path / "out"
 

@@ -100,6 +100,7 @@ def test_a_spectrum_is_a_result_beside_its_lines(scene, tmp_path):
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES | {"spectrum.h5"}
 
 
+@pytest.mark.slow
 def test_records_are_those_of_trace(scene, tmp_path):
     out = tmp_path / "out"
     run("simulate", scene, "--out", out, "--records", "--quiet", *DEVICE, "--photons", 1000)

@@ -72,6 +72,7 @@ def test_photons_stand_where_their_light_was_reflected(result, cloud):
     np.testing.assert_allclose(cloud.true_range * along[:, 2] + shots.position[cloud.shot, 2], 2.2, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_table_is_that_of_pandas(result, cloud, tmp_path):
     pandas, _ = pytest.importorskip("pandas"), pytest.importorskip("pyarrow")
     (path,) = spadwarp.export(result, tmp_path / "photons.parquet", seed=3)

@@ -60,7 +60,10 @@ def test_load_and_info_take_every_file(files, name, tmp_path):
     assert name != "frames" or tables(tmp_path / "printed.json")["noise_ratio"] > 0.0
 
 
-@pytest.mark.parametrize("name", ["unfinished", "frames", "analytic", "dataset", "shard"])
+@pytest.mark.parametrize(
+    "name",
+    ["frames", "dataset", *(pytest.param(n, marks=pytest.mark.slow) for n in ("unfinished", "analytic", "shard"))],
+)
 def test_view_depth_and_export_take_every_file_with_an_image(files, name, tmp_path):
     run("view", files[name], "--out", tmp_path / "view.html", *DEVICE)
     assert (tmp_path / "view.html").stat().st_size > 1e6

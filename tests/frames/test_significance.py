@@ -25,7 +25,7 @@ def empty(mode, **options):
     return spadwarp.detect(backscatter, background=backscatter, **exposure, **CALL)
 
 
-@pytest.mark.parametrize("mode", ["first_photon", "free_running"])
+@pytest.mark.parametrize("mode", ["first_photon", pytest.param("free_running", marks=pytest.mark.slow)])
 def test_frames_of_empty_water(mode):
     """One false alarm in 20 pixels was asked for."""
     frames, least = empty(mode), -np.log10(0.05)

@@ -114,7 +114,7 @@ def _changed(scene: str, name: str, command: str) -> tuple[int, str]:
 
 def _command(arguments: tuple[str, ...]) -> tuple[int, str]:
     """Exit code and stderr."""
-    if arguments[0] == "train":  # what torch knows of threads and of GPUs does not survive a fork
+    if arguments[0] == "train":  # after Warp's start, torch's derivatives do not survive a fork
         run = [sys.executable, "-m", "spadwarp", *arguments]
         done = subprocess.run(run, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}, capture_output=True)
         text = done.stderr.decode(errors="replace")

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-SECONDS = 60.0  # kernels may have to be compiled
+SECONDS = 60  # of the processor; kernels may have to be compiled
+PATIENCE = 240.0  # seconds, beside others
 BYTES = int(os.environ.get("FUZZ_GIB", "2")) << 30  # torch with CUDA maps much
 
 
@@ -29,7 +30,7 @@ class Outcome:
     seconds: float
 
 
-def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: int = BYTES) -> Outcome:
+def run_isolated(call: Callable[[], Any], *, patience: float = PATIENCE, memory: int = BYTES) -> Outcome:
     """What `call()` returns, from a forked child that may take `memory` bytes more than its parent has now."""
     began = time.monotonic()
     source, sink = os.pipe()
@@ -39,7 +40,7 @@ def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: i
             os.close(source)
             _live(call, sink, log.fileno(), memory)
         os.close(sink)
-        answer = _read(source, began + seconds)
+        answer = _read(source, began + patience)
         taken = time.monotonic() - began
         if answer is None:
             os.kill(child, signal.SIGKILL)
@@ -51,6 +52,8 @@ def run_isolated(call: Callable[[], Any], *, seconds: float = SECONDS, memory: i
         text = (stderr[fault:][:4000] if fault >= 0 else stderr[-4000:]).decode(errors="replace")
     if answer is None:
         return Outcome("hang", None, text, taken)
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
+        return Outcome("hang", "of the processor", text, taken)
     if os.WIFSIGNALED(status):
         return Outcome("crash", signal.Signals(os.WTERMSIG(status)).name, text, taken)
     if not answer:
@@ -76,6 +79,7 @@ def _live(call: Callable[[], Any], sink: int, log: int, memory: int) -> None:
     faulthandler.enable()
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + memory, used + memory))
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 9))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         answer = ("done", call(), "")

@@ -1,7 +1,8 @@
 # ruff: noqa: E402  (threads are switched off before anything is loaded)
 """The fuzzing harness by itself: `python tests/fuzz/run.py 20000 --out findings.jsonl`.
 
-Each case runs in a child process of its own, forked from this one in which everything is loaded, with 60 s and 2 GB.
+Each case runs in a child process of its own, forked from this one in which everything is loaded, with 60 s of the
+processor and 2 GB.
 """
 
 import argparse

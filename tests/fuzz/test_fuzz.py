@@ -41,4 +41,4 @@ def test_the_harness_sees_how_a_call_ends(call, kind, value):
 
 
 def test_the_harness_ends_what_hangs():
-    assert run_isolated(lambda: os.read(os.pipe()[0], 1), seconds=0.3).kind == "hang"
+    assert run_isolated(lambda: os.read(os.pipe()[0], 1), patience=0.3).kind == "hang"

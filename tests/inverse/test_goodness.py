@@ -23,7 +23,7 @@ def detected(light, seed=3):
     return spadwarp.detect(light, pulses=500_000, seed=seed, device="cpu")
 
 
-@pytest.mark.parametrize(("level", "photons"), [(0.05, 1e9), (0.2, 50), (1.0, 10)])
+@pytest.mark.parametrize(("level", "photons"), [(0.05, 1e9), (1.0, 10), pytest.param(0.2, 50, marks=pytest.mark.slow)])
 def test_p_of_right_models_is_uniform(level, photons):
     """100 draws of counts and of a model by so many photons a count: Kolmogorov–Smirnov p above 0.001."""
     random, bins = np.random.default_rng(int(photons + 100 * level)), np.arange(100)

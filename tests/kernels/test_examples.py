@@ -81,6 +81,7 @@ def test_depth_camera(depth_camera):
         camera.frame(worlds, normal)
 
 
+@pytest.mark.slow
 def test_depth_camera_takes_torch(depth_camera):
     torch = pytest.importorskip("torch")
     module, _, depth, normal = depth_camera

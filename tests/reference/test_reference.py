@@ -62,6 +62,7 @@ def test_slab_reproduces_the_published_reflection_function():
     assert forth.sum() == pytest.approx(solved.transmitted - solved.direct, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_time_resolved_reflectance_agrees_with_the_walk_and_adds_up_to_the_steady_one():
     case = {"anisotropy": 0.0, "scattering": 0.8, "absorption": 0.2, "nodes": 24}
     assert cumulative_reflectance(200.0, **case) == pytest.approx(0.285255, abs=1e-6)

@@ -84,8 +84,10 @@ def test_results_and_frames_share_their_memory(result):
     assert dataclasses.replace(view, counts=frames.counts).seed == frames.seed
 
 
-@pytest.mark.parametrize("summed", [False, True], ids=["frames", "summed"])
-@pytest.mark.parametrize("mode", ["first_photon", "free_running", "daylight"])
+@pytest.mark.parametrize(
+    ("mode", "summed"),
+    [("first_photon", False), ("free_running", True), pytest.param("daylight", False, marks=pytest.mark.slow)],
+)
 def test_frames_are_the_same_in_torch(result, mode, summed):
     sections = {"detector.mode": "free_running", "detector.dead_time_ns": 20.0} if mode == "free_running" else {}
     sections |= {"daylight": {"sun_elevation_deg": 30.0, "depth": 20.0}} if mode == "daylight" else {}

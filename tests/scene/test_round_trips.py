@@ -124,7 +124,7 @@ def reloaded(one: Scene) -> Scene:
     return Scene.from_dict(tomllib.loads(one.to_toml()))
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(st.fixed_dictionaries(section_values))
 def test_the_text_of_a_scene_reloads_to_an_equal_scene(tables):
     one = Scene.from_dict(tables)

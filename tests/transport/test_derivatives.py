@@ -190,6 +190,7 @@ def test_runs_with_other_derivatives_are_not_added():
         simulated(scene(), "cpu", (), 256).derivatives["medium.absorption"]
 
 
+@pytest.mark.slow
 def test_records_have_scores(tmp_path):
     """In water alone the score by absorption is minus the path, that by scattering the mean free path's multiple."""
     one = scene(targets=[], gate={"bins": 8})

@@ -47,7 +47,9 @@ def layered_cells(tmp_path_factory):
     return {"file": str(path)}
 
 
-@pytest.mark.parametrize(("estimator", "tracking"), [("analog", "regular"), ("next_event", "delta")])
+@pytest.mark.parametrize(
+    ("estimator", "tracking"), [("analog", "regular"), pytest.param("next_event", "delta", marks=pytest.mark.slow)]
+)
 def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, device):
     """No tentative collision is rejected: up to rounding, the same histories."""
     plain, cellular = (
@@ -61,6 +63,7 @@ def test_cells_of_one_water_are_that_water(estimator, tracking, one_water, devic
     np.testing.assert_allclose(*light, rtol=2e-3 if device == "cpu" else 2e-2, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_regular_tracking_of_cells_that_repeat_layers_has_their_histories(layered_cells, device):
     """Not those of guided light, which is taken to the target in layers alone."""
     layered, cellular = (

@@ -37,7 +37,9 @@ def analytic():
     return spadwarp.simulate_analytic(SCENE, frames=2, seed=1, device="cpu")
 
 
-@pytest.fixture(params=["scene", "result", "frames", "analytic"])
+@pytest.fixture(
+    params=["scene", "result", *(pytest.param(one, marks=pytest.mark.slow) for one in ("frames", "analytic"))]
+)
 def shown(request):
     return SCENE if request.param == "scene" else request.getfixturevalue(request.param)
 

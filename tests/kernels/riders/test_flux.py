@@ -156,6 +156,7 @@ def traced(parts=(PHOTONS,)):
     return data.flux.numpy(), sk.read_ledger(data)[0]
 
 
+@pytest.mark.slow
 def test_fluence_and_balance_of_a_source_in_water_without_end():
     """Far away 4 pi r phi = 2.9520 c exp(-.172511 c r), from c r = 10 on, by tracks and by collisions; absorption times
     fluence of all water is what the ledger has, but for the rounding of weights to single precision."""

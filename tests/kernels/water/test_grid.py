@@ -128,6 +128,7 @@ def test_delta_and_ratio_tracking_have_the_expectation_of_the_cells(device, bloc
     assert chi2 < (expected > 5).sum() + 4.0 * (2.0 * (expected > 5).sum()) ** 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracking", [REGULAR, DELTA], ids=["regular", "delta"])
 def test_flights_in_vacuum_and_beside_the_box_know_no_end(tracking, device):
     medium, layers, _ = water(device)
