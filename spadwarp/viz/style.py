@@ -373,7 +373,7 @@ class Panels:
             short = axis.yaxis if height < width else axis.xaxis
             short.set_major_locator(MaxNLocator(nbins=1, integer=True, min_n_ticks=1))
         shown = axis.imshow(image, cmap=colour_map(colours), norm=scale, clim=limits)
-        if self.unclear is not None:
+        if self.unclear is not None and np.isfinite(image).any():
             hatch(axis, self.unclear)
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)
