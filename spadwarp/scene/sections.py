@@ -834,6 +834,8 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
     """A hint where a value is of another kind: how it is written."""
     if kind == "tuple_type" and isinstance(value, Mapping):
         return f" of tables; write [[{key_text(key)}]]"
+    if kind == "tuple_type" and isinstance(value, str) and not {float, int} & set(parts_of(info)):
+        return f"; write [{value!r}]"
     models = models_of(info) if kind.startswith("model") else []
     if not models:
         return _factor(key, value)
