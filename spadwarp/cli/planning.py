@@ -251,8 +251,7 @@ def sweep(
       spadwarp sweep staircase_5m --set medium.chlorophyll=0.5 --set laser.polarisation=linear --no-range \\
           --vary laser.wavelength_nm=480,532 --vary camera.analyser=none,cross --out sweep/
     """
-    read = opt.read_scene(scene, overrides)
-    texts = vary or ["range="]
+    read, texts = opt.read_scene(scene, overrides), vary or ["range="]
     asked = no_range or photons or (depth_error, time, seed) != (0.01, 1.0, 0)  # what a budget does not take
     of = of or ("plan" if asked or len(texts) > 1 or texts[0].strip().startswith("camera.analyser") else "budget")
     of_range = of == "budget" and len(texts) == 1 and texts[0].partition("=")[0].strip() == "range"
