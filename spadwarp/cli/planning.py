@@ -238,7 +238,7 @@ def sweep(
             camera.analyser=none,co,cross (to the laser's polarisation), and none for the preset of a port.
         medium: With range: a named water; may be repeated. By default the scene's.
         reflectance: With range: of the surface; by default that of the first target.
-        of: By default a budget; a plan where several fields vary.
+        of: By default a budget; a plan where several fields vary, or with an option of plans.
         depth_error (LENGTH): Of a plan, asked for [m].
         time (TIME): Of a plan, the longest for a depth frame [s].
         photons: Of a plan, for each combination. By default as many as judge, or 60 s.
@@ -251,9 +251,9 @@ def sweep(
       spadwarp sweep staircase_5m --set medium.chlorophyll=0.5 --set laser.polarisation=linear --no-range \\
           --vary laser.wavelength_nm=480,532 --vary camera.analyser=none,cross --out sweep/
     """
-    read = opt.read_scene(scene, overrides)
-    texts = vary or ["range="]
-    of = of or ("budget" if len(texts) == 1 and not texts[0].strip().startswith("camera.analyser") else "plan")
+    read, texts = opt.read_scene(scene, overrides), vary or ["range="]
+    asked = no_range or photons or (depth_error, time, seed) != (0.01, 1.0, 0)  # what a budget does not take
+    of = of or ("plan" if asked or len(texts) > 1 or texts[0].strip().startswith("camera.analyser") else "budget")
     of_range = of == "budget" and len(texts) == 1 and texts[0].partition("=")[0].strip() == "range"
     if not of_range:
         opt.refuse("is for a budget over range: --vary range=FROM:TO:N", "--medium", "--reflectance")

@@ -724,9 +724,8 @@ def describe(error: ValidationError, model: type[BaseModel], overrides: Mapping[
     lines: dict[Key, str] = {}
     problems = error.errors(include_url=False)
     located = [(*locate(model, problem["loc"]), problem) for problem in problems[:_MOST]]
-    values = [key for key, _, problem in located if problem["type"] != "literal_error"]
+    values = [key for key, _, problem in located if problem["type"] != "literal_error"]  # which count, not the words
     for key, info, problem in located:
-        # Of a word or a value, or a list of values, the value counts.
         if problem["type"] != "literal_error" or not any(one[: len(key)] == key for one in values):
             lines.setdefault(key, _line(key, info, problem, model, _is_overridden(key, overrides)))
     more = [f"{len(problems) - _MOST} more problems"] if len(problems) > _MOST else []
@@ -809,8 +808,7 @@ def _line(key: Key, info: FieldInfo | None, problem: Any, model: type[BaseModel]
         return f"{entry} is{words}{_instead(key, info, kind, value)}"
     if kind == "string_pattern_mismatch" and info is not None:
         return f"{entry} is no {info.description}"
-    message = problem["msg"]
-    return f"{entry}: {message[0].lower()}{message[1:]}"
+    return f"{entry}: {problem['msg'][0].lower()}{problem['msg'][1:]}"
 
 
 def _factor(key: Key, value: Any) -> str:
@@ -834,6 +832,8 @@ def _instead(key: Key, info: FieldInfo | None, kind: str, value: Any) -> str:
     """A hint where a value is of another kind: how it is written."""
     if kind == "tuple_type" and isinstance(value, Mapping):
         return f" of tables; write [[{key_text(key)}]]"
+    if kind == "tuple_type" and isinstance(value, str) and not {float, int} & set(parts_of(info)):
+        return f"; write [{value!r}]"
     models = models_of(info) if kind.startswith("model") else []
     if not models:
         return _factor(key, value)

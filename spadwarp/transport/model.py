@@ -791,6 +791,7 @@ def target_map(scene: SceneLike, *, device: str | None = None) -> NDArray[np.int
 def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int, int]) -> list[NDArray[np.float32]]:
     """Depth, distance, normal and reflectance of what rays `[H, W, 3]` hit, NaN for nothing; of the camera's own rays
     where they are empty."""
+    reach = 2.0 * np.abs(origins)[np.isfinite(origins)].max(initial=0.0)
     # A ray that does not get through a port goes where nothing is.
     if np.size(origins):
         passes = np.isfinite(origins + directions).all(axis=-1, keepdims=True)
@@ -802,4 +803,8 @@ def trace_rays(model: sk.Model, origins: Any, directions: Any, shape: tuple[int,
     normal = wp.empty(shape, dtype=wp.vec3, device=model.device)
     inputs, outputs = [model.camera, model.surfaces, *rays], [depth, distance, normal, reflectance]
     wp.launch(sk.truth_kernel, dim=shape, inputs=inputs, outputs=outputs, device=model.device)
-    return [array.numpy() for array in (depth, distance, normal, reflectance)]
+    found = [array.numpy() for array in (depth, distance, normal, reflectance)]
+    if model.mesh is not None:  # a ray along a face may seem to meet its plane far beyond the mesh
+        beyond = found[1] > np.linalg.norm(model.mesh.points.numpy(), axis=1).max() + reach
+        found = [np.where(beyond.reshape(shape + (1,) * (one.ndim - 2)), np.float32(np.nan), one) for one in found]
+    return found

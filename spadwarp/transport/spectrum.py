@@ -48,11 +48,6 @@ class Spectrum:
     """Whether the runs were interrupted: lines are missing, or have fewer photons."""
 
     @property
-    def wavelengths(self) -> tuple[float, ...]:
-        """In vacuum [nm], ascending."""
-        return tuple(self.results)
-
-    @property
     def shares(self) -> dict[float, float]:
         """Part of the laser's photons that is of each line and passes the filter; where the lines are not those of the
         laser's spectrum, what the filter passes of a laser of this line alone."""

@@ -146,7 +146,7 @@ def draw_spectrum(
 
     `depth`: frames by wavelength `[H, W]` [m], of which up to six are shown. `width`: [inch]. Raises `FileError`.
     """
-    lines = spectrum.wavelengths
+    lines = [*spectrum.results]
     shown = [lines[k] for k in np.unique(np.linspace(0, len(lines) - 1, min(len(lines), _MOST_DEPTHS)).astype(int))]
     first = spectrum.results[lines[0]]
     panels = Panels(first.truth.depth.shape, 1 + len(shown), width=width, below=(2.0,))

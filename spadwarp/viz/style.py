@@ -373,7 +373,7 @@ class Panels:
             short = axis.yaxis if height < width else axis.xaxis
             short.set_major_locator(MaxNLocator(nbins=1, integer=True, min_n_ticks=1))
         shown = axis.imshow(image, cmap=colour_map(colours), norm=scale, clim=limits)
-        if self.unclear is not None:
+        if self.unclear is not None and np.isfinite(image).any():
             hatch(axis, self.unclear)
         extend = ("neither", "min", "max", "both")[int((image < low).any()) + 2 * int((image > high).any())]
         label = wrapped(label, self._line)
@@ -476,10 +476,10 @@ def target_limits(truth: NDArray[Any], measured: NDArray[Any]) -> tuple[float, f
     if not np.isfinite(truth).any():
         return least, most
     low, high = shown_limits(truth, margin=0.05)
-    error = measured - truth
-    spare = error_limit(error) if np.isfinite(error).any() else 0.0
-    # Errors may all have one sign, and single ones may be as large as the gate.
-    return max(low - spare, min(low, least)), min(high + spare, max(high, most))
+    # Errors may all have one sign, and those of false peaks are as large as the gate: the target keeps its colours.
+    error, span = np.abs(measured - truth), high - low
+    spare = 0.0 if np.isnan(error).all() else min(error_limit(error), max(span, 2.0 * np.nanpercentile(error, 68)))
+    return float(max(low - spare, min(low, least))), float(min(high + spare, max(high, most)))
 
 
 def median_pixel(values: NDArray[Any], among: NDArray[np.bool_]) -> tuple[int, int]:

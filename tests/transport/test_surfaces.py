@@ -16,8 +16,10 @@ import spadwarp
 from helpers.estimators import agreeing_cells
 from helpers.scenes import scene
 from spadwarp import simulate
+from spadwarp.device import pick_device
 from spadwarp.mesh import build_mesh
 from spadwarp.mesh.files import srgb_to_linear
+from spadwarp.transport.model import first_hits
 from spadwarp.values import ConfigError, MeshError
 
 pytestmark = pytest.mark.physics
@@ -314,3 +316,11 @@ def test_an_image_shows_in_the_picture(hidden, tmp_path):
     # An even cone on a plate: cos^3 of the lighting, cos^4 of the view (lens, square of the distance, plate).
     image = result.component("ballistic").sum(axis=2) / cosine**7
     assert np.corrcoef(image.ravel(), result.truth.reflectance.ravel())[0, 1] > 0.9
+
+
+def test_rays_along_faces_meet_nothing_beyond_the_mesh():
+    corners = np.random.default_rng(1).uniform(-0.5, 0.5, (2000, 3, 3)) * [1.0, 1e-7, 1.0] + [0.0, 0.0, 5.0]
+    x = np.linspace(-0.15, 0.15, 3001)
+    rays = np.stack([x, np.zeros_like(x), np.sqrt(1.0 - x**2)], axis=-1)
+    distance = first_hits(corners, np.zeros(3), rays, pick_device("cpu"))
+    assert np.isfinite(distance).any() and np.nanmax(distance) <= np.linalg.norm(corners, axis=-1).max()
