@@ -9,19 +9,8 @@ import warp as wp
 from .kernels import memoised
 from .native import held_word
 
-__all__ = [
-    "STREAM_ANALYTIC",
-    "STREAM_DETECTOR",
-    "STREAM_EMISSION",
-    "STREAM_FLIGHT_SAMPLE",
-    "STREAM_FRAMES",
-    "STREAM_ROULETTE",
-    "STREAM_SURFACE",
-    "STREAM_TRANSPORT",
-    "random_block",
-    "u01",
-    "u01_tail",
-]
+__all__ = ["STREAM_ANALYTIC", "STREAM_DETECTOR", "STREAM_EMISSION", "STREAM_FLIGHT_SAMPLE", "STREAM_FRAMES"]
+__all__ += ["STREAM_ROULETTE", "STREAM_SURFACE", "STREAM_TRANSPORT", "random_block", "u01", "u01_tail"]
 
 _M0 = wp.constant(wp.uint32(0xD2511F53))
 _M1 = wp.constant(wp.uint32(0xCD9E8D57))

@@ -22,16 +22,7 @@ from spadwarp_kernels.water.limits import fresnel_reflectance
 
 from .port import FLAT_PORT, Connection, Port, refracted
 
-__all__ = [
-    "FACETS",
-    "WAVES",
-    "Sea",
-    "SeaKind",
-    "Waves",
-    "make_sea",
-    "see_through_waves_kernel",
-    "slope_variances",
-]
+__all__ = ["FACETS", "WAVES", "Sea", "SeaKind", "Waves", "make_sea", "see_through_waves_kernel", "slope_variances"]
 
 _INV_PI = wp.constant(0.3183098861837907)
 _INV_SQRT_PI = wp.constant(0.5641895835477563)

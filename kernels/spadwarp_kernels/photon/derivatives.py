@@ -14,16 +14,8 @@ from spadwarp_kernels.base import check
 from spadwarp_kernels.base.check import ArgumentError
 from spadwarp_kernels.water.medium import MOST_CONSTITUENTS, Grid
 
-__all__ = [
-    "BLOCK_DERIVATIVES",
-    "DERIVATIVES",
-    "MOST_BLOCK_DERIVATIVES",
-    "MOST_DERIVATIVES",
-    "Blocks",
-    "Derivatives",
-    "make_blocks",
-    "make_derivatives",
-]
+__all__ = ["BLOCK_DERIVATIVES", "DERIVATIVES", "MOST_BLOCK_DERIVATIVES", "MOST_DERIVATIVES", "Blocks", "Derivatives"]
+__all__ += ["make_blocks", "make_derivatives"]
 
 # What a derivative may be with respect to, and the range of such a parameter: a at fixed b, b at fixed a, the mean
 # cosine g of Henyey and Greenstein's phase function, a reflectance or a factor on one that varies, and the

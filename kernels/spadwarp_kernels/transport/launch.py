@@ -49,15 +49,8 @@ from spadwarp_kernels.water.phase_functions import TABULATED, Guiding
 
 from .loops import make_transport_kernel
 
-__all__ = [
-    "Data",
-    "Model",
-    "launch_transport",
-    "load_transport_kernel",
-    "make_data",
-    "prepare_transport",
-    "read_ledger",
-]
+__all__ = ["Data", "Model", "launch_transport", "load_transport_kernel", "make_data", "prepare_transport"]
+__all__ += ["read_ledger"]
 
 # The structs of a model, by name.
 _STRUCTS = {name: var.type for name, var in World.vars.items() if name not in ("seed", "keys")}

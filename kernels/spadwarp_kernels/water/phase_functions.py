@@ -15,23 +15,10 @@ from spadwarp_kernels.base.tables import DensityTables, Floats, fold
 
 from .medium import MOST_CONSTITUENTS, Medium
 
-__all__ = [
-    "HENYEY_GREENSTEIN",
-    "TABULATED",
-    "Guiding",
-    "PhaseFunction",
-    "PhaseGuide",
-    "fournier_forand_density",
-    "henyey_greenstein_density",
-    "henyey_greenstein_pdf",
-    "interpolated_density",
-    "make_mixture",
-    "make_phase_tables",
-    "rayleigh_density",
-    "sample_henyey_greenstein",
-    "sphere_integral",
-    "two_term_henyey_greenstein_density",
-]
+__all__ = ["HENYEY_GREENSTEIN", "TABULATED", "Guiding", "PhaseFunction", "PhaseGuide", "fournier_forand_density"]
+__all__ += ["henyey_greenstein_density", "henyey_greenstein_pdf", "interpolated_density", "make_mixture"]
+__all__ += ["make_phase_tables", "rayleigh_density", "sample_henyey_greenstein", "sphere_integral"]
+__all__ += ["two_term_henyey_greenstein_density"]
 
 
 def henyey_greenstein_density(t: ArrayLike, g: float) -> Floats:
