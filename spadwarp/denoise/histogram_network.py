@@ -81,7 +81,7 @@ def rebinned(counts: Tensor, background: Tensor, response: Tensor, merged: int) 
 class _Convolution(torch.autograd.Function):
     """Two-dimensional convolution whose derivative by the filters is a product of matrices for each image.
 
-    There are thousands of small images, over which the libraries of GPUs sum in a fixed order only slowly.
+    Of thousands of small images, over which no product has to sum at once.
     """
 
     @staticmethod
