@@ -71,13 +71,16 @@ def _messages(score: Tensor, *, columns: bool, jump: float, slope: float) -> Ten
     """
     received = torch.zeros_like(score, memory_format=torch.contiguous_format)
     if score.is_cuda:
-        flat = [wp.from_torch(cube.flatten(), requires_grad=False) for cube in (score.contiguous(), received)]
         start_warp()
+        sent, found = (wp.from_torch(cube.flatten(), requires_grad=False) for cube in (score.contiguous(), received))
         stream = wp.stream_from_torch(torch.cuda.current_stream(score.device))
-        given = {"columns": columns, "jump": jump, "slope": slope, "stream": stream}
-        launch_messages(*flat, tuple(score.shape), **given)  # type: ignore[arg-type]
+        frames, height, width, bins = score.shape
+        launch_messages(
+            sent, found, (frames, height, width, bins), columns=columns, jump=jump, slope=slope, stream=stream
+        )
         return received
-    _sweep(*(cube.movedim(1 if columns else 2, 0) for cube in (score, received)), jump, slope)
+    along = 1 if columns else 2
+    _sweep(score.movedim(along, 0), received.movedim(along, 0), jump, slope)
     return received
 
 
