@@ -5,6 +5,8 @@ A `score` is the log-likelihood of a return in each bin of each pixel, `[B, H, W
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 import torch.nn.functional as F
 import warp as wp
@@ -72,7 +74,8 @@ def _messages(score: Tensor, *, columns: bool, jump: float, slope: float) -> Ten
     received = torch.zeros_like(score, memory_format=torch.contiguous_format)
     if score.is_cuda:
         start_warp()
-        sent, found = (wp.from_torch(cube.flatten(), requires_grad=False) for cube in (score.contiguous(), received))
+        cubes = score.contiguous(), received
+        sent, found = (cast(wp.array, wp.from_torch(cube.flatten(), requires_grad=False)) for cube in cubes)
         stream = wp.stream_from_torch(torch.cuda.current_stream(score.device))
         frames, height, width, bins = score.shape
         launch_messages(
