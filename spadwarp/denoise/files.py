@@ -446,7 +446,7 @@ def _from_counts(
     known = np.broadcast_to(known, counts.shape[-3:] if known.ndim == 3 else counts.shape[-1:])
     assert histograms.response is not None and read.gate is not None
     response = histograms.response.per_bin(width)
-    first, stop, _ = target_bins(counts, known, response, read.gate)
+    first, stop, part = target_bins(counts, known, response, read.gate)
     some, level = counts[..., first:stop], known[..., first:stop]
     start = histograms.gate_start + first * width
 
@@ -455,8 +455,8 @@ def _from_counts(
         return depth_at(time, histograms, group_index)
 
     found = estimate_histograms(
-        read.depth, counts, known, response, bins=slice(first, stop), model=model, to_depth=to_depth, weights=weights,
-        device=device,
+        read.depth, counts, known, response, bins=slice(first, stop), gate=part, model=model, to_depth=to_depth,
+        weights=weights, device=device,
     )  # fmt: skip
     near, far = (to_depth(np.full_like(found.depth, place)) for place in (0.0, 1.0))
     place = ((found.depth - near) / (far - near)).reshape(some.shape[:-1])  # depth is linear in the place
