@@ -68,8 +68,8 @@ class Samples:
         if self.histograms:
             host = np.random.default_rng((self.recipe.seed, self.scenes.rank, step))
             self.part = self.parts[host.choice(len(self.parts), p=[part.share for part in self.parts])]
-            seldom = np.sqrt(COUNT_BINS)  # as many bins take as much more time
-            self.bins = int(host.choice(COUNT_BINS, p=seldom**-1 / (seldom**-1).sum()))
+            often = 1.0 / np.array(COUNT_BINS)  # many bins take as much more time
+            self.bins = int(host.choice(COUNT_BINS, p=often / often.sum()))
             if host.random() < self.part.open_water:
                 now = in_open_water(now)
             if host.random() < self.part.crowded:

@@ -69,7 +69,7 @@ def draw_scenes(count: int, side: int, generator: torch.Generator, *, finer: int
     number = torch.where(random.coin(0.15), 0, 1 + random.integer(_THINGS))
     far = torch.ones_like(place)  # as much smaller are all things
     if finer > 1:
-        far = torch.where(random.coin(0.6), far, random.log_between((1.0, 3.0)))
+        far = torch.where(random.coin(0.4), far, random.log_between((1.0, 4.0)))
     for slot in range(_THINGS):
         apart = random.between((-0.6, 0.6), 2) * side
         at = torch.where(together[:, None], centre + 0.35 * apart, apart)
@@ -302,9 +302,10 @@ COUNT_BINS = (64, 96, 128, 192, 256, 400)
 """Bins of the histograms behind frames with few photons, one number for each batch."""
 
 _RARER = 1.5  # power of a uniform number: low backscatter fractions are drawn more often than high ones
-_WRONG = (0.5, 2.0)  # factors on a background that is not known well; their roots on the width of the response
+_WRONG = (0.5, 2.0)  # factors on a background, and on the width of a response, that are not known well
+_FLOOR = 0.01  # part of the signal that may come in any bin, where a response is fitted
 _ESTIMATED = 0.03, 0.1  # deviations of height and slope, relative, of a background that is estimated from the frame
-_TAPS = 12  # a response extends over this many bins to each side
+_TAPS = 32  # a response extends over this many bins to each side
 
 
 SUBPIXELS = 3
@@ -532,37 +533,59 @@ def _backscatter_depth(profile: Tensor, reach: Tensor, u: Tensor) -> Tensor:
 
 
 class _Response(NamedTuple):
-    """An instrument response, mean 0: a Gaussian whose sides differ, in half of the samples with a wider one."""
+    """An instrument response, mean 0: a Gaussian whose sides differ.
+
+    In some samples a part of the light is in one that is three times as wide, and another part comes late, by a power
+    law, as in detectors to whose junction carriers diffuse.
+    """
 
     early: Tensor  # deviations of the sides [bins], [B, 1]
     late: Tensor
-    wide: Tensor  # part of the light in one that is three times as wide, [B, 1]
+    wide: Tensor  # part of the light in the wider one, [B, 1]
+    tail: Tensor  # part of the light in the tail, [B, 1]
+    decay: Tensor  # its mean delay [bins], [B, 1]
 
     def before(self, time: Tensor) -> Tensor:
-        """Part of the light before times `[B, n]` or `[B, h, w, n]` [bins]."""
-        shape = (-1, *[1] * (time.ndim - 1))
-        early, late, wide = (part.view(shape) for part in self)
-        both, total = (late - early) * math.sqrt(2.0 / math.pi), early + late
+        """Part of the light before times `[…, n]` [bins]."""
+        both, total = (self.late - self.early) * math.sqrt(2.0 / math.pi), self.early + self.late
+        time = time + self.tail * (self.decay - both)
 
         def one(width: float) -> Tensor:
             at = time / width + both
-            first = 2.0 * early * torch.special.ndtr(at / early).clamp_max(0.5)
-            return (first + late * (2.0 * torch.special.ndtr(at / late) - 1.0).clamp_min(0.0)) / total
+            first = 2.0 * self.early * torch.special.ndtr(at / self.early).clamp_max(0.5)
+            return (first + self.late * (2.0 * torch.special.ndtr(at / self.late) - 1.0).clamp_min(0.0)) / total
 
-        return torch.lerp(one(1.0), one(3.0), wide)
+        slow = 1.0 - (1.0 + 0.5 * (time + both).clamp_min(0.0) / self.decay) ** -3
+        return torch.lerp(torch.lerp(one(1.0), one(3.0), self.wide), slow, self.tail)
 
-    def per_bin(self) -> Tensor:
-        """`[B, 2 _TAPS + 1]`, sum 1."""
+    def per_bin(self, shift: Tensor | float = 0.0) -> Tensor:
+        """`[B, 2 _TAPS + 1]`, sum 1, of a response that comes `shift` bins later, `[B, 1]`."""
         edges = torch.arange(-_TAPS - 0.5, _TAPS + 1.0, device=self.early.device)
-        taps = self.before(edges.expand(len(self.early), -1)).diff(dim=1)
-        return taps / taps.sum(dim=1, keepdim=True)
+        taps = self.before(edges - shift).diff(dim=-1)
+        return taps / taps.sum(dim=-1, keepdim=True)
 
 
 def _draw_response(random: Random) -> _Response:
     width, ratio = random.log_between((0.6, 3.6), 1), random.log_between((1.0, 3.0), 1)
     ratio = torch.where(random.coin(0.5, 1), 1.0, torch.where(random.coin(0.8, 1), ratio, 1.0 / ratio))
     wide = 0.3 * random.uniform(1) * random.coin(0.3, 1)
-    return _Response(width / ratio.sqrt(), width * ratio.sqrt(), wide)
+    tail = random.between((0.05, 0.8), 1) * random.coin(0.4, 1)
+    return _Response(width / ratio.sqrt(), width * ratio.sqrt(), wide, tail, random.log_between((1.0, 8.0), 1))
+
+
+def _wrong_response(true: Tensor, random: Random) -> tuple[_Response, Tensor]:
+    """A Gaussian for a response `[B, 2 _TAPS + 1]` that is not known well, and where it fits best, `[B, 1]` [bins].
+
+    Its deviation is wrong by up to a factor of 2. Who knows no better has measured the offset with it, too.
+    """
+    place = torch.arange(-_TAPS, _TAPS + 1, device=true.device)
+    width = (true * place.square()).sum(dim=1, keepdim=True).sqrt() * random.log_between(_WRONG, 1)
+    width, none = width.clamp(0.3, _TAPS / 3.0), torch.zeros_like(width)
+    found = _Response(width, width, none, none, none + 1.0)
+    shift = torch.arange(-60.0, 61.0, device=true.device)[:, None] * 0.1
+    shifted = _Response(*(part[..., None] for part in found)).per_bin(shift)  # [B, shifts, 2 _TAPS + 1]
+    fit = (shifted + _FLOOR).log() @ true[..., None]
+    return found, shift[fit[..., 0].argmax(dim=1)]
 
 
 def _draw_counts(
@@ -573,6 +596,11 @@ def _draw_counts(
     device, subpixels = clean.device, seen.shape[1]
     random = Random(len(clean), generator)
     response = _draw_response(random)
+    # Where the response is not known well, depth is where the one that is given fits best.
+    true = response.per_bin()
+    gaussian, fits_at = _wrong_response(true, random)
+    wrong = random.coin(noise.wrong, 1)
+    true, given = torch.where(wrong, response.per_bin(-fits_at), true), torch.where(wrong, gaussian.per_bin(), true)
     # Signal follows the bound: σ ∝ 1/√signal.
     typical = torch.where(hit, sigma, 0.0).flatten(1).sum(1) / hit.flatten(1).sum(1).clamp_min(1)
     each = (typical[:, None, None, None] / bound.clamp_min(1e-9)).square().clamp(0.05, 4.0)
@@ -609,20 +637,17 @@ def _draw_counts(
     for depth, signal in zip(seen.unbind(dim=1), each.unbind(dim=1), strict=True):
         add(depth, signal * (1.0 - share))
     add(second, shade * share)
-    rate = torch.bmm(rate.flatten(1, 2), toeplitz(response.per_bin(), bins).mT).view_as(rate)
+    rate = torch.bmm(rate.flatten(1, 2), toeplitz(true, bins).mT).view_as(rate)
     scattered = round(noise.scattered * len(clean))
     if scattered:
         rate[:scattered] = _scattered(rate[:scattered], noise, generator)
     from_before = (edges[:-1] < (reach * bins)[..., None]) | ambient[:, None, None, None]
     rate += level[:, None, None] * bright[..., None] * from_before
     counts = torch.poisson(rate.add_(1e-4), generator=generator)
-    # Where they are not known well, background and width of the response are given wrong.
     level = level * torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1), 1.0)
     height, slope = (random.normal(torch.Size((len(clean), 1))) * random.coin(0.5, 1) for _ in range(2))
     level = level * torch.exp(_ESTIMATED[0] * height + _ESTIMATED[1] * slope * (place - 0.5))
-    wrong = torch.where(random.coin(noise.wrong, 1), random.log_between(_WRONG, 1).sqrt(), 1.0)
-    given = response._replace(early=response.early * wrong, late=response.late * wrong)
-    return counts, level, given.per_bin()
+    return counts, level, given
 
 
 def _second_surface(clean: Tensor, hit: Tensor, noise: Noise, random: Random) -> tuple[Tensor, Tensor]:
